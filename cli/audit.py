@@ -15,11 +15,12 @@ from rich.table import Table
 from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.loop import DelayRange, Loop
+from controller.older import AUDITS, with_older
 from design.audit import LONGEST_DELAY, report
 from design.certificate import check_ranges
 from design.coverage import ranges_rows
 from design.designs import KINDS
-from design.result import OLDER_NAMES, listed
+from design.result import listed
 from models.device import CATALOGUE, Listed, listed_device
 from sim.couplings import check_stored, fitted, read_coupling
 from sim.report import encoder_steps
@@ -64,7 +65,7 @@ def main(argv: list[str]) -> int:
         "notes": _notes(args, scenario, switching),
         "wall_s": time.perf_counter() - begin,
     }
-    outcome |= {older: outcome[name] for older, name in (*OLDER_NAMES.items(), ("jitter-proof", "switching"))}
+    outcome = with_older(outcome, AUDITS)
     render.publish(args, outcome, _tables(outcome), _remarks(outcome), out)
     proof = outcome["switching"]
     holds = outcome["certified"] and (proof is None or proof["certified"])
@@ -92,7 +93,7 @@ def _parser() -> options.Parser:
 
 
 def _with_device(args: argparse.Namespace) -> argparse.Namespace:
-    """The options, with a device's numbers where none are given; `source` allows its gains. Raises InputError."""
+    """The options, with the catalogue's numbers where none are given; `source` allows its gains. Raises InputError."""
     if not args.device:
         return args
     try:
@@ -119,7 +120,7 @@ _UNITS = {"damping": 1.0, "mass": 1e3, "force_limit": 1.0, "encoder_step": 1e6, 
 
 
 def _device_part(device: Listed) -> dict[str, Any]:
-    """What is known of a device, each number with its source; null is what nobody publishes."""
+    """The published numbers of a device with their sources; null where none is published."""
     part: dict[str, Any] = {"title": device.title}
     for name in (*_UNITS, "framework_damping"):
         fact = getattr(device, name)

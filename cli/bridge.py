@@ -17,18 +17,25 @@ import numpy as np
 from rich.console import Console
 
 from cli import options, render
-from cli.session_cli import add_link_options, add_safety_options, check_link, hold_session, host_clocked, limits_from
+from cli.session_cli import (
+    add_link_options,
+    add_safety_options,
+    check_link,
+    hold_session,
+    host_clocked,
+    limits_from,
+    steady_scenario,
+)
 from design.certificate import CONDITIONS
-from design.files import write_json
+from design.files import plain, write_json
 from design.guarantees import CAVEATS, LATE
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages
-from hw.recording import Recorder, outcome, save
+from hw.recording import Recorder, SessionReport, outcome, save
 from hw.session import session_for
 from sim.couplings import NAMES
-from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
-from sim.trace import format_growth
+from sim.scenario import InputError, Scenario
 
 _LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
 
@@ -36,10 +43,7 @@ _LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
 def main(argv: list[str]) -> int:
     """One session. 0: it ended as planned, 1: refused, stopped, lost or e-stop, 130: interrupted, after a ramp."""
     args = _parser().parse_args(argv)
-    scenario, settings = options.scenario_from(args), check_link(args)
-    require_linear(scenario, "hw.bridge")
-    require_constant_delay(scenario, "hw.bridge")
-    require_even_ticks(scenario, "hw.bridge")
+    scenario, settings = steady_scenario(args, "hw.bridge"), check_link(args)
     seconds = scenario.duration if args.duration is None else args.duration
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
@@ -71,10 +75,10 @@ def main(argv: list[str]) -> int:
         if signal.SIGHUP not in live.signals:
             raise
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - the terminal is gone, and with it whoever would read this
-    report["files"] = [str(p) for p in save(out, session, recorder, report, not args.no_plot)]
-    render.console(args).print("files: " + ", ".join(report["files"]), soft_wrap=True)
+    files = [str(p) for p in save(out, session, recorder, report, not args.no_plot)]
+    render.console(args).print("files: " + ", ".join(files), soft_wrap=True)
     if args.json:
-        write_json(args.json, report)
+        write_json(args.json, plain(report) | {"files": files})
     if set(live.signals) - {signal.SIGUSR1}:
         return options.INTERRUPTED
     return options.DONE if session.stage == Stage.FINISHED else options.DOES_NOT_HOLD
@@ -153,23 +157,21 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
     )
 
 
-def print_session(report: dict[str, Any], console: Console) -> None:
+def print_session(report: SessionReport, console: Console) -> None:
     """The log, then what the link did."""
-    rows = [(f"{one['t_s']:.3f} s", _colour(one["stage"]), one["cause"]) for one in report["session"]["log"]]
-    title = f"case {report['case']} · {report['scenario']}"
+    rows = [(f"{one.t_s:.3f} s", _colour(one.stage), one.cause) for one in report.session.log]
+    title = f"case {report.case} · {report.scenario}"
     console.print(render.grid(title, ("after", "stage", "cause"), rows, left=(1, 2)))
-    link = report["link"]
-    if link["age_us"]:
-        ages = ", ".join(f"{name} {us / 1000:.2f} ms" for name, us in link["age_us"].items())
-        console.print(
-            f"link: {link['rate_hz']:.0f} answers a second, {link['missed_percent']:.2f} % missed; age {ages}"
-        )
-    for i, part in enumerate(report["growth"], start=1):
-        console.print(f"growth at full gain, arming {i}, {format_growth(part, report['run']['T_s'])}")
-    for i, part in enumerate(report["energy_budget"] or [], start=1):
+    link = report.link
+    if link.age_us:
+        ages = ", ".join(f"{name} {us / 1000:.2f} ms" for name, us in link.age_us.items())
+        console.print(f"link: {link.rate_hz:.0f} answers a second, {link.missed_percent:.2f} % missed; age {ages}")
+    for i, growth in enumerate(report.growth, start=1):
+        console.print(f"growth at full gain, arming {i}, {growth.words(report.run.T_s)}")
+    for i, part in enumerate(report.energy_budget or [], start=1):
         console.print(f"energy budget, arming {i}: limited {part['limited_ticks']} of {part['ticks']} ticks")
         console.print(f"  {part['guarantee']}")
-    counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link["counters"].items() if n)
+    counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link.counters.items() if n)
     console.print(f"counted: {counted or 'nothing'}")
     console.print(f"[dim]·[/] {CAVEATS}")
 

@@ -19,13 +19,14 @@ from rich.table import Table
 
 from cli import options, render
 from cli.design import add_optimal_options, optimal_options
+from controller import older
 from controller.loop import Loop
 from controller.lti import Array
 from design import compare
 from design.certificate import CONDITIONS
-from design.compare import AXES, FEEL_HZ, LADDERS, Demands, LadderRow, Limit, Perceived, Setting, optimum, settings
+from design.compare import AXES, FEEL_HZ, LADDERS, Demands, LadderRow, Limit, Perceived, Point, optimum, points_along
 from design.program import Options
-from design.result import OLDER_NAMES, DesignFailed, certificate_part, finite
+from design.result import DesignFailed, certificate_part, finite
 from design.robustness import robustness_part
 from design.transparency import transparency
 from sim import baselines, report
@@ -223,7 +224,7 @@ def _shown(loop: Loop, name: str, chosen: Chosen, judged: Demands, hz: Array) ->
         lines.sigma_M,
         lines.perceived,
         report.coupling_part(chosen.kind, chosen.coupling, loop.T),
-        conditions | {older: conditions[name] for older, name in OLDER_NAMES.items() if name in conditions},
+        older.with_older(conditions, older.CONDITIONS),
     )
 
 
@@ -291,7 +292,7 @@ def _feel(report: _Couplings) -> Table:
 
 
 def _list(values: Iterable[float]) -> str:
-    """'1, 2', or '1' where all would read the same."""
+    """'1, 2', or '1' where all are equal."""
     shown = [format(v, ".0f" if abs(v) >= 1000 else ".3g") for v in values]
     return shown[0] if len(set(shown)) == 1 else ", ".join(shown)
 
@@ -342,7 +343,7 @@ def _rung(row: LadderRow) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Baselines:
-    """The classics and ours on the same runs."""
+    """The classics and our couplings on the same runs."""
 
     scenario: str
     case: str
@@ -407,13 +408,13 @@ class _Sweep:
     curves: dict[str, list[Limit]] = render.unseen("beside")
 
     @classmethod
-    def of(cls, name: str, along: Sequence[Setting], curves: dict[str, list[Limit]]) -> _Sweep:
-        return cls(AXES[name].label, AXES[name].unit, [setting.value for setting in along], curves)
+    def of(cls, name: str, along: Sequence[Point], curves: dict[str, list[Limit]]) -> _Sweep:
+        return cls(AXES[name].label, AXES[name].unit, [point.value for point in along], curves)
 
 
 @dataclass(frozen=True)
 class _Limits:
-    """How good any coupling could be."""
+    """How good a coupling can be."""
 
     scenario: str
     seed: int
@@ -478,15 +479,15 @@ def _wish(args: argparse.Namespace) -> Options:
         raise InputError(options.as_option(error, args)) from None
 
 
-def _plan(args: argparse.Namespace, loop: Loop, wish: Options) -> dict[str, list[Setting]]:
-    """The settings of every sweep that is asked for. Raises InputError."""
+def _plan(args: argparse.Namespace, loop: Loop, wish: Options) -> dict[str, list[Point]]:
+    """The points of every sweep that is asked for. Raises InputError."""
     plan = {}
     for part in args.over.split(","):
         name, _, text = part.partition("=")
         if name not in AXES:
             raise InputError(f"--over has {name!r}, allowed are {', '.join(AXES)}")
         try:
-            plan[name] = settings(name, loop, wish, args.points, _span(name, text) if text else None, args.keep)
+            plan[name] = points_along(name, loop, wish, args.points, _span(name, text) if text else None, args.keep)
         except InputError:
             raise
         except ValueError as error:
@@ -502,16 +503,16 @@ def _span(name: str, text: str) -> tuple[float, float]:
 
 
 def _designed(
-    plan: dict[str, list[Setting]], designers: dict[str, compare.Designer]
+    plan: dict[str, list[Point]], designers: dict[str, compare.Designer]
 ) -> tuple[dict[str, dict[str, list[Limit]]], bool]:
-    """Every design at every setting; what is done when the keyboard interrupts is kept."""
+    """Every design at every point; what is done when the keyboard interrupts is kept."""
     curves: dict[str, dict[str, list[Limit]]] = {name: {kind: [] for kind in designers} for name in plan}
-    jobs = [(name, setting, kind) for name, along in plan.items() for setting in along for kind in designers]
+    jobs = [(name, point, kind) for name, along in plan.items() for point in along for kind in designers]
     with render.progress("designing") as move:
         try:
-            for done, (name, setting, kind) in enumerate(jobs):
+            for done, (name, point, kind) in enumerate(jobs):
                 move(done, len(jobs))
-                curves[name][kind].append(designers[kind](setting))
+                curves[name][kind].append(designers[kind](point))
         except KeyboardInterrupt:
             return {name: rows for name, rows in curves.items() if any(rows.values())}, True
     return curves, False

@@ -42,7 +42,7 @@ def _snapshot(session: Session) -> dict[str, Any]:
 
 
 def _doing(session: Session) -> str:
-    """What takes longer than a moment."""
+    """What is being done where it takes longer than a moment."""
     if session.stage == Stage.MEASURING:
         return f"measuring the delay: {len(session.measurement.ages)} of {session.settings.measure} answers"
     return "designing the coupling" if session.stage == Stage.MEASURED else ""
@@ -97,7 +97,7 @@ class Dashboard:
 
 
 def main() -> None:
-    """Draw what comes in until nothing comes any more."""
+    """Draw every snapshot until the pipe ends."""
     with Live(console=Screen(stderr=True), auto_refresh=False) as live:
         for line in sys.stdin:
             with suppress(ValueError):

@@ -24,7 +24,7 @@ from design.gain_search import STIFFEST
 from design.guarantees import ANY, HERE, switching_guarantee
 from design.optimal import Optimal, robustness_parts, widest_ranges
 from design.program import DEFAULT, OBJECTIVES, Options
-from design.result import METHODS, Design, DesignFailed, NotProved, listed
+from design.result import Design, DesignFailed, NotProved, listed
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts
@@ -70,7 +70,8 @@ def _parser() -> options.Parser:
     options.add_limiter_option(one_of, "design and prove as if forces were never at their limits")
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
-    ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
+    ways = "complementarity (as printed), inner or fixed-poles (default inner)"
+    ccl.add_argument("--method", metavar="NAME", help=ways)
     optimal = parser.add_argument_group("optimal: the best filter of the environment's forces")
     add_optimal_options(optimal)
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
@@ -81,7 +82,7 @@ def _parser() -> options.Parser:
 
 
 def add_optimal_options(group: argparse._ActionsContainer) -> None:
-    """What is asked of an optimal coupling; options that are not given are None."""
+    """The options of an optimal coupling; None where not given."""
     error = "which transparency error is minimised (default rms)"
     group.add_argument("--objective", choices=OBJECTIVES, help=error)
     options.add_band_option(group)
@@ -92,7 +93,7 @@ def add_optimal_options(group: argparse._ActionsContainer) -> None:
 
 
 def optimal_options(args: argparse.Namespace) -> dict[str, Any]:
-    """What is asked of an optimal coupling."""
+    """The options of an optimal coupling, checked."""
     given = {name: getattr(args, name) for name in ("objective", "band_hz", "high_gain", "seconds")}
     given = {name: value for name, value in given.items() if value is not None}
     if getattr(args, "limiter", False):
@@ -343,7 +344,7 @@ _OBJECTIVE_WORDS = {
 
 
 def _best_rows(part: dict[str, Any]) -> render.Rows:
-    """What only an optimal coupling has."""
+    """Rows that only an optimal coupling has."""
     limit = part["bound"]
     climbed = ", ".join(f"{rung['mismatch_db']:.2f}" for rung in part["ladder"])
     bounded = f"no linear coupling can be better than {limit['rms_mismatch_db'] or 0:.2f} dB rms"
@@ -366,7 +367,7 @@ def _stored_rows(part: dict[str, Any]) -> render.Rows:
 
 @dataclass(frozen=True, eq=False)
 class _Report:
-    """What was designed; parts are null where there is none of it."""
+    """The design; parts that it does not have are null."""
 
     case: str
     seed: int

@@ -11,18 +11,15 @@ import sys
 from typing import Any
 
 from cli import options
-from cli.session_cli import add_pace_option
+from cli.session_cli import add_pace_option, steady_scenario
 from hw.emulator import AXIS, DEVICE, LINE, Emulator, FaultInjection, Line, RealTimeEmulator, Terminal, nobody
-from sim.scenario import InputError, require_constant_delay, require_even_ticks, require_linear
+from sim.scenario import InputError
 
 
 def main(argv: list[str]) -> int:
     """Emulate until told to stop. 0: the time was over or the cable was pulled, 130: interrupted."""
     args = _parser().parse_args(argv)
-    scenario = options.scenario_from(args)
-    require_linear(scenario, "hw.emulator")
-    require_constant_delay(scenario, "hw.emulator")
-    require_even_ticks(scenario, "hw.emulator")
+    scenario = steady_scenario(args, "hw.emulator")
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
     if args.duration <= 0:
         raise InputError(f"--duration is {args.duration:g}, allowed are numbers above 0 up to 1000000 s")

@@ -9,24 +9,24 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.table import Table
 
 from cli import options, render
-from cli.session_cli import add_link_options, check_link, hold_session, measured_link
-from design.files import write
+from cli.session_cli import add_link_options, check_link, hold_session, steady_scenario
+from design.files import plain, write
+from hw.control import link_delay
 from hw.emulator import nobody
 from hw.identify import Estimate, Excitation, capped, chirp, estimate, held, settled
 from hw.limits import Stage
 from hw.monitor import Ages, LinkSettings
-from hw.recording import Recorder, outcome, result_of
+from hw.recording import Recorder, SessionReport, outcome, result_of
 from hw.session import Session, session_for
 from models.device import RigidDevice
-from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
+from sim.scenario import InputError, Scenario
 
 _LIMITS = (
     "The bound is a statement about these records: the least viscous friction of all laws that fit, less its scatter "
@@ -39,28 +39,40 @@ _LIMITS = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Sitting:
     """One session, and what its record says."""
 
-    report: dict[str, Any]
-    session: Session
-    estimates: list[Estimate]  # by axis; none where there is a reason
-    reason: str
-    trace: Path | None
-    signals: Sequence[int]
+    axes: list[Estimate]  # none where there is a reason
+    reason: str | None
+    report: SessionReport = render.unseen("table")
+    session: Session = render.unseen("table")
+    trace: Path | None = render.unseen("table")
+    signals: Sequence[int] = render.unseen("table")
 
-    def part(self) -> dict[str, Any]:
-        return {"axes": [asdict(e) for e in self.estimates], "reason": self.reason or None}
+
+@dataclass(frozen=True, eq=False)
+class _Report:
+    """The last session, one estimate per axis from all sittings, and whether each has a bound above zero."""
+
+    session: SessionReport = render.unseen("beside")
+    axes: list[Estimate] = render.unseen()
+    sittings: list[_Sitting] = render.unseen()
+    bounded: bool = render.unseen()
+    warnings: list[str] = render.unseen()
+    reason: str | None = render.unseen("given")
+    limits: str = render.unseen(default=_LIMITS)
+
+    def lines(self) -> list[str]:
+        """What stands below the table."""
+        reason = [f"no bound: {self.reason}"] if self.reason else []
+        return [*reason, *(f"[yellow]{warning}[/]" for warning in self.warnings), self.limits]
 
 
 def main(argv: list[str]) -> int:
     """Identify every axis. 0: each has a bound above zero, 1: not, or a session did not end as planned."""
     args = _parser().parse_args(argv)
-    scenario, settings = options.scenario_from(args), check_link(args)
-    require_linear(scenario, "hw.identify")
-    require_constant_delay(scenario, "hw.identify")
-    require_even_ticks(scenario, "hw.identify")
+    scenario, settings = steady_scenario(args, "hw.identify"), check_link(args)
     low, high = args.band
     if not 0.5 <= low < high <= 0.4 / scenario.T:
         raise InputError(f"--band is {low:g},{high:g}, expected LOW,HIGH within 0.5 to {0.4 / scenario.T:.0f} Hz")
@@ -73,15 +85,15 @@ def main(argv: list[str]) -> int:
         last = sittings[-1].session.link.last
         if args.port and not args.same_place and last:
             settings = replace(settings, elsewhere=last.counts)
-    report, estimates = _identified(scenario, sittings)
+    report = _identified(scenario, sittings)
     files = [sitting.trace for sitting in sittings if sitting.trace]
-    if report["bounded"]:
-        tables = [_table(e, scenario, i) for i, e in enumerate(estimates)]
+    if report.bounded:
+        tables = [_table(e, scenario, i) for i, e in enumerate(report.axes)]
         files.append(write(out / "devices.toml", "\n".join(tables)))
-    render.publish(args, report, [_figures(report)], _lines(report), out, files)
+    render.publish(args, report, [_figures(report)], report.lines(), out, files)
     if sittings[-1].signals:
         return options.INTERRUPTED
-    return options.DONE if report["bounded"] else options.DOES_NOT_HOLD
+    return options.DONE if report.bounded else options.DOES_NOT_HOLD
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -119,7 +131,7 @@ def _sitting(args: argparse.Namespace, scenario: Scenario, settings: LinkSetting
         return chirp(scenario.channels, scenario.T, link, args.force, args.band, args.seconds)
 
     def plan(ages: Ages) -> Sequence[Excitation]:
-        return [played(measured_link(args, ages, scenario.T))]
+        return [played(link_delay(ages, 1e6 * scenario.T, args.quantile, 1e6 * args.guard))]
 
     if args.port and number > 1:
         told = "let go of every handle" if args.same_place else "take every handle 5 mm or more away and let go"
@@ -128,38 +140,36 @@ def _sitting(args: argparse.Namespace, scenario: Scenario, settings: LinkSetting
     alone = nobody(scenario, args.hand if number == 1 else 0.0)
     seconds = played(1).seconds - 0.2  # the lead has the ramp
     live = hold_session(args, session, plan, seconds, out, alone, args.coulomb)
-    report, estimates, reason = outcome("identify", session, recorder, live.dropped, args.pace), list[Estimate](), ""
+    report, axes, reason = outcome("identify", session, recorder, live.dropped, args.pace), list[Estimate](), None
     if session.stage == Stage.FINISHED and len(recorder):
         try:
             with render.progress("estimating") as move:
-                estimates = estimate(recorder, session, scenario, move)
+                axes = estimate(recorder, session, scenario, move)
         except ValueError as error:
             reason = str(error)
     else:
         reason = f"the session ended in {session.stage}: {session.cause}"
     trace = None
     if len(recorder):
-        trace = result_of(recorder, session.units, scenario.T, report).save_npz(out / f"trace-{number}.npz")
-    return _Sitting(report, session, estimates, reason, trace, live.signals)
+        trace = result_of(recorder, session.units, scenario.T, plain(report)).save_npz(out / f"trace-{number}.npz")
+    return _Sitting(axes, reason, report, session, trace, live.signals)
 
 
-def _identified(scenario: Scenario, sittings: list[_Sitting]) -> tuple[dict[str, Any], list[Estimate]]:
-    """The report of all sittings, and one estimate per axis."""
-    session, told = sittings[-1].session, [sitting.estimates for sitting in sittings if sitting.estimates]
+def _identified(scenario: Scenario, sittings: list[_Sitting]) -> _Report:
+    """The report of all sittings, with one estimate per axis."""
+    session, told = sittings[-1].session, [sitting.axes for sitting in sittings if sitting.axes]
     left_out = [f"sitting {k}: {sitting.reason}" for k, sitting in enumerate(sittings, start=1) if sitting.reason]
-    estimates, reason, warnings = (told[0] if told else []), "; ".join(left_out), left_out
+    axes, reason, warnings = (told[0] if told else []), "; ".join(left_out), left_out
     try:
         if told:
-            estimates, hands = settled(told)
+            axes, hands = settled(told)
             reason, warnings = "", left_out + hands
     except ValueError as error:
         reason, warnings = str(error), left_out
-    suspicious = [] if reason else held(estimates, scenario, session)
-    estimates = capped(estimates, scenario, session)
-    bounded = not reason and not suspicious and all(e.delta > 0 for e in estimates)
-    report = sittings[-1].report | {"axes": [asdict(e) for e in estimates], "sittings": [s.part() for s in sittings]}
-    report |= {"bounded": bounded, "warnings": warnings + suspicious, "limits": _LIMITS}
-    return report | ({"reason": reason} if reason else {}), estimates
+    suspicious = [] if reason else held(axes, scenario, session)
+    axes = capped(axes, scenario, session)
+    bounded = not reason and not suspicious and all(e.delta > 0 for e in axes)
+    return _Report(sittings[-1].report, axes, sittings, bounded, warnings + suspicious, reason or None)
 
 
 def _table(e: Estimate, scenario: Scenario, i: int) -> str:
@@ -178,18 +188,13 @@ def _table(e: Estimate, scenario: Scenario, i: int) -> str:
     return "\n".join([*lines, 'kind = "compliant"', *masses, f"transmission_stiffness = {stiffness:.6g}", ""])
 
 
-def _figures(report: dict[str, Any]) -> Table:
+def _figures(report: _Report) -> Table:
     cells = []
-    for i, axis in enumerate(report["axes"], start=1):
-        found = axis["friction"]
-        mode = "-" if axis["transmission"] is None else f"{axis['transmission']['mode_hz']:.2f}"
+    for i, axis in enumerate(report.axes, start=1):
+        found = axis.friction
+        mode = "-" if axis.transmission is None else f"{axis.transmission.mode_hz:.2f}"
         names = ("mass", "viscous", "coulomb", "stiffness")
-        figures = [f"{found[name]:.5g} ± {2 * found['errors'][name]:.2g}" for name in names]
-        cells.append((str(i), *figures, mode, f"{found['delta']:.4f}" if report["bounded"] else "-"))
+        figures = [f"{getattr(found, name):.5g} ± {2 * found.errors[name]:.2g}" for name in names]
+        cells.append((str(i), *figures, mode, f"{found.delta:.4f}" if report.bounded else "-"))
     heads = ("axis", "mass [kg]", "viscous [N s/m]", "dry [N]", "to ground [N/m]", "mode [Hz]", "delta at least")
-    return render.grid(f"{report['scenario']}, identified", heads, cells, left=())
-
-
-def _lines(report: dict[str, Any]) -> list[str]:
-    reason = [f"no bound: {report['reason']}"] if "reason" in report else []
-    return [*reason, *(f"[yellow]{warning}[/]" for warning in report["warnings"]), _LIMITS]
+    return render.grid(f"{report.session.scenario}, identified", heads, cells, left=())

@@ -23,15 +23,16 @@ from typing import Any, NoReturn, TypeVar
 import msgspec
 from threadpoolctl import threadpool_limits
 
+from controller import older
 from controller.delay import LOST, VaryingDelay
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import SingularLoop
 from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
-from design.result import OLDER_NAMES, DesignFailed
+from design.result import DesignFailed
 from models.device import MOST_DAMPING
-from sim.scenario import CASES, DEFAULT, OLDER_SCENARIOS, InputError, Scenario, built_in, load, load_humans
+from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load, load_humans
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -52,7 +53,7 @@ class Parser(argparse.ArgumentParser):
         )
 
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
-        """As argparse's; an empty word is no name, number or choice, whatever the option is."""
+        """As argparse's; an empty word is refused for every option."""
         found, rest = super().parse_known_args(*args, **how)
         for action in self._actions:
             if getattr(found, action.dest, None) == "":
@@ -145,9 +146,9 @@ def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 def condition(text: str) -> str:
     """A condition by its name, or by the name that it had before."""
-    name = OLDER_NAMES.get(text, text)
-    if name not in OLDER_NAMES.values():
-        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(OLDER_NAMES.values())}")
+    name = older.CONDITIONS.get(text, text)
+    if name not in older.CONDITIONS.values():
+        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(older.CONDITIONS.values())}")
     return name
 
 
@@ -226,7 +227,7 @@ def add_loop_options(parser: argparse.ArgumentParser) -> None:
 def scenario_from(args: argparse.Namespace) -> Scenario:
     """The scenario that the loop options describe. Raises InputError."""
     scenario = load(args.scenario)
-    if args.scenario in OLDER_SCENARIOS:
+    if args.scenario in older.SCENARIOS:
         print(f"scenario {args.scenario} is called {scenario.name} now", file=sys.stderr)
     given = {name: getattr(args, name) for name in ("theta", "psi", "lam") if getattr(args, name) is not None}
     changes: dict[str, Any] = {name: per_channel(f"--{name}", n, scenario.channels) for name, n in given.items()}
@@ -270,8 +271,8 @@ def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: s
 
 def add_condition_option(parser: argparse._ActionsContainer, what: str = "that the certificate is about") -> None:
     """--condition."""
-    names = ",".join(OLDER_NAMES.values())
-    help_ = f"{what}: {' or '.join(OLDER_NAMES.values())} (default: the coupling's own)"
+    names = ",".join(older.CONDITIONS.values())
+    help_ = f"{what}: {' or '.join(older.CONDITIONS.values())} (default: the coupling's own)"
     parser.add_argument("--condition", type=condition, metavar=f"{{{names}}}", help=help_)
 
 
@@ -321,14 +322,14 @@ def out_folder(args: argparse.Namespace, command: str) -> Path:
 
 
 def place(args: argparse.Namespace) -> str:
-    """The case, or of a scenario of one's own its name, for the names of files."""
+    """The case, or the name of the user's own scenario, for file names."""
     if args.scenario == DEFAULT:
         return args.case
     return Path(args.scenario).stem + ("" if args.case == "I" else f"-{args.case}")
 
 
 def as_option(error: ValueError, args: argparse.Namespace) -> str:
-    """What a design says of its argument, with the option's name where the argument has one."""
+    """The message of a design about its argument, with the option's name in the argument's place."""
     text = str(error)
     name, _, _ = text.partition(" ")
     given = getattr(args, name, None)
@@ -511,13 +512,13 @@ def _say(message: str, code: int) -> int:
 
 
 def _cannot(error: OSError) -> int:
-    """One line for what the system refused; what is still to be printed goes nowhere."""
+    """One line for a refusal of the system; later output goes nowhere."""
     nobody_reads()
     return _say(f"error: {error.filename or 'standard output'}: {error.strerror or error}", BAD_INPUT)
 
 
 def _streams() -> None:
-    """A standard stream that is closed leads nowhere, and no character is one that a terminal cannot show."""
+    """Replace closed standard streams, and characters that a terminal cannot show."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         stream = getattr(sys, name)
         if stream is None:
@@ -531,7 +532,7 @@ def _terminated(number: int, frame: Any) -> NoReturn:
 
 
 def _not_lost(unraisable: Any) -> None:
-    """Ctrl-C that comes while Python clears something away would be swallowed there: it comes again."""
+    """Repeat a Ctrl-C that came during Python's clean-up, where it would be lost."""
     if issubclass(unraisable.exc_type, KeyboardInterrupt):
         _thread.interrupt_main()
     else:

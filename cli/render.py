@@ -11,11 +11,10 @@ import argparse
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, field, fields, is_dataclass
+from dataclasses import MISSING, field, fields
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 from rich.console import Console
 from rich.errors import MarkupError
 from rich.progress import Progress
@@ -23,8 +22,9 @@ from rich.table import Table
 from rich.text import Text
 
 from controller.loop import Loop
-from design.files import nobody_reads, printable, write_json
-from design.result import DesignFailed, finite, listed
+from controller.older import REPORTS, with_older
+from design.files import nobody_reads, plain, printable, write_json
+from design.result import DesignFailed, listed
 
 # ----------------------------------------------------------------------------------------------------
 # The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
@@ -122,10 +122,6 @@ def designing(loop: Loop | None = None, kind: str | None = None, condition: str 
 # A whole report: files, tables, lines below them, JSON.
 
 
-#: parts of reports -> their other name in JSON, an older one but for the last
-_OTHER_NAMES = {"ranges": "set", "varying_delay": "jitter", "promise": "guarantee"}
-
-
 def publish(
     args: argparse.Namespace,
     report: Any,
@@ -138,8 +134,7 @@ def publish(
 
     `files` are those written before; the report names them and its own. A part stands there by its older name, too.
     """
-    outcome = plain(report)
-    outcome |= {other: outcome[name] for name, other in _OTHER_NAMES.items() if name in outcome}
+    outcome = with_older(plain(report), REPORTS)
     if folder:
         kept = folder / "report.json"
         outcome["files"] = [*map(str, files), str(kept)]
@@ -153,32 +148,6 @@ def publish(
         screen.print("files: " + ", ".join(outcome["files"]), soft_wrap=True)
     if args.json:
         write_json(args.json, outcome)
-
-
-def plain(report: Any) -> Any:
-    """A report as JSON takes it: dataclasses by their fields, null for what is infinite or no number."""
-    if is_dataclass(report) and not isinstance(report, type):
-        return _part(report)
-    if isinstance(report, Mapping):
-        return {name: plain(value) for name, value in report.items()}
-    if isinstance(report, np.ndarray | np.generic):
-        return plain(report.tolist())
-    if isinstance(report, list | tuple):
-        return [plain(value) for value in report]
-    if isinstance(report, float):
-        return finite(report)
-    return str(report) if isinstance(report, Path) else report
-
-
-def _part(report: Any) -> dict[str, Any]:
-    part: dict[str, Any] = {}
-    for one in fields(report):
-        value, how = getattr(report, one.name), one.metadata.get("json", "key")
-        if how == "beside":
-            part |= plain(value) or {}
-        elif how == "key" or (how == "given" and value is not None):
-            part[one.name] = plain(value)
-    return part
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -280,7 +249,7 @@ def channel_row(contacts: Sequence[str]) -> tuple[str, str | None]:
 
 
 def optional(value: float | None, form: str, absent: str = "-") -> str:
-    """A figure that may not exist."""
+    """A figure in this format, `absent` where there is none."""
     return absent if value is None else form.format(value)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,13 @@ from design.transparency import BAND_HZ, transparency
 from sim import accuracy, report
 from sim import passivity_layer as layer
 from sim.alternatives import Alternative, alternatives
+from sim.api import ScenarioRun, run_scenario
 from sim.couplings import NAMES, Chosen, choose
-from sim.engines import INTEGRATORS, default_integrator
-from sim.run import ENGINES, Simulation, assemble, beginnings, make_engine, run
+from sim.engines import INTEGRATORS
+from sim.run import ENGINES, beginnings
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, stability_part
-from sim.stepping import MOST, check_substeps, default_substeps
-from sim.switching import Period, switching
-from sim.trace import Trace
+from sim.stepping import MOST
 
 
 def main(argv: list[str]) -> int:
@@ -37,9 +35,9 @@ def main(argv: list[str]) -> int:
         raise InputError("--error chooses integrator and substeps of MuJoCo: give no --engine exact, --integrator, ..")
     scenario, out = _scenario(args), options.out_folder(args, "run")
     environment, simulated = _environment(args, scenario)
-    chosen = _chosen(args, scenario)
-    judged = judge(args, scenario, chosen, simulated)
-    done = _run(args, simulated, chosen, judged.limits.rho)
+    chosen = _chosen(args, scenario)  # V, Q or R
+    judged = judge(args, scenario, chosen, simulated)  # what each condition asks of the devices, and what is proved
+    done = _run(args, simulated, chosen, judged.limits.rho)  # sample, compute, limit, hold, advance
     same = args.limiter is None and not scenario.ranges and args.case != "none"
     others = _alternatives(args, scenario, done, (chosen, judged.requirements, judged.limits) if same else None)
     report = _reported(args, scenario, chosen, judged, done, environment, others)
@@ -114,83 +112,19 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
 # The run and what it came to.
 
 
-@dataclass(frozen=True, eq=False)
-class _Run:
-    """One run of a scenario, and the exact engine's beside it."""
-
-    simulation: Simulation
-    ran: Simulation  # the same, with the net that was asked for
-    period: Period | None  # of the worst switching found, where the delays switch
-    integrator: str | None  # None for the exact engine, and so are the substeps
-    substeps: int | None
-    choices: tuple[accuracy.EngineChoice, ...]  # what --error compared, the cheapest first
-    warnings: list[str]
-    trace: Trace
-    exact: Trace | None  # None where friction makes the loop another one than the linear
-    wall_s: float
-
-
-def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tuple[float, ...] | None) -> _Run:
-    """Close the loop. Raises InputError for settings that cannot be."""
-    simulation, period = assemble(scenario, chosen.coupling, lag, args.seed), None
-    for name in ("integrator", "substeps"):
-        if args.engine == "exact" and getattr(args, name) is not None:
-            raise InputError(f"--{name} with --engine exact: it takes no steps; leave it out")
-    if args.engine == "exact" and simulation.friction:
-        raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
-    if scenario.switches:
-        simulation, period = switching(simulation, chosen.coupling, args.seed, scenario.samples)
-    choices = _compared(args, simulation)
-    integrator, substeps, warnings = _steps(args, simulation)
-    if choices:
-        kept = accuracy.pick(choices, args.error)
-        integrator, substeps = kept.integrator, kept.substeps
-    engine, ran = make_engine(simulation, args.engine, integrator, substeps), simulation
+def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tuple[float, ...] | None) -> ScenarioRun:
+    """Close the loop as the options say. Raises InputError for settings that cannot be."""
+    net: layer.Wanted | None = None
     if args.coupling in layer.BASELINES:
-        ran = layer.netted(simulation, chosen.coupling, layer.Classic(args.coupling))
+        net = layer.Classic(args.coupling)
     elif args.energy_budget:
-        ran = _budgeted(simulation, chosen, *args.energy_budget)
+        net = layer.EnergyNet(*args.energy_budget)
+    asked = {name: getattr(args, name) for name in ("engine", "integrator", "substeps", "error", "seed")}
     with render.progress("simulating") as move:
-        begin = time.perf_counter()
-        trace = run(ran, engine, progress=move)
-        wall = time.perf_counter() - begin
-    exact = trace
-    if args.engine != "exact":
-        exact = None if simulation.friction else run(ran, "exact", ticks=trace.t.size)
-    return _Run(simulation, ran, period, integrator, substeps, choices, warnings, trace, exact, wall)
+        return run_scenario(scenario, chosen.coupling, lag, **asked, net=net, progress=move)
 
 
-def _budgeted(simulation: Simulation, chosen: Chosen, start: float, cap: float) -> Simulation:
-    try:
-        return layer.netted(simulation, chosen.coupling, layer.EnergyNet(start, cap))
-    except ValueError as error:
-        raise InputError(f"--energy-budget: {error}") from None
-
-
-def _steps(args: argparse.Namespace, simulation: Simulation) -> tuple[str | None, int | None, list[str]]:
-    """Integrator and substeps of this run, with remarks on a number that was asked for."""
-    if args.engine == "exact":
-        return None, None, []
-    integrator = args.integrator or default_integrator(simulation.scene)
-    try:
-        if args.substeps is None:
-            return integrator, default_substeps(simulation, integrator), []
-        return integrator, args.substeps, check_substeps(simulation, integrator, args.substeps)
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"--integrator {integrator}: {error}") from None
-
-
-def _compared(args: argparse.Namespace, simulation: Simulation) -> tuple[accuracy.EngineChoice, ...]:
-    """Every engine and step on this scene, where an error is asked for. Raises InputError."""
-    if args.error is None:
-        return ()
-    with render.progress("comparing engines"):
-        return accuracy.compare_engines(simulation, args.error)
-
-
-def _alternatives(args: argparse.Namespace, scenario: Scenario, run: _Run, own: Any) -> list[Alternative]:
+def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun, own: Any) -> list[Alternative]:
     """What other couplings come to in the scenario's own environment. Raises InputError for a picture of nothing."""
     skipped = args.no_alternatives or run.trace.interrupted or args.vertex > 0
     with render.progress("other couplings") as move:
@@ -223,7 +157,7 @@ def _panel_title(other: Alternative) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Report:
-    """What a run came to; parts are null where the run has none of it."""
+    """The result of a run; parts that it does not have are null."""
 
     case: str
     scenario: str
@@ -292,11 +226,11 @@ def _reported(
     scenario: Scenario,
     chosen: Chosen,
     judged: Judged,
-    run: _Run,
+    run: ScenarioRun,
     environment: str,
     others: list[Alternative],
 ) -> _Report:
-    """Everything that the run came to."""
+    """The report of a run."""
     simulation, lam = run.simulation, scenario.loop(args.case).lam
     covered = any(requirement.certified for requirement in judged.requirements.values())
     delays = report.delays_part(simulation, chosen, run.period, run.trace.t.size, covered)
@@ -327,7 +261,7 @@ def _reported(
         [other.part() for other in others],
     )
     paper = report.beside_the_paper(simulation.scenario, args.case, stability, judged.coupling)
-    remarks = (*run.warnings, *chosen.notes, *report.remarks(render.plain(found)))
+    remarks = (*run.remarks, *chosen.notes, *report.remarks(render.plain(found)))
     return replace(found, reproducibility=paper, remarks=remarks)
 
 
@@ -340,7 +274,7 @@ def _robustness(chosen: Chosen, loop: Loop, judged: Judged) -> dict[str, Any]:
         return robustness_parts(loop, chosen.coupling)
 
 
-def _settings(args: argparse.Namespace, run: _Run, lam: tuple[int, ...]) -> dict[str, Any]:
+def _settings(args: argparse.Namespace, run: ScenarioRun, lam: tuple[int, ...]) -> dict[str, Any]:
     scenario, process, samples = run.simulation.scenario, run.simulation.process, run.trace.t.size
     duration = float(beginnings(scenario.T, run.simulation.timing, samples, 1)[0])
     return {
@@ -368,25 +302,25 @@ def _settings(args: argparse.Namespace, run: _Run, lam: tuple[int, ...]) -> dict
     }
 
 
-def _save(args: argparse.Namespace, out: Path, run: _Run, report: _Report) -> list[Path]:
+def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: _Report) -> list[Path]:
     result, stability = replace(run.trace, meta=render.plain(report)), report.stability
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", run.simulation.scene.xml))
     if not args.no_plot and result.t.size:
-        from sim.plots import Onset, Surroundings, plot_run
+        from sim.plots import Contacts, Onset, plot_run
 
         apart, hertz = report.ideal_force["error_percent"], stability["exact_frequency_hz"]
         ideal = None if apart is None else (report.alike.ideal, apart)
         grows = stability["exact_verdict"] == "unstable" and run.exact is not None
         growth = stability["exact_growth_rate_per_s"] if grows and report.unstable is None else None
         onset = Onset(growth, report.run["steady_ticks"][0][1], report.credible["until_s"])
-        around = Surroundings(run.simulation.scenario.environment.contacts, *_walls(run))
+        around = Contacts(run.simulation.scenario.environment.contacts, *_walls(run))
         title = _title(run.simulation.scenario.title(args.case), report)
         files.append(plot_run(result, out / "figure.png", title, hertz, ideal, onset, around))
     return files
 
 
-def _walls(run: _Run) -> tuple[list[tuple[int, float, str]], Any]:
+def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
     """Walls between a contact and ground, (channel, place, name), and in which ticks any wall was touched, (N,)."""
     contact, network = run.simulation.process.contact, run.simulation.scenario.environment
     if not network.walls or contact is None:

@@ -17,7 +17,7 @@ from typing import Any
 from cli import options
 from cli.dashboard import Dashboard
 from cli.render import console, progress
-from hw.control import Program, link_delay
+from hw.control import Armable
 from hw.emulator import Emulator, FaultInjection, spawned
 from hw.force_dimension import FORCE_DIMENSION, ForceDimension
 from hw.monitor import Ages, LinkSettings
@@ -26,7 +26,7 @@ from hw.rehearsal import Rehearsal
 from hw.seam import HapticDevice, SerialDevice
 from hw.session import Operator, Session
 from hw.transport import Live, SerialPort, preflight
-from sim.scenario import InputError, Scenario
+from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 _USUAL_BAUD = 921_600
 _SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself
@@ -64,7 +64,7 @@ def add_pace_option(parser: argparse._ActionsContainer, what: str) -> None:
 
 
 def add_safety_options(parser: argparse.ArgumentParser) -> None:
-    """What the bridge never does, and who has to be there."""
+    """The bridge's limits, and the deadman."""
     safety = parser.add_argument_group("safety")
     cap = "largest force (default 2, for first sessions)"
     safety.add_argument("--force-cap", type=options.number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
@@ -81,6 +81,14 @@ def add_safety_options(parser: argparse.ArgumentParser) -> None:
     safety.add_argument("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
 
 
+def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
+    """The scenario, which a serial link wants linear, with even ticks and constant delays. Raises InputError."""
+    scenario = options.scenario_from(args)
+    for require in (require_linear, require_constant_delay, require_even_ticks):
+        require(scenario, command)
+    return scenario
+
+
 def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
     """The limits of the safety options, with `cap`. Raises InputError."""
     more: dict[str, Any] = {"cap": args.force_cap, "speed": args.max_speed, "thermal": args.thermal_time}
@@ -92,7 +100,7 @@ def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
 
 
 def touched(path: str) -> Callable[[], bool]:
-    """Whether a file was touched since the call before; one that is not there is nobody's."""
+    """Whether a file was touched since the last call; False where there is no such file."""
     last = [_mtime(path)]
 
     def look() -> bool:
@@ -141,14 +149,9 @@ def host_clocked(args: argparse.Namespace) -> bool:
     return (args.port or "").split(":")[0] == FORCE_DIMENSION
 
 
-def measured_link(args: argparse.Namespace, ages: Ages, T: float) -> int:
-    """Ticks of delay for the ages that were measured, by --quantile and --guard."""
-    return link_delay(ages, 1e6 * T, args.quantile, 1e6 * args.guard)
-
-
 @dataclass(frozen=True)
 class _Held:
-    """What came to pass beside the session: signals, and bytes that the port would not take at once."""
+    """What happens beside the session: signals, and bytes that the port did not take at once."""
 
     signals: Sequence[int] = ()
     dropped: int = 0
@@ -157,7 +160,7 @@ class _Held:
 def hold_session(
     args: argparse.Namespace,
     session: Session,
-    plan: Callable[[Ages], Sequence[Program]],
+    plan: Callable[[Ages], Sequence[Armable]],
     seconds: float,
     out: Path,
     alone: Scenario | None = None,
@@ -220,13 +223,13 @@ def hold_session(
 def _rehearsed(
     args: argparse.Namespace,
     session: Session,
-    plan: Callable[[Ages], Sequence[Program]],
+    plan: Callable[[Ages], Sequence[Armable]],
     seconds: float,
     incidents: IncidentLog,
     alone: Scenario | None,
     coulomb: float,
 ) -> _Held:
-    """The session in virtual time; whoever would be there arms once, and holds the deadman."""
+    """The session in virtual time; the emulated person arms once and holds the deadman."""
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
     try:
         emulator = Emulator(alone or options.scenario_from(args), faults, coulomb=coulomb)
@@ -234,7 +237,7 @@ def _rehearsed(
         raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
     with progress("rehearsing") as move:
 
-        def planned(ages: Ages) -> Sequence[Program]:
+        def planned(ages: Ages) -> Sequence[Armable]:
             move(0, 1, "designing the coupling")
             return plan(ages)
 

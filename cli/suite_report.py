@@ -47,7 +47,7 @@ def markdown(outcome: dict[str, Any]) -> str:
 
 def machine() -> dict[str, str]:
     """What figures of speed, and the last digits of all others, depend on."""
-    packages = {name: version(name) for name in ("mujoco", "numpy", "scipy", "cvxpy", "clarabel")}
+    packages = {name: version(name) for name in ("mujoco", "numpy", "scipy", "clarabel")}
     return {
         "Python": platform.python_version(),
         **packages,

@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from cli import options, render
 from design.files import check_file
 from sim.scenario import InputError
-from sim.trace import Trace, format_growth, growths
+from sim.trace import Growth, Trace, growths
 
 _ZOOM_HZ = 10.0  # the picture shows six periods of it where nothing oscillates
+
+
+@dataclass(frozen=True)
+class _Traced:
+    """The machine-readable result."""
+
+    trace: str
+    ticks: int
+    duration_s: float
+    growth: list[Growth]
 
 
 def main(argv: list[str]) -> int:
@@ -22,20 +33,15 @@ def main(argv: list[str]) -> int:
     found = growths(result)
     if not result.t.size:
         raise InputError(f"{args.trace}: it has no ticks")
-    outcome = {
-        "trace": args.trace,
-        "ticks": result.t.size,
-        "duration_s": float(result.t[-1]),
-        "growth": [one.part() for one in found],
-    }
     if args.plot:
         from sim.plots import plot_run
 
         strongest = next((one.frequency_hz for one in found if one.frequency_hz), _ZOOM_HZ)
         plot_run(result, Path(args.plot), args.trace, strongest)
-    T = float(result.t[-1]) / max(1, result.t.size - 1)
-    lines = [f"growth, {format_growth(part, T)}" for part in outcome["growth"]]
-    render.publish(args, outcome, (), lines or ["no loop was closed at full gain: there is no growth to report"])
+    traced = _Traced(args.trace, result.t.size, float(result.t[-1]), found)
+    T = traced.duration_s / max(1, traced.ticks - 1)
+    lines = [f"growth, {one.words(T)}" for one in found]
+    render.publish(args, traced, (), lines or ["no loop was closed at full gain: there is no growth to report"])
     return options.DONE
 
 

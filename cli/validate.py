@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from cli import options, render
-from cli.judged import judge
-from controller.environment import Member
+from cli.judged import Judged, judge
+from controller.lti import Array
+from controller.ranges import Member
 from design.certificate import RangesCheck
 from design.conditions import this_environment
 from design.guarantees import ANY
+from design.result import finite
 from models.human import Human, Population
 from sim import report
 from sim.adversary import Worst, search, search_population
@@ -37,46 +42,21 @@ def main(argv: list[str]) -> int:
     with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
         chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
     judged = judge(args, scenario, chosen)
-    environments, guarantee = _environments(args, judged.whole), judged.promise
-    certified = guarantee is not None and (not environments or guarantee == ANY or judged.proved)
-
-    question = _question(args, scenario, chosen, environments, judged.limits.rho)
+    question = _question(args, scenario, chosen, judged)
     findings, wall = _findings(args, question, Table(question, out, args.resume))
-    outcome = {
-        "case": args.case,
-        "scenario": scenario.name,
-        "scenario_digest": scenario.digest,
-        **report.validation_part(question, findings, certified, wall),
-        **render.plain(judged),
-        "remarks": list(chosen.notes),
-    }
-    _add(outcome, "own_humans", _own_humans(args, scenario, chosen, certified))
-    if scenario.varying_delay:
-        covered = report.delay_range_part(scenario.varying_delay) | certified_part(scenario, chosen, certified)
-        _add(outcome, "switching", report.varying_delays_part(findings, covered))
-    if scenario.uneven:
-        met = report.timing_part(scenario.timing(args.seed, max(1, question.ticks)), scenario) or {}
-        _add(outcome, "timing", report.varying_delays_part(findings, met | {"covered": certified}))
-    worst = None
+    searched = _Searched()
     if args.adversary and not (findings.interrupted or findings.lost):
-        attacked, ratio = scenario, judged.requirements["this-environment"].ratio
-        if environments and judged.whole:
-            member, requirement = judged.whole.worst_found
-            attacked, ratio = scenario.replace(environment=member.network, ranges=None), requirement.ratio
-        worst = _attack(args, attacked, chosen, outcome)
-        if worst:
-            _add(outcome, "adversary", report.adversary_part(worst, ratio, certified))
-        own_draws = worst is not None and not isinstance(scenario.population, Population)
-        if own_draws and (own := _attack(args, attacked, chosen, outcome, True)):
-            _add(outcome, "adversary_population", report.adversary_part(own, ratio, certified))
-    files = _save(args, out, question, findings, worst, outcome)
+        searched = _searched(args, question, chosen, judged)
+    report = _reported(args, chosen, judged, question, findings, wall, searched)
+    files = _save(args, out, question, findings, searched.worst, chosen.kind)
     title = f"{scenario.title(args.case)}: coupling {chosen.kind}"
-    render.publish(args, outcome, [render.facts(title, _rows(outcome), ("", ""))], _lines(outcome), out, files)
-    if outcome["interrupted"]:
+    lines = [*([f"Delays that vary: {report.switching.met['covers']}."] if report.switching else []), *report.remarks]
+    render.publish(args, report, [render.facts(title, render.rows_of(report), ("", ""))], lines, out, files)
+    if report.interrupted:
         return options.INTERRUPTED
-    if outcome["unfinished"]:
+    if report.unfinished:
         return options.UNFINISHED
-    return options.DONE if outcome["holds"] else options.DOES_NOT_HOLD
+    return options.DONE if report.holds else options.DOES_NOT_HOLD
 
 
 def _parser() -> options.Parser:
@@ -139,20 +119,15 @@ def _environments(args: argparse.Namespace, whole: RangesCheck | None) -> tuple[
     return (*whole.members, *others[: len(whole.members)])
 
 
-def _question(
-    args: argparse.Namespace,
-    scenario: Scenario,
-    chosen: Chosen,
-    environments: tuple[Member, ...],
-    lag: tuple[float, ...] | None,
-) -> Validation:
+def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, judged: Judged) -> Validation:
+    """What is asked of whom. Raises InputError."""
     links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
-    work = args.humans, links, args.engine, args.duration
-    return Validation(scenario, chosen.coupling, args.seed, *work, environments=environments, lag=lag)
+    work, met = (args.humans, links, args.engine, args.duration), _environments(args, judged.whole)
+    return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=judged.limits.rho)
 
 
 def _findings(args: argparse.Namespace, question: Validation, table: Table) -> tuple[Findings, float]:
-    """What the humans did, and the seconds that it took."""
+    """The findings on all humans, and the seconds that they took."""
     begin = time.perf_counter()
     with render.progress("validating") as move:
         if args.dask is not None:
@@ -162,47 +137,36 @@ def _findings(args: argparse.Namespace, question: Validation, table: Table) -> t
     return findings, time.perf_counter() - begin
 
 
-def _add(outcome: dict[str, Any], name: str, part: dict[str, Any]) -> None:
-    """A further check: the whole holds only if it holds."""
-    outcome[name] = part
-    outcome["holds"] = outcome["holds"] and part["holds"]
+@dataclass(frozen=True)
+class _Searched:
+    """What the adversary found; None where it was not asked, or the keyboard ended its search."""
+
+    worst: Worst | None = None
+    drawn: Worst | None = None  # the worst that the scenario's own population draws
+    ratio: float = 0.0  # required over available damping of the loop that was attacked
+    interrupted: bool = False
 
 
-def _own_humans(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, certified: bool) -> dict[str, Any]:
-    """What the exact loop does in the hands of the scenario, or of --human FILE."""
-    mode = worst_mode(assemble(scenario, chosen.coupling))
-    return {
-        "from": args.human or scenario.name,
-        **eigenvalue_part(mode),
-        "holds": not (certified and unstable(mode.growth)),
-    }
-
-
-def _attack(
-    args: argparse.Namespace, scenario: Scenario, chosen: Chosen, outcome: dict[str, Any], drawn: bool = False
-) -> Worst | None:
-    """The worst human, or None where the keyboard ends the search: what was found out before is kept.
-
-    With `drawn` among the hands that the population draws.
-    """
-    seek = search_population if drawn else search
+def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, judged: Judged) -> _Searched:
+    """The worst humans, in the environment that asks most; what was found before Ctrl-C is kept."""
+    scenario, ratio = question.scenario, judged.requirements["this-environment"].ratio
+    if question.environments and judged.whole:
+        member, requirement = judged.whole.worst_found
+        scenario, ratio = scenario.replace(environment=member.network, ranges=None), requirement.ratio
+    found: list[Worst] = []
     try:
-        with render.progress("searching the worst human") as move:
-            frozen = assemble(scenario, chosen.coupling).process.frozen().values()
-            F = max(frozen, key=lambda F: this_environment(F, scenario.delta).ratio)  # the contact state that asks most
-            return seek(scenario, F, args.seed, args.generations or 150, progress=move)
+        for seek in (search, search_population)[: 1 if isinstance(scenario.population, Population) else 2]:
+            with render.progress("searching the worst human") as move:
+                frozen = assemble(scenario, chosen.coupling).process.frozen().values()
+                F = max(frozen, key=lambda F: this_environment(F, scenario.delta).ratio)  # the state that asks most
+                found.append(seek(scenario, F, args.seed, args.generations or 150, progress=move))
     except KeyboardInterrupt:
-        outcome["interrupted"] = True
-        return None
+        return _Searched(*found, ratio=ratio, interrupted=True)
+    return _Searched(*found, ratio=ratio)
 
 
 def _save(
-    args: argparse.Namespace,
-    out: Path,
-    question: Validation,
-    findings: Findings,
-    adversary: Worst | None,
-    outcome: dict[str, Any],
+    args: argparse.Namespace, out: Path, question: Validation, findings: Findings, worst: Worst | None, kind: str
 ) -> list[Path]:
     """Humans that can be replayed with `sim.run --human`, and the picture."""
     scenario, files = question.scenario, []
@@ -215,98 +179,355 @@ def _save(
             continue
         remark = f"seed {question.seed}, index {i}"
         files.append(save_humans(out / name, crowd.humans(0), remark, crowd.persons(0)))
-    if adversary:
-        remark = f"found by the adversary, seed {question.seed}: growth {adversary.growth:+.6g} 1/s"
-        files.append(save_humans(out / "adversary.toml", adversary.humans, remark, adversary.persons))
+    if worst:
+        remark = f"found by the adversary, seed {question.seed}: growth {worst.growth:+.6g} 1/s"
+        files.append(save_humans(out / "adversary.toml", worst.humans, remark, worst.persons))
     if not args.no_plot and findings.index.size:
         from sim.plots import plot_population
 
-        kind = "no coupling" if args.case == "none" else f"{outcome['coupling']['kind']} coupling"
+        coupling = "no coupling" if args.case == "none" else f"{kind} coupling"
         what = scenario.title(args.case).removesuffix(", no coupling")
-        title = f"{what}, {kind}: {outcome['humans']} random humans"
+        title = f"{what}, {coupling}: {findings.index.size} random humans"
         files.append(plot_population(findings.mass, findings.damping, findings.exact, out / "population.png", title))
     return files
 
 
 # ----------------------------------------------------------------------------------------------------
-# The report as a table.
+# The report and its parts. Each says itself what stands in its row of the table.
 
 
-def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
-    bad, worst, traces, own = (outcome[name] for name in ("unstable", "worst", "traces", "own_humans"))
-    audit, adversary, switching = (outcome.get(name) for name in ("energy_audit", "adversary", "switching"))
-    timing, drawn = outcome.get("timing"), outcome.get("adversary_population")
-    mujoco = "" if bad["mujoco"] is None else f", {bad['mujoco']} MuJoCo"
-    verdict = {True: "[green]yes[/]", False: "[red]no[/]"}.get(outcome["holds"]) or str(outcome["reason"])
-    kept = f"{outcome['humans']} humans that were finished are kept, --resume does the others; searches are not kept"
+_SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be slower in its last quarter than before
+_ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
+_NOTHING = "no batch of humans was done"
+
+
+@dataclass(frozen=True)
+class _Unstable:
+    """Hands that make the loop unstable, by engine; None for one that was not asked."""
+
+    exact: int
+    mujoco: int | None
+
+    def __str__(self) -> str:
+        return f"{self.exact} exact" + ("" if self.mujoco is None else f", {self.mujoco} MuJoCo")
+
+
+@dataclass(frozen=True)
+class _Environments:
+    """Which environments the loops had, and in which of them a loop was unstable."""
+
+    of: str
+    count: int
+    names: list[str] | None = render.unseen("given", None)
+    unstable_in: list[str] | None = render.unseen("given", None)
+
+    @classmethod
+    def met(cls, question: Validation, findings: Findings) -> _Environments:
+        members = question.environments
+        if not members:
+            return cls("the nominal environment", 1)
+        where = sorted({int(i) % len(members) for i in findings.index[unstable(findings.exact)]})
+        return cls("the ranges", len(members), [each.name for each in members], [members[i].name for i in where])
+
+    def __str__(self) -> str:
+        if self.unstable_in is None:
+            return self.of
+        return f"{self.count} of {self.of}, in turn; unstable in: {'; '.join(self.unstable_in) or 'none'}"
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A set of humans that the population drew, and the environment that it met."""
+
+    seed: int
+    index: int
+    human: list[dict[str, Any]]
+    person: list[dict[str, Any]]
+    environment: str | None = render.unseen("given", None)
+    network: dict[str, Any] | None = render.unseen("given", None)
+
+    @classmethod
+    def of(cls, question: Validation, index: int) -> _Drawn:
+        crowd, member = question.crowd(index), question.environment(index)
+        humans, persons = _humans(crowd.humans(0)), msgspec.to_builtins(crowd.persons(0))
+        where, network = (member.name, msgspec.to_builtins(member.network)) if member else (None, None)
+        return cls(question.seed, index, humans, persons, where, network)
+
+
+@dataclass(frozen=True)
+class _Slowest:
+    """The humans of the largest spectral radius."""
+
+    spectral_radius: float
+    growth_rate_per_s: float
+    frequency_hz: float
+    who: _Drawn = render.unseen("beside")
+
+    @classmethod
+    def of(cls, question: Validation, findings: Findings) -> _Slowest:
+        k = int(np.argmax(findings.radius))
+        radius, growth, frequency = (float(of[k]) for of in (findings.radius, findings.exact, findings.frequency))
+        return cls(radius, growth, frequency, _Drawn.of(question, int(findings.index[k])))
+
+    def __str__(self) -> str:
+        growth = f"{self.growth_rate_per_s:+.4g} 1/s at {self.frequency_hz:.2f} Hz (index {self.who.index})"
+        return growth + (f", at {self.who.environment}" if self.who.environment else "")
+
+
+@dataclass(frozen=True)
+class _Own:
+    """What the exact loop does in the hands of the scenario, or of --human FILE."""
+
+    from_: str
+    mode: Mapping[str, Any] = render.unseen("beside")
+    holds: bool = render.unseen()
+
+    def rows(self) -> render.Rows:
+        mode = self.mode
+        growth = f"{mode['exact_growth_rate_per_s']:+.4g} 1/s at {mode['exact_frequency_hz']:.2f} Hz"
+        yield f"hands of {self.from_}", f"{growth}: {mode['exact_verdict']}"
+
+
+@dataclass(frozen=True)
+class _Traces:
+    """What the traces say, and whether they are long enough for hands to be slower at their end."""
+
+    duration_s: float
+    clipped_runs: int
+    contacts: int
+    measured: int
+    largest_difference_per_s: float | None
+    stable_and_settling: int
+    stable: int
+    slowest_settling: float | None
+    slowest_decay_s: float | None
+    settling_decides: bool
+    reason: str | None = render.unseen("given", None)
+
+    @classmethod
+    def of(cls, question: Validation, findings: Findings) -> _Traces:
+        stable, duration = ~unstable(findings.exact), question.ticks * question.scenario.T
+        decay = _largest(-1 / findings.exact[findings.exact < 0])
+        decides = decay is None or duration >= _SETTLING * decay
+        slow = f"the slowest mode decays in {decay:.3g} s: in {duration:g} s its hands need not be slower"
+        return cls(
+            duration_s=duration,
+            clipped_runs=int((findings.clipped > 0).sum()),
+            contacts=int(findings.contacts.sum()),
+            measured=int(np.isfinite(findings.trace).sum()),
+            largest_difference_per_s=_largest(np.abs(findings.trace - findings.exact)),
+            stable_and_settling=int((stable & (findings.settling < 1)).sum()),
+            stable=int(stable.sum()),
+            slowest_settling=_largest(findings.settling[stable]),
+            slowest_decay_s=decay,
+            settling_decides=decides,
+            reason=None if decides else slow,
+        )
+
+    def rows(self) -> render.Rows:
+        yield "traces", f"{self.duration_s:g} s each, {self.clipped_runs} reached a force limit"
+        yield "contacts made", f"{self.contacts} on these traces" if self.contacts else None
+
+    def settled(self) -> str:
+        undecided = "" if self.settling_decides else f"; no verdict: {self.reason}"
+        return f"{self.stable_and_settling} of {self.stable} stable loops slower at the end{undecided}"
+
+
+@dataclass(frozen=True)
+class _Energy:
+    """Traces on which W >= 0 was asked: forces that were clipped are covered by nothing, those of a limiter are."""
+
+    audited: int
+    clipped: int
+    violated: int
+    least_J: float | None
+    holds: bool
+
+    @classmethod
+    def of(cls, question: Validation, findings: Findings) -> _Energy:
+        asked = (findings.clipped == 0) | (question.lag is not None)
+        violated = int((asked & ~(findings.energy >= -_ROUNDING * findings.audited)).sum())
+        least = float(findings.energy[asked].min()) if asked.any() else None
+        return cls(int(asked.sum()), int((~asked).sum()), violated, least, not violated)
+
+    def __str__(self) -> str:
+        left = f", {self.clipped} clipped left out" if self.clipped else ""
+        return f"{self.audited - self.violated} of {self.audited}{left}"
+
+
+@dataclass(frozen=True)
+class _Growing:
+    """How many humans grow while delays or ticks vary; it holds unless certificates cover these and one grows."""
+
+    met: Mapping[str, Any] = render.unseen("beside")
+    unstable: _Unstable = render.unseen()
+    humans: int = render.unseen()
+    mujoco_unclipped: int = render.unseen()
+    largest_growth_per_s: float | None = render.unseen()
+    worst_index: int | None = render.unseen()
+    holds: bool = render.unseen()
+
+    @classmethod
+    def of(cls, findings: Findings, met: Mapping[str, Any]) -> _Growing:
+        exact, mujoco = findings.switching, findings.switching_mujoco
+        seen, mujoco = ~np.isnan(exact), mujoco[~np.isnan(mujoco)]
+        grow = _Unstable(int((exact > 0).sum()), int((mujoco > 0).sum()) if mujoco.size else None)
+        worst = int(np.nanargmax(exact)) if seen.any() else None
+        figures = (None, None) if worst is None else (float(exact[worst]), int(findings.index[worst]))
+        return cls(met, grow, int(seen.sum()), mujoco.size, *figures, not (met["covered"] and grow.exact))
+
+    def row(self, what: str) -> tuple[str, str | None]:
+        mujoco, growth = self.unstable.mujoco, self.largest_growth_per_s
+        also = "" if mujoco is None else f", MuJoCo {mujoco} of {self.mujoco_unclipped} unclipped"
+        worst = "" if growth is None else f"; worst {growth:+.4g} 1/s (index {self.worst_index})"
+        grow = f"{self.unstable.exact} of {self.humans} exact{also}{worst}"
+        return f"grow while {what} vary", grow if self.humans else None
+
+
+@dataclass(frozen=True)
+class _Adversary:
+    """What a search found, and how far the loop is from its required damping."""
+
+    found: bool
+    spectral_radius: float
+    growth_rate_per_s: float
+    frequency_hz: float
+    evaluated: int
+    required_over_available_damping: float | None
+    human: list[dict[str, Any]]
+    person: list[dict[str, Any]]
+    holds: bool
+
+    @classmethod
+    def of(cls, worst: Worst, ratio: float, certified: bool) -> _Adversary:
+        humans, persons = _humans(worst.humans), msgspec.to_builtins(worst.persons)
+        figures = worst.spectral_radius, worst.growth, worst.frequency_hz, worst.evaluated
+        return cls(worst.destabilises, *figures, finite(ratio), humans, persons, not (certified and worst.destabilises))
+
+    def __str__(self) -> str:
+        grows = f"a human that grows at {self.growth_rate_per_s:+.4g} 1/s"
+        ratio, found = self.required_over_available_damping, grows if self.found else "no destabilising human"
+        close = "no damping is enough" if ratio is None else f"the loop needs {ratio:.4g} of the damping it has"
+        return f"{found} among {self.evaluated}; {close}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Report:
+    """What a validation found; parts are null, or left out, where there is none of them."""
+
+    case: str
+    scenario: str
+    scenario_digest: str
+    links: int | str
+    seed: int
+    engine: str
+    humans: int = render.figure("humans", "{} (links {r.links}, seed {r.seed})")
+    environments: _Environments = render.figure("environments")
+    unstable: _Unstable = render.figure("unstable")
+    disagreements: int = render.figure("disagreements")
+    disagreeing: list[_Drawn]
+    worst: _Slowest | None = render.figure("worst human")
+    own_humans: _Own = render.several(_Own.rows)
+    largest_difference_per_s: float | None = render.figure(
+        "MuJoCo's growth rates", "within {:.1e} 1/s of the exact ones"
+    )
+    traces: _Traces | None = render.several(_Traces.rows)
+    judged: Judged = render.figure("force limits", "{.limiter[words]}", json="beside")
+    settled: str | None = render.figure("handles come to rest", json="table")
+    energy_audit: _Energy | None = render.figure("energy audit W >= 0", json="given")
+    switching: _Growing | None = render.several(lambda g: [*render.delay_rows(g.met), g.row("delays")], "given")
+    timing: _Growing | None = render.several(lambda g: [render.timing_row(g.met), g.row("ticks")], "given")
+    adversary: _Adversary | None = render.figure("adversary", json="given")
+    adversary_population: _Adversary | None = render.figure("adversary, own population", json="given")
+    certified: bool = render.figure("certified", lambda yes: "yes" if yes else "no")
+    holds: bool | None = render.figure("holds", lambda yes: "[green]yes[/]" if yes else "[red]no[/]", absent=_NOTHING)
+    reason: str | None = render.unseen("given")
+    interrupted: bool
+    kept: str = render.unseen("table")
+    ended: str | None = render.figure("interrupted", "{r.kept}", json="table")
+    unfinished: str | None = render.figure("unfinished", "{}; {r.kept}")
+    wall_s: float = render.figure("time", "{:.1f} s, {r.simulated_s_per_s:.0f} simulated seconds per second")
+    simulated_s_per_s: float
+    remarks: Sequence[str]
+
+
+def _reported(
+    args: argparse.Namespace,
+    chosen: Chosen,
+    judged: Judged,
+    question: Validation,
+    findings: Findings,
+    wall: float,
+    searched: _Searched,
+) -> _Report:
+    """Everything that was found, and whether all of it holds."""
+    scenario, any_done = question.scenario, bool(findings.index.size)
+    guarantee = judged.promise
+    certified = guarantee is not None and (not question.environments or guarantee == ANY or judged.proved)
+    mode = worst_mode(assemble(scenario, chosen.coupling))
+    own = _Own(args.human or scenario.name, eigenvalue_part(mode), not (certified and unstable(mode.growth)))
+    energy = _Energy.of(question, findings) if certified and question.ticks else None
+    switching = timing = None
+    if scenario.varying_delay:
+        covered = report.delay_range_part(scenario.varying_delay) | certified_part(scenario, chosen, certified)
+        switching = _Growing.of(findings, covered)
+    if scenario.uneven:
+        met = report.timing_part(scenario.timing(args.seed, max(1, question.ticks)), scenario) or {}
+        timing = _Growing.of(findings, met | {"covered": certified})
+    worst, drawn = (w and _Adversary.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))
+    also = all(part.holds for part in (own, energy, switching, timing, worst, drawn) if part)
+    traces = _Traces.of(question, findings) if question.ticks and any_done else None
+    both, bad, grows = question.engine != "exact", unstable(findings.exact), unstable(findings.mujoco)
+    disagreements, wrong = int(findings.disagreements.sum()), bad | (both & grows & (findings.mujoco > 1e-3))
+    interrupted = findings.interrupted or searched.interrupted
+    kept = f"{findings.index.size} humans that were finished are kept, --resume does the others; searches are not kept"
+    return _Report(
+        case=args.case,
+        scenario=scenario.name,
+        scenario_digest=scenario.digest,
+        links="mixed" if question.links == MIXED else question.links,
+        seed=question.seed,
+        engine=question.engine,
+        humans=findings.index.size,
+        environments=_Environments.met(question, findings),
+        unstable=_Unstable(int(bad.sum()), int(grows.sum()) if both else None),
+        disagreements=disagreements,
+        disagreeing=[_Drawn.of(question, int(i)) for i in findings.index[findings.disagreements]],
+        worst=_Slowest.of(question, findings) if any_done else None,
+        own_humans=own,
+        largest_difference_per_s=_largest(np.abs(findings.mujoco - findings.exact)),
+        traces=traces,
+        judged=judged,
+        settled=traces and traces.settled(),
+        energy_audit=energy,
+        switching=switching,
+        timing=timing,
+        adversary=worst,
+        adversary_population=drawn,
+        certified=certified,
+        holds=also and not disagreements and not (certified and wrong.any()) if any_done else None,
+        reason=None if any_done else _NOTHING,
+        interrupted=interrupted,
+        kept=kept,
+        ended=kept if interrupted else None,
+        unfinished=findings.lost or None,
+        wall_s=wall,
+        simulated_s_per_s=findings.simulated / wall,
+        remarks=chosen.notes,
+    )
+
+
+def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
+    """Links of each channel's human; of a user's own class what the handle feels of it."""
+    parts = ("mass", "across", "damping", "stiffness")
     return [
-        ("humans", f"{outcome['humans']} (links {outcome['links']}, seed {outcome['seed']})"),
-        ("environments", _met(outcome["environments"])),
-        ("unstable", f"{bad['exact']} exact{mujoco}"),
-        ("disagreements", str(outcome["disagreements"])),
-        ("worst human", worst and _worst(worst)),
-        (
-            f"hands of {own['from']}",
-            f"{own['exact_growth_rate_per_s']:+.4g} 1/s at {own['exact_frequency_hz']:.2f} Hz: {own['exact_verdict']}",
-        ),
-        (
-            "MuJoCo's growth rates",
-            render.optional(outcome["largest_difference_per_s"], "within {:.1e} 1/s of the exact ones", "") or None,
-        ),
-        ("traces", traces and f"{traces['duration_s']:g} s each, {traces['clipped_runs']} reached a force limit"),
-        ("contacts made", f"{traces['contacts']} on these traces" if traces and traces["contacts"] else None),
-        ("force limits", outcome["limiter"]["words"]),
-        ("handles come to rest", traces and _settled(traces)),
-        ("energy audit W >= 0", audit and _audited(audit)),
-        *([*render.delay_rows(switching), _growing("delays", switching)] if switching else []),
-        *([render.timing_row(timing), _growing("ticks", timing)] if timing else []),
-        ("adversary", adversary and _adversary(adversary)),
-        ("adversary, own population", drawn and _adversary(drawn)),
-        ("certified", "yes" if outcome["certified"] else "no"),
-        ("holds", verdict),
-        ("interrupted", kept if outcome["interrupted"] else None),
-        ("unfinished", f"{outcome['unfinished']}; {kept}" if outcome["unfinished"] else None),
-        ("time", f"{outcome['wall_s']:.1f} s, {outcome['simulated_s_per_s']:.0f} simulated seconds per second"),
+        {"links": msgspec.to_builtins(human.links)}
+        if isinstance(human, Human)
+        else {"class": type(human).__name__} | {name: getattr(human.port(), name) for name in parts}
+        for human in humans
     ]
 
 
-def _lines(outcome: dict[str, Any]) -> list[str]:
-    switching = outcome.get("switching")
-    return [*([f"Delays that vary: {switching['covers']}."] if switching else []), *outcome["remarks"]]
-
-
-def _met(environments: dict[str, Any]) -> str:
-    if "names" not in environments:
-        return environments["of"]
-    found = "; ".join(environments["unstable_in"]) or "none"
-    return f"{environments['count']} of {environments['of']}, in turn; unstable in: {found}"
-
-
-def _worst(worst: dict[str, Any]) -> str:
-    growth = f"{worst['growth_rate_per_s']:+.4g} 1/s at {worst['frequency_hz']:.2f} Hz (index {worst['index']})"
-    return growth + (f", at {worst['environment']}" if "environment" in worst else "")
-
-
-def _settled(traces: dict[str, Any]) -> str:
-    undecided = "" if traces["settling_decides"] else f"; no verdict: {traces['reason']}"
-    return f"{traces['stable_and_settling']} of {traces['stable']} stable loops slower at the end{undecided}"
-
-
-def _audited(audit: dict[str, Any]) -> str:
-    left = f", {audit['clipped']} clipped left out" if audit["clipped"] else ""
-    return f"{audit['audited'] - audit['violated']} of {audit['audited']}{left}"
-
-
-def _growing(what: str, switching: dict[str, Any]) -> tuple[str, str | None]:
-    mujoco, growth = switching["unstable"]["mujoco"], switching["largest_growth_per_s"]
-    also = "" if mujoco is None else f", MuJoCo {mujoco} of {switching['mujoco_unclipped']} unclipped"
-    worst = "" if growth is None else f"; worst {growth:+.4g} 1/s (index {switching['worst_index']})"
-    grow = f"{switching['unstable']['exact']} of {switching['humans']} exact{also}{worst}"
-    return f"grow while {what} vary", grow if switching["humans"] else None
-
-
-def _adversary(part: dict[str, Any]) -> str:
-    found = f"a human that grows at {part['growth_rate_per_s']:+.4g} 1/s" if part["found"] else "no destabilising human"
-    ratio = part["required_over_available_damping"]
-    close = "no damping is enough" if ratio is None else f"the loop needs {ratio:.4g} of the damping it has"
-    return f"{found} among {part['evaluated']}; {close}"
+def _largest(values: Array) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(values.max()) if values.size else None

@@ -5,17 +5,19 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from math import inf
+from dataclasses import dataclass, field
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
 from cli import options, render
 from design.files import write_json
+from design.result import certificate_part
 from sim.scenario import InputError, require_even_ticks
-from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, Script, first_loop, parse_script
+from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, PreparedLoop, Script, first_loop, parse_script
 from sim.view.film import Picture, check_film, painter, save_film
-from sim.view.session import LONGEST_LAG, Session, session_report
-from sim.view.stage import Stage, keys_help
+from sim.view.session import LONGEST_LAG, LiveLoop
+from sim.view.stage import ShownScene, keys_help
 
 _EXAMPLE = "python -m sim.view --video out.gif --script '0:none 1:theta+1 6:designed'"
 _SCRIPT = "0:none 1:theta+1 6:designed"  # of a video: an oscillation starts and dies
@@ -40,15 +42,99 @@ def main(argv: list[str]) -> int:
     prepared = first_loop(menu, scenario, label)
     executor = ThreadPoolExecutor(1)
     try:
-        session = Session(prepared, executor, script, inf if args.video else LONGEST_LAG)
-        outcome = _film(args, session) if args.video else _window(session, args.duration)
+        session = LiveLoop(prepared, executor, script, inf if args.video else LONGEST_LAG)
+        ended = _film(args, session) if args.video else _window(session, args.duration)
     finally:
         executor.shutdown(cancel_futures=True)
-    outcome = {"case": args.case, **session_report(session), **outcome}
-    _print_story(outcome, render.console(args))
+    events = [_Event.of(*change) for change in session.log]
+    report = _Report(args.case, session.prepared.scenario.name, session.t, session.clipped, events, ended)
+    for line in report.lines():
+        render.console(args).print(line, soft_wrap=True)
     if args.json:
-        write_json(args.json, outcome)
-    return options.INTERRUPTED if outcome["interrupted"] else options.DONE
+        write_json(args.json, report)
+    return options.INTERRUPTED if ended.interrupted else options.DONE
+
+
+@dataclass(frozen=True)
+class _Event:
+    """What was changed when, and what could be said of the loop that came of it."""
+
+    t_s: float
+    event: str
+    coupling: str
+    theta: tuple[int, ...]
+    psi: tuple[int, ...]
+    exact_growth_rate_per_s: float  # null in JSON where there is none
+    exact_frequency_hz: float
+    certificates: dict[str, Any]
+    promise: str | None
+    limiter: dict[str, Any]
+
+    @classmethod
+    def of(cls, t: float, what: str, prepared: PreparedLoop) -> _Event:
+        scenario, mode = prepared.scenario, prepared.mode
+        loop = prepared.label, scenario.theta, scenario.psi, float(mode.growth), float(mode.frequency_hz)
+        certificates = {name: certificate_part(need) for name, need in prepared.requirements.items()}
+        limiter = prepared.limits.part([device.force_limit for device in scenario.device])
+        return cls(t, what, *loop, certificates, prepared.guarantee, limiter)
+
+    def line(self) -> str:
+        held = [name for name in render.ORDER if self.certificates[name]["certified"]]
+        growth = f"{self.exact_growth_rate_per_s:+.3g} 1/s at {self.exact_frequency_hz:.1f} Hz"
+        grows = growth if isfinite(self.exact_growth_rate_per_s) else "no growth"
+        proved = f"certified ({', '.join(held)})" if held else "NOT certified"
+        loop = f"{self.coupling}, theta {list(self.theta)}, psi {list(self.psi)}: {grows}, {proved}"
+        return f"{self.t_s:6.2f} s  {self.event:<10} {loop}"
+
+
+@dataclass(frozen=True)
+class _Film:
+    """The file that was made."""
+
+    file: str
+    pictures: int
+    fps: int
+    drawn: str
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """How far the window's clock ran ahead of the loop."""
+
+    overruns: int
+    lost_s: float
+
+
+@dataclass(frozen=True)
+class _Ended:
+    """How the session was shown, and whether the keyboard ended it."""
+
+    interrupted: bool
+    remarks: list[str] = field(default_factory=list)
+    video: _Film | None = render.unseen("given", None)
+    clock: _Clock | None = render.unseen("given", None)
+
+
+@dataclass(frozen=True)
+class _Report:
+    """What was seen; its fields are the keys of its JSON."""
+
+    case: str
+    scenario: str
+    simulated_s: float
+    clipped_ticks: int
+    events: list[_Event]
+    ended: _Ended = render.unseen("beside")
+
+    def lines(self) -> Iterator[str]:
+        """One line per event, and where the film is."""
+        yield from (event.line() for event in self.events)
+        yield f"{self.simulated_s:6.2f} s  end        {self.clipped_ticks} ticks at a force limit"
+        if clock := self.ended.clock:
+            yield f"The clock was missed {clock.overruns} times: {clock.lost_s:.2f} s lost."
+        if film := self.ended.video:
+            yield f"{film.file}: {film.pictures} pictures, drawn by {film.drawn}"
+        yield from (f"Note: {remark}." for remark in self.ended.remarks)
 
 
 def _parser() -> options.Parser:
@@ -110,12 +196,12 @@ def _names() -> list[str]:
     return list(dict.fromkeys([*LABELS, *COUPLINGS]))
 
 
-def _film(args: argparse.Namespace, session: Session) -> dict[str, Any]:
+def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
     """The session against a clock of its own: the same film every time. Interrupted, it is as long as it got."""
     seconds = args.duration or (session.script_ends + _AFTER)
     count, interrupted = round(seconds * args.fps) + 1, False
-    assembly = session.prepared.assembly
-    artist, drawn, remarks = painter(args.draw, assembly.scene, assembly.process.force_limit)
+    simulation = session.prepared.simulation
+    artist, drawn, remarks = painter(args.draw, simulation.scene, simulation.process.force_limit)
 
     def pictures(move: render.Move) -> Iterator[Picture]:
         nonlocal interrupted
@@ -133,14 +219,13 @@ def _film(args: argparse.Namespace, session: Session) -> dict[str, Any]:
             made = save_film(Path(args.video), pictures(move), args.fps)
     finally:
         artist.close()
-    video = {"file": args.video, "pictures": made, "fps": args.fps, "drawn": drawn}
-    return {"video": video, "interrupted": interrupted, "remarks": remarks}
+    return _Ended(interrupted, remarks, _Film(args.video, made, args.fps, drawn))
 
 
-def _window(session: Session, duration: float | None) -> dict[str, Any]:
+def _window(session: LiveLoop, duration: float | None) -> _Ended:
     from sim.view.window import NoWindow, show
 
-    stage = Stage(session.prepared.assembly.scene, session.prepared.assembly.process.force_limit)
+    stage = ShownScene(session.prepared.simulation.scene, session.prepared.simulation.process.force_limit)
     interrupted = False
     try:
         show(session, stage, duration)
@@ -148,23 +233,4 @@ def _window(session: Session, duration: float | None) -> dict[str, Any]:
         raise InputError(f"{error}; --video FILE.gif needs no window") from None
     except KeyboardInterrupt:
         interrupted = True
-    clock = {"overruns": session.pace.overruns, "lost_s": session.pace.lost}
-    return {"clock": clock, "interrupted": interrupted, "remarks": []}
-
-
-def _print_story(outcome: dict[str, Any], out: render.Screen) -> None:
-    """One line per event, and where the film is."""
-    for event in outcome["events"]:
-        held = [name for name in render.ORDER if event["certificates"][name]["certified"]]
-        growth = event["exact_growth_rate_per_s"]
-        grows = "no growth" if growth is None else f"{growth:+.3g} 1/s at {event['exact_frequency_hz']:.1f} Hz"
-        proved = f"certified ({', '.join(held)})" if held else "NOT certified"
-        loop = f"{event['coupling']}, theta {event['theta']}, psi {event['psi']}: {grows}, {proved}"
-        out.print(f"{event['t_s']:6.2f} s  {event['event']:<10} {loop}", soft_wrap=True)
-    out.print(f"{outcome['simulated_s']:6.2f} s  end        {outcome['clipped_ticks']} ticks at a force limit")
-    if clock := outcome.get("clock"):
-        out.print(f"The clock was missed {clock['overruns']} times: {clock['lost_s']:.2f} s lost.")
-    if video := outcome.get("video"):
-        out.print(f"{video['file']}: {video['pictures']} pictures, drawn by {video['drawn']}", soft_wrap=True)
-    for remark in outcome["remarks"]:
-        out.print(f"Note: {remark}.", soft_wrap=True)
+    return _Ended(interrupted, clock=_Clock(session.pace.overruns, session.pace.lost))

@@ -246,7 +246,7 @@ def _ratio(sweep: zwidth.Sweep, drawn: zwidth.Map, name: str, unsafe: NDArray[np
 
 
 def _mark(mark: zwidth.Mark) -> dict[str, Any]:
-    """What is asked about a single coupling."""
+    """The question about one coupling."""
     return {
         "K": mark.K,
         "B": mark.B,
@@ -452,7 +452,7 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
             "certificates": judged.certificates,
             "promise": judged.promise,
             "ranges": judged.ranges,
-            "set": judged.ranges,  # its older name
+            "set": judged.ranges,
         },
         "limiter": judged.limiter,
         "remarks": list(chosen.notes),

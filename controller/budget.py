@@ -154,7 +154,7 @@ class EnergyBudget(_Net):
         return sent
 
     def tell(self, tick: int, acted: ArrayLike) -> None:
-        """The devices' word for a tick (counted from 0) that was booked as its largest loss: what acted, (m, nsim)."""
+        """The forces that acted in a tick (counted from 0) that was booked as its largest loss, (m, nsim)."""
         if tick not in self._untold:
             raise ValueError(f"tick {tick} does not wait for the devices' word")
         self._settle(tick, np.asarray(acted, dtype=float), *self._untold.pop(tick))
@@ -174,7 +174,7 @@ class EnergyBudget(_Net):
         self._untold[tick] = dx.copy(), most
 
     def _settle(self, tick: int, acted: Array, dx: Array, most: Array) -> None:
-        """What a tick brought, in place of its largest loss."""
+        """Replace a tick's largest loss by its real one."""
         self.surprises += int((self._loss(acted) > most * (1 + 1e-9)).any())
         if not self._coarse:
             self._earn((acted * dx + self._damping * dx**2 + most).sum(axis=0))

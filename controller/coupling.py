@@ -37,15 +37,15 @@ class Coupling(ABC):
         """(I + Psi E V)^-1 Psi E, given Psi E, whose last `further` ports lie behind no coupling."""
 
     def compliance(self, T: Number) -> Lti | None:
-        """V(z) in the arithmetic of T, or None where the coupling is no V in feedback around any environment."""
+        """V(z) in the arithmetic of T; None where the coupling is not a V in feedback around any environment."""
         return Lti.diag(*channels) if (channels := self.channels(T)) else None
 
     def channels(self, T: Number) -> list[Lti] | None:
-        """V_i(z) where V is diagonal by its making."""
+        """V_i(z) of each channel, where V is diagonal by construction."""
         return None
 
     def with_model(self, model: Lti) -> Compliance | None:
-        """The V that it is where its model stays `model` while the environment changes, None for a coupling without."""
+        """The V that results where its model of the environment stays `model`; None for a coupling without a model."""
         return None
 
     def at_period(self, T: float) -> Coupling:
@@ -53,12 +53,12 @@ class Coupling(ABC):
         return self
 
     def figures(self, T: float) -> dict[str, Any]:
-        """What a report says of it: order of V, Q or R, and gains where it has some."""
+        """Figures for a report: the order of V, Q or R, and the gains where it has gains."""
         V = self.compliance(T)
         return {"order": V.order if V else 0}
 
     def form(self) -> Form:
-        """What a file holds of it."""
+        """Its form in a file."""
         raise ValueError(f"a coupling of class {type(self).__name__} has no form in a file")
 
 
@@ -160,6 +160,13 @@ def _spring_damper(k: Array, b: Array, beta: Any, T: Number) -> Lti:
 def _scalar(value: Any) -> Any:
     """A number, or numbers with axes, as 1 x 1 matrices."""
     return np.asarray(value)[..., None, None]
+
+
+#: The gains that the paper prints, by case: (27) for Lambda = Theta Psi and (28) for Lambda = I. Neither satisfies the
+#: paper's own condition.
+CASE_I = SpringDamper(K=[2870.0, 2320.0], B=[5.47, 5.55])
+CASE_II = SpringDamper(K=[1810.0, 120.0], B=[5.78, 3.81])
+PUBLISHED = {"I": CASE_I, "II": CASE_II}
 
 
 @dataclass(frozen=True, eq=False)
@@ -405,7 +412,7 @@ def basis(poles: Array, z: NDArray[np.complex128], pairs: Array = NO_PAIRS) -> N
 
 
 def _own_columns(R: Array) -> Array:
-    """Coefficients (.., m, m) of those of the forces and of their sum, (.., m, m + 1), if there are any of the sum."""
+    """Coefficients (.., m, m) from those of the forces and, in one more column, of their sum."""
     m = R.shape[-2]
     return R[..., :m] + R[..., m:].sum(axis=-1)[..., None] if R.shape[-1] > m else R
 

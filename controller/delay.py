@@ -170,7 +170,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def steady(self) -> bool:
-        """Whether every force is delayed by a constant theta after all: then Theta is linear, and certificates hold."""
+        """Whether every force has the same constant delay theta: then Theta is linear, and certificates hold."""
         return self.loss == 0 and (self.playout or self.pattern == "constant" or self.lo == self.hi) and not self._gaps
 
     @property

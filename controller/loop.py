@@ -5,7 +5,7 @@
                               ^-               |
                               +----- V <-------+                F = Theta (I + Psi E V)^-1 Psi E     (6)
 
-No device is known but by its damping, and no human at all. It computes nothing in time: the tick is controller.process.
+No device is known but by its damping, and no human at all. It computes nothing in time: the tick is controller.tick.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ import msgspec
 
 from controller.coupling import Coupling, Strict
 from controller.delay import delay
-from controller.environment import Environment, Member, Network, Ranges, RigidWall, members, walled_force_map
+from controller.environment import Environment, Network, RigidWall, walled_force_map
 from controller.lti import Complex, Lti, Number, Sampled, rational
+from controller.ranges import Member, Ranges, members
 
 Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=100)], ...]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -43,24 +44,6 @@ class DelayRange(Strict, frozen=True):
         """Whether every delay that `other` allows is allowed here; a constant theta is DelayRange(theta, theta)."""
         below, above = zip(self.lo, other.lo, strict=True), zip(self.hi, other.hi, strict=True)
         return all(a <= b for a, b in below) and all(a >= b for a, b in above)
-
-
-#: fields of loops and scenarios -> their names in the first files, which are still read and which digests are made of
-_FIRST_NAMES = {"ranges": "box", "varying_delay": "jitter"}
-
-
-def named_today(fields: dict[str, Any]) -> dict[str, Any]:
-    """Fields of a file by their names of today. Raises ValueError where one has both names."""
-    for name, first in _FIRST_NAMES.items():
-        if name in fields and first in fields:
-            raise ValueError(f"{name} and {first}, its older name: give one of them")
-    today = {first: name for name, first in _FIRST_NAMES.items()}
-    return {today.get(name, name): value for name, value in fields.items()}
-
-
-def named_first(fields: dict[str, Any]) -> dict[str, Any]:
-    """Fields by their names in the first files."""
-    return {_FIRST_NAMES.get(name, name): value for name, value in fields.items()}
 
 
 class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without the newer fields keeps the digest it had
@@ -103,10 +86,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
     def _check_latency(self, latency: tuple[tuple[float, float], ...]) -> None:
         if len(latency) != len(self.theta):
             raise ValueError(f"latency has {len(latency)} ranges for {len(self.theta)} channels")
-        for i, (least, most) in enumerate(latency):
+        for i, (least, most) in enumerate(latency, start=1):
             if not 0 <= least <= most < self.T:
                 raise ValueError(
-                    f"latency[{i}] is {least:g} to {most:g} s, expected 0 <= least <= most < T = {self.T:g} s"
+                    f"latency #{i} is {least:g} to {most:g} s, expected 0 <= least <= most < T = {self.T:g} s"
                 )
         if self.varying_delay or self.environment.walls:
             other = "varying_delay" if self.varying_delay else "environment.walls"

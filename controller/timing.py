@@ -108,7 +108,7 @@ def drawn(
     ticks: int,
     rng: np.random.Generator,
 ) -> Timing | None:
-    """A timing of so many ticks; None where all are even and forces latch at them.
+    """A timing of `ticks` ticks; None where all are even and forces latch at their beginning.
 
     A latency is drawn for each tick and channel from the ends and the middle of its range.
     """

@@ -2,7 +2,7 @@
 
     from design import design_coupling, certify, guarantee, transparency_of
 
-design_coupling(loop, kind)         a Design: the best coupling of a kind for a loop, scenario.loop("I"); see Options
+design_coupling(loop, kind)         a Design: the best coupling of a kind for a loop; see DesignOptions
 certify(loop, coupling)             a Requirement by each condition: how much damping the coupling needs, and where
 guarantee(loop, requirements)       for which environments that makes it safe for every passive human, in words
 transparency_of(loop, coupling)     figures of Transparency: how close what one feels comes to the environment
@@ -19,15 +19,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from controller.loop import Loop
-    from design.api import Options, certify, design_coupling, guarantee, transparency_of
+    from design.api import DesignOptions, certify, design_coupling, guarantee, transparency_of
     from design.result import Design, DesignFailed, Requirement
     from design.transparency import Transparency
 
 __all__ = [
     "Design",
     "DesignFailed",
+    "DesignOptions",
     "Loop",
-    "Options",
     "Requirement",
     "Transparency",
     "certify",

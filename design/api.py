@@ -8,10 +8,12 @@ from typing import Literal, TypedDict, Unpack
 
 from controller.coupling import Coupling
 from controller.loop import Loop
+from controller.lti import Lti
+from design.arguments import known, of_kind, one_of, shown
 from design.certificate import assess, check_ranges, switching_requirement
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import guarantee_of
-from design.result import Condition, Design, Requirement, bare, known, of_kind, one_of
+from design.result import Condition, Design, Requirement
 from design.stored import Stored
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
@@ -21,7 +23,7 @@ _Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
 _LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
-class Options(TypedDict, total=False):
+class DesignOptions(TypedDict, total=False):
     """What else can be asked of a kind, see design.designs.KINDS."""
 
     order: int  # ccl: states per channel
@@ -38,14 +40,14 @@ class Options(TypedDict, total=False):
 
 
 def design_coupling(
-    loop: Loop, kind: _Kind = "spring-damper", condition: Condition | None = None, **options: Unpack[Options]
+    loop: Loop, kind: _Kind = "spring-damper", condition: Condition | None = None, **options: Unpack[DesignOptions]
 ) -> Design:
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
     `kind` is "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal"; `condition` is
     "any-environment" or "this-environment", None for what the commands design: a spring-damper for this environment,
     also while forces are limited; for any environment before walls, ranges or delays that vary. `options` are those of
-    the kind, see Options; switching is not taken from loop.varying_delay.
+    the kind, see DesignOptions; switching is not taken from loop.varying_delay.
 
     Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
     that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).
@@ -60,7 +62,7 @@ def design_coupling(
 
 
 #: kinds and conditions that are quick to try in the place of something else; of the optimal coupling the first rung
-_QUICK: tuple[tuple[_Kind, Condition, Options], ...] = (
+_QUICK: tuple[tuple[_Kind, Condition, DesignOptions], ...] = (
     ("optimal", "this-environment", {"seconds": 0.0}),
     ("spring-damper", "this-environment", {}),
     ("spring-damper", "any-environment", {}),
@@ -141,6 +143,19 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
     """
     of_kind("loop", loop, Loop, _LOOP)
     return transparency(loop.F(_fitting(loop, coupling)), loop.E(), loop.lam, band_hz)
+
+
+COUPLING = "a coupling (controller.coupling), or a Design"
+
+
+def bare(coupling: Coupling | Design, expected: str = COUPLING) -> Coupling:
+    """The coupling of a design, or the one given. Raises TypeError for anything else."""
+    found = coupling.coupling if isinstance(coupling, Design) else coupling
+    if isinstance(found, Lti):
+        raise TypeError("coupling is an Lti, expected a coupling: wrap it in Compliance(...) (controller.coupling)")
+    if isinstance(found, type) or not callable(getattr(found, "around", None)):
+        raise TypeError(f"coupling is {shown(coupling)}, expected {expected}")
+    return found
 
 
 def _fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:

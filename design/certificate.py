@@ -18,9 +18,9 @@ from controller.coupling import (
     Coupling,
 )
 from controller.delay import delay
-from controller.environment import Member, inside
 from controller.loop import Loop
 from controller.lti import Array, Lti, SingularLoop, TooLong, rational, within
+from controller.ranges import Member, inside
 from design import conditions, multipliers
 from design.environments import Progress, Searched, in_each, search_ranges, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
@@ -143,6 +143,7 @@ def prove_limiter(
     loop: Loop, coupling: Coupling, beta: float = multipliers.BETA, c: multipliers.Lags | None = None
 ) -> LimiterCertificate:
     """An exact proof with the multiplier `c` or the best one. Raises NotProved with the reason."""
+    _require_limits(loop, coupling, "this-environment")
     found = multipliers.limiter_requirement(loop, coupling, beta, c)
     requirement = found.requirement
     if not requirement.certified:
@@ -517,7 +518,7 @@ def _refuted_proof(loop: Loop, coupling: Coupling, certificate: Certificate) -> 
 
 
 def _multiplier_name(loop: Loop, condition: Condition) -> str:
-    """What the matrices call it: Phi of any-environment with psi >= 1, or g of walls under this-environment."""
+    """Its name among the matrices: Phi of any-environment with psi >= 1, or g of walls under this-environment."""
     return multipliers.WALL_MULTIPLIER if condition == "this-environment" and loop.environment.walls else "Phi"
 
 
@@ -557,7 +558,7 @@ def assess(
 
 
 def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:
-    """What any-environment asks; walls are covered without delay in the environment, and refused with it."""
+    """What any-environment requires; walls are covered without delay in the environment, and refused with it."""
     if loop.latency:
         return refusal("any-environment", loop.delta, LATE)
     if loop.environment.walls and any(loop.psi):
@@ -622,7 +623,7 @@ class RangesCheck:
 
     @property
     def worst_found(self) -> tuple[Member, Requirement]:
-        """Where of all that was looked at, members, search and samples, the most damping is asked."""
+        """The environment that asks the most damping among members, search and samples."""
         places = (*self.members, self.searched.worst[0].member, *self.samples)
         requirements = (*self.at_members, self.at_found, *self.at_samples)
         i = worst(requirements)

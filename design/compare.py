@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Coupling, NoCoupling
+from controller.coupling import PUBLISHED, Coupling, NoCoupling
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
@@ -23,7 +23,7 @@ from design.certificate import any_environment_of, prove
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
 from design.program import LADDER, Options
-from design.result import PUBLISHED, Condition, Design, DesignFailed, NotProved, Requirement, finite
+from design.result import Condition, Design, DesignFailed, NotProved, Requirement, finite
 from design.robustness import robustness_part
 from design.stored import digest
 from design.transparency import decibels, transparency
@@ -153,11 +153,11 @@ _Kept = Literal["samples", "seconds"]  # what stays of a delay when the period c
 
 @dataclass(frozen=True)
 class _Axis:
-    """What is varied: its label, its unit, and the range around what there is, unless another is asked for."""
+    """A quantity that is varied: its label, its unit, and the default range around its value in the loop."""
 
     label: str
     unit: str
-    low: float  # times what there is; nan where it is not a factor
+    low: float  # times its value in the loop; nan where it is not a factor
     high: float
     least: float  # what may be asked for
     most: float
@@ -172,18 +172,23 @@ AXES = {
 
 
 @dataclass(frozen=True)
-class Setting:
+class Point:
     """One point of a curve: where it is drawn, and what is designed there."""
 
     value: float
     loop: Loop
-    wish: Options
+    options: Options
 
 
-def settings(
-    axis: str, loop: Loop, wish: Options, points: int, span: tuple[float, float] | None = None, kept: _Kept = "samples"
-) -> list[Setting]:
-    """The points of one axis, with what there is among them. Raises ValueError for a range that is none.
+def points_along(
+    axis: str,
+    loop: Loop,
+    options: Options,
+    points: int,
+    span: tuple[float, float] | None = None,
+    kept: _Kept = "samples",
+) -> list[Point]:
+    """The points of one axis, the loop's own among them. Raises ValueError for an empty or impossible range.
 
     damping: all devices scaled alike. delay: the same number of samples more or less on every channel. period: `kept`
     says what stays of the delays. Lambda keeps what it lacks of Theta Psi. `span` is in the axis' unit.
@@ -197,7 +202,7 @@ def settings(
         least = min(loop.delta)
         values = _spread(least, AXES[axis], points, span)
         return [
-            Setting(v, msgspec.structs.replace(loop, delta=tuple(v / least * d for d in loop.delta)), wish)
+            Point(v, msgspec.structs.replace(loop, delta=tuple(v / least * d for d in loop.delta)), options)
             for v in values.tolist()
         ]
     if axis == "delay":
@@ -206,16 +211,16 @@ def settings(
         steps = range(int(low), int(low) + points) if high is None else _whole(low, high, points)
         if min(steps) < longest - shortest:
             raise ValueError(f"delay starts at {min(steps)}, but the channels differ by {longest - shortest} samples")
-        return [Setting(float(n), _delayed(loop, n - longest), wish) for n in steps]
+        return [Point(float(n), _delayed(loop, n - longest), options) for n in steps]
     if axis == "period":
-        return [Setting(T, _sampled(loop, T, kept), wish) for T in _spread(loop.T, AXES[axis], points, span).tolist()]
-    rungs = {max(1, round(n)) for n in _spread(len(wish.ladder), AXES[axis], points, span).tolist()}
-    return [Setting(float(n), loop, replace(wish, ladder=LADDER[:n])) for n in sorted(rungs)]
+        return [Point(T, _sampled(loop, T, kept), options) for T in _spread(loop.T, AXES[axis], points, span).tolist()]
+    rungs = {max(1, round(n)) for n in _spread(len(options.ladder), AXES[axis], points, span).tolist()}
+    return [Point(float(n), loop, replace(options, ladder=LADDER[:n])) for n in sorted(rungs)]
 
 
 @dataclass(frozen=True)
 class Limit:
-    """The best that was found at a point, or why there is nothing."""
+    """The best design found at a point, or the reason why there is none."""
 
     value: float
     delta: tuple[float, ...]  # [N s/m]
@@ -233,22 +238,22 @@ class Limit:
     proof_reason: str | None = None  # why there is no exact proof
 
 
-Designer = Callable[[Setting], Limit]
+Designer = Callable[[Point], Limit]
 
 
-def optimum(setting: Setting) -> Limit:
-    """The optimal coupling of a setting."""
-    return measured(setting, "optimal", None, vars(setting.wish))
+def optimum(point: Point) -> Limit:
+    """The optimal coupling of a point."""
+    return measured(point, "optimal", None, vars(point.options))
 
 
 def spring_damper(condition: Condition) -> Designer:
-    """The designed spring-damper of a setting."""
-    return lambda setting: measured(setting, "spring-damper", condition, {})
+    """The designed spring-damper of a point."""
+    return lambda point: measured(point, "spring-damper", condition, {})
 
 
-def measured(setting: Setting, kind: str, condition: Condition | None, options: dict[str, Any]) -> Limit:
+def measured(point: Point, kind: str, condition: Condition | None, options: dict[str, Any]) -> Limit:
     """One design and its figures, from the coupling alone; a request without a solution gives its reason."""
-    loop, begin = setting.loop, time.perf_counter()
+    loop, begin = point.loop, time.perf_counter()
     names = ("states", "rms_mismatch_db", "relative_mismatch_db", "required_damping", "dc_ratio")
     figures: dict[str, Any] = dict.fromkeys(names)
     bare: tuple[float | None, ...] = (None,) * len(loop.delta)
@@ -268,7 +273,7 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
             "dc_ratio": finite(transparent.dc_ratio),
         } | _proof(loop, design)
     wall = time.perf_counter() - begin
-    place = (setting.value, loop.delta, loop.theta, loop.T)
+    place = (point.value, loop.delta, loop.theta, loop.T)
     return Limit(*place, **figures, bare_damping=bare, wall_s=wall)
 
 
@@ -289,20 +294,20 @@ def _damping(requirement: Requirement) -> tuple[float | None, ...]:
 
 
 def remembered(designer: Designer, whole: bool) -> Designer:
-    """The same, but what was designed once is not designed again; `whole` if the wish matters to it."""
+    """A designer that does not repeat a design; `whole` where the options matter to the design."""
     known: dict[tuple[str, Options | None], Limit] = {}
 
-    def recalled(setting: Setting) -> Limit:
-        key = (digest(setting.loop), setting.wish if whole else None)
+    def recalled(point: Point) -> Limit:
+        key = (digest(point.loop), point.options if whole else None)
         if key not in known:
-            known[key] = designer(setting)
-        return replace(known[key], value=setting.value)
+            known[key] = designer(point)
+        return replace(known[key], value=point.value)
 
     return recalled
 
 
 def _spread(base: float, axis: _Axis, points: int, span: tuple[float, float] | None) -> Array:
-    """`points` values, even in their logarithm; the nearest to what there is becomes that, if it lies between."""
+    """`points` values, even in their logarithm; the nearest to `base` becomes `base`, if that lies between the ends."""
     low, high = span or (axis.low * base, axis.high * base)
     values = np.geomspace(low, high, points)
     if low <= base <= high:
@@ -469,15 +474,15 @@ _Sweeps = dict[str, dict[str, list[Limit]]]  # sweep -> design -> its points
 _EXACT_DB = -60.0  # below it the difference to the environment is the solver's
 
 
-def gains(plan: dict[str, list[Setting]], curves: _Sweeps, loop: Loop, wish: Options) -> list[str]:
+def gains(plan: dict[str, list[Point]], curves: _Sweeps, loop: Loop, options: Options) -> list[str]:
     """What there is to gain, in a line per sweep."""
     lines = []
     for name, rows in curves.items():
-        found = [(limit, _figure(limit, wish.objective)) for limit in rows["optimal"]]
+        found = [(limit, _figure(limit, options.objective)) for limit in rows["optimal"]]
         known = [(limit, figure) for limit, figure in found if figure is not None]
         if len(known) < 2:
             continue
-        here = next((s.value for s in plan[name] if s.loop == loop and s.wish == wish), None)
+        here = next((s.value for s in plan[name] if s.loop == loop and s.options == options), None)
         words = [
             f"{printed_decibels(figure)} at {limit.value:.4g}" + (" (here)" if limit.value == here else "")
             for limit, figure in known

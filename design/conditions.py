@@ -12,7 +12,7 @@ any-environment    Lemma 4 of the paper for Psi = I and any passive environment 
 latency            this-environment for forces that latch a fraction of a sample after the tick, anew at every tick
 
 design/multipliers.py has those of this-environment that weigh an error with a multiplier: walls that make and break
-contact, delays that switch, forces that leave through the limiter of controller.contact.
+contact, delays that switch, forces that leave through the limiter of controller.limiter.
 
 The period may vary from tick to tick, up to T_max, in all of them: `even_damping` is where it enters.
 """
@@ -59,7 +59,7 @@ from design.result import Requirement, from_ratio, refusal
 
 @dataclass(frozen=True, eq=False)
 class Demand(Generic[Block]):
-    """free + s gain must be strictly positive real, with s = 1 for the damping that there is.
+    """free + s gain must be strictly positive real, with s = 1 for the available damping.
 
     `static` are matrices that must be symmetric, by name; those in `semidefinite` also positive semidefinite.
     """
@@ -160,7 +160,7 @@ def delayed_coupling_block(
 
     V-hat must be Delta_V-OSP with Delta_V^-1 = S < Phi^-1 - Delta_D^-1 (14). With H = V - Theta-hat = H(1) + (z-1) R,
     divided by |1 - 1/z|^2: T He[H(1)/2 - R] > H* S^-1 H, by a Schur complement the Hermitian part of
-    [[T (H(1)/2 - R), 0], [2 H, S]]. Raises ValueError for a multiplier that is none.
+    [[T (H(1)/2 - R), 0], [2 H, S]]. Raises ValueError for a phi that is not a multiplier.
     """
     T = V.T
     damping = even_damping(delta, T, T_max)
@@ -175,14 +175,14 @@ def delayed_coupling_block(
 
 
 def least_scale(demand: Demand[Any], w: Array) -> Array:
-    """The least s with He[free + s gain] >= 0 at each frequency w (k,) [rad/sample]; inf where there is none."""
+    """The least s with He[free + s gain] >= 0 at each frequency w (k,) [rad/sample]; inf where no s is enough."""
     z = on_circle(w)
     free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
     return least_multiple(free, gain)
 
 
 def least_multiple(free: Complex, gain: Complex) -> Array:
-    """The least s with free + s gain >= 0, (...,), of Hermitian (..., p, p) with gain >= 0; inf where there is none.
+    """The least s with free + s gain >= 0, (...,), of Hermitian (..., p, p) with gain >= 0; inf where no s is enough.
 
     Where gain is singular, free must be positive on its null space; the rest is a Schur complement.
     """
@@ -464,7 +464,7 @@ def _delayed_response(V: Block, theta: Sequence[int]) -> Block:
 
 
 def _delayed_scale(response: Complex, delta: Array, phi: Array) -> Array:
-    """The least s of `any_environment_delayed`, (...,), from `_delayed_response` (..., 3m, m); inf where there is none.
+    """The least s of `any_environment_delayed`, (...,), from `_delayed_response` (..., 3m, m); inf: none is enough.
 
     With S = He (V(1)/2 - R)/T - V* Phi V/T^2 and N = (1 + ... + z^-theta)/2 - Phi V/T the inequality is S > 0 and
     s Delta_D >= Phi + N S^-1 N*: two Schur complements of a matrix that is affine in s.

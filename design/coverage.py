@@ -8,9 +8,10 @@ from typing import Any
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.environment import Member, environment
+from controller.environment import environment
 from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Lti
+from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter
 from design.conditions import this_environment
 from design.environments import SEARCH, Searched, worst
@@ -208,7 +209,7 @@ def search_part(searched: Searched) -> dict[str, Any]:
 
 
 def search_words(part: dict[str, Any]) -> str:
-    """What was found between the vertices, in a line."""
+    """The result of the search between the vertices, in one line."""
     found = "[red]violated[/]" if part["violated"] else "no violation found"
     ratio = "no damping is enough" if part["worst_ratio"] is None else f"worst ratio {part['worst_ratio']:.4f}"
     return f"searched, not proved: {found}, {ratio} in {part['environments']} points, at {part['worst']}"

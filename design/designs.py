@@ -20,10 +20,10 @@ class Kind(NamedTuple):
     """One design: what it promises, where it is made, and what can be asked of it."""
 
     conditions: tuple[str, ...]  # that it can be made for, its own first
-    module: str  # loaded when it is asked for: cvxpy takes a second
+    module: str  # loaded when it is asked for
     function: str  # from a loop to a Design
     takes: tuple[str, ...] = ()  # besides the loop and its options: condition, progress
-    options: tuple[str, ...] = ()  # in words of design.api.Options
+    options: tuple[str, ...] = ()  # in words of design.api.DesignOptions
 
 
 KINDS = {
@@ -47,7 +47,7 @@ KINDS = {
 
 
 def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
-    """What a coupling is designed for where nobody says it: a spring-damper for this environment, which feels best.
+    """The default condition of a design: a spring-damper is designed for this environment, which feels best.
 
     For any environment where this-environment covers less than the loop: limited forces before walls, ranges, delays
     that vary. Other kinds for their own condition.
@@ -64,7 +64,7 @@ def design_by_kind(
     **options: Any,
 ) -> Design:
     """Design and verify a coupling; `options` are those of the design's own function: order, method, diagonal for ccl,
-    those of design.optimal.Options for optimal. `progress` hears what takes long: (what, steps done, of how many).
+    those of design.program.Options for optimal. `progress` hears what takes long: (what, steps done, of how many).
     Without a condition it is the usual one. A spring-damper for this environment is covered also while forces are
     limited, unless `limiter` is False or no such one is found; with `limiter` True it is that or none.
 
@@ -93,7 +93,7 @@ _UNUSED, _MOST_ROUNDS = 0.005, 6
 
 
 def _with_less_damping(loop: Loop, made: Callable[[Loop], Design]) -> Design:
-    """The design for so much less damping that late forces, or walls that make and break contact, need what there is.
+    """The design for less damping, so that late forces, or walls that make and break, need no more than is available.
 
     It is made for forces that latch at the tick, and walls that all touch.
     """

@@ -10,9 +10,9 @@ import numpy as np
 
 from controller.coupling import Coupling, ForceFilter
 from controller.delay import delay
-from controller.environment import Member, Region, regions
 from controller.loop import Loop
 from controller.lti import Array, Sampled, SingularLoop
+from controller.ranges import Member, Region, regions
 from design.conditions import least_multiple, this_environment, this_environment_demand
 from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import Requirement, refusal
@@ -24,7 +24,7 @@ def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[R
 
 
 def worst(requirements: Sequence[Requirement]) -> int:
-    """Which of them asks the most."""
+    """The member that requires the most damping."""
     return max(range(len(requirements)), key=lambda i: requirements[i].ratio)
 
 
@@ -167,7 +167,7 @@ def search_ranges(loop: Loop, coupling: Coupling, progress: Progress = lambda do
 
 
 def ratio_in(loop: Loop, coupling: Coupling) -> float:
-    """What this-environment asks in units of what there is, on a refined sweep, of a coupling that is stable there.
+    """The damping that this-environment requires over the available damping, by a refined sweep of a stable coupling.
 
     Of a force filter the responses of environment and filter are multiplied: the poles of their series are defective
     and cost digits, and time.

@@ -253,6 +253,7 @@ LARGEST = 300  # states of a model that a proof is tried for: 0.1 s at 50, 0.5 s
 _MOST_BITS = 4000  # of the common denominator of a stored P, a power of two of some hundred bits when we made it
 _STORED_BITS = 44  # of each entry of P, relative to its diagonal
 _UNIT = 2.0**-53  # of double precision
+_LONG = 80  # states from which on one solution of the Riccati equation has not been enough
 
 
 def _kyp_matrix(G: Lti, P: Matrix) -> Matrix:
@@ -346,7 +347,7 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     if G.order == 0:
         return Matrix.zeros(0, 0), prove_positive_real(G, Matrix.zeros(0, 0))
     reason: str | None = None
-    for share, again in ((0.5, False), (0.5, True), (0.9, True), (0.1, True)):
+    for share, again in ((0.5, False), (0.5, True), (0.9, True), (0.1, True))[G.order > _LONG :]:
         try:
             P = _riccati(block, margin, share, again)
         except (np.linalg.LinAlgError, ValueError) as error:

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from controller.contact import GROUNDED, PIVOT_ROUNDING, Limiter
+from controller.complementarity import GROUNDED, PIVOT_ROUNDING
 from controller.delay import delay
+from controller.limiter import Limiter
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.certificate import lag
@@ -24,9 +25,10 @@ from design.stored import Stored
 # 0.0 and adds, one rounded product after another, the states z_0, z_1, .. and then the inputs u_0, u_1, ..: an order
 # that every language can keep, so that an exported block repeats its test vector to the last bit.
 #
-# Where forces are limited, a tick that asks for more solves the box problem of controller.contact by switching the
-# first wrong limit, which ends (docs/theory.md), with elimination in the order of the channels, which needs no pivots
-# since all principal minors are positive. e then moves [y; z+] by its kick, and the forces that leave are set to f_e.
+# Where forces are limited, a tick that asks for more solves the box problem of controller.complementarity by switching
+# the first wrong limit, which ends (docs/theory.md), with elimination in the order of the channels, which needs no
+# pivots since all principal minors are positive. e then moves [y; z+] by its kick, and the forces that leave are set to
+# f_e.
 
 
 _TICKS = 64  # of a test vector: longer than the delays and the fast modes of a loop
@@ -160,7 +162,7 @@ def _box_matrix(limiter: Limiter) -> Array:
 
 
 def _turns(m: int) -> int:
-    """Switches of a limit after which the box problem is solved for sure."""
+    """A bound on the number of switches after which the box problem is solved."""
     return min(3**m, _MOST_TURNS)
 
 

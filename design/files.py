@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import re
 import sys
 import tempfile
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from io import BytesIO
 from math import prod
 from pathlib import Path
@@ -60,7 +61,7 @@ def _cut(text: str) -> str:
 
 
 def one_line(text: object) -> str:
-    """A message in one line of at most MOST_WORDS characters; of what a user gave it quotes 80, of a path the whole."""
+    """A message in one line of at most MOST_WORDS characters; user input is cut to 80 characters, a path is not."""
     words = _QUOTED.sub(lambda found: _cut(found[0]), printable(" ".join(str(text).split())))
     half = _MOST_WORDS // 2 - 3
     return words if len(words) <= _MOST_WORDS else f"{words[:half]} [..] {words[-half:]}"
@@ -68,6 +69,11 @@ def one_line(text: object) -> str:
 
 # ----------------------------------------------------------------------------------------------------
 # Which files a command has read, and which its options name as output.
+
+
+def counted(path: str) -> str:
+    """The place of a value in a file, entries of lists counted from 1: human[0].mass as human #1.mass."""
+    return re.sub(r"\[(\d+)\]", lambda match: f" #{int(match[1]) + 1}", path)
 
 
 @dataclass
@@ -93,7 +99,7 @@ def one_command() -> Iterator[None]:
 
 
 def _places(path: Path) -> set[Any]:
-    """What a file is known by; nothing for what is no file, such as a terminal, of which nothing can be destroyed."""
+    """What identifies a file; None for a terminal or another target in which nothing can be destroyed."""
     place = _target(path)
     if not place.exists():
         return {place}
@@ -151,7 +157,7 @@ def read_text(path: str | Path, named: str | None = None, hint: str = "") -> str
 
 
 def toml(text: str, named: str) -> dict[str, Any]:
-    """What TOML text says. Raises InputError."""
+    """The content of TOML text. Raises InputError."""
     if found := _DEEP_KEY.search(text):
         line = text.count("\n", 0, found.start()) + 1
         raise InputError(f"{named}: line {line}: a key of more than {_DEEPEST_KEY} names joined by dots")
@@ -164,7 +170,7 @@ def toml(text: str, named: str) -> dict[str, Any]:
 
 
 def read_arrays(path: str | Path, expected: str) -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file, in which no object is unpickled. Raises InputError where it is none."""
+    """The arrays of an npz file, in which no object is unpickled. Raises InputError where it is not one."""
     content = read(path, most=_MOST_TRACE)
     try:
         with ZipFile(BytesIO(content)) as archive:
@@ -252,7 +258,7 @@ def _try(place: Path, name: str = "") -> None:
 
 
 def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path:
-    """Write a file under a temporary name and rename it into place; what is no file, a device or a pipe, as it is.
+    """Write a file under a temporary name and rename it into place; a device or a pipe is written directly.
 
     A link stays a link: the file that it points to is written. Raises InputError where that cannot be, and where the
     command has read the file or has written it for another option.
@@ -296,9 +302,35 @@ def _fill(file: BinaryIO, content: Callable[[BinaryIO], None] | bytes | str) -> 
         file.write(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
 
 
-def write_json(destination: str | Path, data: dict[str, Any]) -> None:
-    """JSON to a file, or to standard output for '-'. Not-a-number and infinity are refused by construction."""
-    text = json.dumps(data, indent=2, allow_nan=False) + "\n"
+def plain(report: Any) -> Any:
+    """A report as JSON takes it: dataclasses by their fields, null for what is infinite or no number."""
+    if is_dataclass(report) and not isinstance(report, type):
+        return _part(report)
+    if isinstance(report, Mapping):
+        return {name: plain(value) for name, value in report.items()}
+    if isinstance(report, np.ndarray | np.generic):
+        return plain(report.tolist())
+    if isinstance(report, list | tuple):
+        return [plain(value) for value in report]
+    if isinstance(report, float):
+        return report if math.isfinite(report) else None
+    return str(report) if isinstance(report, Path) else report
+
+
+def _part(report: Any) -> dict[str, Any]:
+    part: dict[str, Any] = {}
+    for one in fields(report):
+        value, how = getattr(report, one.name), one.metadata.get("json", "key")
+        if how == "beside":
+            part |= plain(value) or {}
+        elif how == "key" or (how == "given" and value is not None):
+            part[one.name.removesuffix("_")] = plain(value)  # from_, for Python has its own `from`
+    return part
+
+
+def write_json(destination: str | Path, report: Any) -> None:
+    """A report as JSON to a file, or to standard output for '-'."""
+    text = json.dumps(plain(report), indent=2, allow_nan=False) + "\n"
     if str(destination) == "-":
         try:
             sys.stdout.write(text)
@@ -310,7 +342,7 @@ def write_json(destination: str | Path, data: dict[str, Any]) -> None:
 
 
 def nobody_reads() -> None:
-    """What is still written to standard output goes nowhere: its reader has left."""
+    """Send what is still written to standard output to nowhere, because its reader has left."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())
     os.close(nowhere)

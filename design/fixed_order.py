@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 
-import cvxpy as cp
 import msgspec
 import numpy as np
 from scipy.linalg import block_diag
@@ -23,8 +22,10 @@ from controller.coupling import Compliance, SpringDamper
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design import lmi, spring_damper
+from design.arguments import of_kind, one_of, whole
+from design.cone import Block, Problem
 from design.frequency import on_circle
-from design.result import METHODS, Design, DesignFailed, Requirement, of_kind, one_of, whole
+from design.result import Design, DesignFailed, Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # State-space couplings of fixed order, in a realisation where both conditions are affine.
@@ -34,6 +35,9 @@ from design.result import METHODS, Design, DesignFailed, Requirement, of_kind, o
 # are all affine in (A, B, V1). That loses nothing where F has full row rank: any such F is reached by a change of
 # state.
 
+
+#: How such a coupling may be sought.
+_METHODS = ("complementarity", "inner", "fixed-poles")
 
 #: Poles given to states beyond the first of a channel, which a spring-damper does not have.
 _MOST_STATES = 10  # per channel: each adds a row and a column to every cone
@@ -160,12 +164,22 @@ def _gain_storage(family: FixedOrder, p: Array, mu: float) -> Array:
 def _roomiest(inequality: Callable[[Array], Array], n: int, what: str) -> Array:
     """The P that maximises s <= 1 with inequality(P) >= s I and P >= s I."""
     size = inequality(np.zeros((n, n))).shape[0]
-    x, s = cp.Variable(lmi.packed(n)), cp.Variable()
-    matrix = lmi.affine(lambda v: inequality(lmi.symmetric_from(v, n)), x)
-    P = lmi.affine(lambda v: lmi.symmetric_from(v, n), x)
-    constraints = [matrix >> s * np.eye(size), P >> s * np.eye(n), s <= 1]
-    lmi.solve(cp.Problem(cp.Maximize(s), constraints), what)
-    return lmi.symmetric_from(np.asarray(x.value), n)
+    every = range(lmi.packed(n) + 1)  # P and s
+
+    def storage(x: Array) -> Array:
+        return lmi.symmetric_from(x[:-1], n)
+
+    def most(x: Array) -> Array:
+        return 1 - x[-1:, None]
+
+    def roomy(x: Array) -> Array:
+        return inequality(storage(x)) - x[-1] * np.eye(size)
+
+    def positive(x: Array) -> Array:
+        return storage(x) - x[-1] * np.eye(n)
+
+    cost = np.append(np.zeros(lmi.packed(n)), -1.0)
+    return storage(Problem(cost, [Block.of(function, every) for function in (roomy, positive, most)]).solve(what))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -200,7 +214,7 @@ def _step(family: FixedOrder, at: Array, Q0: Array, U0: Array, norm: float) -> t
     LQ, LU = np.linalg.cholesky(Q0), np.linalg.cholesky(U0)
     nq, nu = Q0.shape[0], U0.shape[0]
     ends = np.cumsum([family.unknowns, lmi.packed(nq), lmi.packed(nu)])
-    x = cp.Variable(int(ends[-1]) + 1)
+    every = range(ends[-1] + 1)
 
     def split(v: Array) -> tuple[Array, Array, Array, float]:
         p, q, u, t = np.split(v, ends)
@@ -218,12 +232,15 @@ def _step(family: FixedOrder, at: Array, Q0: Array, U0: Array, norm: float) -> t
         A, B, C = np.linalg.solve(LU, A @ LU), np.linalg.solve(LU, B), C @ LU / norm
         return lmi.lemma3(A, B, C, D / norm, 2 * np.eye(nu) - U, U, t)
 
-    storages = [lmi.affine(lambda v: split(v)[1], x), lmi.affine(lambda v: split(v)[2], x)]
-    least = [Z >> _LEAST * np.eye(Z.shape[0]) for Z in storages]
-    most = [Z << _MOST * np.eye(Z.shape[0]) for Z in storages]
-    cuts: list[cp.Constraint] = [lmi.affine(passivity, x) >> 0, lmi.affine(gain, x) >> 0, *least, *most]
-    lmi.solve(cp.Problem(cp.Minimize(x[-1]), cuts), "a step of the inner convex approximation")
-    p, Q, U, _ = split(lmi.solved(x))
+    storages: list[Callable[[Array], Array]] = [
+        lambda v: split(v)[1] - _LEAST * np.eye(nq),
+        lambda v: split(v)[2] - _LEAST * np.eye(nu),
+        lambda v: _MOST * np.eye(nq) - split(v)[1],
+        lambda v: _MOST * np.eye(nu) - split(v)[2],
+    ]
+    blocks = [Block.of(function, every) for function in (passivity, gain, *storages)]
+    problem = Problem(np.append(np.zeros(ends[-1]), 1.0), blocks)
+    p, Q, U, _ = split(problem.solve("a step of the inner convex approximation"))
     return p, LQ @ Q @ LQ.T, LU @ U @ LU.T
 
 
@@ -279,26 +296,25 @@ class _Relaxed:
 
     def search(self, mu: float, holds: Callable[[Array, float], bool], patience: int) -> tuple[Array | None, int]:
         """(a coupling that holds for mu or None, SDPs spent)."""
-        x = cp.Variable(self.family.unknowns + sum(map(lmi.packed, self.sizes)))
-        constraints = self._constraints(x, mu)
+        blocks = self._blocks(mu)
         matrices = [np.eye(n) for n in self.sizes]
         for spent in range(1, patience + 1):
-            Q0, Y0, U0, X0 = matrices
-            trace = lmi.affine(lambda v, at=(Y0, Q0, X0, U0): self._inner(v, at), x)
             try:
-                lmi.solve(cp.Problem(cp.Minimize(cp.sum(trace)), constraints), "a step of cone complementarity")
+                x = Problem(self._inner(matrices), blocks).solve("a step of cone complementarity")
             except DesignFailed:
                 return None, spent
-            p, matrices = self.split(np.asarray(x.value))
+            p, matrices = self.split(x)
             if holds(p, mu):
                 return p, spent
         return None, patience
 
-    def _inner(self, v: Array, at: tuple[Array, ...]) -> Array:
-        """tr(Y0 Q) + tr(Q0 Y) + tr(X0 U) + tr(U0 X), (1, 1)."""
-        return np.array([[sum(float(np.sum(M * M0)) for M, M0 in zip(self.split(v)[1], at, strict=True))]])
+    def _inner(self, at: Sequence[Array]) -> Array:
+        """The slopes of tr(Y0 Q) + tr(Q0 Y) + tr(X0 U) + tr(U0 X)."""
+        Q0, Y0, U0, X0 = at
+        both = [2 * M - np.diag(np.diag(M)) for M in (Y0, Q0, X0, U0)]
+        return np.concatenate([np.zeros(self.family.unknowns), *(M[np.triu_indices(len(M))] for M in both)])
 
-    def _constraints(self, x: cp.Variable, mu: float) -> list[cp.Constraint]:
+    def _blocks(self, mu: float) -> list[Block]:
         def passivity(v: Array) -> Array:
             p, (Q, Y, _, _) = self.split(v)
             G = _in_coordinates(self.family.ports(p), self.LQ)
@@ -315,7 +331,8 @@ class _Relaxed:
             one = np.eye(self.sizes[first])
             return lambda v: lmi.symmetric([[self.split(v)[1][first + 1], one], [one, self.split(v)[1][first]]])
 
-        return [lmi.affine(f, x) >> 0 for f in (passivity, gain, pair(0), pair(2))]
+        every = range(self.family.unknowns + sum(map(lmi.packed, self.sizes)))
+        return [Block.of(f, every) for f in (passivity, gain, pair(0), pair(2))]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -371,19 +388,18 @@ class FixedPoles:
     def _solve(self, poles: Sequence[Sequence[float]]) -> tuple[Lti, float]:
         N = self.loop.channels
         states = sum(map(len, poles)) + sum(self.loop.theta)
-        gains, storage, t = cp.Variable(N + sum(map(len, poles))), cp.Variable(lmi.packed(states)), cp.Variable()
-        x = cp.hstack([gains, storage])
+        gains, entries = N + sum(map(len, poles)), lmi.packed(states)
 
-        def passive(v: Array) -> Array:
-            g, p = np.split(v, [gains.size])
-            return self._passivity(poles, g, lmi.symmetric_from(p, states))
+        def storage(x: Array) -> Array:
+            return lmi.symmetric_from(x[gains:], states)
 
-        P = lmi.affine(lambda v: lmi.symmetric_from(v, states), storage)
-        cuts = self._cuts(poles, gains, t)
-        problem = cp.Problem(cp.Minimize(t), [lmi.affine(passive, x) >> 0, P >> 0, *cuts])
-        lmi.solve(problem, "the coupling with fixed poles")
+        every = range(gains + entries)
+        passive = Block.of(lambda x: self._passivity(poles, x[:gains], storage(x)), every)
+        cost = np.append(np.zeros(len(every)), 1.0)  # t is the last
+        cuts = self._cuts(poles, [*range(gains), len(every)])
+        x = Problem(cost, [passive, Block.of(storage, every), cuts]).solve("the coupling with fixed poles")
         self.sdps += 1
-        return self._coupling(poles, lmi.solved(gains)), float(np.sqrt(lmi.solved(t)))
+        return self._coupling(poles, x[:gains]), float(np.sqrt(x[-1]))
 
     def _unit(self, poles: Sequence[Sequence[float]], gains: Array) -> tuple[Lti, Array, Array]:
         """V in units T = 1 and usable damping = I, with F and V1 of design.fixed_order.realisation's realisation."""
@@ -411,17 +427,15 @@ class FixedPoles:
         excess = np.hstack([C1, D1])[paid] / np.sqrt(self.sigma[paid])[:, None]
         return lmi.symmetric([[plain, excess.T], [excess, np.eye(excess.shape[0])]])
 
-    def _cuts(self, poles: Sequence[Sequence[float]], gains: cp.Variable, t: cp.Variable) -> list[cp.Constraint]:
+    def _cuts(self, poles: Sequence[Sequence[float]], unknowns: Sequence[int]) -> Block:
         """[[I, L*], [L, t I]] >= 0 for W1 L W2 at the binding frequencies."""
         w = np.array(self.frequencies)
         left, right, late = self.shaping.parts(w)
-        at_zero = late @ right
-        units = np.eye(gains.size)
+        units = np.eye(len(unknowns) - 1)
         slopes = np.stack([left @ self._coupling(poles, e).at(on_circle(w)) @ right for e in units])
         m = right.shape[-1]
         base = np.broadcast_to(np.eye(m), (w.size, m, m)).astype(np.complex128)
-        constant, slopes = lmi.gain_lmi(at_zero, slopes, base, np.zeros((gains.size, w.size, m, m)))
-        return lmi.affine_lmis(constant, slopes, cp.hstack([gains, t]))
+        return lmi.gain_block(unknowns, late @ right, slopes, base, np.zeros((len(units), w.size, m, m)))
 
 
 #: The start is designed for this much less damping, so that it is strictly feasible.
@@ -444,7 +458,7 @@ def design(
     """
     whole("order", order, 1, _MOST_STATES)
     of_kind("diagonal", diagonal, bool, "True or False")
-    one_of("method", method, METHODS)
+    one_of("method", method, _METHODS)
     if method == "fixed-poles" and (order, diagonal) != (1, True):
         raise ValueError("method 'fixed-poles' is for one state per channel, diagonal")
     started = time.perf_counter()

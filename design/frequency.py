@@ -133,7 +133,7 @@ def _sweep_seconds(G: Lti) -> float:
 
 
 def too_long(G: Lti, sweeps: int = 1) -> str | None:
-    """Why so many sweeps of G, or of what is like it, are not begun; None where they are."""
+    """Why this many sweeps of G, or of a system of its size, are refused; None where they are not."""
     seconds, how = sweeps * _sweep_seconds(G), f"some {sweeps} sweeps" if sweeps > 1 else "a sweep"
     if seconds <= MOST_SECONDS:
         return None
@@ -169,7 +169,7 @@ def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: i
 
 
 def rounding(G: Lti, z: NDArray[np.complex128]) -> float:
-    """By how much rounding may change an entry of the response of y = C x + D u, x+ = A x + B u, at any of the z (k,).
+    """How much rounding may change an entry of the response of y = C x + D u, x+ = A x + B u, at any of the z (k,).
 
     A tick in double precision is one of a system whose coefficients are off by (2n + 8) u relatively, entry by entry
     (n states, u the unit). With R = (zI - A)^-1 that moves the response by at most the same part of

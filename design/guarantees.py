@@ -40,7 +40,7 @@ def switching_guarantee(span: DelayRange) -> str:
 
 
 def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_ranges: bool = False) -> str | None:
-    """For which environments a coupling is certified, by its requirements; None for none.
+    """The environments for which a coupling is certified, by its requirements; None where it is certified for none.
 
     The multiplier that any-environment takes for psi >= 1 is of one environment. `whole_ranges`: this-environment is
     proved at every vertex of the loop's ranges, and a search has found no violation between them.
@@ -92,7 +92,7 @@ LATE = "a latency of a fraction of a sample is derived for this environment only
 
 
 def no_compliance(coupling: Coupling) -> str:
-    """Why Theorem 4 has nothing to say of a coupling that is no V of its own."""
+    """Why Theorem 4 does not apply to a coupling that has no V(z) of its own."""
     if coupling.holds_model:
         return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
     return "without a coupling there is nothing that Theorem 4 could use"

@@ -13,11 +13,8 @@ Two transfer matrices of the paper can never satisfy the strict inequalities pri
 
 from __future__ import annotations
 
-import time
-import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # its parts load when they are used
@@ -27,18 +24,16 @@ from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.conditions import even_damping, regular_part, uncovered
+from design.cone import Block, Problem
 from design.frequency import frequencies, hermitian, on_circle, supremum
-from design.result import Attempt, DesignFailed, Infeasible
+from design.result import DesignFailed, Infeasible
 
-if TYPE_CHECKING:  # most of a second: loaded where it is used
-    import cvxpy as cp
-
-#: Designs ask for (1 - RESERVE) of the damping that there is, so that they are certified as stored.
+#: Designs ask for (1 - RESERVE) of the available damping, so that they are certified as stored.
 RESERVE = 1e-4
 
 
 def usable(loop: Loop) -> Array:
-    """(m,) the damping that a design may spend [N s/m], where periods are even. Raises ValueError where it is none."""
+    """(m,) the damping that a design may spend [N s/m], in even periods. Raises ValueError where there is none."""
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
     return (1 - RESERVE) * even_damping(loop.delta, loop.T, loop.T_max)
@@ -82,117 +77,6 @@ def _check_weights(W1: Lti, W2: Lti, channels: int) -> None:
     response = W2.at(z)
     if np.abs(response - response * np.eye(channels)).max() > 1e-9 * np.abs(response).max():
         raise ValueError("W2 must be diagonal: the convex-concave step divides by it channel by channel")
-
-
-# ----------------------------------------------------------------------------------------------------
-# The only caller of cvxpy's solve.
-#
-# A solver's status is a claim. A result is used only if every variable is finite, the constraints hold when they are
-# evaluated again, and the caller's own `accept` agrees; otherwise the next settings of the ladder are tried. Settings
-# change what the solver does to the data, so one that breaks down seldom takes the others with it.
-
-
-#: Largest violation of a constraint that is taken for rounding; problems are posed in units where 1 is large.
-_TOLERANCE = 1e-4
-
-
-@dataclass(frozen=True)
-class _Settings:
-    """A solver and its options."""
-
-    name: str
-    solver: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-
-
-_TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
-_LOOSE = {"tol_gap_abs": 1e-6, "tol_gap_rel": 1e-6, "tol_feas": 1e-6}
-
-LADDER = (
-    _Settings("default", "CLARABEL"),
-    _Settings("tight", "CLARABEL", {**_TIGHT, "max_step_fraction": 0.95}),
-    _Settings("as given", "CLARABEL", {"equilibrate_enable": False, "chordal_decomposition_enable": False}),
-    _Settings("loose", "CLARABEL", {**_LOOSE, "static_regularization_constant": 1e-7}),
-)
-CROSS_CHECK = _Settings("splitting", "SCS", {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 200_000})
-
-
-def solve(
-    problem: cp.Problem,
-    what: str,
-    accept: Callable[[], bool] | None = None,
-    ladder: Sequence[_Settings] = LADDER,
-) -> tuple[Attempt, ...]:
-    """Leave a verified optimum in the problem's variables; return the attempts, the last of which succeeded.
-
-    `what` names the problem in the message of an error. Raises Infeasible when two settings agree that there is no
-    solution and none found one, DesignFailed otherwise. After either, no variable holds a value.
-    """
-    import cvxpy as cp
-
-    attempts: list[Attempt] = []
-    for settings in ladder:
-        attempts.append(_attempt(problem, settings, accept))
-        if attempts[-1].reason is None:
-            return tuple(attempts)
-        if sum(a.status == cp.INFEASIBLE for a in attempts) >= 2:
-            break
-    _forget(problem)
-    statuses = ", ".join(f"{a.settings}: {a.status}" for a in attempts)
-    if sum(a.status == cp.INFEASIBLE for a in attempts) >= 2:
-        raise Infeasible(problem, attempts, f"{what} has no solution ({statuses})")
-    advice = "try fewer delays, a larger damping or a lower order; the error carries the problem"
-    raise DesignFailed(problem, attempts, f"{what} could not be solved ({statuses}); {advice}")
-
-
-def solved(x: cp.Expression) -> Array:
-    """The value that `solve` has left in x."""
-    assert x.value is not None, "read before it was solved for"
-    return np.asarray(x.value)
-
-
-def _attempt(problem: cp.Problem, settings: _Settings, accept: Callable[[], bool] | None) -> Attempt:
-    started = time.perf_counter()
-    status, reason = _call(problem, settings)
-    if reason is None:
-        reason = _doubt(problem, accept)
-    value = None if reason else float(cast(float, problem.value))
-    return Attempt(settings.name, status, value, time.perf_counter() - started, reason)
-
-
-def _call(problem: cp.Problem, settings: _Settings) -> tuple[str, str | None]:
-    """(status, reason for refusing it or None). A cached solver would keep the options of the rung before."""
-    import cvxpy as cp
-
-    _forget(problem)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # cvxpy's "may be inaccurate": we measure that
-            problem.solve(solver=settings.solver, warm_start=False, **settings.options)
-    except BaseException as error:  # Clarabel's Rust panics are not Exceptions
-        panicked = type(error).__name__ == "PanicException"
-        if not panicked and not isinstance(error, cp.SolverError):
-            raise
-        return ("panic" if panicked else cp.SOLVER_ERROR), str(error)
-    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
-        return problem.status, f"the solver reports {problem.status}"
-    return problem.status, None
-
-
-def _doubt(problem: cp.Problem, accept: Callable[[], bool] | None) -> str | None:
-    """Why the values in the variables may not be used, or None."""
-    if any(v.value is None or not np.isfinite(v.value).all() for v in problem.variables()):
-        return "a variable has no finite value"
-    worst = max((float(np.max(c.violation(), initial=0.0)) for c in problem.constraints), default=0.0)
-    if not worst <= _TOLERANCE:
-        return f"a constraint is violated by {worst:.1e}"
-    return None if accept is None or accept() else "the result does not pass the caller's verification"
-
-
-def _forget(problem: cp.Problem) -> None:
-    """A failed solve leaves the values of the one before in place."""
-    for variable in problem.variables():
-        variable.value = None
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -242,19 +126,7 @@ class Shaping:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Affine matrix functions of a real vector, handed to cvxpy as one product with constant coefficients.
-
-
-def affine(function: Callable[[Array], Array], x: cp.Expression) -> cp.Expression:
-    """function(x), for an affine `function` from vectors (p,) to matrices, by its values at 0 and the unit vectors.
-
-    Compiling a block matrix of expressions costs cvxpy far more than these p + 1 evaluations.
-    """
-    import cvxpy as cp
-
-    constant = function(np.zeros(x.size))
-    slopes = np.stack([(function(e) - constant).ravel() for e in np.eye(x.size)], axis=1)
-    return cp.reshape(slopes @ x + constant.ravel(), constant.shape, order="C")
+# Symmetric matrices of unknowns, as vectors.
 
 
 def packed(n: int) -> int:
@@ -321,43 +193,16 @@ def _scaled(G: Lti, left: Array, right: Array) -> Lti:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Hermitian matrix inequalities at sampled frequencies, affine in real variables, with cutting planes.
+# A gain at sampled frequencies, affine in real variables, with cutting planes.
 #
 # A problem in frequency has infinitely many constraints of which few bind. It is solved with some of them, the result
 # is checked on a refined sweep by code that knows no solver, and the worst frequency is added.
 
 
-def _real_form(H: Complex) -> Array:
-    """[[X, -Y], [Y, X]] of H = X + jY, (..., n, n) -> (..., 2n, 2n): Hermitian >= 0 iff symmetric >= 0."""
-    return np.concatenate(
-        [
-            np.concatenate([H.real, -H.imag], axis=-1),
-            np.concatenate([H.imag, H.real], axis=-1),
-        ],
-        axis=-2,
-    )
-
-
-def affine_lmis(constant: Complex, slopes: Complex, x: cp.Expression) -> list[cp.Constraint]:
-    """constant[k] + sum_i slopes[i, k] x_i >= 0 for every frequency k.
-
-    constant (k, n, n) and slopes (p, k, n, n) are Hermitian in their last two axes, x is (p,). One product
-    with a constant matrix each: cvxpy compiles this much faster than block matrices of complex expressions.
-    """
-    import cvxpy as cp
-
-    fixed, by_x = _real_form(constant), _real_form(slopes)
-    size = fixed.shape[-1]
-    return [
-        cp.reshape(by_x[:, k].reshape(len(by_x), -1).T @ x + fixed[k].ravel(), (size, size), order="C") >> 0
-        for k in range(len(fixed))
-    ]
-
-
-def gain_lmi(
-    rows: Complex, row_slopes: Complex, base: Complex, base_slopes: Complex | Array
-) -> tuple[Complex, Complex]:
-    """Constant and slopes of [[base, rows*], [rows, t I]], whose last variable is t.
+def gain_block(
+    unknowns: Sequence[int], rows: Complex, row_slopes: Complex, base: Complex, base_slopes: Complex | Array
+) -> Block:
+    """[[base, rows*], [rows, t I]], where t is the last of the unknowns.
 
     rows (k, p, m) with slopes (q, k, p, m); base (k, m, m) with slopes (q, k, m, m). Where base >= 0 it says
     rows* rows <= t base.
@@ -370,7 +215,7 @@ def gain_lmi(
         target[..., m:, :m] = low
         target[..., :m, m:] = np.conj(np.swapaxes(low, -1, -2))
     slopes[q, :, m:, m:] = np.eye(p)
-    return constant, slopes
+    return Block(constant, slopes, unknowns)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -414,13 +259,16 @@ def least_multiplier(loop: Loop) -> Array:
 
 def _of_least_trace(regular: Lti, most: float) -> Array:
     """The entries of the diagonal Phi <= most of least trace that makes `regular` passive."""
-    import cvxpy as cp
+    m, n = regular.inputs, regular.order
+    ports, zero = Ports.same(regular), np.zeros((regular.inputs,) * 2)
 
-    phi, P = cp.Variable(regular.inputs), cp.Variable((regular.order,) * 2, symmetric=True)
-    passive = lemma1(Ports.same(regular), P, np.zeros((regular.inputs,) * 2), -cp.diag(phi))
-    problem = cp.Problem(cp.Minimize(cp.sum(phi)), [passive >> 0, P >> 0, phi <= most])
-    solve(problem, "the multiplier Phi of the environment")
-    return solved(phi)
+    def passive(x: Array) -> Array:
+        return lemma1(ports, symmetric_from(x[m:], n), zero, -np.diag(x[:m]))
+
+    size = range(m + packed(n))
+    storage, room = Block.of(lambda x: symmetric_from(x[m:], n), size), lambda x: np.diag(most - x[:m])
+    problem = Problem(np.repeat([1.0, 0.0], [m, packed(n)]), [Block.of(passive, size), storage, Block.of(room, size)])
+    return problem.solve("the multiplier Phi of the environment")[:m]
 
 
 def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
@@ -526,12 +374,15 @@ def _shifted_ports(H: Lti) -> Ports:
 
 def symmetric(rows: list[list[_Matrix]]) -> _Matrix:
     """The block matrix, made exactly symmetric; an array if every block is one. Empty blocks are left out."""
-    import cvxpy as cp
-
     kept = [[block for block in row if 0 not in block.shape] for row in rows]
     kept = [row for row in kept if row]
     numbers = all(isinstance(block, np.ndarray) for row in kept for block in row)
-    M = np.block(kept) if numbers else cp.bmat(kept)
+    if numbers:
+        M = np.block(kept)
+    else:
+        import cvxpy as cp  # loaded by who makes expressions
+
+        M = cp.bmat(kept)
     return (M + M.T) / 2
 
 

@@ -293,7 +293,7 @@ def switching_sweep(
 
 
 def _refused(available: tuple[float, ...], reason: str) -> SwitchingSweep:
-    """That no damping is enough, and why."""
+    """The requirement that no damping satisfies, with its reason."""
     return SwitchingSweep(refusal("switching", available, reason), (np.inf,) * len(available), np.inf)
 
 
@@ -317,7 +317,7 @@ class _Search:
         self._n, self._p, self._q = np.zeros(0), none, none  # the bounds collected
 
     def only(self, a: Array) -> _Found:
-        """s at this a."""
+        """s for this a alone."""
         ratio, w = self._swept(a)
         return a, ratio, w, ratio
 
@@ -495,7 +495,7 @@ class _LimiterSearch:
         return limiter_demand(G, theta, delta, rho, c, self._T_max)
 
     def swept(self, c: Lags, spare: float = 0.0) -> tuple[float, float]:
-        """(s(c), w [rad/sample]) by a sweep that is refined between its samples, with so much of rho to spare."""
+        """(s(c), w [rad/sample]) by a sweep that is refined between its samples, with a reserve of rho."""
         demand = self.demand(c)
         demand = replace(demand, free=demand.free - spare * self._lag)
         return supremum(lambda w: conditions.least_scale(demand, w), self._grid)
@@ -591,7 +591,7 @@ def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) 
 
 
 def limiter_refusal(loop: Loop) -> str | None:
-    """Why the limiter's own condition has nothing to say of a loop, or None."""
+    """Why the limiter's own condition does not apply to a loop, or None."""
     if loop.varying_delay:
         return "limiter: forces that are limited are proved for constant delays, not for delays that switch"
     if loop.environment.walls:

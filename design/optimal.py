@@ -16,9 +16,10 @@ import msgspec
 import numpy as np
 
 from controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
-from controller.environment import Network, Ranges
+from controller.environment import Network
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
+from controller.ranges import Ranges
 from design import program
 from design.certificate import prove, prove_limiter
 from design.conditions import this_environment as requirement_of
@@ -386,7 +387,7 @@ def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
 
 @dataclass(frozen=True)
 class _Spread:
-    """What it costs to keep the condition over `vertices`, too: two designs over one small basis."""
+    """The price of keeping the condition over `vertices`, too: two designs over one small basis."""
 
     mismatch_db: float  # of the design for the vertices, in the nominal environment
     price_db: float  # beside the design for the nominal environment alone

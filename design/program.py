@@ -20,11 +20,11 @@ from controller.coupling import ForceFilter, basis
 from controller.delay import delay
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Complex, Lti, Sampled, as_like
+from design.arguments import number, one_of
 from design.barrier import Block, Program, centre, towards
 from design.conditions import Demand, even_damping, this_environment_demand
 from design.frequency import frequencies, hermitian, on_circle, peaks
 from design.multipliers import SPARE, limiter_demand, limiter_lag, switching_block
-from design.result import number, one_of
 from design.transparency import BAND_HZ
 
 OBJECTIVES = ("rms", "sup")

@@ -1,18 +1,16 @@
-"""What a condition asks, what a design is, and the checks of the arguments of functions for scripts."""
+"""What a condition asks of the devices, and what a design returns or raises."""
 
 from __future__ import annotations
 
-import difflib
 import math
-import operator
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
-from controller.coupling import Coupling, SpringDamper
-from controller.lti import Array, Lti
+from controller.coupling import Coupling
+from controller.lti import Array
 
 Condition = Literal["this-environment", "any-environment"]
 
@@ -92,17 +90,6 @@ class NotProved(ValueError):
 # What a design raises when it has nothing to return.
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """What one rung of the ladder gave."""
-
-    settings: str
-    status: str
-    value: float | None  # the objective, None where the attempt was refused
-    wall_s: float
-    reason: str | None = None  # why it was refused
-
-
 class DesignFailed(ValueError):
     """No result could be verified. `problem` is the convex problem, if there is one, `results` what was tried."""
 
@@ -116,31 +103,12 @@ class Infeasible(DesignFailed):
 
 
 # ----------------------------------------------------------------------------------------------------
-# Figures and conditions as text.
-
-
-#: what files, options and reports called the conditions before
-OLDER_NAMES = {"closed-loop": "this-environment", "theorem4": "any-environment"}  # older name
+# Figures as text.
 
 
 def listed(values: Iterable[float | None], digits: int = 6) -> str:
     """1.37, 0.5 with so many significant digits; None stands for infinity in plain data."""
     return ", ".join("inf" if v is None else f"{v:.{digits}g}" for v in values)
-
-
-# ----------------------------------------------------------------------------------------------------
-# The paper's printed gains, as data. Neither pair satisfies the paper's own condition: nothing here is certified.
-
-
-#: (27), case I: Lambda = Theta Psi
-CASE_I = SpringDamper(K=[2870.0, 2320.0], B=[5.47, 5.55])
-#: (28), case II: Lambda = I
-CASE_II = SpringDamper(K=[1810.0, 120.0], B=[5.78, 3.81])
-
-#: The transparency indices (25) printed beside them [dB]; no reading of Figure 4 that we tried gives them.
-PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
-
-PUBLISHED = {"I": CASE_I, "II": CASE_II}
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -156,76 +124,8 @@ class Design:
     figure: str  # what was minimised: "loop-norm" (23), "rms" (mismatch), "stiffness" (maximised)
     objective: float  # its value, of the coupling as returned
     requirement: Requirement  # by `condition`, on a refined sweep
-    sdps: int  # convex problems solved (local searches count their runs)
-    wall_s: float
+    sdps: int = 0  # convex problems solved (local searches count their runs)
+    wall_s: float = 0.0
     phi: Array | None = None  # (N,) multiplier Phi_E [N s/m] of Theorem 4, None where the environment has none
     certificate: Any = field(kw_only=True, default=None)  # design.stored.Certificate, where the design has proved it
     hurried: bool = field(kw_only=True, default=False)  # its clock ended it: more time may find a better
-
-
-COUPLING = "a coupling (controller.coupling), or a Design"
-
-
-def of_kind(name: str, value: Any, kind: type, expected: str) -> None:
-    """Raises TypeError where `value` is no `kind`."""
-    if not isinstance(value, kind):
-        raise TypeError(f"{name} is {shown(value)}, expected {expected}")
-
-
-def bare(coupling: Coupling | Design, expected: str = COUPLING) -> Coupling:
-    """The coupling of a design, or the one given. Raises TypeError for anything else."""
-    found = coupling.coupling if isinstance(coupling, Design) else coupling
-    if isinstance(found, Lti):
-        raise TypeError("coupling is an Lti, expected a coupling: wrap it in Compliance(...) (controller.coupling)")
-    if isinstance(found, type) or not callable(getattr(found, "around", None)):
-        raise TypeError(f"coupling is {shown(coupling)}, expected {expected}")
-    return found
-
-
-def whole(name: str, value: Any, low: int, high: float = math.inf) -> int:
-    """A whole number from `low` to `high`, numpy's too. Raises TypeError, ValueError."""
-    span = f"{low} to {high}" if high < math.inf else f"{low} or more"
-    allowed = f"whole numbers, {span}"
-    try:
-        number = operator.index(value)
-    except TypeError:
-        raise TypeError(f"{name} is {shown(value)}, allowed are {allowed}") from None
-    if isinstance(value, bool):
-        raise TypeError(f"{name} is {shown(value)}, allowed are {allowed}")
-    if not low <= number <= high:
-        raise ValueError(f"{name} is {number}, allowed are {span}")
-    return number
-
-
-def number(name: str, value: Any, expected: str = "a number") -> float:
-    """A float, numpy's too. Raises TypeError."""
-    if isinstance(value, bool | str | bytes) or not hasattr(value, "__float__") or getattr(value, "ndim", 0):
-        raise TypeError(f"{name} is {shown(value)}, expected {expected}")
-    return float(value)
-
-
-def one_of(name: str, value: Any, allowed: Collection[str]) -> None:
-    """Raises ValueError."""
-    if not isinstance(value, str) or value not in allowed:
-        raise ValueError(f"{name} is {value!r}, allowed are {', '.join(allowed)}")
-
-
-def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:
-    """Raises TypeError for an option that `what` does not have."""
-    for option in options:
-        if option not in allowed:
-            close = difflib.get_close_matches(option, allowed, n=1)
-            hint = f" (did you mean {close[0]}?)" if close else ""
-            raise TypeError(f"{option} is no option of {what}{hint}, allowed are {', '.join(allowed)}")
-
-
-def shown(value: Any) -> str:
-    """The value, shortened, with its type."""
-    text = repr(value)
-    if len(text) > 60 or "\n" in text:
-        return f"a {type(value).__name__}"
-    return text if value is None else f"{text} ({type(value).__name__})"
-
-
-#: how a state-space coupling of fixed order may be sought
-METHODS = ("complementarity", "inner", "fixed-poles")

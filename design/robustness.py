@@ -9,8 +9,9 @@ from typing import Any
 import msgspec
 
 from controller.coupling import Coupling
-from controller.environment import Network, Ranges, UncertainSpring
+from controller.environment import Network
 from controller.loop import Loop
+from controller.ranges import Ranges, UncertainSpring
 from design.environments import ratio_in
 from design.result import finite
 

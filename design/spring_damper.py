@@ -8,9 +8,9 @@ Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -18,20 +18,18 @@ from controller.coupling import MovingAverage, SpringDamper
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.conditions import any_environment, any_environment_delayed, even_damping, this_environment
+from design.cone import Block, Problem
 from design.frequency import peaks, too_long
 from design.gain_search import LimiterLoop, SampledLoop, SwitchingLoop, least_rms, polynomials
-from design.lmi import RESERVE, Complex, Shaping, affine_lmis, gain_lmi, least_phi, solve, solved, usable
+from design.lmi import RESERVE, Shaping, gain_block, least_phi, usable
 from design.multipliers import (
     limiter_refusal,
 )
 from design.result import Design, DesignFailed, Infeasible, Requirement
 from design.transparency import BAND_HZ, transparency
 
-if TYPE_CHECKING:  # slow to load
-    import cvxpy as cp
-
 # ----------------------------------------------------------------------------------------------------
-# The exact convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
+# The convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
 #
 # With D = (z-1)/(Tz), W = K/D + B and N = (1 - z^-n)/(2 delta), n = theta + 1, the transformed coupling (11) is V-hat
 # = 1/W - N (a number per channel), and He V-hat >= Delta_V |V-hat|^2 times |W|^2 reads, in units k = KT/delta, b =
@@ -42,93 +40,87 @@ if TYPE_CHECKING:  # slow to load
 # y is a polynomial in 1/z, affine in (k, b), so this is one linear matrix inequality, without conservatism. psi = 0
 # needs no excess of passivity in V-hat (Sigma = inf): the last term is absent.
 #
-# Its matrix has theta + 2 rows and its solution costs their fifth power, so beyond LARGEST_GRAM samples the
-# inequality is imposed frequency by frequency - a second-order cone in the two unknowns - and where the solution
-# fails in between, there too (`solve_within`). The cones contain the set and the rounds shrink them to it: both ways
-# end at the same gains.
+# Its matrix has theta + 2 rows and half as many unknowns as entries, so beyond _LARGEST_GRAM of these the inequality is
+# imposed frequency by frequency, in the two unknowns alone, and where the solution fails in between, there too
+# (`solve_within`). These sets contain the exact one and the rounds shrink them to it: both ways end at the same gains.
 
 
-_LARGEST_GRAM = 12  # samples of delay
+_LARGEST_GRAM = 180  # unknowns besides the gains, of all channels
 _PER_LOBE = 8  # frequencies per ripple of y at which the inequality is imposed first
 _MISSED = 2e-6  # of the usable damping: what the inequality may miss in between, far less than the reserve of a design
 _MOST_ROUNDS = 12
 
 
-def gain_set(k: cp.Expression, b: cp.Expression, theta: int, sigma: float) -> list[cp.Constraint]:
-    """Constraints on the scalars k and b (units above); sigma = inf where psi = 0.
-
-    Gram form: a trigonometric polynomial r - |c(z)|^2 is non-negative iff c c' <= Q for some Q >= 0 whose
-    diagonals sum to r on the main one and to zero on the others.
-    """
-    import cvxpy as cp
-
-    n = theta + 1
-    y = cp.hstack([k + b, *[k] * (n - 1), -b])  # coefficients of 1, 1/z, ..., z^-n
-    columns = [y / 2]
-    if np.isfinite(sigma):
-        one = np.eye(n + 1)[0]
-        columns.append((one - y / 2) / np.sqrt(sigma))
-    c = cp.vstack(columns).T
-    Q = cp.Variable((n + 1, n + 1), symmetric=True)
-    sums = [cp.trace(Q) == k / 2 + b]
-    sums += [cp.sum(cp.diag(Q, d)) == 0 for d in range(1, n + 1)]
-    constraints = [cp.bmat([[Q, c], [c.T, np.eye(len(columns))]]) >> 0, *sums, k >= 0, b >= 0]
-    return cast(list[cp.Constraint], constraints)  # cvxpy gives the type of == as bool
-
-
 def solve_within(
-    objective: cp.Minimize | cp.Maximize,
-    gains: cp.Expression,
+    cost: Array,
     theta: Sequence[int],
     sigma: Array,
     what: str,
-    more: Sequence[cp.Constraint] = (),
+    more: Sequence[Block] = (),
     largest_gram: int = _LARGEST_GRAM,
-) -> cp.Problem:
-    """The solved problem with every channel of gains = (k_1, ..., k_N, b_1, ..., b_N) in its set.
+) -> Array:
+    """The unknowns of least cost: gains (k_1, ..., k_N, b_1, ..., b_N), each channel's in its set, then others.
 
-    Raises as `solve`, and DesignFailed where an inequality still fails after all rounds.
+    `more` blocks bound these, too. Raises as Problem.solve, and DesignFailed where an inequality still fails after all
+    rounds.
     """
-    import cvxpy as cp
-
-    N = len(theta)
-    cones = {i: _first_frequencies(theta[i]) for i in range(N) if theta[i] > largest_gram}
+    N, own = len(theta), len(cost)
+    both = [(i, N + i) for i in range(N)]
+    blocks = [*more, Block.of(np.diag, range(2 * N))]
+    spare = [(n + 1) * (n + 2) // 2 for n in theta]
+    if sum(spare) <= largest_gram:
+        ends = own + np.cumsum([0, *spare])
+        for i in range(N):
+            blocks.append(_gram(theta[i], float(sigma[i]), [*both[i], *range(ends[i], ends[i + 1])]))
+        return Problem(np.append(cost, np.zeros(sum(spare))), blocks).solve(what)[:own]
+    sampled = [_first_frequencies(n) for n in theta]
     for _ in range(_MOST_ROUNDS):
-        problem = cp.Problem(objective, [*_constraints(gains, theta, sigma, cones), *more])
-        solve(problem, what)
-        k, b = np.split(solved(gains), 2)
-        missed = {i: _missed_frequencies(k[i], b[i], theta[i], float(sigma[i])) for i in cones}
-        if not any(w.size for w in missed.values()):
-            return problem
-        cones = {i: np.union1d(w, missed[i]) for i, w in cones.items()}
+        sets = [_sampled(theta[i], float(sigma[i]), both[i], sampled[i]) for i in range(N)]
+        x = Problem(cost, [*blocks, *sets]).solve(what)
+        missed = [_missed_frequencies(x[i], x[N + i], theta[i], float(sigma[i])) for i in range(N)]
+        if not any(w.size for w in missed):
+            return x
+        sampled = [np.union1d(w, further) for w, further in zip(sampled, missed, strict=True)]
     line = f"{what}: after {_MOST_ROUNDS} rounds Theorem 4 still fails between the frequencies"
     raise DesignFailed(None, (), line)
 
 
-def _constraints(
-    gains: cp.Expression, theta: Sequence[int], sigma: Array, cones: Mapping[int, Array]
-) -> list[cp.Constraint]:
-    N, constraints = len(theta), []
-    for i in range(N):
-        k, b = gains[i], gains[N + i]
-        if i in cones:
-            constraints += _gain_cones(k, b, theta[i], float(sigma[i]), cones[i])
-        else:
-            constraints += gain_set(k, b, theta[i], float(sigma[i]))
-    return constraints
+def _gram(theta: int, sigma: float, unknowns: Sequence[int]) -> Block:
+    """The exact set of (k, b): r - |c(z)|^2 is non-negative iff c c' <= Q for some Q whose diagonals sum to r and 0.
+
+    c holds the coefficients of 1, 1/z, ..., z^-n; Q is unknown but for the last entry of each diagonal.
+    """
+    n = theta + 1
+    rows, columns = np.array([(j, j + d) for d in range(n + 1) for j in range(n - d)]).T
+
+    def matrix(x: Array) -> Array:
+        (k, b), y, one = x[:2], np.full(n + 1, x[0]), np.eye(n + 1)[0]
+        y[0], y[n] = k + b, -b
+        parts = [y / 2] if np.isinf(sigma) else [y / 2, (one - y / 2) / np.sqrt(sigma)]
+        Q, c = np.zeros((n + 1, n + 1)), np.stack(parts, axis=1)
+        Q[rows, columns] = x[2:]
+        for d in range(n + 1):
+            Q[n - d, n] = (k / 2 + b) * (d == 0) - np.trace(Q, d)
+        Q += np.triu(Q, 1).T
+        return np.block([[Q, c], [c.T, np.eye(c.shape[1])]])
+
+    return Block.of(matrix, unknowns)
 
 
-def _gain_cones(k: cp.Expression, b: cp.Expression, theta: int, sigma: float, w: Array) -> list[cp.Constraint]:
-    """The inequality at the frequencies w [rad/sample]: |(2c, r - 1)| <= r + 1 says |c|^2 <= r."""
-    import cvxpy as cp
+def _sampled(theta: int, sigma: float, unknowns: Sequence[int], w: Array) -> Block:
+    """The inequality at the frequencies w [rad/sample]: |c|^2 <= r as [[r, c'], [c, I]] >= 0."""
+
+    def arrow(r: float, one: float, y: Any) -> Array:
+        parts = [y / 2] if np.isinf(sigma) else [y / 2, (one - y / 2) / np.sqrt(sigma)]
+        c = np.stack([part for each in parts for part in (each.real, each.imag)], axis=-1)
+        M = np.zeros((w.size, 1 + c.shape[-1], 1 + c.shape[-1]))
+        M[:, 0, 0], M[:, 0, 1:], M[:, 1:, 0] = r, c, c
+        return M
 
     of_k, of_b = polynomials(theta, w)
-    rows = [part * k + other * b for part, other in zip(_parts(of_k), _parts(of_b), strict=True)]
-    if np.isfinite(sigma):
-        rows += [(2 * (i == 0) - row) / np.sqrt(sigma) for i, row in enumerate(rows)]
-    room = (k / 2 + b) * np.ones(w.size)
-    cones = cp.SOC(room + 1, cp.vstack([*rows, room - 1]), axis=0)
-    return cast(list[cp.Constraint], [cones, k >= 0, b >= 0])
+    constant = arrow(0.0, 1.0, np.zeros(w.size, dtype=complex))
+    constant += np.diag([0.0, *np.ones(constant.shape[-1] - 1)])
+    return Block(constant, np.stack([arrow(0.5, 0.0, of_k), arrow(1.0, 0.0, of_b)]), unknowns)
 
 
 def _missed_frequencies(k: float, b: float, theta: int, sigma: float) -> Array:
@@ -147,10 +139,6 @@ def _first_frequencies(theta: int) -> Array:
     return np.linspace(0, np.pi, _PER_LOBE * (theta + 1) + 1)
 
 
-def _parts(values: Array) -> tuple[Array, Array]:
-    return values.real, values.imag
-
-
 # ----------------------------------------------------------------------------------------------------
 # One step of the convex-concave sequence for ||W1 L W2||_inf (23) over spring-damper gains.
 #
@@ -161,17 +149,13 @@ def _parts(values: Array) -> tuple[Array, Array]:
 
 def step(shaping: Shaping, sigma: Array, at: Array, norm: float, w: Array) -> tuple[Array, float]:
     """(gains, bound on the norm at the frequencies w) of one convex-concave step from the gains `at`."""
-    import cvxpy as cp
-
-    loop = shaping.loop
-    gains, t = cp.Variable(2 * loop.channels), cp.Variable()
-    constant, slopes = _tangent(shaping, at, norm, w)
-    cuts = affine_lmis(constant, slopes, cp.hstack([gains, t]))
-    solve_within(cp.Minimize(t), gains, loop.theta, sigma, "a step of the convex sequence", cuts)
-    return solved(gains), norm * float(np.sqrt(solved(t)))
+    cost = np.append(np.zeros(at.size), 1.0)
+    cuts = _tangent(shaping, at, norm, w)
+    x = solve_within(cost, shaping.loop.theta, sigma, "a step of the convex sequence", [cuts])
+    return x[:-1], norm * float(np.sqrt(x[-1]))
 
 
-def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Complex, Complex]:
+def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Block:
     """[[g0* g + g* g0 - g0* g0, (W1 L g W2)*], [W1 L g W2, t norm^2]], scaled to order one; t is the last variable."""
     N = shaping.loop.channels
     left, right, late = shaping.parts(w)
@@ -185,7 +169,7 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Comple
     tangent = 2 * (np.conj(g0) * g).real * scale**2
     diagonal = np.eye(N)
     base = -np.broadcast_to(diagonal, (w.size, N, N)).astype(np.complex128)
-    return gain_lmi(rows, row_slopes, base, tangent[..., None] * diagonal)
+    return gain_block(range(2 * N + 1), rows, row_slopes, base, tangent[..., None] * diagonal)
 
 
 #: The sequence stops when a step improves the norm by less than this, relatively.
@@ -400,18 +384,21 @@ def _coupling(loop: Loop, gains: Array) -> SpringDamper:
 
 
 def _start(loop: Loop, sigma: Array, start: SpringDamper | None) -> tuple[Array, int]:
-    """The gains of the set nearest to `start`, or the stiffest of the set; and the number of SDPs, one."""
-    import cvxpy as cp
-
-    N = loop.channels
-    gains = cp.Variable(2 * N)
-    objective = cp.Maximize(cp.sum(gains[:N]))
-    if start is not None:
+    """The gains of the set nearest to `start`, or the stiffest of the set; and the number of convex problems, one."""
+    N, more = loop.channels, []
+    cost = np.repeat([-1.0, 0.0], N)
+    if start is not None:  # of least t with |gains - wanted| <= t
         wanted = np.concatenate([start.K * loop.T, start.B]) / np.tile(usable(loop), 2)
-        objective = cp.Minimize(cp.norm(gains - wanted))
+        cost = np.append(np.zeros(2 * N), 1.0)
+
+        def near(x: Array) -> Array:
+            away = (x[:-1] - wanted)[:, None]
+            return np.block([[x[-1] * np.eye(2 * N), away], [away.T, x[-1:, None]]])
+
+        more = [Block.of(near, range(2 * N + 1))]
     try:
-        solve_within(objective, gains, loop.theta, sigma, "the set of gains")
+        x = solve_within(cost, loop.theta, sigma, "the set of gains", more)
     except Infeasible as error:
         line = f"Theorem 4 admits no spring-damper with theta = {loop.theta}, psi = {loop.psi}, delta = {loop.delta}"
         raise Infeasible(error.problem, error.results, line) from error
-    return solved(gains), 1
+    return x[: 2 * N], 1

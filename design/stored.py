@@ -15,16 +15,10 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 
 from controller.coupling import Coupling, Form, Strict, require_channels
-from controller.loop import Loop, named_first, named_today
-from design.files import InputError, read, write
-from design.result import OLDER_NAMES, Condition
-
-# ----------------------------------------------------------------------------------------------------
-# The file in which a coupling is kept: the loop it was made for, its coefficients and its certificate, as JSON.
-#
-# Numbers are plain decimals, rationals are strings "p/q". Reading is strict: an unknown or ill-typed field is an
-# error that names it.
-
+from controller.loop import Loop
+from controller.older import CONDITIONS, GUARANTEES, named_first, named_today
+from design.files import InputError, counted, read, write
+from design.result import Condition
 
 _Rows = tuple[tuple[float, ...], ...]
 
@@ -34,7 +28,7 @@ _Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_len
 
 #: for which environments a certificate holds
 Guarantee = Literal["any passive environment", "these ranges", "this environment"]
-_OLDER_GUARANTEES = {"a set": "these ranges"}
+_OLDER = CONDITIONS | GUARANTEES
 
 
 _Part = TypeVar("_Part", bound=msgspec.Struct)
@@ -50,7 +44,7 @@ class SwitchingProof(Strict, frozen=True):
 
 
 class LimiterCertificate(Strict, frozen=True):
-    """What proves this-environment also while forces are limited, by the limiter of controller.contact."""
+    """What proves this-environment also while forces are limited, by the limiter of controller.limiter."""
 
     beta: float  # rho = beta delta/T, to six digits
     rho: tuple[float, ...]  # (m,) lag of the limiter [N/m]; the tick must use these
@@ -61,7 +55,7 @@ class LimiterCertificate(Strict, frozen=True):
 
 
 class Certificate(Strict, frozen=True):
-    """What is claimed of a coupling in its loop, and what proves it."""
+    """The claim about a coupling in its loop, and its proof."""
 
     condition: Condition
     required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
@@ -90,7 +84,7 @@ class Stored(Strict, frozen=True):
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, certificate: Certificate | None = None) -> Stored:
-        """What a file keeps of a coupling in its loop."""
+        """The stored form of a coupling in its loop."""
         return cls(loop, coupling.form(), certificate)
 
     def built(self) -> Coupling:
@@ -114,7 +108,7 @@ def _canonical(part: Any) -> bytes:
 
 def sealed(certificate: Certificate) -> Certificate:
     """The certificate with the digest of all its other fields, named as in the first files."""
-    older: dict[str, Any] = {name: before for before, name in (OLDER_NAMES | _OLDER_GUARANTEES).items()}
+    older: dict[str, Any] = {name: before for before, name in _OLDER.items()}
     plain = _read_back(msgspec.structs.replace(certificate, seal=""))
     guarantee = older.get(plain.guarantee, plain.guarantee)
     first = msgspec.structs.replace(plain, condition=older[plain.condition], guarantee=guarantee)
@@ -133,7 +127,7 @@ def load(path: str | Path) -> Stored:
     except _Twice as error:
         raise InputError(f"{path}: names {str(error)!r} twice in one object") from None
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: is no stored coupling: {' '.join(str(error).split())}") from None
+        raise InputError(f"{path}: is no stored coupling: {counted(' '.join(str(error).split()))}") from None
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: {_place(content, str(error))}{' '.join(str(error).split())}") from None
 
@@ -144,10 +138,9 @@ def _renamed(content: bytes) -> bytes:
         whole = msgspec.json.decode(content)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return content
-    older = OLDER_NAMES | _OLDER_GUARANTEES
     match whole:
         case {"certificate": dict() as claim}:
-            claim |= {key: older[word] for key, word in claim.items() if isinstance(word, str) and word in older}
+            claim |= {key: _OLDER[word] for key, word in claim.items() if isinstance(word, str) and word in _OLDER}
     match whole:
         case {"loop": dict() as loop}:
             whole["loop"] = named_today(loop)
@@ -155,11 +148,11 @@ def _renamed(content: bytes) -> bytes:
 
 
 class _Twice(Exception):
-    """A name that an object of a file gives two values."""
+    """An object of a file has two values for one name."""
 
 
 def _once(pairs: list[tuple[str, Any]]) -> None:
-    """Of the last value JSON readers speak, of the first one a person who reads the file."""
+    """Refuse a repeated name: a JSON reader would take the last value, a person may read the first."""
     names: set[str] = set()
     for name, _ in pairs:
         if name in names:

@@ -18,9 +18,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from controller.budget import EPS, EnergyBudget
-from controller.contact import Limiter, limited
 from controller.coupling import Coupling
 from controller.environment import environment
+from controller.limiter import Limiter, limited
 from controller.loop import force_map
 from controller.lti import Array, Lti
 from design.certificate import assess
@@ -50,7 +50,7 @@ _FALLBACK = ("spring-damper", "any-environment")  # what softer couplings are wh
 
 
 class Controller(Protocol):
-    """What answers a displacement with a force, tick by tick."""
+    """Answers a displacement with a force, tick by tick."""
 
     T: float  # [s]
 
@@ -179,7 +179,7 @@ class SentBudget:
         return tuple(int(n) for n in whole)
 
     def part(self) -> dict[str, Any]:
-        """What it did since it was armed, as plain data."""
+        """What it has done since arming, as plain data."""
         budget = self._budget
         given = f"more than {self.plan.start:g} J" if self.plan.start else "any energy"
         return {
@@ -338,7 +338,7 @@ def overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
     return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
 
 
-class Program(Protocol):
+class Armable(Protocol):
     """What a session can be armed with."""
 
     @property
@@ -348,7 +348,7 @@ class Program(Protocol):
 
     @property
     def certified(self) -> bool:
-        """Whether every passive human is safe with it."""
+        """Whether it is certified for every passive human."""
         ...
 
     @property
@@ -394,7 +394,7 @@ class CertifiedCoupling:
 
     @property
     def held(self) -> int:
-        """Missed answers in a row through which the device may hold a force: so much the coupling's file proves."""
+        """Missed answers in a row through which the device may hold a force, as far as the coupling's file proves."""
         span = self.chosen.switching
         return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
 

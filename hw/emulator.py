@@ -1,4 +1,4 @@
-"""A device that is not there: the scenario's plant under the firmware's own state machine, with faults to order.
+"""An emulated device: the scenario's plant under the firmware's own state machine, with faults to order.
 
 Faults are what a cable, a process or a device can do wrong. They are written KIND[=VALUE][@START[+DURATION]], with
 `up:` (device to host) or `down:` in front for one direction of the line, `axis2:` for another axis than the first:
@@ -242,12 +242,12 @@ class EmulatedPlant:
 
 
 def nobody(scenario: Scenario, damping: float = 0.0) -> Scenario:
-    """The scenario's devices with nobody at their handles, or what only damps by `damping` [N s/m], and no tap."""
+    """The scenario's devices without hands, or with a pure damper of `damping` [N s/m] at each, and without the tap."""
     return scenario.replace(human=(Human((Link(0.0, damping, 0.0),)),) * scenario.channels, tap=None)
 
 
 def info_of(scenario: Scenario) -> Info:
-    """What the emulated device says of itself: the scenario's devices, in the units of the wire."""
+    """The INFO of the emulated device: the scenario's devices, in the units of the wire."""
     encoder = [round(1e12 * (device.encoder_step or _ENCODER_STEP)) for device in scenario.device]
     return Info(
         version=PROTOCOL,
@@ -399,7 +399,7 @@ class Emulator:
 
 
 def _wilful(device: Device, axis: int, force: int) -> Device:
-    """The same device with a motor that has `force` [steps] while it is armed, whatever it is told."""
+    """The same device with a motor that drives `force` [steps] while armed, whatever FORCE says."""
     obeys = device.latch
 
     def latch(frame: Force | None) -> None:
@@ -434,7 +434,7 @@ class Terminal:
             os.write(self.master, data)
 
     def unplug(self) -> None:
-        """Close both ends: whoever has the path open sees the device disappear."""
+        """Close both ends: a host that has the path open sees the device disappear."""
         for end in (self.master, self._slave):
             os.close(end)
 
@@ -462,7 +462,7 @@ class RealTimeEmulator:
         return (time.monotonic_ns() - self._start) * self._pace / 1000 - self._lost
 
     def run(self, seconds: float, asked_to_stop: Callable[[], bool]) -> None:
-        """Tick until the time is over, the cable is pulled or somebody stops it."""
+        """Tick until the time is over, the cable is pulled or it is stopped."""
         due, unplugged_at = self._period, None
         while not asked_to_stop() and self.now() < 1e6 * seconds:
             self._wait(due)

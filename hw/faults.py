@@ -82,7 +82,7 @@ def person(what: str) -> _Call:
 
 
 def at(text: str) -> tuple[str, ...]:
-    """The fault `text` from WHEN on."""
+    """The fault `text`, beginning at WHEN."""
     return tuple(f"{part}@{_WHEN}" for part in text.split())
 
 
@@ -241,7 +241,7 @@ _MEASURED = 100  # answers whose age is measured: enough for a line that does no
 
 @dataclass(frozen=True)
 class _FaultOutcome:
-    """What a case came to."""
+    """The outcome of a case."""
 
     fault: str
     stage: str
@@ -315,7 +315,7 @@ def _plan(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) 
 
 
 def _wrong(case: Fault, rehearsal: Rehearsal, zero_ms: float | None) -> list[str]:
-    """What did not go as it must."""
+    """What went wrong in a case."""
     session, wrong = rehearsal.session, []
     if session.stage != case.stage:
         wrong.append(f"ended in {session.stage} ({session.cause}), expected {case.stage}")

@@ -98,7 +98,7 @@ def _held(force: Array, sigma: float, T: float) -> tuple[Array, Array, Array]:
 
 
 def _moving(x: Array, step: float, T: float) -> NDArray[np.bool_]:
-    """Where the encoder does not stand still."""
+    """The ticks at which the encoder moves."""
     counts, n = np.round(x / step), max(2, round(_STILL / T))
     moves = np.ones(len(x), dtype=bool)
     view = np.lib.stride_tricks.sliding_window_view(counts, n)
@@ -268,7 +268,7 @@ def _scatter(fit: _Fit, force: Array) -> Array:
 
 
 def _apart(columns: Array, i: int) -> Array:
-    """What of a column the others do not explain."""
+    """The part of a column that the others do not explain."""
     others = np.linalg.qr(np.delete(columns, i, axis=1))[0]
     return columns[:, i] - others @ (others.T @ columns[:, i])
 

@@ -184,17 +184,17 @@ class _Model:
         return np.array(play(A.tolist(), B.tolist(), float(p[_COULOMB]), self.force.tolist(), substeps))
 
     def allowed(self) -> float:
-        """What a fit may leave unexplained [m] rms."""
+        """The largest error of an acceptable fit [m] rms."""
         return max(_UNEXPLAINED[0] * self.step, _UNEXPLAINED[1] * float(np.std(self.x[self.used])))
 
     def error(self, p: Array) -> Array:
-        """Measured less simulated (used,) [m]; where the origin lies is not known."""
+        """Measured minus simulated (used,) [m], less its mean: the origin is unknown."""
         error = (self.x - self.simulate(p))[self.used]
         error -= np.average(error, weights=self.weight)
         return np.nan_to_num(error, nan=1e3, posinf=1e3, neginf=-1e3)
 
     def residual(self, p: Array) -> Array:
-        """What a fit makes small: the error (used,) [m], times the root of what a sample is worth."""
+        """What a fit minimises: the error (used,) [m] times the root of each sample's weight."""
         return np.sqrt(self.weight) * self.error(p)
 
     def jacobian(self, p: Array) -> Array:
@@ -209,7 +209,7 @@ class _Model:
         return np.sqrt(self.weight)[:, None] * (J - np.average(J, axis=0, weights=self.weight))
 
     def rms(self, residual: Array) -> float:
-        """[m] of the error behind a residual."""
+        """The rms error [m] that belongs to a residual."""
         return float(np.sqrt(residual @ residual / self.weight.sum()))
 
 
@@ -412,7 +412,7 @@ def _polished(model: _Model, p: Array) -> Array:
 
 
 def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[str]:
-    """Axes with far more damping than they are said to have, by INFO's guarantee and the scenario's own damping.
+    """Warnings for axes with far more damping than INFO and the scenario declare.
 
     Of an honest device the estimate scatters about what is declared, and one bound in twenty lies above it: that alone
     is no reason to ask.
@@ -428,7 +428,7 @@ def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> lis
 
 
 def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], list[str]]:
-    """Of two or more sittings one estimate per axis, and in words where somebody damped in some of them only.
+    """One estimate per axis from two or more sittings, and warnings where a hand damped only some of them.
 
     The least damped sitting of an axis counts, with the least bound of all. A passive hand adds damping to a device,
     and takes none away (docs/hardware.md): it is enough that one sitting was free of it. Raises ValueError where the
@@ -462,7 +462,7 @@ def _declared(scenario: Scenario, session: Session) -> list[float]:
 
 
 def capped(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[Estimate]:
-    """No bound above the declared damping: what is more may be a hand."""
+    """The bounds, at most the declared damping: more may be a hand's."""
     said = _declared(scenario, session)
     return [
         replace(e, friction=replace(e.friction, delta=min(e.delta, limit)))

@@ -1,4 +1,4 @@
-"""What may be done to a device, and by which device: limits of forces and encoders, and what INFO must declare first.
+"""Limits of forces and encoders, and what a device must declare in INFO before it is driven.
 
 Pure functions, no clock, no port. Order matters: a number that is not finite is found before any clamping, because
 max(-12, min(12, nan)) is +12.
@@ -64,8 +64,8 @@ class SafetyLimits:
     thermal: float = 10.0  # [s] time constant of the motors
 
     def __post_init__(self) -> None:
-        for i, cap in enumerate(self.cap):
-            require(f"cap[{i}]", cap, 1e-3, 12.0, "N")
+        for i, cap in enumerate(self.cap, start=1):
+            require(f"cap #{i}", cap, 1e-3, 12.0, "N")
         require("slew", self.slew, 1.0, 2000.0, "N/s")
         require("jump", self.jump, 1e-6, 3e-3, "m")
         require("watchdog_us", self.watchdog_us, 1000, 20000, "us")
@@ -75,8 +75,8 @@ class SafetyLimits:
         require("thermal", self.thermal, 0.1, 1000.0, "s")
         if self.continuous and len(self.continuous) != len(self.cap):
             raise ValueError(f"continuous has {len(self.continuous)} entries, cap {len(self.cap)}")
-        for i, (most, cap) in enumerate(zip(self.continuous, self.cap, strict=False)):
-            require(f"continuous[{i}]", most, 1e-3, cap, "N")
+        for i, (most, cap) in enumerate(zip(self.continuous, self.cap, strict=False), start=1):
+            require(f"continuous #{i}", most, 1e-3, cap, "N")
 
 
 class _Shaped(NamedTuple):
@@ -283,7 +283,7 @@ def objections(info: Info, scenario: Scenario, limits: SafetyLimits, baud: int |
 
 
 def _impossible(i: int, info: Info) -> str | None:
-    """What axis i says of itself that docs/protocol.md does not allow."""
+    """Values of axis i that docs/protocol.md does not allow."""
     allowed = {"encoder_step": 0xFFFFFFFF, "force_step": 0xFFFFFFFF, "hard_limit": 0x7FFF, "range": 0x7FFFFFFF}
     for name, most in allowed.items():
         if not 1 <= (value := getattr(info, name)[i]) <= most:
@@ -292,7 +292,7 @@ def _impossible(i: int, info: Info) -> str | None:
 
 
 def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
-    """What is too coarse on axis i for limits on forces and displacements to mean anything."""
+    """Steps of axis i that are too coarse for limits on forces and displacements."""
     reasons, force, count = [], 1e-6 * info.force_step[i], 1e-12 * info.encoder_step[i]
     finest = min(limits.cap[i] / _FEWEST_STEPS, limits.slew * T)
     if force > finest:
@@ -326,7 +326,7 @@ def watchdog_for(T: float) -> int:
 
 
 def configuration(info: Info, limits: SafetyLimits, theta: int) -> Config:
-    """What the device is told: never more than the host allows itself, nor than the device can do."""
+    """The CONFIG for the device: never more than the host allows itself, nor than the device can do."""
     T_ns = info.period_ns
     ramp = max(1, min(0xFF, math.ceil(1000 * _RAMP_US / T_ns)))
     steps = [1e-6 * step for step in info.force_step]

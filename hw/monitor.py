@@ -158,7 +158,7 @@ class Counters:
 
 
 class LinkMonitor:
-    """Order of STATEs, and over a sliding window what came late, what was missed, and what nobody told."""
+    """The order of STATEs, and over a sliding window late answers, missed answers and ticks without a STATE."""
 
     def __init__(self, settings: LinkSettings, counters: Counters) -> None:
         self.settings, self.counters = settings, counters
@@ -233,7 +233,7 @@ class LinkMonitor:
 
 
 class _Tick(NamedTuple):
-    """What one fresh STATE tells of its link."""
+    """What one new STATE says about the link."""
 
     margin: int | None  # [us]
     missed: int
@@ -300,7 +300,7 @@ class ClockMonitor:
 
 
 def check_state(state: State, config: Config, stage: Stage, gain: float) -> None:
-    """Raise SafetyStop where the device is where it may not be, or has a force that nobody can have asked for."""
+    """Raise SafetyStop where the device is in a wrong phase, or has a force that cannot have been asked for."""
     for force, cap in zip(state.applied, config.cap, strict=True):
         if not -cap <= force <= cap:
             raise SafetyStop(f"the device applies {state.applied} steps, the cap is {config.cap}")

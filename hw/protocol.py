@@ -36,7 +36,7 @@ class Phase(IntEnum):
 
 
 class Cause(IntEnum):
-    """Why the device is where it is, bits 4 to 6 of a status."""
+    """Why the device is in its state, bits 4 to 6 of a status."""
 
     NONE = 0
     HOST = 1  # a STOP from the host
@@ -159,12 +159,12 @@ class State(NamedTuple):
 
     @property
     def drives(self) -> bool:
-        """Whether the motors are moved as by nobody who was told to stop; a ramp is on its way to zero."""
+        """Whether the motors are driven as if no STOP had come; a ramp to zero is not that."""
         return self.phase in (Phase.ARMED, Phase.HOLDING) or (self.phase != Phase.RAMP and any(self.applied))
 
     @property
     def deadman(self) -> bool:
-        """Whether somebody holds the deadman at the device."""
+        """Whether the deadman at the device is held."""
         return self.status >= DEADMAN
 
 
@@ -305,8 +305,8 @@ def _check(message: Message) -> None:
             axes = len(value) if axes is None else axes
             if len(value) != axes or not 1 <= axes <= _MAX_AXES:
                 raise ValueError(f"{name}.{field}: {len(value)} entries; 1 to {_MAX_AXES} axes, every field the same")
-            for axis, entry in enumerate(value):
-                _check_integer(f"{name}.{field}[{axis}]", entry, limits)
+            for axis, entry in enumerate(value, start=1):
+                _check_integer(f"{name}.{field} #{axis}", entry, limits)
 
 
 def _check_integer(name: str, value: Any, limits: tuple[int, int]) -> None:

@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from struct import Struct
 from typing import Annotated, Any, BinaryIO
@@ -22,16 +22,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.coupling import Form
-from controller.loop import named_today
 from controller.lti import Array
-from design.files import read_arrays, write, write_json
-from hw.control import BudgetPlan, CertifiedCoupling, Controller, Program, SentBudget, TraceRow, host_controller
+from controller.older import named_today
+from design.files import counted, plain, read_arrays, write, write_json
+from hw.control import Armable, BudgetPlan, CertifiedCoupling, Controller, SentBudget, TraceRow, host_controller
 from hw.limits import SafetyLimits, SafetyStop, Units, shape
 from hw.protocol import NO_MARGIN, Config
 from hw.session import Session
 from models.device import require
 from sim.scenario import InputError, Scenario
-from sim.trace import Trace, growths
+from sim.trace import Growth, Trace, growths
 
 #: what the link adds, one entry per tick: name -> axes of the array
 _LINK = {"tick": 1, "arming": 1, "received": 1, "asked": 2, "gain": 1, "sent": 2, "margin_us": 1, "status": 1}
@@ -177,7 +177,7 @@ def _first(wrong: Array) -> int:
 
 
 class IncidentLog:
-    """A file that is true up to the last second, however the process ended: appended to, never kept in memory.
+    """A log that is complete up to the last second however the process ends: it is appended to, not kept in memory.
 
     One JSON object a line: every change of the stage at once, and every second where things stand. What was written
     survives SIGKILL, though not a power failure.
@@ -193,12 +193,12 @@ class IncidentLog:
         self._told = 0  # [us]
 
     def attach(self, session: Session) -> None:
-        """From now on, follow this session."""
+        """Record this session from now on."""
         self._write({"at": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "scenario": session.scenario.name, "pid": os.getpid()})
         session.listen = lambda event: self._write({"t_us": event.t_us, "stage": event.stage, "cause": event.cause})
 
     def glance(self, session: Session) -> None:
-        """Where things stand, once a second."""
+        """Write the session's state, once a second."""
         if session.now - self._told < 1_000_000:
             return
         self._told, drive = session.now, session.drive
@@ -217,81 +217,132 @@ class IncidentLog:
 # the report, and the files
 
 
-def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> dict[str, Any]:
-    """Stage, cause and log; the coupling with its certificates; what the link did, as a report without a verdict."""
-    begin = session.log[0].t_us if session.log else 0
-    log = [{"t_s": 1e-6 * (e.t_us - begin), "stage": str(e.stage), "cause": e.cause} for e in session.log]
-    parts = session.program.part(session.limits.cap) if isinstance(session.program, CertifiedCoupling) else {}
-    empty = {"coupling": None, "certificate": None, "certificates": None, "promise": None, "theta": None}
-    loop = isinstance(session.program, CertifiedCoupling) and len(recorder) > 0
-    report = {
-        "case": case,
-        "scenario": session.scenario.name,
-        **(empty | parts),
-        "session": {"stage": str(session.stage), "cause": session.cause, "armed": len(recorder) > 0, "log": log},
-        "link": _link(session, recorder, dropped),
-        "run": {
-            "samples": len(recorder),
-            "duration_s": len(recorder) * session.scenario.T,
-            "T_s": session.scenario.T,
-            "scenario_digest": session.scenario.digest,
-            "pace": pace,  # below 1: slow motion, in which a link looks faster than it is
-            "encoder_step_m": list(session.units.encoder_step) if len(recorder) else None,
-            "steady_ticks": steady_ticks(recorder, session.units.force_step, session.limits.cap) if loop else [],
-        },
-    }
-    trace = result_of(recorder, session.units, session.scenario.T, report) if loop else None
-    budgets = [budget.part() for budget in session.budgets] or None
-    return report | {"growth": [one.part() for one in growths(trace)] if trace else [], "energy_budget": budgets}
+@dataclass(frozen=True)
+class _Event:
+    """A change of the stage, and why."""
+
+    t_s: float  # since the session began
+    stage: str
+    cause: str
 
 
-def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
-    measured = session.measurement
-    counters = asdict(session.counters) | {"host_dropped_bytes": dropped}
-    part: dict[str, Any] = {
-        "measured_age_us": _percentiles(np.array(measured.ages)),
-        "measured_missing": measured.missing,
-        "measured_tick_us": _percentiles(np.array(measured.result.ticks)),
-        "age_us": None,
-        "rate_hz": None,
-        "missed_percent": None,
-        "counters": counters,
-    }
-    if len(recorder) and session.config:
+@dataclass(frozen=True)
+class _Ended:
+    """How far the session came."""
+
+    stage: str
+    cause: str
+    armed: bool
+    log: list[_Event]
+
+
+@dataclass(frozen=True)
+class _Link:
+    """What the link did: when it was measured, and while forces acted (None where they never did)."""
+
+    measured_age_us: dict[str, float] | None
+    measured_missing: int
+    measured_tick_us: dict[str, float] | None
+    counters: dict[str, int]
+    age_us: dict[str, float] | None = None
+    rate_hz: float | None = None
+    missed_percent: float | None = None
+
+    @classmethod
+    def of(cls, session: Session, recorder: Recorder, dropped: int) -> _Link:
+        measured, T = session.measurement, session.scenario.T
+        counters = asdict(session.counters) | {"host_dropped_bytes": dropped}
+        ages, ticks = (_percentiles(np.array(times)) for times in (measured.ages, measured.result.ticks))
+        found = cls(ages, measured.missing, ticks, counters)
+        if not (len(recorder) and session.config):
+            return found
         arrays = recorder.link()
-        margins = arrays["margin_us"][arrays["received"] & (arrays["margin_us"] != NO_MARGIN)]
-        part["age_us"] = _percentiles(session.config.due * 1e6 * session.scenario.T - margins)
-        part["rate_hz"] = float(arrays["received"].mean() / session.scenario.T)
-        answered = arrays["received"].sum()
-        part["missed_percent"] = 100 * session.missed_while_driving / answered if answered else None
-    return part
+        received = arrays["received"]
+        margins, answered = arrays["margin_us"][received & (arrays["margin_us"] != NO_MARGIN)], received.sum()
+        return replace(
+            found,
+            age_us=_percentiles(session.config.due * 1e6 * T - margins),
+            rate_hz=float(received.mean() / T),
+            missed_percent=float(100 * session.missed_while_driving / answered) if answered else None,
+        )
+
+
+@dataclass(frozen=True)
+class _Ran:
+    """The ticks in which forces acted."""
+
+    samples: int
+    duration_s: float
+    T_s: float
+    scenario_digest: str
+    pace: float  # below 1: slow motion, in which a link looks faster than it is
+    encoder_step_m: list[float] | None
+    steady_ticks: list[list[int]]
+
+
+@dataclass(frozen=True)
+class SessionReport:
+    """What a session came to, without a verdict: the coupling with its certificates, the log, the link."""
+
+    case: str
+    scenario: str
+    program: dict[str, Any] = field(metadata={"json": "beside"})
+    session: _Ended
+    link: _Link
+    run: _Ran
+    growth: list[Growth]
+    energy_budget: list[dict[str, Any]] | None  # arming by arming
+
+
+def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:
+    """The report of a session that has ended."""
+    begin = session.log[0].t_us if session.log else 0
+    log = [_Event(1e-6 * (e.t_us - begin), str(e.stage), e.cause) for e in session.log]
+    program: dict[str, Any] = dict.fromkeys(("coupling", "certificate", "certificates", "promise", "theta"))
+    steady, ticks, T = list[list[int]](), len(recorder), session.scenario.T
+    if coupled := isinstance(session.program, CertifiedCoupling):
+        program |= session.program.part(session.limits.cap)
+        steady = steady_ticks(recorder, session.units.force_step, session.limits.cap) if ticks else []
+    step = list(session.units.encoder_step) if ticks else None
+    ran = _Ran(ticks, ticks * T, T, session.scenario.digest, pace, step, steady)
+    trace = result_of(recorder, session.units, T, {"run": asdict(ran)}) if coupled and ticks else None
+    return SessionReport(
+        case,
+        session.scenario.name,
+        program,
+        _Ended(str(session.stage), session.cause, ticks > 0, log),
+        _Link.of(session, recorder, dropped),
+        ran,
+        growths(trace) if trace else [],
+        [budget.part() for budget in session.budgets] or None,
+    )
 
 
 def _percentiles(values: np.ndarray) -> dict[str, float] | None:
     return {f"p{q}": float(np.percentile(values, q)) for q in _PERCENTILES} if values.size else None
 
 
-def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any], plot: bool) -> list[Path]:
+def save(out: Path, session: Session, recorder: Recorder, report: SessionReport, plot: bool) -> list[Path]:
     """The trace (where forces acted), its picture, and the report."""
     files = []
     if len(recorder):
         plans = [asdict(budget.plan) for budget in session.budgets] or [None] * len(session.armings)
         armings = zip(session.armings, plans, strict=True)
         replay = [_recipe_of(session, *arming) | {"energy_budget": plan} for arming, plan in armings]
-        result = result_of(recorder, session.units, session.scenario.T, report | {"replay": replay})
+        result = result_of(recorder, session.units, session.scenario.T, plain(report) | {"replay": replay})
         files += [save_npz(out / "trace.npz", result, recorder), result.save_csv(out / "trace.csv")]
         if plot:
             from sim.plots import plot_run
 
-            title = f"{report['scenario']}, case {report['case']}: a session that ended {session.stage}"
+            title = f"{report.scenario}, case {report.case}: a session that ended {session.stage}"
             files.append(plot_run(result, out / "figure.png", title, 10.0))
     files.append(out / "report.json")
-    write_json(files[-1], report | {"files": [str(p) for p in files]})
+    write_json(files[-1], plain(report) | {"files": [str(p) for p in files]})
     return files
 
 
-def _recipe_of(session: Session, program: Program, config: Config) -> dict[str, Any]:
-    """All that hw.replay needs of one arming."""
+def _recipe_of(session: Session, program: Armable, config: Config) -> dict[str, Any]:
+    """What hw.replay needs to repeat one arming."""
     assert isinstance(program, CertifiedCoupling)
     return {
         "scenario": json.loads(msgspec.json.encode(program.scenario)),
@@ -320,21 +371,21 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lag: tuple[float, ...] | None = None  # (m,) [N/m] rho of the limiter, where there was one
 
     def __post_init__(self) -> None:
-        """Raises ValueError naming what no session can have written."""
+        """Raises ValueError naming a value that no session can have written."""
         m, least = self.scenario.channels, min(self.scenario.theta)
         for name, given in (("limits.cap", self.limits.cap), ("force_step", self.force_step), ("cap", self.cap)):
             if len(given) != m:
                 raise ValueError(f"{name} has {len(given)} entries, the scenario {m} channels")
         for i in range(m):
-            require(f"force_step[{i}]", self.force_step[i], 1e-9, 1.0, "N")
-            require(f"cap[{i}]", self.cap[i], 1, 0x7FFF, "steps")
+            require(f"force_step #{i + 1}", self.force_step[i], 1e-9, 1.0, "N")
+            require(f"cap #{i + 1}", self.cap[i], 1, 0x7FFF, "steps")
         soonest = 0 if self.scenario.latency else 1
         if not soonest <= self.link_delay <= least:
             allowed = f"{soonest} to {least}, the scenario's least theta"
             raise ValueError(f"link_delay is {self.link_delay}, allowed are {allowed}")
 
     def controller(self) -> Controller:
-        """F as the host ran it. Raises InputError where nothing can have run."""
+        """F as the host ran it. Raises InputError where the recipe is impossible."""
         try:
             coupling = self.coupling.build(self.scenario.T)
             return host_controller(self.scenario, coupling, self.link_delay, self.lag, self.limits.cap)
@@ -342,7 +393,7 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise InputError(f"the trace cannot be replayed: {error}") from None
 
     def budget(self) -> SentBudget | None:
-        """The energy budget at its start, where there was one. Raises InputError where none can be so."""
+        """The energy budget at its start, where there was one. Raises InputError where it is impossible."""
         if self.energy_budget is None:
             return None
         try:
@@ -376,7 +427,7 @@ def recipes_of(result: Trace) -> list[_Recipe]:
                 recipe["scenario"] = named_today(scenario)
         return msgspec.convert(raw, Annotated[list[_Recipe], msgspec.Meta(min_length=1)])
     except (msgspec.ValidationError, ValueError) as error:
-        raise InputError(f"the trace cannot be replayed: {error}") from None
+        raise InputError(f"the trace cannot be replayed: {counted(str(error))}") from None
 
 
 def _require_limits(raw: object) -> None:

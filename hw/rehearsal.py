@@ -15,9 +15,11 @@ import numpy as np
 
 from controller.coupling import Coupling
 from controller.lti import Array
+from design.api import COUPLING, bare
+from design.arguments import number, of_kind, whole
 from design.guarantees import guarantee_of
-from design.result import COUPLING, Design, Requirement, bare, number, of_kind, whole
-from hw.control import CertifiedCoupling, Program, certified_coupling, certified_couplings, timed
+from design.result import Design, Requirement
+from hw.control import Armable, CertifiedCoupling, certified_coupling, certified_couplings, timed
 from hw.emulator import Emulator, FaultInjection, Line
 from hw.limits import ENDED, Stage
 from hw.monitor import Ages, LinkSettings
@@ -34,7 +36,7 @@ _BEGIN_US = 500  # after the device's first tick
 _GRACE_US = 20_000  # after the end
 _LATENCY_US = 60  # one way, and as long for the host to answer: the measured median age of 130 us
 
-Plan = Callable[[Ages], Sequence[Program]]
+Plan = Callable[[Ages], Sequence[Armable]]
 
 
 class _Moment(NamedTuple):
@@ -47,7 +49,7 @@ class _Moment(NamedTuple):
 
 @dataclass
 class Rehearsal:
-    """What happens, in order of time: a port whose other end is the emulator, and the session at it.
+    """A session and its emulated device in virtual time: the session's port leads to the emulator.
 
     `actions` are what a person does: (seconds after arming, call).
     """
@@ -223,7 +225,7 @@ class Rehearsal:
 
 @dataclass(frozen=True, eq=False)
 class Rehearsed:
-    """What a session came to."""
+    """The result of a session."""
 
     stage: str  # "finished" where all went well; else "refused", "stopped", "lost", "e-stop"
     cause: str  # of the end

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from hw import protocol as wire
-from hw.control import Program
+from hw.control import Armable
 from hw.limits import SafetyStop, Stage
 from hw.monitor import Ages
 from hw.session import Said, Session
@@ -27,7 +27,7 @@ class PortLost(OSError):
 
 
 class HapticDevice(Protocol):
-    """What can be driven. Numbers are those of the wire: counts and steps, with their units in INFO."""
+    """A device that can be driven. Numbers are those of the wire: counts and steps, with their units in INFO."""
 
     @property
     def errors(self) -> int:
@@ -35,7 +35,7 @@ class HapticDevice(Protocol):
         ...
 
     def info(self) -> wire.Info | None:
-        """Who it is; None as long as it has not answered."""
+        """The device's INFO; None as long as it has not answered."""
         ...
 
     def configure(self, config: wire.Config) -> int | None:
@@ -51,8 +51,8 @@ class HapticDevice(Protocol):
         ...
 
 
-class Port(Protocol):
-    """Bytes. All of these raise PortLost where the port is gone."""
+class BytePort(Protocol):
+    """A port for bytes. Every method raises PortLost where the port is gone."""
 
     def wait(self, seconds: float) -> bool:
         """Whether there is something to read, at the latest after so many seconds."""
@@ -71,7 +71,7 @@ class Port(Protocol):
 class SerialDevice:
     """A device at a serial port, which has the clock."""
 
-    def __init__(self, port: Port, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, port: BytePort, clock: Callable[[], float] = time.monotonic) -> None:
         self._port, self._clock = port, clock
         self._decoder, self._waiting = wire.Decoder(), list[wire.Message]()
         self._question: wire.Hello | wire.Config | None = None
@@ -108,7 +108,7 @@ class SerialDevice:
         self._write(wire.encode(wire.Stop(reason)))
 
     def _answer(self, question: wire.Hello | wire.Config) -> wire.Message | None:
-        """What came, to a question that is asked now and then; a device that drives meanwhile is told to stop."""
+        """The answer to a question that is repeated; a device that drives meanwhile is told to stop."""
         now = self._clock()
         if question != self._question:  # what came before is of no use
             self._port.discard()
@@ -140,7 +140,7 @@ class Driver:
         self,
         session: Session,
         device: HapticDevice,
-        plan: Callable[[Ages], Sequence[Program]],
+        plan: Callable[[Ages], Sequence[Armable]],
         clock: Callable[[], int],
     ) -> None:
         """`plan` gives couplings for the delay that was measured, `clock` the time [us]."""
@@ -148,7 +148,7 @@ class Driver:
         self._force: wire.Force | None = None
 
     def do(self, said: Said) -> None:
-        """What the session says."""
+        """Carry out what the session asks for."""
         for message in said:
             if isinstance(message, wire.Force):
                 self._force = message

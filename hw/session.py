@@ -1,4 +1,4 @@
-"""One session with a device: what it says and the time go in, forces and stops come out. No port, no clock, no thread.
+"""One session with a device: its messages and the time go in, forces and stops come out. No port, no clock, no thread.
 
     connecting -> configuring -> measuring -> measured -> configuring -> disarmed
                      (load: a certified coupling)     (arm: a person)  -> arming -> armed -> disarming -> finished
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from hw import protocol as wire
-from hw.control import BudgetPlan, Drive, Program, SentBudget, TraceRow
+from hw.control import Armable, BudgetPlan, Drive, SentBudget, TraceRow
 from hw.limits import (
     DRIVING,
     ENDED,
@@ -68,10 +68,10 @@ class Session:
         self.log: list[_Event] = []
         self.info: wire.Info | None = None  # what the device is; None before it said so
         self.config: wire.Config | None = None  # how the device was asked to run, last
-        self.programs: tuple[Program, ...] = ()
-        self.program: Program | None = None
+        self.programs: tuple[Armable, ...] = ()
+        self.program: Armable | None = None
         self.drive: Drive | None = None  # the coupling at work, from one arming to the next end
-        self.armings: list[tuple[Program, wire.Config]] = []  # what forces came from, arming by arming
+        self.armings: list[tuple[Armable, wire.Config]] = []  # what forces came from, arming by arming
         self.budgets: list[SentBudget] = []  # arming by arming, where the settings ask for one
         self.record: Callable[[TraceRow], None] = lambda row: None
         self.listen: Callable[[_Event], None] = lambda event: None
@@ -93,7 +93,7 @@ class Session:
 
     @property
     def hindrance(self) -> str | None:
-        """Why nobody can arm it at the moment."""
+        """Why it cannot be armed at the moment."""
         if not self.held:
             return "the deadman at the device is not held"
         last, before = self.link.last, self.settings.elsewhere
@@ -119,7 +119,7 @@ class Session:
         self.now = now
         self._enter(Stage.CONNECTING, "HELLO")
 
-    def load(self, programs: Sequence[Program], now: int) -> Said:
+    def load(self, programs: Sequence[Armable], now: int) -> Said:
         """Take the couplings for the measured delay, the fastest first; the device is told its theta."""
         self.now = now
         if self.stage != Stage.MEASURED:
@@ -135,7 +135,7 @@ class Session:
         return () if self.stage in ENDED else self._end(Stage.REFUSED, cause)
 
     def arm(self, now: int) -> Said:
-        """A person's wish to feel forces; does nothing unless the session is disarmed, and nothing hinders it."""
+        """Arm at a person's request; does nothing unless the session is disarmed and nothing forbids it."""
         self.now = now
         if self.stage == Stage.DISARMED and (hindrance := self.hindrance):
             self._log(hindrance)
@@ -200,15 +200,15 @@ class Session:
     # what the link does
 
     def met(self, info: wire.Info, now: int) -> Said:
-        """Who the device is."""
+        """The device has said what it is."""
         return self._guarded(now, self._on_info, info)
 
     def configured(self, refused: int, now: int) -> Said:
-        """The device runs as `config` says, or why not."""
+        """The device confirms `config`, or says why it refuses."""
         return self._guarded(now, self._on_answer, refused)
 
     def take(self, state: wire.State, now: int) -> Said:
-        """What answers a STATE."""
+        """Answer a STATE."""
         return self._guarded(now, self._on_state, state)
 
     def _guarded(self, now: int, understand: Callable[[Any], Said], heard: Any) -> Said:
@@ -221,7 +221,7 @@ class Session:
             return self.fail(f"{type(error).__name__} in the bridge: {error}", now)
 
     def poll(self, now: int) -> Said:
-        """Look at the time."""
+        """Act on what is due at this time."""
         self.now = now
         if self.stage in ENDED:
             return self._shutdown.again(now) if self._shutdown else ()
@@ -369,13 +369,13 @@ class Session:
 
 
 def _limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> SafetyLimits:
-    """Limits for the scenario's devices, of at most `cap` [N]. Raises ValueError where T is none for a serial link."""
+    """Limits for the scenario's devices, of at most `cap` [N]. Raises ValueError where T is impossible."""
     watchdog = watchdog_for(scenario.T)
     return SafetyLimits(tuple(min(cap, d.force_limit) for d in scenario.device), watchdog_us=watchdog, **more)
 
 
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
-    """A session that never asks for more than `cap` [N], with `more` limits. Raises InputError for what cannot be."""
+    """A session that never asks for more than `cap` [N]. Raises InputError where `more` limits are impossible."""
     try:
         return Session(scenario, _limits_for(scenario, cap, **more), settings)
     except ValueError as error:
@@ -383,7 +383,7 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONG
 
 
 class _Shutdown:
-    """STOP, told until the device says that it rests; an emergency stop, until it says that it has latched it."""
+    """STOP, repeated until the device rests; an emergency stop, until the device has latched it."""
 
     def __init__(self, reason: wire.Reason, acted: bool, now: int, T: float) -> None:
         """`acted`: forces have acted, so that a device which says nothing is told again, every T seconds."""
@@ -398,7 +398,7 @@ class _Shutdown:
         return () if self._rests else self._stop
 
     def again(self, now: int) -> Said:
-        """STOP, where no STATE has said for a tick that it was heard: the one before may be lost, and STATEs too."""
+        """Repeat STOP where no STATE has confirmed it for a tick: the last STOP, or the STATEs, may be lost."""
         due = now - self._told >= self._every and now - self._began < _STOPPING_US
         if self._rests or not due or not self._repeat:
             return ()
@@ -406,7 +406,7 @@ class _Shutdown:
         return self._stop
 
     def disobeyed(self, state: wire.State, now: int) -> str | None:
-        """Said once, of a device that goes on driving."""
+        """Say once that the device goes on driving."""
         if not self._obeys or now - self._began <= _OBEYING_US or not state.drives:
             return None
         self._obeys = False
@@ -430,7 +430,7 @@ class Operator:
     _free_at: int = 0  # [us] before which it does not arm by itself
 
     def look(self, session: Session, now: int) -> Said:
-        """What is to be said at `now` [us] because of where the session stands."""
+        """The message that is due at `now` [us] in this stage."""
         if session.stage == Stage.DISARMED:
             self._armed_at = None
             if self.auto_arm and session.hindrance:
@@ -449,7 +449,7 @@ class Operator:
         return ()
 
     def press(self, key: str, session: Session, now: int) -> Said:
-        """A key of a person, who is there then. `a` means something to a disarmed session only."""
+        """A key was pressed, so a person is there. `a` arms a disarmed session only."""
         self._seen_at = now
         match _KEYS.get(key):
             case "arm" if session.stage == Stage.DISARMED:

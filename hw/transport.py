@@ -1,6 +1,6 @@
 """A session in real time over a serial port, by pyserial, and one thread that waits for nothing else.
 
-Python holds up a loop by itself: a full garbage collection takes 40 ms with MuJoCo and cvxpy loaded. So what is loaded
+Python holds up a loop by itself: a full garbage collection takes 30 ms with MuJoCo and SciPy loaded. So what is loaded
 is frozen and the collector is off while forces act.
 """
 
@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Self
 
-from hw.control import Program
+from hw.control import Armable
 from hw.limits import ENDED, SafetyStop, Stage
 from hw.monitor import Ages
 from hw.seam import Driver, HapticDevice, PortLost
@@ -170,7 +170,7 @@ class Live(Driver):
         self,
         session: Session,
         device: HapticDevice,
-        plan: Callable[[Ages], Sequence[Program]],
+        plan: Callable[[Ages], Sequence[Armable]],
         auto_arm: bool,
         seconds: float,
         keyboard: int | None = None,  # a file descriptor with single keys
@@ -202,7 +202,7 @@ class Live(Driver):
         return session
 
     def turn(self) -> None:
-        """Then what is no answer: keys, arming and the planned end, signals."""
+        """Everything but the answer: keys, arming, the planned end, signals."""
         super().turn()
         try:
             self._steer(self.clock())

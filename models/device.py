@@ -15,7 +15,7 @@ import msgspec
 
 
 def require(field: str, value: float, low: float, high: float, unit: str) -> None:
-    """Raise ValueError unless low <= value <= high; not-a-number never passes. TypeError for what is no number."""
+    """Raise ValueError unless low <= value <= high (nan is refused), TypeError for anything but a number."""
     if not isinstance(value, Real):
         raise TypeError(f"{field} is {value!r}, expected a number")
     if not low <= value <= high:
@@ -81,7 +81,7 @@ class RigidDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
 
     @property
     def bodies(self) -> dict[str, float]:
-        """Its mass by name [kg]; a hand holds the motor."""
+        """Its mass by name [kg]; the hand holds the motor itself."""
         return {"motor": self.mass}
 
     def __post_init__(self) -> None:
@@ -99,8 +99,8 @@ def passivity_level(device: Device) -> float:
 def credible_force(device: CompliantDevice) -> float:
     """What the transmission may carry [N] before the linear model of it is doubted.
 
-    Nobody publishes at which force a cable slips on its capstan. Assumed where a device says nothing: three times what
-    its motor can push, because a transmission that is made for a motor need not hold more.
+    The force at which a cable slips on its capstan is not published. Where a device declares none, it is three times
+    what its motor can push, because a transmission that is made for a motor need not hold more.
     """
     return 3.0 * device.force_limit if device.credible_force is None else device.credible_force
 
@@ -129,7 +129,7 @@ def _check_common(device: Device, masses: tuple[str, ...]) -> None:
 
 @dataclass(frozen=True)
 class _Known:
-    """A number that somebody has published."""
+    """A published number with its source."""
 
     value: float
     source: str
@@ -145,7 +145,7 @@ _OMNI, _PREMIUM = _SHEET.format("Phantom Omni"), _SHEET.format("Phantom Premium 
 
 @dataclass(frozen=True)
 class Listed:
-    """A real device along one axis; None is what nobody publishes, or what we found no source for."""
+    """A real device along one axis; None stands for a number without a published source."""
 
     title: str
     damping: tuple[_Known, _Known] | None = None  # [N s/m] least and most over the workspace
@@ -158,7 +158,7 @@ class Listed:
 
     @property
     def known(self) -> dict[str, _Known]:
-        """The fields of a RigidDevice that are published; friction is an upper bound, and no guarantee: left out."""
+        """The published fields of a RigidDevice. Friction is left out: what is published is an upper bound."""
         least = self.damping[0] if self.damping else None
         fields = {"damping": least, "mass": self.mass, "force_limit": self.force_limit}
         fields["encoder_step"] = self.encoder_step
@@ -215,7 +215,7 @@ _NEEDED = ("damping", "force_limit")  # of a simulated device; for mass and enco
 
 
 def listed_device(name: str) -> tuple[str, Listed]:
-    """The device of a name, and its name in the catalogue. Raises ValueError with those that there are."""
+    """The catalogue's device of this name, and its spelling there. Raises ValueError that lists the names."""
     key = _OTHER_NAMES.get(name.lower(), name.lower())
     if key not in CATALOGUE:
         close = difflib.get_close_matches(key, CATALOGUE, n=1)
@@ -225,9 +225,9 @@ def listed_device(name: str) -> tuple[str, Listed]:
 
 
 def fields_of(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """A device of the catalogue as the fields of a scenario's [[device]], with what is given in place of what is known.
+    """A catalogue device as the fields of a scenario's [[device]]; numbers that are given replace the catalogue's.
 
-    Raises ValueError for a name that is none, and for a number that nobody publishes and that is not given.
+    Raises ValueError for an unknown name, and where a number is neither published nor given.
     """
     key, device = listed_device(name)
     fields: dict[str, Any] = {"kind": "rigid"} | {field: fact.value for field, fact in device.known.items()}

@@ -125,7 +125,7 @@ class Port:
         return cls(mass, first.across, damping, stiffness, impedance, first.handles, first.pull)
 
     def of(self, i: int) -> Self:
-        """One of many."""
+        """Port i of a stack."""
         z = self.impedance
         impedance = Impedance(z.A[i], z.B[i], z.C[i], z.D[i]) if z else None
         one = self.mass[i], self.across, self.damping[i], self.stiffness[i]
@@ -133,7 +133,7 @@ class Port:
 
     @property
     def layout(self) -> tuple[Any, ...]:
-        """What is the same for humans that differ in their numbers only."""
+        """The structure of the port without its numbers: equal for humans that can be stacked."""
         order = self.impedance.order if self.impedance else None
         return self.across.shape, self.across.tobytes(), order, self.handles, self.pull
 
@@ -162,10 +162,10 @@ def state_space(A: Any, B: Any, C: Any, D: Any, mass: float = 0.0) -> Port:
 
 
 class Hand(Protocol):
-    """Whatever can hold a device."""
+    """What can hold a device: a passive port and a voluntary force."""
 
     def port(self) -> Port:
-        """What the handle feels."""
+        """The port that the handle feels."""
         ...
 
     def voluntary_force(self, t: _Array) -> _Array:
@@ -259,9 +259,9 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     voluntary: Voluntary | None = None
 
     def __post_init__(self) -> None:
-        for i, link in enumerate(self.links[1:], start=1):
+        for i, link in enumerate(self.links[1:], start=2):
             if link.mass == 0:
-                raise ValueError(f"links[{i}].mass is 0: only the mass at the handle may be missing")
+                raise ValueError(f"links #{i}.mass is 0: only the mass at the handle may be missing")
 
     def port(self) -> Port:
         """The chain as the handle feels it."""
@@ -296,7 +296,7 @@ class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return state_space(self.A, self.B, self.C, self.D, self.mass)
 
     def voluntary_force(self, t: _Array) -> _Array:
-        """None of its own."""
+        """No voluntary force."""
         return np.zeros_like(t)
 
 
@@ -312,7 +312,7 @@ class Cross(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Somebody who holds several devices: a passive mechanical multi-port.
+    """A person who holds several devices: a passive mechanical multi-port.
 
     The arms of these channels' humans end on this person's body instead of on ground: a mass with a spring-damper
     to ground. `cross` joins each hand to the next, in the order of `holds`.
@@ -339,14 +339,14 @@ class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def check_holds(held_by: Sequence[tuple[int, ...]], channels: int) -> None:
-    """Raise ValueError where a person holds what is not there or what another one holds."""
+    """Raise ValueError where a person holds a channel that does not exist or that another person holds."""
     held: set[int] = set()
-    for i, holds in enumerate(held_by):
+    for i, holds in enumerate(held_by, start=1):
         for channel in holds:
             if channel > channels:
-                raise ValueError(f"person[{i}].holds has channel {channel}, allowed are 1 to {channels}")
+                raise ValueError(f"person #{i}.holds has channel {channel}, allowed are 1 to {channels}")
             if channel in held:
-                raise ValueError(f"person[{i}].holds has channel {channel}, which somebody else holds already")
+                raise ValueError(f"person #{i}.holds has channel {channel}, which somebody else holds already")
         held.update(holds)
 
 
@@ -361,8 +361,8 @@ class Population(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         for name, unit in (("mass", "kg"), ("damping", "N s/m"), ("stiffness", "N/m")):
             low, high = getattr(self, name)
-            require(f"{name}[0]", low, 1e-9, 1e9, unit)
-            require(f"{name}[1]", high, low, 1e9, unit)
+            require(f"{name} #1", low, 1e-9, 1e9, unit)
+            require(f"{name} #2", high, low, 1e9, unit)
         require("links", self.links, 1, 8, "links")
 
     def draw(self, rng: np.random.Generator, n: int) -> list[Human]:

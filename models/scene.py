@@ -171,7 +171,7 @@ def from_mjcf(xml: str, handle: str = "handle", pull: str | None = None) -> Port
 
     The body `handle` is the part of the hand that moves with the handle; the world is the base. The voluntary force
     contracts the joint or tendon named `pull` (default: the last spring-damper). Gravity and shapes are left out.
-    Raises ValueError for what is no network of masses, springs and dampers.
+    Raises ValueError unless it is a network of masses, springs and dampers.
     """
     import mujoco
 
@@ -292,13 +292,13 @@ def _placed(
     placed = []
     for i, port in enumerate(ports, start=1):
         if port.handles > 1:
-            raise ValueError(f"human[{i - 1}] has {port.handles} handles, expected one: a person holds several")
+            raise ValueError(f"human #{i} has {port.handles} handles, expected one: a person holds several")
         own = (f"human_{i}_{j}" for j in range(2, port.mass.shape[-1] + 1))
         placed.append(_place(port, (handles[i - 1], *own), body.get(i), f"link_{i}"))
     for p, (holds, port) in enumerate(held, start=1):
         extra = port.mass.shape[-1] - len(holds)
         if port.handles != len(holds) or extra < 1:
-            raise ValueError(f"person[{p - 1}] has {port.handles} handles and {extra} bodies, expected {len(holds)}, 1")
+            raise ValueError(f"person #{p} has {port.handles} handles and {extra} bodies, expected {len(holds)}, 1")
         own = (f"body_{p}_{j}" for j in range(1, extra))
         hands = (handles[channel - 1] for channel in holds)
         placed.append(_place(port, (*hands, *own, f"body_{p}"), None, f"cross_{p}"))
@@ -510,15 +510,15 @@ class Crowd:
 
     @property
     def held(self) -> tuple[tuple[tuple[int, ...], Port], ...]:
-        """Who holds several devices: which, and the port with a leading axis over the sets."""
+        """The persons with several devices: their channels, and their port with a leading axis over the sets."""
         return tuple((holds, body_port(len(holds), self.bodies[:, p])) for p, holds in enumerate(self.holds))
 
     def humans(self, i: int) -> tuple[Human, ...]:
-        """Set i, one human per device."""
+        """The humans of set i, one per device."""
         return tuple(Human(tuple(Link(*link) for link in human)) for human in self.links[i].tolist())
 
     def persons(self, i: int) -> tuple[Person, ...]:
-        """Set i, those who hold several devices."""
+        """The persons of set i who hold several devices."""
         pairs = zip(self.holds, self.bodies[i].tolist(), strict=True)
         return tuple(Person(holds, m, b, k, Cross(*cross)) for holds, (m, b, k, *cross) in pairs)
 
@@ -535,20 +535,20 @@ class HumanSets:
 
     @property
     def ports(self) -> tuple[Port, ...]:
-        """As of a Crowd. Raises ValueError where two humans of a device are built differently."""
+        """As Crowd.ports. Raises ValueError where two humans of a device are built differently."""
         return tuple(Port.stack([human.port() for human in column]) for column in zip(*self.sets, strict=True))
 
     @property
     def held(self) -> tuple[tuple[tuple[int, ...], Port], ...]:
-        """As of a Crowd."""
+        """As in Crowd."""
         return tuple((person.holds, Port.stack([person.port()] * len(self))) for person in self.people)
 
     def humans(self, i: int) -> tuple[Hand, ...]:
-        """Set i, one human per device."""
+        """The humans of set i, one per device."""
         return self.sets[i]
 
     def persons(self, i: int) -> tuple[Person, ...]:
-        """Set i, those who hold several devices."""
+        """The persons of set i who hold several devices."""
         return self.people
 
 

@@ -25,18 +25,17 @@ if TYPE_CHECKING:
     from sim.crowds import Findings
     from sim.plots import plot_run
     from sim.scenario import InputError, Scenario, load, parse
-    from sim.trace import Result, Trace
+    from sim.trace import Trace
 
 set_aside()
 
-__all__ = ["Findings", "InputError", "Result", "Scenario", "Trace", "load", "parse", "plot_run", "simulate", "validate"]
+__all__ = ["Findings", "InputError", "Scenario", "Trace", "load", "parse", "plot_run", "simulate", "validate"]
 
 _HOMES = {
     "simulate": "sim.api",
     "validate": "sim.api",
     "Findings": "sim.crowds",
     "plot_run": "sim.plots",
-    "Result": "sim.trace",
     "Trace": "sim.trace",
 }
 

@@ -2,7 +2,8 @@
 
 A run is of one coupling. Beside it stand the loop without any, the paper's printed gains where the loop is the paper's,
 the spring-damper for any passive environment, the one for this environment, and the optimal coupling where it is quick
-to find. Every one is judged as the run's own is, and drives the same hands with the exact engine.
+to find. Every one is judged as the run's own is, and drives the same hands with the exact engine, its forces clipped
+where its proof is one without a limiter.
 """
 
 from __future__ import annotations
@@ -132,8 +133,7 @@ def _alternative(
     except ValueError as error:
         return Alternative(kind, condition, reason=str(error))
     requirements = own[1] if own else assess(loop, chosen.coupling, chosen.phi, chosen.known)
-    limits = own[2] if own else limits_of(scenario, chosen, requirements)
-    simulation = assemble(scenario, chosen.coupling, limits.rho)
+    simulation = assemble(scenario, chosen.coupling, own[2].rho if own else _lag(scenario, chosen, requirements))
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
     made = Alternative(
@@ -153,3 +153,9 @@ def _alternative(
     error = None if unstable(growth) else alike.part()["error_percent"]
     until = credible_part(simulation, trace)["until_s"]
     return replace(made, error_percent=error, trace=trace, ideal=alike.ideal, until_s=until)
+
+
+def _lag(scenario: Scenario, chosen: Chosen, requirements: dict[str, Requirement]) -> tuple[float, ...] | None:
+    """rho (m,) [N/m] of the limiter; None: forces are clipped, as those of a coupling just proved without a limiter."""
+    without = chosen.known and chosen.known.condition == "this-environment" and not chosen.limiter
+    return None if without else limits_of(scenario, chosen, requirements).rho

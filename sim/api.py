@@ -2,26 +2,91 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 from controller.coupling import Coupling
 from controller.lti import Array
-from design.result import Design, number, of_kind, one_of, whole
-from sim import crowds
+from design.arguments import number, of_kind, one_of, whole
+from design.result import Design
+from sim.accuracy import EngineChoice, compare_engines, pick
 from sim.couplings import given, limits_of
 from sim.engines import INTEGRATORS
-from sim.passivity_layer import EnergyNet, Plugged, netted
-from sim.run import ENGINES, Progress, assemble, make_engine, run
+from sim.passivity_layer import EnergyNet, Plugged, Wanted, netted
+from sim.run import ENGINES, Progress, Simulation, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
-from sim.shards import validate as validate_all
 from sim.stability import stability_part
 from sim.stepping import MOST, settle
-from sim.switching import switching
+from sim.switching import Period, switching
 from sim.trace import Trace
+
+if TYPE_CHECKING:
+    from sim import crowds
 
 _MOST_HUMANS = 1_000_000
 _SCENARIO = 'a Scenario, as load("omega-pair") gives it'
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioRun:
+    """A scenario's run, with what it was run by."""
+
+    simulation: Simulation
+    ran: Simulation  # the same, with the net that was asked for
+    period: Period | None  # of the worst switching found, where the delays switch
+    choices: tuple[EngineChoice, ...]  # what was compared for the error that was asked, the cheapest first
+    integrator: str | None  # None for the exact engine, and so are the substeps
+    substeps: int | None
+    remarks: list[str]  # on a number of substeps that was asked for
+    trace: Trace
+    wall_s: float
+
+    @cached_property
+    def exact(self) -> Trace | None:
+        """The exact engine's trace of the same loop; None where friction makes it another one than the linear."""
+        if self.integrator is None:
+            return self.trace
+        return None if self.simulation.friction else run(self.ran, "exact", ticks=self.trace.t.size)
+
+
+def run_scenario(
+    scenario: Scenario,
+    coupling: Coupling,
+    lag: tuple[float, ...] | None = None,
+    *,
+    engine: str = "mujoco",
+    integrator: str | None = None,
+    substeps: int | None = None,
+    error: float | None = None,
+    seed: int = 0,
+    net: Wanted | None = None,
+    progress: Progress = lambda done, ticks: None,
+) -> ScenarioRun:
+    """Close the loop for the scenario's duration: what `sim.run` and `simulate` have in common.
+
+    With `lag`, rho (m,) [N/m], forces leave through a limiter; with `error`, relative rms of the positions, MuJoCo's
+    engine is the cheapest that keeps it; `net` stands between the forces and the devices. Raises InputError for
+    settings that cannot be.
+    """
+    simulation, period = assemble(scenario, coupling, lag, seed), None
+    if scenario.switches:
+        simulation, period = switching(simulation, coupling, seed, scenario.samples)
+    choices, remarks = (), []
+    if error is not None:
+        choices = compare_engines(simulation, error)
+        kept = pick(choices, error)
+        integrator, substeps = kept.integrator, kept.substeps
+    else:
+        integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)
+    ran = simulation if net is None else netted(simulation, coupling, net)
+    stepped = make_engine(simulation, engine, integrator, substeps)
+    begin = time.perf_counter()
+    trace = run(ran, stepped, progress=progress)
+    wall = time.perf_counter() - begin
+    return ScenarioRun(simulation, ran, period, choices, integrator, substeps, remarks, trace, wall)
 
 
 def simulate(
@@ -63,27 +128,25 @@ def simulate(
         one_of("integrator", integrator, tuple(INTEGRATORS))
     if substeps is not None:
         substeps = whole("substeps", substeps, 1, MOST)
-    alone, limits = chosen.coupling, limits_of(scenario, chosen, limiter=limiter and environment is None)
-    simulation = assemble(scenario, alone, limits.rho, seed)
-    if scenario.switches:
-        simulation, _ = switching(simulation, alone, seed, scenario.samples)
-    integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)
-    ran = simulation
+    limits = limits_of(scenario, chosen, limiter=limiter and environment is None)
+    net: Wanted | None = None
     if environment is not None:
-        ran = netted(simulation, alone, Plugged(environment, energy_budget or 0.0))
+        net = Plugged(environment, energy_budget or 0.0)
     elif energy_budget is not None:
-        ran = netted(simulation, alone, EnergyNet(energy_budget))
-    trace = run(ran, make_engine(simulation, engine, integrator, substeps))
+        net = EnergyNet(energy_budget)
+    steps = {"engine": engine, "integrator": integrator, "substeps": substeps}
+    done = run_scenario(scenario, chosen.coupling, limits.rho, **steps, seed=seed, net=net)
+    trace = done.trace
     meta = {
         "scenario": scenario.name,
         "scenario_digest": scenario.digest,
         "engine": engine,
-        "integrator": integrator,
-        "substeps": substeps,
+        "integrator": done.integrator,
+        "substeps": done.substeps,
         "seed": seed,
         "limiter": limits.part([device.force_limit for device in scenario.device]),
-        "stability": None if scenario.switches or environment else stability_part(simulation, trace),
-        "remarks": remarks,
+        "stability": None if scenario.switches or environment else stability_part(done.simulation, trace),
+        "remarks": done.remarks,
         "energy_budget": trace.net.part() if trace.net else None,
     }
     return replace(trace, meta=meta)
@@ -115,6 +178,9 @@ def validate(
     Raises InputError for Coulomb friction (verdicts are of linear loops), ValueError for numbers out of range,
     TypeError for an argument of another type.
     """
+    from sim import crowds  # its workers are loaded where they are used
+    from sim.shards import validate as validate_all
+
     of_kind("scenario", scenario, Scenario, _SCENARIO)
     chosen = given(coupling)
     require_linear(scenario, "validate", walls=True)

@@ -15,7 +15,7 @@ import numpy as np
 
 from controller.coupling import NoCoupling
 from controller.lti import Array
-from controller.process import StepBuffer
+from controller.tick import StepBuffer
 from design.result import DesignFailed
 from models.scene import Crowd, variants
 from sim.accuracy import force_error

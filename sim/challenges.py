@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from controller.contact import limited
 from controller.coupling import SpringDamper
 from controller.environment import GROUND, Network, Spring, Wall
+from controller.limiter import limited
 from controller.loop import Loop
 from controller.lti import Array
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
 from design.conditions import any_environment, encoder_friction, this_environment
 from design.multipliers import BETA, limiter, limiter_lag, walls_of
 from models.device import RigidDevice
@@ -42,7 +42,7 @@ _ROUNDING = 1e-10  # of the energy that flows
 
 @dataclass(frozen=True)
 class _Challenge:
-    """What the adversaries came to in one loop."""
+    """What the adversaries found in one loop."""
 
     guarantee: str
     loop: int  # the number of the draw
@@ -272,7 +272,7 @@ def _anywhere(rng: np.random.Generator, factor: float) -> _Case:
 
 
 def _budget(rng: np.random.Generator, factor: float) -> _Case:
-    """Behind the budget stands a loop that needs twice to four times the damping that there is."""
+    """The budget guards a loop that needs two to four times the available damping."""
     loop, coupling = _pair(rng)
     delta = np.array(this_environment(loop.F(coupling), loop.delta).required) / rng.uniform(2, 4)
     simulation = assemble(_scenario(loop, delta), coupling)
@@ -311,7 +311,7 @@ def _friction(rng: np.random.Generator, factor: float) -> _Case:
 
 
 def _scenario(loop: Loop, delta: Array) -> Scenario:
-    """The loop with rigid devices of this damping, held by somebody."""
+    """The loop as a scenario with rigid devices of this damping and a hand at each."""
     devices = tuple(RigidDevice(mass=0.1, damping=float(d)) for d in delta)
     people = tuple(Human((Link(0.5, 1.0, 100.0),)) for _ in devices)
     loop_of = {"T": loop.T, "theta": loop.theta, "psi": loop.psi, "environment": loop.network}

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from controller.coupling import Coupling, NoCoupling
+from controller.coupling import PUBLISHED, Coupling, NoCoupling
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
+from design.api import COUPLING, bare
 from design.certificate import assess, verify
 from design.coverage import Limits, covered_limits
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import switching_guarantee
-from design.result import COUPLING, PUBLISHED, Design, DesignFailed, Requirement, bare
+from design.result import Design, DesignFailed, Requirement
 from design.stored import Certificate, LimiterCertificate, Stored, load
 from sim import design_cache
 from sim.scenario import InputError, Scenario
@@ -72,12 +73,12 @@ def choose(
                 proof = kept.certificate.limiter or None
                 return Chosen(name, kept.built(), condition, limiter=proof, known=kept.certificate)
             design = design_by_kind(loop, name, condition, progress, **asked)
-            design_cache.keep(design, *question)
+            known = design_cache.keep(design, *question)
         except DesignFailed:
             raise
         except ValueError as error:
             raise InputError(str(error)) from None
-        return given(design, name)
+        return replace(given(design, name), known=known, limiter=(known and known.limiter) or None)
     if Path(name).suffix != ".json":
         raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)} or a FILE.json")
     stored = read_coupling(name)
@@ -114,7 +115,7 @@ def limits_of(
 
 
 def read_coupling(path: str | Path) -> Stored:
-    """A stored coupling. Raises InputError where there is none that can be read."""
+    """A stored coupling. Raises InputError where it cannot be read."""
     stored = load(path)
     try:
         stored.built()
@@ -135,7 +136,7 @@ def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
 
 @dataclass(frozen=True)
 class _FileCheck:
-    """What a coupling's file is worth in a loop."""
+    """Whether a coupling's file proves anything in this loop."""
 
     notes: tuple[str, ...]  # what a reader should know of it
     switching: DelayRange | None = None  # the file proves that any switching of the delays within it is safe here

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from controller.coupling import Coupling
-from controller.environment import Member
 from controller.lti import Array
+from controller.ranges import Member
 from controller.timing import Timing
 from models.human import Population
 from models.scene import Crowd, HumanSets, Variants, variants

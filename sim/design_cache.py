@@ -1,8 +1,9 @@
 """Designs kept on disk, since a run asks for the same couplings again and again and a design is a pure function.
 
-In $XDG_CACHE_HOME/haptic-loop (~/.cache/haptic-loop), a stored coupling file for each question. An entry is proved
-again whenever it is read; what is not proved is designed anew. What a busy machine had no time to finish is not kept.
-HAPTIC_LOOP_CACHE=off keeps nothing.
+In $XDG_CACHE_HOME/haptic-loop (~/.cache/haptic-loop), a stored coupling file for each question; those of the paper's
+two cases come with the package (sim/designs, which docs/regenerate.py writes). An entry is proved again whenever it is
+read; what is not proved is designed anew. What a busy machine had no time to finish is not kept.
+HAPTIC_LOOP_CACHE=off keeps nothing and reads nothing.
 """
 
 from __future__ import annotations
@@ -14,46 +15,75 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 import controller
 import design
 from controller.loop import Loop
-from design.certificate import prove, verify
+from design.certificate import prove, prove_limiter, verify
 from design.files import one_command
-from design.result import Design
-from design.stored import Stored, digest, load, save
+from design.result import Design, NotProved
+from design.stored import Certificate, Stored, digest, load, save, sealed
 
+_SHIPPED = Path(__file__).with_name("designs")
 _MOST = 200  # entries; the oldest go
 
 
-def find(loop: Loop, *question: Any) -> Stored | None:
-    """What `keep` kept of the same loop, question and code, with its certificate, which has just been proved again."""
-    path = _place(loop, question)
-    if path is None:
+def find(loop: Loop, kind: str, condition: Any, *options: Any) -> Stored | None:
+    """What is kept of the same loop, question and code, or came with the package; it has just been proved again."""
+    if _off():
         return None
-    with one_command(), suppress(OSError, ValueError, ArithmeticError):
-        stored = load(path)
-        if stored.loop == loop and verify(stored).proved:
-            os.utime(path)
-            return stored
+    question = kind, condition, *options
+    kept = _place(loop, question)
+    for path in (kept, shipped(loop, *question)):
+        with one_command(), suppress(OSError, ValueError, ArithmeticError):
+            if path is None or (stored := load(path)).loop != loop:
+                continue
+            if stored.certificate is None:  # a coupling alone, whose storage function is found again
+                certificate = prove(loop, stored.built(), condition)
+                return msgspec.structs.replace(stored, certificate=certificate)
+            if verify(stored).proved:
+                if path == kept:
+                    os.utime(path)
+                return stored
     return None
 
 
-def keep(made: Design, loop: Loop, *question: Any) -> None:
-    """Keep a design that can be proved from its coupling alone, if there is a place for it."""
-    path = _place(loop, question)
-    if path is None or made.phi is not None or made.hurried:
-        return
+def keep(made: Design, loop: Loop, *question: Any) -> Certificate | None:
+    """Prove a design from its coupling alone and keep it, if there is a place for it; the proof, if there is one."""
+    path, certificate = _place(loop, question), made.certificate
+    if _off() or path is None or made.phi is not None or made.hurried:
+        return certificate
     with one_command(), suppress(OSError, ValueError, ArithmeticError):  # no place, or no proof
-        certificate = made.certificate or prove(loop, made.coupling, made.condition)
+        certificate = certificate or proved(made, loop)
         path.parent.mkdir(parents=True, exist_ok=True)
         save(Stored.of(loop, made.coupling, certificate), path)
         for old in sorted(path.parent.glob("*.json"), key=os.path.getmtime)[:-_MOST]:
             old.unlink()
+    return certificate
+
+
+def proved(made: Design, loop: Loop) -> Certificate:
+    """The proof of a design, also while forces are limited where that can be had. Raises NotProved."""
+    certificate = prove(loop, made.coupling, made.condition)
+    if made.condition == "this-environment":
+        with suppress(NotProved):
+            limiter = prove_limiter(loop, made.coupling)
+            certificate = sealed(msgspec.structs.replace(certificate, limiter=limiter))
+    return certificate
+
+
+def shipped(loop: Loop, kind: str, condition: str, *options: Any) -> Path:
+    """Where the package has its design for this question, if it has one."""
+    named = hashlib.sha256(repr((digest(loop), options)).encode()).hexdigest()
+    return _SHIPPED / f"{kind}-{condition}-{named[:12]}.json"
+
+
+def _off() -> bool:
+    return os.environ.get("HAPTIC_LOOP_CACHE", "").lower() == "off"
 
 
 def _place(loop: Loop, question: tuple[Any, ...]) -> Path | None:
-    if os.environ.get("HAPTIC_LOOP_CACHE", "").lower() == "off":
-        return None
     asked = os.environ.get("XDG_CACHE_HOME", "")
     home = Path(asked if os.path.isabs(asked) else os.path.expanduser("~/.cache"))
     if not home.is_absolute():  # a user without a home

@@ -31,7 +31,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from controller.lti import Array
-from controller.process import StepBuffer
+from controller.tick import StepBuffer
 from controller.timing import Timing
 from design.files import InputError
 from models.scene import Plant, Scene, Variants, impeded, plant

@@ -7,8 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from controller.coupling import Coupling, SpringDamper
-from design.result import CASE_I
+from controller.coupling import CASE_I, Coupling, SpringDamper
 from models.device import CompliantDevice
 from models.human import Human, Link
 from sim.accuracy import position_error

@@ -14,10 +14,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.contact import Contact, Limiter
+from controller.limiter import Limiter
 from controller.lti import Array, Lti
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
 from controller.timing import Timing
+from controller.walls import Contact
 from design.conditions import Latency
 from models.device import Device
 from models.human import Population

@@ -1,4 +1,4 @@
-"""What MUJOCO_GL asks for, set aside until somebody draws.
+"""What MUJOCO_GL asks for, set aside until something is drawn.
 
 MuJoCo looks at it when it is imported, and cannot be imported where what it names is not there; few commands draw.
 """
@@ -18,7 +18,7 @@ def set_aside() -> None:
 
 
 def asked() -> str:
-    """What the user has asked for, in lower case; empty where nothing."""
+    """The user's MUJOCO_GL in lower case; empty where it is not set."""
     return (os.environ.get(_OURS) or os.environ.get("MUJOCO_GL") or "").lower().strip()
 
 

@@ -17,15 +17,16 @@ from typing import Any
 import numpy as np
 
 from controller.budget import EPS, EnergyBounding, EnergyBudget, PassivityControl, Shell
-from controller.contact import Limiter, contact, limited
 from controller.coupling import Coupling
 from controller.delay import LOST, Ticks, ages
+from controller.limiter import Limiter, limited
 from controller.loop import DelayRange
 from controller.lti import Array, Lti
-from controller.process import Net, Process
+from controller.tick import Net, Process
+from controller.walls import contact
 from design.result import Requirement
 from sim.run import Simulation
-from sim.scenario import Scenario
+from sim.scenario import InputError, Scenario
 from sim.switching import with_delays
 
 _HELD = 4  # ticks for which a device goes on holding a force, beyond the largest delay, where packets are lost
@@ -69,18 +70,18 @@ class Plugged:
     start: float = 0.0  # W0 [J]
 
 
-_Wanted = EnergyNet | Classic | Plugged
+Wanted = EnergyNet | Classic | Plugged
 
 
-def netted(simulation: Simulation, coupling: Coupling, wanted: _Wanted, ticks: int | None = None) -> Simulation:
+def netted(simulation: Simulation, coupling: Coupling, wanted: Wanted, ticks: int | None = None) -> Simulation:
     """The same loop with a net under it, for runs of up to `ticks` (default: the scenario's).
 
     What is linear about a loop, such as certificates and modes, ask the simulation without. Delays that vary are those
-    that it has. Raises ValueError for numbers that no budget can have.
+    that it has. Raises InputError for numbers that no budget can have.
     """
     scenario, process = simulation.scenario, simulation.process
     if scenario.latency:
-        raise ValueError("latency: a net counts forces that latch at ticks; count a whole sample of theta")
+        raise InputError("latency: a net counts forces that latch at ticks; count a whole sample of theta")
     delays, spans = process.delays, DelayRange(scenario.theta, scenario.theta)
     if delays is None:
         samples = scenario.samples if ticks is None else ticks
@@ -110,7 +111,10 @@ def _budget(wanted: EnergyNet, scenario: Scenario, process: Process, spans: Dela
     given: dict[str, Any] = {"eps": EPS, "start": wanted.start, "cap": wanted.cap, "nsim": nsim, "hold": hold}
     given["encoder_step"] = process.encoder_step
     longest = scenario.longest_period or scenario.T  # the most that a held force can lose grows with the period
-    budget = EnergyBudget(delta, longest, spans.lo, spans.hi, **given)
+    try:
+        budget = EnergyBudget(delta, longest, spans.lo, spans.hi, **given)
+    except ValueError as error:
+        raise InputError(f"energy budget: {error}") from None
     late = ages(process.delays) if lost else None
     return _Budgeted(budget, wanted, process.force_limit, late, np.array(spans.hi) + hold)
 

@@ -88,7 +88,7 @@ def _plain_numbers(axes: Any) -> None:
 
 
 def _array(values: Any) -> Array:
-    """Numbers as they stand in JSON, null as not-a-number (which is not drawn)."""
+    """Numbers of a JSON report; null becomes not-a-number, which is not drawn."""
     return np.array(values, dtype=float)
 
 
@@ -99,8 +99,8 @@ _SAME = 1e-6  # [%] what rounding leaves between two forces that are one
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
-    """What a picture says of the scenario: the contacts' names, where walls stand and when they were touched."""
+class Contacts:
+    """The contacts as a picture shows them: their names, where walls stand and when they were touched."""
 
     names: Sequence[str] = ()  # (m,) of the channels; "device 1", .. where there are none
     walls: Sequence[tuple[int, float, str]] = ()  # channel from 0, place [m] and name of each wall on ground
@@ -126,7 +126,7 @@ def plot_run(
     frequency_hz: float,
     ideal: tuple[Array, float | None] | None = None,
     onset: Onset | None = None,
-    around: Surroundings | None = None,
+    around: Contacts | None = None,
 ) -> Path:
     """Displacements and forces over the whole run, and six periods of `frequency_hz` where forces turn most sharply.
 
@@ -137,7 +137,7 @@ def plot_run(
     grows the oscillation's amplitude is drawn over time beside its prediction, in place of the displacements' zoom.
     """
     last, growth = result.t.size, onset.growth if onset else None
-    around = around or Surroundings()
+    around = around or Contacts()
     if onset and onset.until is not None:
         last = int(np.searchsorted(result.t, onset.until))
     if onset and growth is not None:
@@ -177,7 +177,7 @@ def plot_run(
     return save(figure, path)
 
 
-def _ordered(entries: dict[str, Any], around: Surroundings) -> dict[str, Any]:
+def _ordered(entries: dict[str, Any], around: Contacts) -> dict[str, Any]:
     """Channel by channel, of each what the hand holds first, and then the rest."""
     names = around.names or [f"device {i}" for i in range(1, 100)]
 
@@ -200,7 +200,7 @@ def _calmest_last(values: Array) -> list[int]:
 _ALIKE = 0.005  # of the largest value: curves that differ by less cannot be told apart
 
 
-def _coinciding(values: Array, around: Surroundings) -> list[str]:
+def _coinciding(values: Array, around: Contacts) -> list[str]:
     """Per curve of (N, m) which earlier one it lies on, as the end of its label."""
     scale = np.abs(values).max(initial=0.0)
     ends = [""] * values.shape[1]
@@ -228,7 +228,7 @@ def _one_point(result: Trace) -> str:
     return f"displacement of the handle [mm],\n{beside}"
 
 
-def _draw_walls(axes: Array, result: Trace, around: Surroundings) -> None:
+def _draw_walls(axes: Array, result: Trace, around: Contacts) -> None:
     """Where walls stand, in the panel of displacements, and when they were touched, in both."""
     for i, place, name in around.walls:
         colour = STYLES[i % len(STYLES)]["color"]
@@ -243,7 +243,7 @@ def _draw_walls(axes: Array, result: Trace, around: Surroundings) -> None:
             axis.axvspan(*span, color="#F0E442", alpha=0.35, zorder=0, linewidth=0, label=label)
 
 
-def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], around: Surroundings) -> None:
+def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], around: Contacts) -> None:
     """Handles over encoders, in millimetres; the handle alone where a picture shows them as one point."""
     two, alike = _two_points(result), _coinciding(result.x, around)
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
@@ -270,7 +270,7 @@ def _grey_out(axes: Array | list[Axes], result: Trace, until: float) -> None:
     axes[0].annotate(text, (1.0, 1.0), (-6, -5), fontsize=8, zorder=6, **where)
 
 
-def _draw_onset(axis: Axes, result: Trace, hertz: float, onset: Onset, around: Surroundings) -> None:
+def _draw_onset(axis: Axes, result: Trace, hertz: float, onset: Onset, around: Contacts) -> None:
     """The amplitude of the oscillation at the encoders over time, up to the first clipped tick, and its prediction."""
     assert onset.growth is not None
     t, sizes = _amplitudes(result, hertz, onset.steady)
@@ -339,7 +339,7 @@ def _sharpest(result: Trace, frequency_hz: float, ticks: int | None = None) -> s
 
 
 def _turns(f: Array) -> int:
-    """How often the force that does so most turns round; (k, m)."""
+    """How often the force that turns round most often does so, (k, m)."""
     signs = (np.sign(column[column != 0]) for column in np.diff(f, axis=0).T)
     return max((int(np.count_nonzero(np.diff(sign))) for sign in signs), default=0)
 
@@ -359,7 +359,7 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
 
     The axes are those of the forces that should be felt, as far as they are credible; what oscillates leaves them.
     """
-    columns, around = 2 if len(panels) > 1 else 1, Surroundings(names)
+    columns, around = 2 if len(panels) > 1 else 1, Contacts(names)
     rows = -(-len(panels) // columns)
     title, size = "the same devices, hands and object, another coupling in each panel", (11, 3.1 * rows + 0.6)
     figure, axes = _panels(title, rows, columns, size, sharex=True, sharey=True)

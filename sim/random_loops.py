@@ -65,7 +65,7 @@ class _Proof:
     """One network, with half as much to one and a half times the damping that its loop asks for."""
 
     number: int
-    required: float  # of the damping that there is
+    required: float  # over the available damping
     proved: bool
     reason: str | None
 
@@ -92,7 +92,7 @@ def proofs(seed: int, count: int = 500) -> Iterator[_Proof]:
 
 
 @dataclass(frozen=True)
-class _Told:
+class _TraceVerdict:
     """What one run says of its stability, and what its eigenvalues say."""
 
     number: int
@@ -135,7 +135,7 @@ def _scenario(rng: np.random.Generator) -> Scenario:
     ).replace(tap=tap)
 
 
-def traces(seed: int, count: int = 460) -> Iterator[_Told]:
+def traces(seed: int, count: int = 460) -> Iterator[_TraceVerdict]:
     """Whether so many runs, half of them MuJoCo's, tell of their stability what their eigenvalues tell."""
     rng, number = np.random.default_rng(seed), 0
     while number < count:
@@ -150,5 +150,5 @@ def traces(seed: int, count: int = 460) -> Iterator[_Told]:
         growth, exact = part["growth_rate_per_s"], part["exact_growth_rate_per_s"]
         silent, other = part.get("reason") == NOT_EXCITED, growth is not None and bool(disagree(exact, growth))
         opposite = other or (growth is None and part["verdict"] not in (None, part["exact_verdict"]))
-        yield _Told(number, engine, exact, growth, part["verdict"], part.get("reason"), silent, not opposite)
+        yield _TraceVerdict(number, engine, exact, growth, part["verdict"], part.get("reason"), silent, not opposite)
         number += 1

@@ -1,6 +1,6 @@
-"""What a run and a validation came to, as plain data in SI units: null with a "reason" where a figure does not exist.
+"""Results of a run as plain data in SI units: null with a "reason" where a figure does not exist.
 
-The rows on the screen are made of it in the commands: cli/run.py, cli/validate.py.
+The rows on the screen are made of it in cli/run.py.
 """
 
 from __future__ import annotations
@@ -9,25 +9,20 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from controller.coupling import Coupling
+from controller.coupling import PUBLISHED, Coupling
 from controller.delay import LOST, Ticks, VaryingDelay, ages
-from controller.lti import Array
+from controller.older import CONDITIONS, with_older
 from controller.timing import Timing
 from design.certificate import assess
 from design.guarantees import ANY, CAVEATS, MAKING, encoder_part
-from design.result import OLDER_NAMES, PRINTED_TAU_DB, PUBLISHED, Requirement, certificate_part, finite, listed
+from design.result import Requirement, certificate_part, finite, listed
 from design.transparency import Transparency, decibels
-from models.human import Human, Person
-from sim.adversary import Worst
 from sim.couplings import Chosen
-from sim.crowds import MIXED, Findings, Validation
 from sim.run import Simulation
 from sim.scenario import Scenario, load
-from sim.stability import close, dominant_mode, eigenvalue_part, linear_growth, unstable
+from sim.stability import close, dominant_mode, eigenvalue_part, linear_growth
 from sim.switching import Period, certified_part
 from sim.trace import Trace
 
@@ -38,7 +33,7 @@ from sim.trace import Trace
 def certificates_part(requirements: Mapping[str, Requirement]) -> dict[str, Any]:
     """Both conditions, each under its name and under the name that it had before: the same objects."""
     parts = {name: certificate_part(requirement) for name, requirement in requirements.items()}
-    return parts | {older: parts[name] for older, name in OLDER_NAMES.items() if name in parts}
+    return with_older(parts, CONDITIONS)
 
 
 def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
@@ -107,6 +102,10 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
 
 # ----------------------------------------------------------------------------------------------------
 # What the paper prints beside what comes out here, for its own scenario.
+
+
+#: The transparency indices (25) printed beside the gains [dB]; no reading of Figure 4 that we tried gives them.
+PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 
 def beside_the_paper(
@@ -258,171 +257,3 @@ def _how(delays: dict[str, Any]) -> str:
     if delays["period"]:
         return f"growth by the eigenvalues of the product over the {delays['period']['ticks']} ticks of a period"
     return f"growth of the linear loop after an impulse, over {delays['judged_s']:.3g} s under the run's delays"
-
-
-# ----------------------------------------------------------------------------------------------------
-# What a validation found: one dictionary for machines, and the same as a table for people.
-
-
-_SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be slower in its last quarter than before
-_ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
-
-
-def validation_part(question: Validation, findings: Findings, certified: bool, wall: float) -> dict[str, Any]:
-    """The contract of `sim.validate --json`."""
-    bad, mujoco = unstable(findings.exact), question.engine != "exact"
-    disagreements = int(findings.disagreements.sum())
-    wrong = int((bad | (mujoco & unstable(findings.mujoco) & (findings.mujoco > 1e-3))).sum())
-    part: dict[str, Any] = {
-        "humans": int(findings.index.size),
-        "links": "mixed" if question.links == MIXED else question.links,
-        "seed": question.seed,
-        "engine": question.engine,
-        "unstable": {
-            "exact": int(bad.sum()),
-            "mujoco": int(unstable(findings.mujoco).sum()) if mujoco else None,
-        },
-        "disagreements": disagreements,
-        "disagreeing": [_identified(question, int(i)) for i in findings.index[findings.disagreements]],
-        "worst": _worst(question, findings),
-        "largest_difference_per_s": _largest(np.abs(findings.mujoco - findings.exact)),
-        "traces": _traces(question, findings),
-        "environments": _environments(question, findings, bad),
-        "certified": certified,
-        "holds": disagreements == 0 and not (certified and wrong),
-        "interrupted": findings.interrupted,
-        "unfinished": findings.lost or None,
-        "wall_s": wall,
-        "simulated_s_per_s": findings.simulated / wall,
-    }
-    if certified and question.ticks:
-        part["energy_audit"] = _energy(question, findings)
-        part["holds"] = part["holds"] and part["energy_audit"]["holds"]
-    if not findings.index.size:
-        part |= {"holds": None, "reason": "no batch of humans was done"}
-    return part
-
-
-def varying_delays_part(findings: Findings, covered: dict[str, Any]) -> dict[str, Any]:
-    """How many humans grow under delays or ticks that vary; it holds unless certificates cover these and one grows."""
-    exact, mujoco = findings.switching, findings.switching_mujoco
-    seen = ~np.isnan(exact)
-    unstable, also = int((exact > 0).sum()), mujoco[~np.isnan(mujoco)]
-    worst = int(np.nanargmax(exact)) if seen.any() else None
-    return covered | {
-        "unstable": {"exact": unstable, "mujoco": int((also > 0).sum()) if also.size else None},
-        "humans": int(seen.sum()),
-        "mujoco_unclipped": int(also.size),
-        "largest_growth_per_s": None if worst is None else finite(float(exact[worst])),
-        "worst_index": None if worst is None else int(findings.index[worst]),
-        "holds": not (covered["covered"] and unstable),
-    }
-
-
-def adversary_part(worst: Worst, ratio: float, certified: bool) -> dict[str, Any]:
-    """What the search found, and how far the loop is from its required damping."""
-    return {
-        "found": worst.destabilises,
-        "spectral_radius": worst.spectral_radius,
-        "growth_rate_per_s": finite(worst.growth),
-        "frequency_hz": worst.frequency_hz,
-        "evaluated": worst.evaluated,
-        "required_over_available_damping": finite(ratio),
-        "human": _humans(worst.humans),
-        "person": _persons(worst.persons),
-        "holds": not (certified and worst.destabilises),
-    }
-
-
-def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
-    """Links of each channel's human."""
-    names = ("mass", "damping", "stiffness")
-
-    def plain(human: Any) -> dict[str, Any]:
-        if isinstance(human, Human):
-            return {"links": [{name: getattr(link, name) for name in names} for link in human.links]}
-        port = human.port()  # a user's own class: what the handle feels of it
-        parts = ("mass", "across", "damping", "stiffness")
-        return {"class": type(human).__name__} | {name: getattr(port, name).tolist() for name in parts}
-
-    return [plain(human) for human in humans]
-
-
-def _persons(persons: tuple[Person, ...]) -> list[dict[str, Any]]:
-    """Those who hold several devices."""
-    return [msgspec.to_builtins(person) for person in persons]
-
-
-def _identified(question: Validation, index: int) -> dict[str, Any]:
-    crowd = question.crowd(index)
-    who = {"human": _humans(crowd.humans(0)), "person": _persons(crowd.persons(0))}
-    member = question.environment(index)
-    where = {"environment": member.name, "network": msgspec.to_builtins(member.network)} if member else {}
-    return {"seed": question.seed, "index": index} | who | where
-
-
-def _environments(question: Validation, findings: Findings, bad: NDArray[np.bool_]) -> dict[str, Any]:
-    """Which environments the loops had, and in which of them a loop was unstable."""
-    if not question.environments:
-        return {"of": "the nominal environment", "count": 1}
-    unstable_in = sorted({int(i) % len(question.environments) for i in findings.index[bad]})
-    return {
-        "of": "the ranges",
-        "count": len(question.environments),
-        "names": [member.name for member in question.environments],
-        "unstable_in": [question.environments[i].name for i in unstable_in],
-    }
-
-
-def _worst(question: Validation, findings: Findings) -> dict[str, Any] | None:
-    if not findings.index.size:
-        return None
-    k = int(np.argmax(findings.radius))
-    figures = {
-        "spectral_radius": float(findings.radius[k]),
-        "growth_rate_per_s": finite(float(findings.exact[k])),
-        "frequency_hz": float(findings.frequency[k]),
-    }
-    return figures | _identified(question, int(findings.index[k]))
-
-
-def _traces(question: Validation, findings: Findings) -> dict[str, Any] | None:
-    if not question.ticks or not findings.index.size:
-        return None
-    measured, stable = np.isfinite(findings.trace), ~unstable(findings.exact)
-    duration = question.ticks * question.scenario.T
-    decay = _largest(-1 / findings.exact[findings.exact < 0])
-    decides = decay is None or duration >= _SETTLING * decay
-    part = {
-        "duration_s": duration,
-        "clipped_runs": int((findings.clipped > 0).sum()),
-        "contacts": int(findings.contacts.sum()),
-        "measured": int(measured.sum()),
-        "largest_difference_per_s": _largest(np.abs(findings.trace - findings.exact)),
-        "stable_and_settling": int((stable & (findings.settling < 1)).sum()),
-        "stable": int(stable.sum()),
-        "slowest_settling": _largest(findings.settling[stable]),
-        "slowest_decay_s": decay,
-        "settling_decides": decides,
-    }
-    if not decides:
-        part["reason"] = f"the slowest mode decays in {decay:.3g} s: in {duration:g} s its hands need not be slower"
-    return part
-
-
-def _energy(question: Validation, findings: Findings) -> dict[str, Any]:
-    """Forces that were clipped are covered by nothing; those of a limiter are."""
-    unclipped = (findings.clipped == 0) | (question.lag is not None)
-    violated = unclipped & ~(findings.energy >= -_ROUNDING * findings.audited)
-    return {
-        "audited": int(unclipped.sum()),
-        "clipped": int((~unclipped).sum()),
-        "violated": int(violated.sum()),
-        "least_J": float(findings.energy[unclipped].min()) if unclipped.any() else None,
-        "holds": not violated.any(),
-    }
-
-
-def _largest(values: Array) -> float | None:
-    values = values[np.isfinite(values)]
-    return float(values.max()) if values.size else None

@@ -3,7 +3,7 @@
     trace = run(assemble(scenario, coupling), "mujoco")
 
 A tick samples the positions, computes the forces, limits and holds them, and advances the plant by T: see
-controller.process for the order of these steps and sim.engines for what advances the plant.
+controller.tick for the order of these steps and sim.engines for what advances the plant.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 
-from controller.contact import contact, limited
 from controller.coupling import Coupling
 from controller.environment import environment, held
+from controller.limiter import limited
 from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import Net, Process, StepBuffer
+from controller.tick import Net, Process, StepBuffer
 from controller.timing import Timing
+from controller.walls import contact
 from models.scene import Scene, build, plant
 from sim.engines import (
     EXPONENTIAL,

@@ -21,17 +21,19 @@ import msgspec
 import numpy as np
 
 from controller.delay import VaryingDelay
-from controller.environment import Network, Ranges, Spring, UncertainSpring, Wall, environment
-from controller.loop import DelayRange, Loop, named_first, named_today
+from controller.environment import Network, Spring, Wall, environment
+from controller.loop import DelayRange, Loop
+from controller.older import SCENARIOS as OLDER_SCENARIOS
+from controller.older import named_first, named_today
+from controller.ranges import Ranges, UncertainSpring
 from controller.timing import Periods, Timing, drawn
-from design.files import InputError, printable, read_text, toml, write
+from design.files import InputError, counted, printable, read_text, toml, write
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
 from models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
 CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
-OLDER_SCENARIOS = {"omega-pair-box": "omega-pair-ranges"}  # older name -> the name of today
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
 _MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many states take ten seconds, of 2000 a minute
@@ -56,7 +58,7 @@ class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _usual_hand(i: int) -> Human:
-    """Who holds device i where a scenario does not say it: .3 kg that swings 15 mm at .6 Hz, a quarter turn apart."""
+    """The default hand of device i: .3 kg that swings 15 mm at .6 Hz, a quarter turn apart."""
     return Human((Link(0.3, 3.0, 200.0),), Voluntary(0.015, 0.6, phase=0.5 * np.pi * i))
 
 
@@ -95,8 +97,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             if value is not None and len(value) != self.channels:
                 contacts = f"the environment has {self.channels} contacts ({', '.join(self.environment.contacts)})"
                 raise ValueError(f"{name} has {len(value)} entries, but {contacts}")
-            for i, n in enumerate(value if name in ("theta", "psi", "lam") and value else ()):
-                require(f"{name}[{i}]", n, 0, LONGEST_DELAY, "samples")
+            for i, n in enumerate(value if name in ("theta", "psi", "lam") and value else (), start=1):
+                require(f"{name} #{i}", n, 0, LONGEST_DELAY, "samples")
         if (total := sum((*self.theta, *self.psi))) > _MOST_DELAYS:
             many = f"theta and psi are {total} samples in all, allowed are {_MOST_DELAYS}"
             seconds = f"each is a state, and their eigenvalues would take about {1e-8 * total**3:.0f} s"
@@ -104,7 +106,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         for i, lam in enumerate(self.lam or ()):
             if lam > self.theta[i] + self.psi[i]:
                 total = self.theta[i] + self.psi[i]
-                raise ValueError(f"lam[{i}] is {lam}, allowed are 0 to theta + psi = {total} samples")
+                raise ValueError(f"lam #{i + 1} is {lam}, allowed are 0 to theta + psi = {total} samples")
         check_holds([person.holds for person in self.person], self.channels)
         if self.varying_delay:
             self._check_varying_delay(self.varying_delay)
@@ -119,9 +121,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         if self.period and self.T_max is not None and self.period.longest > self.T_max:
             raise ValueError(f"period is up to {self.period.longest:g} s, above T_max = {self.T_max:g} s")
         shortest = self.period.shortest if self.period else self.T
-        for i, (_, most) in enumerate(self.latency or ()):
+        for i, (_, most) in enumerate(self.latency or (), start=1):
             if most >= shortest:
-                raise ValueError(f"latency[{i}] is up to {most:g} s, expected less than every period, {shortest:g} s")
+                raise ValueError(f"latency #{i} is up to {most:g} s, expected less than every period, {shortest:g} s")
 
     def _check_varying_delay(self, varying: VaryingDelay) -> None:
         if varying.channels != self.channels:
@@ -130,11 +132,11 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError("varying_delay and ranges: switching delays are judged in one environment; give one")
         if self.environment.walls:
             raise ValueError("varying_delay and environment.walls: switching delays are judged in linear loops only")
-        for i, (n, lo, hi) in enumerate(zip(self.theta, varying.lo, varying.hi, strict=True)):
+        for i, (n, lo, hi) in enumerate(zip(self.theta, varying.lo, varying.hi, strict=True), start=1):
             if varying.playout and n != hi:
-                raise ValueError(f"theta[{i}] is {n}, but varying_delay.playout makes it the largest delay, {hi}")
+                raise ValueError(f"theta #{i} is {n}, but varying_delay.playout makes it the largest delay, {hi}")
             if not lo <= n <= hi:
-                raise ValueError(f"theta[{i}] is {n}, outside of its varying_delay, {lo} to {hi} samples")
+                raise ValueError(f"theta #{i} is {n}, outside of its varying_delay, {lo} to {hi} samples")
 
     @property
     def channels(self) -> int:
@@ -147,7 +149,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def delay_range(self) -> DelayRange:
-        """What the delay of a force may be; of one that is lost nothing is said."""
+        """The range of the delay of a force that is not lost."""
         varying = self.varying_delay
         return DelayRange(varying.lo, varying.hi) if varying else DelayRange(self.theta, self.theta)
 
@@ -162,7 +164,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def longest_period(self) -> float | None:
-        """What certificates are for: T_max, or the longest of the periods that are simulated; None where all are T."""
+        """The period that certificates must cover: T_max, or the longest simulated one; None where all are T."""
         if self.T_max is not None or self.period is None:
             return self.T_max
         return max(self.period.longest, self.T)
@@ -201,7 +203,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return tuple(t + p for t, p in zip(self.theta, self.psi, strict=True))
 
     def title(self, case: str) -> str:
-        """What reports and pictures are headed with: the paper's cases have names for its own loop only."""
+        """The title of reports and pictures; the paper's cases have names for the paper's loop only."""
         if (case == "none" or self.varying_delay is None) and self.loop(case) == load().loop(case):
             return f"{self.name}, case {case}"
         return self.name + {"none": ", no coupling", "II": ", reference without delay"}.get(case, "")
@@ -272,23 +274,23 @@ def built_in() -> list[str]:
 
 def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
     """Raises InputError where a loop has Coulomb friction or, unless `walls` are decided too, walls."""
-    for i, device in enumerate(scenario.device):
+    for i, device in enumerate(scenario.device, start=1):
         if device.friction:
             instead = "sim.run and sim.zwidth simulate it"
-            raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
+            raise InputError(f"device #{i}.friction is {device.friction:g} N: {what} decides linear loops; {instead}")
     if scenario.environment.walls and not walls:
         raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
 
 
 def require_constant_delay(scenario: Scenario, what: str) -> None:
-    """Raises InputError where a scenario's delays vary, for what would not make them vary."""
+    """Raises InputError where delays vary, for commands that cannot simulate this."""
     if scenario.varying_delay is not None:
         instead = "sim.run simulates it"
         raise InputError(f"varying_delay: {what} takes the delays that its link has; take the table out, {instead}")
 
 
 def require_even_ticks(scenario: Scenario, what: str) -> None:
-    """Raises InputError where periods are drawn or forces latch between ticks, for what would do neither."""
+    """Raises InputError where ticks are uneven or late, for commands that cannot simulate this."""
     for name in ("period", "latency"):
         if getattr(scenario, name) is not None:
             raise InputError(f"{name}: {what} takes the ticks that it has; take the key out, sim.run simulates it")
@@ -329,16 +331,16 @@ def _humans_of(text: str, source: str) -> _HumanFile:
     """A file of humans; a [[human]] with A, B, C and D is a measured transfer function, any other a chain."""
     people: _HumanFile = _converted(text, _HumanFile, source)
     made = []
-    for i, human in enumerate(people.human):
+    for i, human in enumerate(people.human, start=1):
         kind = MeasuredHand if isinstance(human, dict) and "A" in human else Human
         try:
             made.append(msgspec.convert(human, kind))
         except msgspec.ValidationError as error:
             joint = "." if re.search(r" - at `\$\.", str(error)) else ": "
             place = _located(str(error), human if isinstance(human, dict) else {})
-            raise InputError(f"{source}: human[{i}]{joint}{place}") from None
+            raise InputError(f"{source}: human #{i}{joint}{place}") from None
         except ValueError as error:
-            raise InputError(f"{source}: human[{i}]: {error}") from None
+            raise InputError(f"{source}: human #{i}: {error}") from None
     return _HumanFile(tuple(made), people.person)
 
 
@@ -352,9 +354,9 @@ def _run_file(path: str | Path) -> _HumanFile:
             names = runpy.run_path(str(path))
         sys.stderr.write(printable(heard.getvalue()))
         hands, persons = _kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ()))
-        for i, person in enumerate(persons):
+        for i, person in enumerate(persons, start=1):
             if not isinstance(person, Person):
-                raise ValueError(f"persons[{i}] is {person!r}, expected a models.human.Person")
+                raise ValueError(f"persons #{i} is {person!r}, expected a models.human.Person")
         population = names.get("population")
         if population is not None and len(_kept(tuple(population.draw(np.random.default_rng(0), 2)))) != 2:
             raise ValueError("population.draw(rng, 2) gives not two humans")
@@ -400,7 +402,7 @@ def _converted(text: str, kind: Any, source: str) -> Any:
 
 
 def _whole(raw: dict[str, Any]) -> dict[str, Any]:
-    """The file, if it has every key that a scenario needs; of an unknown key it is told first. Raises ValueError."""
+    """The file, if it has every key that a scenario needs. An unknown key is reported first. Raises ValueError."""
     missing = [name for name in _NEEDED if name not in raw]
     if missing and set(raw) <= set(Scenario.__struct_fields__):
         raise ValueError(f"missing {', '.join(missing)}; every scenario has {', '.join(_NEEDED)}")
@@ -416,13 +418,13 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(devices, list):
         return raw
     made = []
-    for i, one in enumerate(devices):
+    for i, one in enumerate(devices, start=1):
         given = {"device": one} if isinstance(one, str) else one
         if isinstance(given, dict) and isinstance(name := given.get("device"), str):
             try:
                 given = fields_of(name, {key: value for key, value in given.items() if key != "device"})
             except ValueError as error:
-                raise InputError(f"device[{i}]: {error}") from None
+                raise InputError(f"device #{i}: {error}") from None
         made.append(given)
     return raw | {"device": made}
 
@@ -431,8 +433,8 @@ class _Damping(msgspec.Struct, frozen=True):
     delta: tuple[float, ...]  # [N s/m]
 
     def __post_init__(self) -> None:
-        for i, damping in enumerate(self.delta):
-            require(f"delta[{i}]", damping, 0.0, MOST_DAMPING, "N s/m")
+        for i, damping in enumerate(self.delta, start=1):
+            require(f"delta #{i}", damping, 0.0, MOST_DAMPING, "N s/m")
 
 
 def _strictly(fields: dict[str, Any], kind: Any) -> Any:
@@ -475,25 +477,25 @@ def _kept(value: Any) -> Any:
     """A user's own population as it is, or humans, each of which must be able to hold a device. Raises ValueError."""
     if not isinstance(value, list | tuple):
         return value
-    for i, human in enumerate(value):
+    for i, human in enumerate(value, start=1):
         if not (callable(getattr(human, "port", None)) and callable(getattr(human, "voluntary_force", None))):
-            raise ValueError(f"human[{i}] is {human!r}, expected a Human, or what has port() and voluntary_force(t)")
+            raise ValueError(f"human #{i} is {human!r}, expected a Human, or what has port() and voluntary_force(t)")
         if not isinstance(port := human.port(), Port):  # which raises ValueError where it is not passive
-            raise ValueError(f"human[{i}].port() is {port!r}, expected a models.human.Port")
+            raise ValueError(f"human #{i}.port() is {port!r}, expected a models.human.Port")
         with np.errstate(all="ignore"):
             force = np.asarray(human.voluntary_force(_TIMES))
         if force.shape != _TIMES.shape or force.dtype.kind not in "fiu" or not np.isfinite(force).all():
-            raise ValueError(f"human[{i}].voluntary_force(t) is {force!r} for two times, expected as many forces in N")
+            raise ValueError(f"human #{i}.voluntary_force(t) is {force!r} for two times, expected as many forces in N")
     return tuple(value)
 
 
 def _contents(part: Any) -> Any:
-    """What a user's own human or population is made of."""
+    """The contents of a user's own human or population."""
     return part.tolist() if isinstance(part, np.ndarray | np.generic) else [type(part).__qualname__, vars(part)]
 
 
 def _located(message: str, raw: dict[str, Any]) -> str:
-    """'Expected `int`, got `float` - at `$.theta[0]`' as 'theta[0] = 1.5: expected `int`, got `float`'."""
+    """'Expected `int`, got `float` - at `$.theta[0]`' as 'theta #1 = 1.5: expected `int`, got `float`'."""
     match = re.fullmatch(r"(.*?)(?: - at `(?:key in )?\$\.?(.*)`)?", message, flags=re.DOTALL)
     assert match
     what, path = match[1], match[2] or ""
@@ -508,11 +510,11 @@ def _located(message: str, raw: dict[str, Any]) -> str:
     shown = f" = {value!r}" if isinstance(value, int | float | str) else ""
     if what[1:2].islower():  # a word of msgspec's, not a symbol of ours
         what = what[0].lower() + what[1:]
-    return f"{path}{shown}: {what}" if path else what
+    return f"{counted(path)}{shown}: {what}" if path else what
 
 
 def _hint(what: str) -> str:
-    """What would have been allowed, where the message does not say it."""
+    """What is allowed, where the message does not say it."""
     unknown = re.search(r"unknown field `(.*)`", what)
     if unknown:
         known = {name for struct in _STRUCTS for name in struct.__struct_fields__}

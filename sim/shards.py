@@ -34,11 +34,12 @@ if TYPE_CHECKING:
 
 _PATIENCE = 3.0  # [s] for a scheduler to answer, and again for its first worker
 _AGAIN = 3  # times in a row that workers may die without finishing a batch
+_LOOK, _DESERTED = 5.0, 60.0  # [s] between looks for workers of a cluster, and without any until it is given up
 _AHEAD = 4  # batches in hand for every worker: results are put away before others are begun
 
 
 class Table:
-    """What is known of every human, a column each: in memory, or in a file that is mapped only while it is used."""
+    """The findings, a column for each figure: in memory, or in a file that is mapped only while it is used."""
 
     def __init__(self, question: Validation, folder: Path | None = None, resume: bool = False) -> None:
         """With `resume` the unfinished file of the same question goes on. Raises InputError where there is none."""
@@ -171,7 +172,7 @@ def _pool(question: Validation, table: Table, missing: list[int], shards: int, p
 
 
 def _finished(running: dict[Future[Findings], int], table: Table) -> int:
-    """Put away what is done besides; how many batches that were."""
+    """Store the other batches that are finished, and return their number."""
     ready = [future for future in running if future.done() and not future.cancelled() and not future.exception()]
     for future in ready:
         table.put(running[future], future.result())
@@ -179,7 +180,7 @@ def _finished(running: dict[Future[Findings], int], table: Table) -> int:
 
 
 def as_worker() -> None:
-    """Ctrl-C reaches every process of a terminal, and only the one that merges may act on it; a worker ends with it."""
+    """Ignore Ctrl-C, which reaches every process of a terminal and is the parent's; end with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -216,40 +217,46 @@ def validate_on_cluster(
 def _on_workers(question: Validation, table: Table, client: Client, address: str, progress: Progress) -> str:
     """Why batches are missing at the end, or nothing."""
     from distributed import CancelledError as Cancelled
-    from distributed import KilledWorker, as_completed
+    from distributed import KilledWorker
+    from distributed import wait as wait_on_cluster
 
     batches, missing, alone, lost = question.batches(), table.missing(), replace(question, threads=1), ""
-    begun, done, numbers = iter(missing), len(batches) - len(missing), dict[Any, int]()
-
-    def submit() -> Any:
-        number = next(begun, None)
-        if number is None:
-            return None
-        task = client.submit(_examine_alone, alone, batches[number], pure=False)
-        numbers[task.key] = number
-        return task
-
-    ahead = _AHEAD * max(1, len(client.scheduler_info()["workers"]))
-    queue = as_completed([task for _ in range(ahead) if (task := submit())], loop=client.loop)
+    left, done, running, deserted = iter(missing), len(batches) - len(missing), dict[Any, int](), 0.0
     try:
-        for task in queue:
+        while True:
+            ahead = _AHEAD * max(1, len(client.scheduler_info()["workers"]))
+            for number in left:
+                running[client.submit(_examine_alone, alone, batches[number], pure=False)] = number
+                if len(running) >= ahead:
+                    break
+            if not running:
+                return lost
             try:
-                table.put(numbers.pop(task.key), task.result())
+                with client.as_current():
+                    found: Any = wait_on_cluster(list(running), timeout=_LOOK, return_when=FIRST_COMPLETED)
+            except TimeoutError:
+                deserted = 0.0 if client.nthreads() else deserted + _LOOK
+                if deserted >= _DESERTED:
+                    return f"--dask {address}: the cluster has had no workers for {deserted:g} s"
+                continue
+            for task in found.done:
+                number = running.pop(task)
+                try:
+                    part = task.result()
+                except ImportError as error:
+                    raise InputError(f"--dask {address}: the workers cannot import this package: {error}") from None
+                except KilledWorker as error:
+                    lost = f"--dask {address}: a batch killed every worker that tried it: {error}"
+                    continue
+                table.put(number, part)
                 done += 1
                 progress(done, len(batches))
-            except ImportError as error:
-                raise InputError(f"--dask {address}: the workers cannot import this package: {error}") from None
-            except KilledWorker as error:
-                lost = f"--dask {address}: a batch killed every worker that tried it: {error}"
-            except (CancelledError, Cancelled, OSError):
-                return f"--dask {address}: the cluster was lost before all batches were done"
-            if (more := submit()) is not None:
-                queue.add(more)
+    except (CancelledError, Cancelled, OSError):
+        return f"--dask {address}: the cluster was lost before all batches were done"
     except KeyboardInterrupt:
         with suppress(Exception):
-            client.cancel([task for task in client.futures if task in numbers])
+            client.cancel(list(running))
         raise
-    return lost
 
 
 _one_at_a_time = threading.Lock()  # MuJoCo's clock and warning handler are global to a process

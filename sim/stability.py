@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controller.contact import Limiter, State
+from controller.limiter import Limiter
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
 from controller.timing import Timing
+from controller.walls import State
 from design.result import finite
 from models.scene import Scene, Variants
 from sim.engines import Engine, HeldPlant, MujocoBatchEngine, at_the_latch, hold, profiler_off, quiet_warnings
@@ -33,7 +34,7 @@ _SHORTEST_TRACE = 200  # ticks below which a growth rate is not read from a trac
 
 
 def unstable(growth: ArrayLike) -> NDArray[np.bool_]:
-    """Whether each growth rate [1/s] counts as unstable; what is not a number does."""
+    """Whether each growth rate [1/s] counts as unstable; nan does."""
     return ~(np.asarray(growth) <= MARGINAL)
 
 
@@ -113,7 +114,7 @@ def dominant_mode(loop: ClosedLoop) -> Mode:
 
 
 def left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
-    """Of the dominant mode, (..., n), of unit length: left* A = lambda left*. No other mode has a part in left* xi."""
+    """The dominant mode's, (..., n), of unit length: left* A = lambda left*. No other mode contributes to left* xi."""
     values, vectors = np.linalg.eig(np.swapaxes(loop.A, -1, -2))
     largest = np.argmax(np.abs(values), axis=-1)[..., None, None]
     return np.take_along_axis(vectors, largest, axis=-1)[..., 0].conj()

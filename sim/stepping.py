@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.lti import Array
-from controller.process import StepBuffer
+from controller.tick import StepBuffer
 from models.scene import plant
 from sim.engines import EXPONENTIAL, LEAST, HeldPlant, default_integrator, quiet_warnings
 from sim.run import Simulation, make_engine
@@ -67,6 +67,13 @@ def settle(
     Raises InputError where they cannot be had.
     """
     if engine == "exact":
+        for name, asked in (("integrator", integrator), ("substeps", substeps)):
+            if asked is not None:
+                raise InputError(f"--{name} with --engine exact: it takes no steps; leave it out")
+        if simulation.friction:
+            raise InputError(
+                "--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco"
+            )
         return None, None, []
     integrator = integrator or default_integrator(simulation.scene)
     if substeps is None:

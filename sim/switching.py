@@ -26,7 +26,7 @@ from controller.coupling import Coupling
 from controller.delay import LOST, Ticks, VaryingDelay, realising
 from controller.loop import DelayRange, force_map
 from controller.lti import Array, Lti
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
 from design.certificate import switching_requirement
 from design.coverage import switching_part
 from design.guarantees import switching_guarantee

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
 
@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.lti import Array, ReadOnly, frozen
-from controller.process import Net
+from controller.tick import Net
 from design.files import InputError, read_arrays, write
 
 _MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep
@@ -41,7 +41,7 @@ def _real(name: str, values: NDArray[Any]) -> Array:
 
 
 def _is_frozen(value: Any, ndim: int) -> bool:
-    """Whether nobody can write to it, so that a long run needs no second copy."""
+    """Whether it is read-only, so that a long run needs no second copy."""
     own = isinstance(value, np.ndarray) and value.dtype == np.float64 and value.ndim == ndim
     return own and not value.flags.writeable and not (isinstance(value.base, np.ndarray) and value.base.flags.writeable)
 
@@ -108,12 +108,12 @@ class Trace(ReadOnly):
 
     @classmethod
     def load_npz(cls, path: Path) -> Self:
-        """A trace written by `save_npz`. Raises InputError where it is none."""
+        """A trace written by `save_npz`. Raises InputError where the file is not one."""
         return cls.of_arrays(path, read_arrays(path, "a trace of this program"))
 
     @classmethod
     def of_arrays(cls, path: Path, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """A trace from the arrays of its file. Raises InputError where they are none."""
+        """A trace from the arrays of its file. Raises InputError where they are not those of a trace."""
         try:
             measured: dict[str, Any] = {name: _real(name, arrays[name]) for name in _MEASURED}
             return cls(**measured, meta=json.loads(str(arrays["meta"])))
@@ -226,9 +226,14 @@ class Growth:
     trend: str | None = None  # grows | decays | neither: by more than _CLEAR standard errors
     reason: str | None = None
 
-    def part(self) -> dict[str, Any]:
-        """As plain data."""
-        return asdict(self)
+    def words(self, T: float) -> str:
+        """In one line, for ticks of T [s]."""
+        where = f"ticks {self.first} to {self.stop} ({(self.stop - self.first) * T:.2f} s)"
+        above = "" if self.slowest_hz is None else f" (from {self.slowest_hz:.3g} Hz up)"
+        if self.reason or self.amplitude_m is None:
+            return f"{where}: {self.reason}{above}"
+        rate = f"{self.growth_rate_per_s:+.4g} ± {self.error_per_s:.2g} 1/s at {self.frequency_hz:.4g} Hz"
+        return f"{where}: {rate}{above}, {1e3 * self.amplitude_m:.2g} mm at last: {self.trend}"
 
 
 def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
@@ -325,19 +330,6 @@ def growths(trace: Trace) -> list[Growth]:
     if not np.abs(np.diff(trace.t) - T).max(initial=0.0) <= _EVEN * T:
         raise InputError(f"the trace's samples are not evenly spaced: t steps by {T:g} s at first, not everywhere")
     return [growth(trace.x[first:stop], T, steps, first) for first, stop in ends.tolist()]
-
-
-def format_growth(part: dict[str, Any], T: float) -> str:
-    """The growth of one part of a trace in words, from its plain data."""
-    where = f"ticks {part['first']} to {part['stop']} ({(part['stop'] - part['first']) * T:.2f} s)"
-    above = "" if part["slowest_hz"] is None else f" (from {part['slowest_hz']:.3g} Hz up)"
-    if part["reason"]:
-        return f"{where}: {part['reason']}{above}"
-    rate = f"{part['growth_rate_per_s']:+.4g} ± {part['error_per_s']:.2g} 1/s at {part['frequency_hz']:.4g} Hz"
-    return f"{where}: {rate}{above}, {1e3 * part['amplitude_m']:.2g} mm at last: {part['trend']}"
-
-
-Result = Trace  # its name in earlier versions
 
 
 if __name__ == "__main__":

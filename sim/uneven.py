@@ -33,7 +33,7 @@ _GROWN = 100.0  # times the energy at the start
 
 @dataclass(frozen=True)
 class _UnevenTicks:
-    """What became of one loop under one kind of uneven ticks."""
+    """The result of one loop under one kind of uneven ticks."""
 
     loop: str
     ticks: str

@@ -21,12 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller import environment
-from controller.contact import Limiter, contact, limited
 from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.delay import delay
+from controller.limiter import Limiter, limited
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
-from controller.process import Process
+from controller.tick import Process
+from controller.walls import contact
 from design import conditions
 from design.audit import check_loop, edge
 from design.certificate import CONDITIONS, any_environment_of

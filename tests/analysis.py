@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,8 +18,6 @@ from design.lmi import (
     e_hat_regular,
     lemma1,
     lemma4,
-    solve,
-    solved,
     theta_hat,
     unit_coupling,
     unit_environment,
@@ -82,9 +81,18 @@ def _solve(shortage: Lti, excess: Ports) -> Analysis:
         Delta_V + s * np.eye(m) >> 0,
         *(P >> 0 for P in (P_E, P_V) if isinstance(P, cp.Variable)),
     ]
-    solve(cp.Problem(cp.Minimize(s), constraints), "the analysis by Theorem 4")
-    E_storage, V_storage = (solved(P) if isinstance(P, cp.Variable) else P for P in (P_E, P_V))
-    return Analysis(-float(solved(s)), solved(Phi), solved(Delta_V), E_storage, V_storage)
+    solve(cp.Problem(cp.Minimize(s), constraints))
+    E_storage, V_storage = (P.value if isinstance(P, cp.Variable) else P for P in (P_E, P_V))
+    return Analysis(-float(s.value), Phi.value, Delta_V.value, E_storage, V_storage)
+
+
+def solve(problem: cp.Problem, solver: str = "CLARABEL") -> float:
+    """The optimal value, with the optimum left in the problem's variables; how exact it is, the caller judges."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        problem.solve(solver=solver)
+    assert problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE), problem.status
+    return float(problem.value)
 
 
 def _storage(A: Array) -> cp.Variable | Array:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
 from sim.engines import Engine
 from sim.run import Outside, run_blocks
 

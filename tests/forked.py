@@ -128,7 +128,7 @@ def _serve() -> None:
     mpl.use("Agg")
     from cli.main import COMMANDS
 
-    for name in ["matplotlib.pyplot", "cvxpy", *(f"cli.{command}" for command in COMMANDS)]:
+    for name in ["matplotlib.pyplot", "clarabel", *(f"cli.{command}" for command in COMMANDS)]:
         import_module(name)
     if sys.argv[1]:
         share_designs(Path(sys.argv[1]))

@@ -144,7 +144,7 @@ class PreparedLoop:
     menu: Menu
     label: str  # as the user calls the coupling
     chosen: Chosen
-    assembly: Simulation
+    simulation: Simulation
     mode: Mode  # of the exact linear loop; before walls, of the worst contact state
     requirements: dict[str, Requirement]
     guarantee: str | None
@@ -152,7 +152,7 @@ class PreparedLoop:
 
     @property
     def scenario(self) -> Scenario:
-        return self.assembly.scenario
+        return self.simulation.scenario
 
     @property
     def coupling(self) -> Coupling:
@@ -189,5 +189,5 @@ def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> Prep
     loop = scenario.loop(menu.case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
     limits = limits_of(scenario, chosen, requirements, menu.limiter)
-    assembly, guarantee = assemble(scenario, chosen.coupling, limits.rho), guarantee_of(requirements, loop)
-    return PreparedLoop(menu, label, chosen, assembly, worst_mode(assembly), requirements, guarantee, limits)
+    simulation, guarantee = assemble(scenario, chosen.coupling, limits.rho), guarantee_of(requirements, loop)
+    return PreparedLoop(menu, label, chosen, simulation, worst_mode(simulation), requirements, guarantee, limits)

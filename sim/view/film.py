@@ -40,7 +40,7 @@ _PROBE = "from mujoco.{} import GLContext; c = GLContext(8, 8); c.make_current()
 
 
 def painter(draw: str, scene: Scene, force_limit: Array) -> tuple[Flat | Offscreen, str, list[str]]:
-    """Who draws ("auto", "gl" or "flat"), under which name, and why not OpenGL where that is not there.
+    """The painter ("auto", "gl" or "flat"), its name, and the reason where OpenGL is not used.
 
     Raises InputError where it is not there and "gl" asks for it.
     """
@@ -52,7 +52,7 @@ def painter(draw: str, scene: Scene, force_limit: Array) -> tuple[Flat | Offscre
         if draw == "gl":
             raise InputError(f"--draw gl: {error}") from None
         return Flat(scene, force_limit), "flat", [f"{error}: the bodies are drawn flat"]
-    return Offscreen(drawn.Stage(scene, force_limit), name), name, []
+    return Offscreen(drawn.ShownScene(scene, force_limit), name), name, []
 
 
 class NoOffscreen(Exception):
@@ -77,7 +77,7 @@ def backend() -> str:
 class Offscreen:
     """Renders frames of a stage."""
 
-    def __init__(self, stage: drawn.Stage, name: str) -> None:
+    def __init__(self, stage: drawn.ShownScene, name: str) -> None:
         """`name` is what backend() gave."""
         self.stage = stage
         width, height = drawn.SIZE
@@ -165,7 +165,7 @@ class Flat:
         return np.asarray(image)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing to free."""
 
     def _bodies(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
         steps = max(self._places) + 2

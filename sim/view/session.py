@@ -16,13 +16,12 @@ from __future__ import annotations
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
-from typing import Any
 
 import numpy as np
 
 from controller.lti import Array, SingularLoop
-from controller.process import StepBuffer
-from design.result import DesignFailed, certificate_part, finite
+from controller.tick import StepBuffer
+from design.result import DesignFailed
 from models.scene import Plant, Scene, plant
 from sim.engines import ExactEngine, HeldPlant, hold
 from sim.run import outside_forces, run_block
@@ -92,7 +91,7 @@ def gripped(scene: Scene, channel: int, T: float) -> HeldPlant:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What there is to see and to say at one moment."""
+    """What is shown at one moment."""
 
     t: float  # [s] simulated
     q: Array  # (n,) positions of all joints [m], motors first
@@ -109,7 +108,7 @@ class Frame:
     factor: float  # simulated over real time
 
 
-class Session:
+class LiveLoop:
     """The closed loop, advanced to wherever the clock is."""
 
     def __init__(
@@ -137,7 +136,7 @@ class Session:
         self._history = np.zeros((max(1, round(HISTORY / prepared.scenario.T)), prepared.scenario.channels))
         self._grip: Grip | None = None
         self._note = ""
-        self._enter(prepared, np.zeros(prepared.assembly.plant.A.shape[0]))
+        self._enter(prepared, np.zeros(prepared.simulation.plant.A.shape[0]))
 
     @property
     def t(self) -> float:
@@ -147,7 +146,7 @@ class Session:
     @property
     def state(self) -> Array:
         """Positions, then velocities."""
-        return self._tape.s[0, :, 0].copy()
+        return self._buffer.s[0, :, 0].copy()
 
     def frame(self, now: float, grip: Grip | None = None) -> Frame:
         """Take what has been asked for, then advance to `now` [s] with the mouse's hand where it is."""
@@ -158,11 +157,11 @@ class Session:
         self._run(self.pace.due(now))
         push = self._pushed.copy()
         if grip:
-            push[grip.channel] += grip.force(self.prepared.assembly.scene, self.state)
+            push[grip.channel] += grip.force(self.prepared.simulation.scene, self.state)
         made = self._history[-min(self._tick - first, len(self._history)) :] if self._tick > first else None
         recent = self._history[-1:] if made is None else made
         shown = self._history[-max(1, min(self._tick, len(self._history))) :]
-        n, limit = self.prepared.assembly.scene.model.nq, self.prepared.assembly.process.force_limit
+        n, limit = self.prepared.simulation.scene.model.nq, self.prepared.simulation.process.force_limit
         return Frame(
             t=self.t,
             q=self.state[:n],
@@ -192,7 +191,7 @@ class Session:
                 self._happen(event)
 
     def _make(self, event: Couple | Delay) -> PreparedLoop | str:
-        """The loop after an event, or why there is none. The executor makes one after the other."""
+        """The loop after an event, or why there is none. The executor makes them in turn."""
         try:
             self._latest = changed(self._latest, event)
         except (InputError, DesignFailed, SingularLoop) as error:  # the old loop goes on
@@ -222,25 +221,25 @@ class Session:
             self._advance(min(_STRETCH, until - self._tick))
 
     def _advance(self, count: int) -> None:
-        tape, scene = self._tape, self.prepared.assembly.scene
+        buffer, scene = self._buffer, self.prepared.simulation.scene
         w = outside_forces(self.prepared.scenario, scene, self._tick, count)
         for column, force in zip(scene.tapped, self._pushed, strict=True):
             w[:, column] += force
         if self._grip:
             w[:, scene.tapped[self._grip.channel]] += self._grip.pull
-        tape.w[:count] = w[:, :, None]
+        buffer.w[:count] = w[:, :, None]
         with np.errstate(over="ignore", invalid="ignore"):  # a process that runs away is noticed below
-            run_block(tape, self._engine, count)
+            run_block(buffer, self._engine, count)
         self._tick += count
-        if not (np.isfinite(tape.s[: count + 1]).all() and np.isfinite(tape.z[: count + 1]).all()):
+        if not (np.isfinite(buffer.s[: count + 1]).all() and np.isfinite(buffer.z[: count + 1]).all()):
             self._happen(Restart())
             self._note = "the process itself ran away, beyond all numbers: restarted from rest"
             return
-        tape.saturate(count)
-        f = tape.f[:count, :, 0]
-        self.clipped += int((np.abs(f) >= tape.process.force_limit).any(axis=1).sum())
+        buffer.saturate(count)
+        f = buffer.f[:count, :, 0]
+        self.clipped += int((np.abs(f) >= buffer.process.force_limit).any(axis=1).sum())
         self._history = np.concatenate([self._history[count:], f])[-len(self._history) :]
-        tape.rewind(count)
+        buffer.rewind(count)
 
     def _happen(self, event: Event) -> None:
         if isinstance(event, Push):
@@ -255,13 +254,13 @@ class Session:
         self.log.append((self.t, words(event), prepared))
 
     def _enter(self, prepared: PreparedLoop, s: Array) -> None:
-        """Go on with another process from the plant state s."""
-        process = prepared.assembly.process
-        outside = prepared.assembly.plant.B.shape[1] - process.channels
-        tape = StepBuffer(process, _STRETCH, s.size, outside)
-        tape.s[0, :, 0] = s
-        tape.z[0, :, 0] = process.at_rest(s[: process.channels])
-        self.prepared, self._tape = prepared, tape
+        """Continue with another process from the plant state s."""
+        process = prepared.simulation.process
+        outside = prepared.simulation.plant.B.shape[1] - process.channels
+        buffer = StepBuffer(process, _STRETCH, s.size, outside)
+        buffer.s[0, :, 0] = s
+        buffer.z[0, :, 0] = process.at_rest(s[: process.channels])
+        self.prepared, self._buffer = prepared, buffer
         self._start_engine()
 
     def _hold(self, grip: Grip | None) -> None:
@@ -271,11 +270,11 @@ class Session:
             self._start_engine()
 
     def _start_engine(self) -> None:
-        """The plant, with the mouse's hand where there is one, on the present tape."""
-        assembly, held = self.prepared.assembly, self._grip
-        plant = gripped(assembly.scene, held.channel, assembly.scenario.T) if held else assembly.plant
-        self._engine = ExactEngine(plant, assembly.process.force_limit)
-        self._engine.start(self._tape)
+        """The engine of the plant, with the mouse's hand where there is one, on the present buffer."""
+        simulation, held = self.prepared.simulation, self._grip
+        plant = gripped(simulation.scene, held.channel, simulation.scenario.T) if held else simulation.plant
+        self._engine = ExactEngine(plant, simulation.process.force_limit)
+        self._engine.start(self._buffer)
 
 
 def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, Event, PreparedLoop | None]]:
@@ -287,26 +286,3 @@ def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, Event,
             into = prepared = changed(prepared, event)
         made.append((round(time / prepared.scenario.T), event, into))
     return made
-
-
-def session_report(session: Session) -> dict[str, Any]:
-    """How long it ran, what was changed when, and what could be said of each loop."""
-    return {
-        "scenario": session.prepared.scenario.name,
-        "simulated_s": session.t,
-        "clipped_ticks": session.clipped,
-        "events": [{"t_s": t, "event": what, **_facts(prepared)} for t, what, prepared in session.log],
-    }
-
-
-def _facts(prepared: PreparedLoop) -> dict[str, Any]:
-    return {
-        "coupling": prepared.label,
-        "theta": list(prepared.scenario.theta),
-        "psi": list(prepared.scenario.psi),
-        "exact_growth_rate_per_s": finite(float(prepared.mode.growth)),
-        "exact_frequency_hz": float(prepared.mode.frequency_hz),
-        "certificates": {name: certificate_part(need) for name, need in prepared.requirements.items()},
-        "promise": prepared.guarantee,
-        "limiter": prepared.limits.part([device.force_limit for device in prepared.scenario.device]),
-    }

@@ -1,4 +1,4 @@
-"""What a picture shows, whoever draws it: where things stand and in which colours, what is said, arrows and plots.
+"""What a picture shows, in the window and in a film: places, colours, text, arrows and plots.
 
 The scene as it is shown is a dressed copy. What is simulated stays as small as models.scene builds it; the shapes have
 no mass and touch nothing, so both models have the same matrices.
@@ -133,7 +133,7 @@ def keys_help(given: bool) -> _Lines:
 
 
 def apart(lines: _Lines) -> tuple[_Lines, _Lines]:
-    """The lines, and what was last refused, where that takes several lines."""
+    """The lines, and the last refusal, which may take several lines."""
     at = next((i for i, (label, _) in enumerate(lines) if label == "last"), len(lines))
     return (lines[:at], lines[at:]) if len(lines) - at > 1 else (lines, [])
 
@@ -147,7 +147,7 @@ def _list(values: tuple[int, ...]) -> str:
     return ", ".join(map(str, values))
 
 
-class Stage:
+class ShownScene:
     """A scene that can be looked at, and pushed with the mouse."""
 
     def __init__(self, scene: Scene, force_limit: Array, size: tuple[int, int] = SIZE) -> None:

@@ -12,8 +12,8 @@ import mujoco
 from mujoco import viewer
 
 from sim.view.events import KEYS
-from sim.view.session import Frame, Grip, Session
-from sim.view.stage import Stage, apart, columns, keys_help, overlay
+from sim.view.session import Frame, Grip, LiveLoop
+from sim.view.stage import ShownScene, apart, columns, keys_help, overlay
 
 _RATE = 60.0  # frames per second
 _PATIENCE = 30  # [s] for the display to answer
@@ -38,7 +38,7 @@ def _display() -> bool:
     return done.returncode == 0
 
 
-def show(session: Session, stage: Stage, until: float | None = None) -> None:
+def show(session: LiveLoop, stage: ShownScene, until: float | None = None) -> None:
     """Run the session in a window until that is closed, or until it is `until` [s] old.
 
     Raises NoWindow where there is no display, or on macOS without MuJoCo's own launcher.
@@ -63,8 +63,8 @@ def show(session: Session, stage: Stage, until: float | None = None) -> None:
 
 
 def loop(
-    session: Session,
-    stage: Stage,
+    session: LiveLoop,
+    stage: ShownScene,
     window: viewer.Handle,
     clock: Callable[[], float],
     sleep: Callable[[float], None],
@@ -81,8 +81,8 @@ def loop(
         sleep(max(0.0, 1 / _RATE - (clock() - begun)))
 
 
-def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Grip | None:
-    """Show a frame, and return what the mouse holds by then."""
+def _shown(stage: ShownScene, window: viewer.Handle, frame: Frame) -> Grip | None:
+    """Show a frame, and return what the mouse holds afterwards."""
     with window.lock():
         stage.show(frame.q)
         grip = stage.grip(window.perturb)
@@ -99,8 +99,8 @@ def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Grip | None:
     return grip
 
 
-def typed(session: Session) -> Callable[[int], None]:
-    """What the viewer calls, in its own thread, when a key is pressed."""
+def typed(session: LiveLoop) -> Callable[[int], None]:
+    """The viewer's callback for a key, in the viewer's own thread."""
 
     def key(code: int) -> None:
         if code in KEYS:

@@ -131,13 +131,13 @@ def fast(f: Array, T: float) -> float:
 
 def moved(scenario: Scenario, F: Lti, nets: tuple[Net, Net], seconds: float) -> Iterator[tuple[float, ...]]:
     """Error, high-frequency force, peak and acted, for either encoder."""
-    assembly = assemble(scenario, NoCoupling())
-    w = outside_forces(scenario, assembly.scene, 0, round(seconds / scenario.T))
-    start = np.zeros((assembly.plant.A.shape[0], 1))
+    simulation = assemble(scenario, NoCoupling())
+    w = outside_forces(scenario, simulation.scene, 0, round(seconds / scenario.T))
+    start = np.zeros((simulation.plant.A.shape[0], 1))
     for step in (0.0, STEP):
         made = (nets[0](1, step), nets[1](1, step))
         limit = scenario.device[0].force_limit
-        x, f, _ = close(assembly.plant, linear(F, 1), scenario.theta, made, w, start, limit, step)
+        x, f, _ = close(simulation.plant, linear(F, 1), scenario.theta, made, w, start, limit, step)
         felt = linear(delay(scenario.loop("I").lam, scenario.T) @ environment(scenario.environment, scenario.T), 1)
         ideal = np.array([felt(row) for row in x])
         acted = [net.__self__.limited[0] / len(w) for net in made if hasattr(net, "__self__")]

@@ -19,8 +19,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from controller.coupling import CASE_I
 from controller.lti import Array
-from design.result import CASE_I
 from models.scene import actuation, tendon_jacobian
 from sim.engines import EXPONENTIAL
 from sim.run import Simulation, assemble, make_engine, outside_forces, run
@@ -35,17 +35,17 @@ Peer = Callable[[Simulation, Array], States]  # from rest, under outside forces 
 def ours(engine: str, integrator: str | None = None, substeps: int | None = None) -> Peer:
     """One of this package's engines."""
 
-    def peer(assembly: Simulation, w: Array) -> States:
-        stepped = make_engine(assembly, engine, integrator, substeps)
-        trace = run(assembly, stepped, lambda first, n: w[first : first + n], len(w))
+    def peer(simulation: Simulation, w: Array) -> States:
+        stepped = make_engine(simulation, engine, integrator, substeps)
+        trace = run(simulation, stepped, lambda first, n: w[first : first + n], len(w))
         return trace.z, trace.s, trace.f
 
     return peer
 
 
-def numpy_loop(assembly: Simulation, w: Array) -> States:
+def numpy_loop(simulation: Simulation, w: Array) -> States:
     """The loop as one would write it down in an hour, with the sampled plant."""
-    F, plant, limit = assembly.F, assembly.plant, assembly.process.force_limit
+    F, plant, limit = simulation.F, simulation.plant, simulation.process.force_limit
     z, s = np.zeros(F.order), np.zeros(plant.A.shape[0])
     zs, ss, fs = [], [], []
     for pushed in w:
@@ -60,11 +60,11 @@ def numpy_loop(assembly: Simulation, w: Array) -> States:
     return np.array(zs), np.array(ss), np.array(fs)
 
 
-def scipy_dlsim(assembly: Simulation, w: Array) -> States:
+def scipy_dlsim(simulation: Simulation, w: Array) -> States:
     """scipy.signal.dlsim of the closed loop: no force limits."""
     from scipy.signal import dlsim, dlti
 
-    F, plant = assembly.F, assembly.plant
+    F, plant = simulation.F, simulation.plant
     loop = close(plant, F)
     n, states = loop.A.shape[0], plant.A.shape[0]
     _, _, xi = dlsim(dlti(loop.A, loop.B, np.eye(n), np.zeros((n, w.shape[1])), dt=loop.T), w)
@@ -72,11 +72,11 @@ def scipy_dlsim(assembly: Simulation, w: Array) -> States:
     return z, s, z @ F.C.T + s @ (F.D @ plant.C).T
 
 
-def python_control(assembly: Simulation, w: Array) -> States:
+def python_control(simulation: Simulation, w: Array) -> States:
     """control.input_output_response of a nonlinear discrete system."""
     import control
 
-    F, plant, limit = assembly.F, assembly.plant, assembly.process.force_limit
+    F, plant, limit = simulation.F, simulation.plant, simulation.process.force_limit
     states = plant.A.shape[0]
 
     def force(xi):
@@ -95,11 +95,11 @@ def python_control(assembly: Simulation, w: Array) -> States:
 def drake(step: str, substeps: int) -> Peer:
     """pydrake's MultibodyPlant, continuous with fixed Runge-Kutta steps ("RK3") or "discrete"."""
 
-    def peer(assembly: Simulation, w: Array) -> States:
+    def peer(simulation: Simulation, w: Array) -> States:
         from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
-        T, model, F = assembly.scenario.T, assembly.scene.model, assembly.F
-        plant = _drake_plant(assembly, T / substeps if step == "discrete" else 0.0)
+        T, model, F = simulation.scenario.T, simulation.scene.model, simulation.F
+        plant = _drake_plant(simulation, T / substeps if step == "discrete" else 0.0)
         simulator = Simulator(plant)
         context = simulator.get_mutable_context()
         if step == "RK3":
@@ -107,7 +107,7 @@ def drake(step: str, substeps: int) -> Peer:
             integrator.set_fixed_step_mode(True)
         held = plant.get_applied_generalized_force_input_port().FixValue(context, np.zeros(model.nv))
         simulator.Initialize()
-        forces, limit, m = actuation(model), assembly.process.force_limit, F.outputs
+        forces, limit, m = actuation(model), simulation.process.force_limit, F.outputs
         z, s = np.zeros(F.order), np.zeros(2 * model.nv)
         zs, ss, fs = [], [], []
         for k, pushed in enumerate(w):
@@ -125,12 +125,12 @@ def drake(step: str, substeps: int) -> Peer:
     return peer
 
 
-def _drake_plant(assembly: Simulation, time_step: float):
+def _drake_plant(simulation: Simulation, time_step: float):
     """The compiled scene as bodies on prismatic joints along x; what acts between two of them is a bushing."""
     from pydrake.multibody.plant import MultibodyPlant
     from pydrake.multibody.tree import LinearBushingRollPitchYaw, PrismaticJoint, PrismaticSpring, SpatialInertia
 
-    model = assembly.scene.model
+    model = simulation.scene.model
     plant, bodies = MultibodyPlant(time_step), []
     plant.mutable_gravity_field().set_gravity_vector([0, 0, 0])
     world, stiffness = plant.world_frame(), np.ravel(model.jnt_stiffness)
@@ -167,9 +167,9 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=15.0, metavar="SECONDS")
     parser.add_argument("--rounds", type=int, default=3, metavar="N")
     args = parser.parse_args()
-    assembly = assemble(load().replace(duration=args.duration), CASE_I)
-    scenario, m = assembly.scenario, assembly.scene.channels
-    w = outside_forces(scenario, assembly.scene, 0, scenario.samples)
+    simulation = assemble(load().replace(duration=args.duration), CASE_I)
+    scenario, m = simulation.scenario, simulation.scene.channels
+    w = outside_forces(scenario, simulation.scene, 0, scenario.samples)
     used, traces, missing = {name: [] for name in PEERS}, {}, {}
     for _ in range(args.rounds):
         for name, peer in PEERS.items():
@@ -177,12 +177,12 @@ def main() -> None:
                 continue
             begin = time.process_time()
             try:
-                traces[name] = peer(assembly, w)
+                traces[name] = peer(simulation, w)
             except ImportError as error:
                 missing[name] = error
             used[name].append(time.process_time() - begin)
 
-    loop = close(assembly.plant, assembly.F)
+    loop = close(simulation.plant, simulation.F)
     mode, exact = dominant_mode(loop), traces["exact"][1]
     ratio = np.median(used["exponential x 1"])
     print(f"{scenario.name}, case I, {args.duration:g} s; exact growth {mode.growth:+.6f} 1/s")
@@ -192,7 +192,7 @@ def main() -> None:
         t, x, unknown = loop.T * np.arange(len(s)), s[:, :m], np.full_like(f, np.nan)
         trace = Trace(t, x, f, unknown, unknown, w, z=z, s=s)
         error = np.sqrt(np.mean((s[:, :m] - exact[:, :m]) ** 2) / np.mean(exact[:, :m] ** 2))
-        growth, _ = measured_growth(loop, trace, assembly.process.force_limit)
+        growth, _ = measured_growth(loop, trace, simulation.process.force_limit)
         right = (growth > MARGINAL) == (mode.growth > MARGINAL)
         cost = np.median(used[name])
         print(

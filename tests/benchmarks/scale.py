@@ -11,9 +11,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from controller.coupling import SpringDamper
+from controller.coupling import CASE_I, SpringDamper
 from design import certify, design_coupling
-from design.result import CASE_I
 from sim.crowds import MIXED, Validation
 from sim.run import assemble, run
 from sim.scenario import Scenario, load, parse

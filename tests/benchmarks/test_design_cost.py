@@ -5,12 +5,12 @@ make bench
 
 import pytest
 
+from controller.coupling import CASE_I
 from design import fixed_order as ccl
 from design import optimal, spring_damper
 from design.audit import report
 from design.certificate import assess, prove, verify
 from design.program import LADDER, Options
-from design.result import CASE_I
 from design.stored import Stored
 from design.transparency import decibels
 from sim.scenario import load

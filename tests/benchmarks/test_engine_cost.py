@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from controller.process import StepBuffer
-from design.result import CASE_I
+from controller.coupling import CASE_I
+from controller.tick import StepBuffer
 from models.device import CompliantDevice
 from models.scene import plant, variants
 from sim.crowds import crowds
@@ -47,21 +47,21 @@ def cpu_seconds(call) -> float:
     return time.process_time() - begin
 
 
-def looped(assembly, engine, integrator=None, substeps=None):
+def looped(simulation, engine, integrator=None, substeps=None):
     """A run of the scenario, as sim.run makes it."""
-    return run(assembly, make_engine(assembly, engine, integrator, substeps))
+    return run(simulation, make_engine(simulation, engine, integrator, substeps))
 
 
-def raw(assembly, integrator, substeps, record) -> float:
+def raw(simulation, integrator, substeps, record) -> float:
     """CPU seconds of MuJoCo's calls of that run alone."""
-    model = discretised(assembly.scene, assembly.scenario.T, integrator, substeps)
+    model = discretised(simulation.scene, simulation.scenario.T, integrator, substeps)
     data, nq = mujoco.MjData(model), model.nq
     q, v, ctrl = data.qpos, data.qvel, data.ctrl
     inputs = list(np.concatenate([record.w, record.f], axis=1))
     with profiler_off():
         if integrator == EXPONENTIAL:
-            forward, move = mujoco.mj_forward, make_engine(assembly, "mujoco", EXPONENTIAL, substeps)._access.move
-            product, qacc = move(assembly.scenario.T / substeps), data.qacc
+            forward, move = mujoco.mj_forward, make_engine(simulation, "mujoco", EXPONENTIAL, substeps)._access.move
+            product, qacc = move(simulation.scenario.T / substeps), data.qacc
             sight, after = np.zeros(3 * nq), np.zeros(2 * nq)
             seen, rates, (at, by) = sight[: 2 * nq], sight[2 * nq :], np.split(after, 2)
             begin = time.process_time()
@@ -84,31 +84,31 @@ def raw(assembly, integrator, substeps, record) -> float:
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_speed_and_error_side_by_side(benchmark, scene):
-    assembly = assemble(SCENES[scene], CASE_I)
-    substeps = default_substeps(assembly, "RK4")
+    simulation = assemble(SCENES[scene], CASE_I)
+    substeps = default_substeps(simulation, "RK4")
     settings = {
         "exact": ("exact", None, None),
         "exponential x 1": ("mujoco", EXPONENTIAL, 1),
         f"RK4 x {substeps}": ("mujoco", "RK4", substeps),
     }
-    records = {name: looped(assembly, *setting) for name, setting in settings.items()}
+    records = {name: looped(simulation, *setting) for name, setting in settings.items()}
     used, bare = {name: [] for name in settings}, {name: [] for name in settings}
 
     def once():
         for name, setting in settings.items():
-            used[name].append(cpu_seconds(lambda setting=setting: looped(assembly, *setting)))
+            used[name].append(cpu_seconds(lambda setting=setting: looped(simulation, *setting)))
             if setting[0] == "mujoco":
-                bare[name].append(raw(assembly, *setting[1:], records[name]))
+                bare[name].append(raw(simulation, *setting[1:], records[name]))
 
     benchmark.pedantic(once, rounds=ROUNDS, iterations=1, warmup_rounds=1)
     exact, slow = records["exact"].s[:, :2], np.array(used[f"RK4 x {substeps}"])
     errors = {}
     for name, (_, integrator, count) in settings.items():
         position = np.sqrt(np.mean((records[name].s[:, :2] - exact) ** 2) / np.mean(exact**2))
-        errors[name] = simulated_growth(assembly, integrator, count) - exact_growth(assembly) if integrator else 0.0
+        errors[name] = simulated_growth(simulation, integrator, count) - exact_growth(simulation) if integrator else 0.0
         ratio = f"{np.median(np.array(used[name]) / bare[name]):.2f}" if bare[name] else "-"
         print(
-            f"\n{scene}: {name}: {1e3 * np.median(used[name]):.1f} ms for {assembly.scenario.duration:g} s, "
+            f"\n{scene}: {name}: {1e3 * np.median(used[name]):.1f} ms for {simulation.scenario.duration:g} s, "
             f"{np.median(slow / used[name]):.1f} x as fast as RK4 x {substeps}, loop / raw calls {ratio} "
             f"(median of {ROUNDS}), position error {position:.1e}, growth error {errors[name]:+.1e} 1/s",
             end="",
@@ -120,8 +120,8 @@ def test_speed_and_error_side_by_side(benchmark, scene):
 
 def test_what_a_force_evaluation_is_made_of(benchmark):
     """Skipping the position stage saves a part of one call, and leaves spring forces of an old position behind."""
-    assembly = assemble(load(), CASE_I)
-    model, calls = assembly.scene.model, 20_000
+    simulation = assemble(load(), CASE_I)
+    model, calls = simulation.scene.model, 20_000
     data, position = mujoco.MjData(model), mujoco.mjtStage.mjSTAGE_POS
     parts = {
         "mj_forward": lambda: mujoco.mj_forward(model, data),
@@ -150,10 +150,10 @@ def test_what_a_force_evaluation_is_made_of(benchmark):
 def test_many_hands(benchmark):
     """CPU time per simulation and tick, one thread, 125 hands as in a batch of sim.validate."""
     scenario, nsim, ticks = load(), 125, 320
-    assembly = assemble(scenario, CASE_I)
+    simulation = assemble(scenario, CASE_I)
     ((_, crowd),) = crowds(scenario.population, scenario.channels, 0, range(nsim), 1)
     held_by = variants(scenario.device, crowd)
-    plants, limit = hold(held_by.plants(), scenario.T), assembly.process.force_limit
+    plants, limit = hold(held_by.plants(), scenario.T), simulation.process.force_limit
     batches = {
         "exact": ExactBatchEngine(plants, limit),
         "exponential x 1": MujocoBatchEngine(held_by.scene, scenario.T, EXPONENTIAL, 1, nsim, 1, held_by.fields),
@@ -164,12 +164,12 @@ def test_many_hands(benchmark):
 
     def once():
         for name, engine in batches.items():
-            tape = StepBuffer(assembly.process, ticks, len(start), held_by.scene.outside, nsim)
-            tape.s[0] = start
-            engine.start(tape)
+            buffer = StepBuffer(simulation.process, ticks, len(start), held_by.scene.outside, nsim)
+            buffer.s[0] = start
+            engine.start(buffer)
             with profiler_off():
-                used[name].append(cpu_seconds(lambda engine=engine, tape=tape: run_block(tape, engine, ticks)))
-            after[name] = tape.s.copy()
+                used[name].append(cpu_seconds(lambda engine=engine, buffer=buffer: run_block(buffer, engine, ticks)))
+            after[name] = buffer.s.copy()
 
     benchmark.pedantic(once, rounds=ROUNDS, iterations=1, warmup_rounds=1)
     scale = np.abs(after["exact"]).max(axis=0).max(axis=1, keepdims=True)
@@ -186,11 +186,11 @@ def test_many_hands(benchmark):
 
 def test_how_long_a_period_may_be(benchmark):
     """The map over 0.1 s of a plant whose fastest mode turns 497 rad in it: one step, against scipy's exponential."""
-    assembly = assemble(SCENES["transmission of 1.45e6 N/m"], CASE_I)
-    T, turns = 0.1, pace(plant(assembly.scene.model).A).mode * 0.1
+    simulation = assemble(SCENES["transmission of 1.45e6 N/m"], CASE_I)
+    T, turns = 0.1, pace(plant(simulation.scene.model).A).mode * 0.1
     step = benchmark.pedantic(
-        lambda: measured_hold(assembly, "mujoco", EXPONENTIAL, 1, T), rounds=3, iterations=1, warmup_rounds=1
+        lambda: measured_hold(simulation, "mujoco", EXPONENTIAL, 1, T), rounds=3, iterations=1, warmup_rounds=1
     )
-    error = np.abs(step.A - hold(plant(assembly.scene.model), T).A).max() / np.abs(step.A).max()
+    error = np.abs(step.A - hold(plant(simulation.scene.model), T).A).max() / np.abs(step.A).max()
     print(f"\none step of {T} s, {turns:.0f} rad of the fastest mode: map within {error:.1e}")
     assert error < 1e-9

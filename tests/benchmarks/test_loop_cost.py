@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from controller.contact import BoxProblem
-from controller.coupling import SpringDamper
-from design.result import CASE_I
+from controller.complementarity import BoxProblem
+from controller.coupling import CASE_I, SpringDamper
 from sim.run import assemble, run
 from sim.scenario import load
 
@@ -26,11 +25,11 @@ def seconds(call) -> float:
 
 
 def test_exact_engine(benchmark):
-    assembly = assemble(load(), CASE_I)
-    benchmark.pedantic(lambda: run(assembly, "exact"), rounds=9, iterations=1, warmup_rounds=1)
+    simulation = assemble(load(), CASE_I)
+    benchmark.pedantic(lambda: run(simulation, "exact"), rounds=9, iterations=1, warmup_rounds=1)
     median = benchmark.stats.stats.median if benchmark.stats else float("nan")
-    print(f"\nexact: {assembly.scenario.duration / median:.0f} x real time, the reference for errors")
-    assert assembly.scenario.samples == 12500
+    print(f"\nexact: {simulation.scenario.duration / median:.0f} x real time, the reference for errors")
+    assert simulation.scenario.samples == 12500
 
 
 @pytest.mark.parametrize("engine", ["exact", "mujoco"])

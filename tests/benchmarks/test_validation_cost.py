@@ -8,10 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from controller.coupling import NoCoupling
-from controller.process import StepBuffer
+from controller.coupling import CASE_I, NoCoupling
+from controller.tick import StepBuffer
 from design.conditions import this_environment
-from design.result import CASE_I
 from models.scene import variants
 from sim.adversary import attempts
 from sim.crowds import crowds
@@ -34,14 +33,14 @@ def held_by():
 @pytest.mark.parametrize("coupling", [NoCoupling(), CASE_I], ids=["no coupling", "published"])
 def test_verdicts(benchmark, held_by, coupling, request):
     name = request.node.callspec.id
-    assembly = assemble(load(), coupling)
+    simulation = assemble(load(), coupling)
 
     def once():
-        return dominant_mode(exact_loops(held_by, assembly.F)).growth
+        return dominant_mode(exact_loops(held_by, simulation.F)).growth
 
     exact = benchmark.pedantic(once, rounds=7, iterations=1, warmup_rounds=1)
     begin = time.perf_counter()
-    mujoco = dominant_mode(mujoco_loops(held_by, assembly.process)).growth
+    mujoco = dominant_mode(mujoco_loops(held_by, simulation.process)).growth
     wall = time.perf_counter() - begin
     median = benchmark.stats.stats.median if benchmark.stats else float("nan")
     wrong = int(disagree(exact, mujoco).sum())
@@ -54,29 +53,29 @@ def test_verdicts(benchmark, held_by, coupling, request):
 
 def test_batched_exact_engine(benchmark, held_by):
     """CPU seconds for the whole loop: process, limits and plant of every simulation."""
-    assembly, ticks, short = assemble(load(), CASE_I), 960, 32
-    plants = hold(held_by.plants(), assembly.scenario.T)
-    engine = ExactBatchEngine(plants, assembly.process.force_limit)
-    tape = StepBuffer(assembly.process, short, plants.A.shape[1], held_by.scene.outside, HUMANS)
+    simulation, ticks, short = assemble(load(), CASE_I), 960, 32
+    plants = hold(held_by.plants(), simulation.scenario.T)
+    engine = ExactBatchEngine(plants, simulation.process.force_limit)
+    buffer = StepBuffer(simulation.process, short, plants.A.shape[1], held_by.scene.outside, HUMANS)
     rng = np.random.default_rng(0)
-    tape.s[0] = 1e-4 * rng.normal(size=tape.s[0].shape)
-    engine.start(tape)
-    start, used = np.concatenate([tape.s[0], tape.z[0]]), []
+    buffer.s[0] = 1e-4 * rng.normal(size=buffer.s[0].shape)
+    engine.start(buffer)
+    start, used = np.concatenate([buffer.s[0], buffer.z[0]]), []
 
     def once():
-        tape.s[0], tape.z[0] = np.split(start, [tape.s.shape[1]])
+        buffer.s[0], buffer.z[0] = np.split(start, [buffer.s.shape[1]])
         begin = time.process_time()
         for _ in range(ticks // short):
-            run_block(tape, engine, short)
-            tape.rewind(short)
+            run_block(buffer, engine, short)
+            buffer.rewind(short)
         used.append(time.process_time() - begin)
 
     benchmark.pedantic(once, rounds=5, iterations=1, warmup_rounds=1)
-    loops = exact_loops(held_by, assembly.F)
+    loops = exact_loops(held_by, simulation.F)
     powers = np.linalg.matrix_power(loops.A, ticks)
-    expected = np.einsum("nij,jn->in", powers, start)[: tape.s.shape[1]]
-    error = np.abs(tape.s[0] - expected).max() / np.abs(expected).max()
-    rate = ticks * assembly.scenario.T * HUMANS / np.median(used)
+    expected = np.einsum("nij,jn->in", powers, start)[: buffer.s.shape[1]]
+    error = np.abs(buffer.s[0] - expected).max() / np.abs(expected).max()
+    rate = ticks * simulation.scenario.T * HUMANS / np.median(used)
     print(f"\nbatched exact engine: {rate:.0f} simulated seconds per CPU second, error {error:.1e} after {ticks} ticks")
     assert error < 1e-9
 
@@ -84,12 +83,12 @@ def test_batched_exact_engine(benchmark, held_by):
 @pytest.mark.parametrize("substeps", [2, 4])
 def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
     """The loop around the batch against the batch's own steps, alternating, on all cores."""
-    assembly, ticks, short, nsim = assemble(load(), CASE_I), 160, 32, 200
-    T, fields = assembly.scenario.T, {name: rows[:nsim] for name, rows in held_by.fields.items()}
+    simulation, ticks, short, nsim = assemble(load(), CASE_I), 160, 32, 200
+    T, fields = simulation.scenario.T, {name: rows[:nsim] for name, rows in held_by.fields.items()}
     engine, bare = (MujocoBatchEngine(held_by.scene, T, "RK4", substeps, nsim, fields=fields) for _ in range(2))
-    tape = StepBuffer(assembly.process, short, 2 * held_by.scene.model.nv, held_by.scene.outside, nsim)
-    tape.s[0] = 1e-4
-    engine.start(tape)
+    buffer = StepBuffer(simulation.process, short, 2 * held_by.scene.model.nv, held_by.scene.outside, nsim)
+    buffer.s[0] = 1e-4
+    engine.start(buffer)
     ratios = []
 
     def once():
@@ -99,14 +98,14 @@ def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
         raw = time.perf_counter() - begin
         begin = time.perf_counter()
         for _ in range(ticks // short):
-            run_block(tape, engine, short)
-            tape.rewind(short)
+            run_block(buffer, engine, short)
+            buffer.rewind(short)
         ratios.append((time.perf_counter() - begin) / raw)
 
     with profiler_off():
         benchmark.pedantic(once, rounds=9, iterations=1, warmup_rounds=1)
-    exact = dominant_mode(exact_loops(held_by, assembly.F)).growth
-    mujoco = dominant_mode(mujoco_loops(held_by, assembly.process, substeps=substeps)).growth
+    exact = dominant_mode(exact_loops(held_by, simulation.F)).growth
+    mujoco = dominant_mode(mujoco_loops(held_by, simulation.process, substeps=substeps)).growth
     error, wrong = np.abs(mujoco - exact).max(), int(disagree(exact, mujoco).sum())
     print(
         f"\nMuJoCo batch RK4 x {substeps}: loop / raw steps {np.median(ratios):.2f} (median of {len(ratios)}), growth "

@@ -3,15 +3,7 @@
 import numpy as np
 import pytest
 
-from controller.environment import (
-    FIGURE_4,
-    GROUND,
-    Network,
-    Spring,
-    environment,
-    environment_of,
-    sampled_environment,
-)
+from controller.environment import FIGURE_4, GROUND, Network, Spring, environment, environment_of, sampled_environment
 
 T = 1.2e-3
 W = np.geomspace(1e-3, np.pi, 80)

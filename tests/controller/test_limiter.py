@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from worlds import STIFF, T
 
-from controller.contact import BoxProblem, Limiter, contact, limited
+from controller.complementarity import BoxProblem
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall, environment
+from controller.limiter import Limiter, limited
 from controller.loop import force_map
 from controller.lti import Lti, SingularLoop
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
+from controller.walls import contact
 
 LIMITS = (12.0, 5.657)
 

@@ -7,7 +7,7 @@ from controller.coupling import SpringDamper
 from controller.delay import LOST, HeldLine, VaryingDelay, ages, newest, packet_delays, realising
 from controller.environment import FIGURE_4, environment
 from controller.loop import force_map
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
 
 T = 1.2e-3
 COUPLING = SpringDamper([7806, 3137], [0.105, 1.68])
@@ -58,13 +58,13 @@ def test_a_constant_delay_is_the_linear_block():
     constant = np.tile(np.array([1, 2])[None, :, None], (200, 1, 1))
     forces = []
     for process in (Process(G, NO_LIMIT, IDEAL, delays=constant), Process(F, NO_LIMIT, IDEAL)):
-        tape = StepBuffer(process, 50, 2)
+        buffer = StepBuffer(process, 50, 2)
         for first in range(0, 200, 50):  # stretches: the line goes on where it was
             for k in range(50):
-                tape.x[k] = x[first + k]
-                tape.tick(k)
-            forces.append(tape.f[:50].copy())
-            tape.rewind(50)
+                buffer.x[k] = x[first + k]
+                buffer.tick(k)
+            forces.append(buffer.f[:50].copy())
+            buffer.rewind(50)
     np.testing.assert_allclose(np.concatenate(forces[:4]), np.concatenate(forces[4:]), rtol=1e-12, atol=1e-12)
 
 
@@ -142,7 +142,7 @@ def test_a_process_refuses_delays_that_do_not_fit():
     G = force_map(environment(FIGURE_4, T), COUPLING, (0, 0), (0, 0))
     with pytest.raises(ValueError, match="1 channels, expected 2"):
         Process(G, NO_LIMIT, IDEAL, delays=np.zeros((5, 1, 1)))
-    tape = StepBuffer(Process(G, NO_LIMIT, IDEAL, delays=np.zeros((1, 2, 1))), 2, 2)
-    tape.tick(0)
+    buffer = StepBuffer(Process(G, NO_LIMIT, IDEAL, delays=np.zeros((1, 2, 1))), 2, 2)
+    buffer.tick(0)
     with pytest.raises(ValueError, match="given for 1 ticks"):
-        tape.tick(1)
+        buffer.tick(1)

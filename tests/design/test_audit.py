@@ -11,15 +11,15 @@ from worlds import PAIR, SOFT
 
 from cli.audit import main
 from cli.options import execute
-from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, RIGID_WALL, Network, Ranges, Spring
+from controller.coupling import CASE_I, Compliance, Coupling, NoCoupling, SpringDamper
+from controller.environment import FIGURE_4, GROUND, RIGID_WALL, Network, Spring
 from controller.loop import Loop
 from controller.lti import Lti
+from controller.ranges import Ranges
 from design import certificate, frequency, stored
 from design.api import certify
 from design.audit import MOST_EXTRA_SAMPLES, edge, remedies, report, requirement, stiffest, tolerance
 from design.guarantees import ANY, CAVEATS, guarantee_of
-from design.result import CASE_I
 
 CONDITIONS = ("this-environment", "any-environment")
 T = 1.2e-3
@@ -318,7 +318,7 @@ BAD = [
     ("--K 1 --B 1 --delta=-1", "--delta is -1, allowed are 0 to 10000"),
     ("--K 1 --B 1 --delta nan", "--delta is nan, allowed"),
     ("--K 1 --B 1 --T 0", "T is 0, allowed"),
-    ("--K 1 --B 1 --theta=-1", "theta[0] is -1, allowed"),
+    ("--K 1 --B 1 --theta=-1", "theta #1 is -1, allowed"),
     ("--K 1 --B 1 --theta 101", "theta is 101, 101, allowed are 0 to 100 samples"),
     ("--K 1 --B 1 --theta 0.5", "--theta is '0.5', expected whole numbers"),
     ("--K 1 --B 1 --seed x", "--seed is 'x'"),

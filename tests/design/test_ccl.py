@@ -1,6 +1,5 @@
 """State-space couplings: the realisation, what each method reaches, and that every result stands on its own."""
 
-import cvxpy as cp
 import numpy as np
 import pytest
 from worlds import DELTA, SOFT_NETWORK, T
@@ -13,7 +12,7 @@ from design import fixed_order as ccl
 from design import spring_damper
 from design.conditions import any_environment, this_environment
 from design.fixed_order import FixedOrder, FixedPoles, descend
-from design.lmi import RESERVE, Shaping, affine, symmetric_from, v_hat_regular
+from design.lmi import RESERVE, Shaping, v_hat_regular
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
 NO_MULTIPLIER = np.full(2, np.inf)
@@ -69,11 +68,6 @@ def test_the_inequalities_are_affine_in_the_unknowns(diagonal):
 
     middle = (everything(one) + everything(two)) / 2
     np.testing.assert_allclose(everything((one + two) / 2), middle, atol=1e-9 * np.abs(middle).max())
-
-
-def test_affine_reproduces_its_function():
-    x = cp.Variable(6, value=np.arange(6.0))
-    np.testing.assert_allclose(affine(lambda v: symmetric_from(v, 3) + 1, x).value, symmetric_from(np.arange(6), 3) + 1)
 
 
 def test_the_inner_approximation_reaches_the_optimum_of_its_order(inner, structured):

@@ -9,7 +9,7 @@ import pytest
 from worlds import PAIR, SOFT, SOFT_NETWORK, STIFF
 
 from controller import coupling as controller_coupling
-from controller.coupling import Compliance, ComplianceForm, InternalModelForm, NoCoupling, SpringDamper
+from controller.coupling import PUBLISHED, Compliance, ComplianceForm, InternalModelForm, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, SingularLoop, rational
@@ -19,7 +19,7 @@ from design.certificate import Verdict, prove, required_damping, verify
 from design.conditions import this_environment
 from design.files import InputError
 from design.frequency import frequencies, on_circle, rounding
-from design.result import PUBLISHED, NotProved, from_ratio
+from design.result import NotProved, from_ratio
 from design.stored import Stored, digest, load, save, sealed
 from sim.random_loops import proofs
 from sim.scenario import load as scenario
@@ -244,7 +244,7 @@ def test_a_forger_who_repairs_the_digests_still_has_to_prove():
         (b"7806.0", b"-7806.0", "K is [-7806.0, 3137.0]"),
         (b'"theta": [', b'"theta": [0, ', "theta has 3 entries"),
         (b'"proof": "rational"', b'"proof": "faith"', "$.certificate.proof"),
-        (b"7806.0", b"1e400", "$.coupling.K[0]"),
+        (b"7806.0", b"1e400", "$.coupling.K #1"),
         (b"7806.0", b"NaN", ", 'NaN,': JSON is malformed"),
     ],
 )

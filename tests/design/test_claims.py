@@ -13,18 +13,18 @@ from driven import driven
 from scipy.signal import dlsim, lfilter
 from worlds import SOFT, STIFF
 
-from controller.contact import limited
-from controller.coupling import NoCoupling, SpringDamper
+from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.limiter import limited
 from controller.loop import Loop, force_map
 from controller.lti import Lti
 from design.conditions import any_environment, this_environment
 from design.lmi import Infeasible, Shaping, least_multiplier
 from design.multipliers import limiter_lag
-from design.result import CASE_I, CASE_II, PRINTED_TAU_DB
 from design.spring_damper import step
 from models.device import RigidDevice
 from models.human import Human, Link, Population
+from sim.report import PRINTED_TAU_DB
 from sim.run import assemble, make_engine, run
 from sim.scenario import load
 from sim.stability import close, dominant_mode
@@ -79,13 +79,13 @@ def test_sampled_energy_balance_of_devices_and_hands():
     E_N <= E_0 + sum -f'dx + sum w'dh - sum (1/T) dx' Delta dx, hence (a) of docs/theory.md where w = 0.
     """
     rng = np.random.default_rng(1)
-    assembly = assemble(load(), CASE_I)
+    simulation = assemble(load(), CASE_I)
     masses = np.array([0.06, 0.06, 0.19 + 0.3, 0.19 + 0.3])  # motors, then handles with the hands
     for pushing in (0.0, 3.0):
         w = pushing * rng.normal(size=(3000, 2))
         start = rng.normal(size=(8, 1)) * np.repeat([1e-3, 0.2], 4)[:, None]
-        record = run(assembly, "exact", lambda first, n, w=w: w[first : first + n], len(w), start)
-        assert not record.clipped(assembly.process.force_limit).any()
+        record = run(simulation, "exact", lambda first, n, w=w: w[first : first + n], len(w), start)
+        assert not record.clipped(simulation.process.force_limit).any()
         q, v = np.split(record.s, 2, axis=1)
         stored = (v**2 @ masses) / 2 + (14500 * (q[:, :2] - q[:, 2:]) ** 2 + 200 * q[:, 2:] ** 2).sum(axis=1) / 2
         dq = np.diff(q, axis=0)
@@ -134,8 +134,8 @@ def test_certified_loops_come_to_rest_with_every_random_human(coupling, links):
     base = load()
     for devices in (base.device, (RigidDevice(), RigidDevice())):
         for pair in random_pairs(links, 60):
-            assembly = assemble(base.replace(human=pair, device=devices), coupling)
-            assert dominant_mode(close(assembly.plant, assembly.F)).spectral_radius < 1
+            simulation = assemble(base.replace(human=pair, device=devices), coupling)
+            assert dominant_mode(close(simulation.plant, simulation.F)).spectral_radius < 1
 
 
 def test_without_coupling_only_the_compliant_device_oscillates():
@@ -365,18 +365,18 @@ def test_saturation_is_outside_every_certificate():
     devices = tuple(
         msgspec.structs.replace(d, force_limit=limit) for d, limit in zip(base.device, (12.0, 5.657), strict=True)
     )
-    assembly = assemble(base.replace(human=hands, device=devices, tap=None), STIFF)
+    simulation = assemble(base.replace(human=hands, device=devices, tap=None), STIFF)
     starts = np.random.default_rng(0).normal(size=(8, 20)) * np.repeat([0.2, 4.0], 4)[:, None]
-    assert dominant_mode(close(assembly.plant, assembly.F)).spectral_radius < 1
+    assert dominant_mode(close(simulation.plant, simulation.F)).spectral_radius < 1
 
-    def late(assembly):
-        engine = make_engine(assembly, "exact")
+    def late(simulation):
+        engine = make_engine(simulation, "exact")
         record = driven(
-            assembly.process, engine, lambda first, n: np.zeros((n, assembly.scene.outside)), 20_000, starts
+            simulation.process, engine, lambda first, n: np.zeros((n, simulation.scene.outside)), 20_000, starts
         )
         return record.s[-8000:, :2]
 
-    tail = late(assembly)
+    tail = late(simulation)
     caught = np.abs(tail).max(axis=(0, 1)) > 0.1
     assert 0 < caught.sum() < 20
     motion = tail[:, 0, caught][:, 0]
@@ -386,12 +386,12 @@ def test_saturation_is_outside_every_certificate():
     soothed = tuple(Human((msgspec.structs.replace(h.links[0], damping=0.1),)) for h in hands)
     calmer = assemble(base.replace(human=soothed, device=devices, tap=None), STIFF)
     assert np.abs(late(calmer)).max() < 0.01
-    unlimited = replace(assembly, process=replace(assembly.process, force_limit=np.full(2, np.inf)))
+    unlimited = replace(simulation, process=replace(simulation.process, force_limit=np.full(2, np.inf)))
     assert np.abs(late(unlimited)).max() < 0.01
     for beta in (0.0, 0.01):  # the limiter in the place of clipping: every start comes to rest
         rho = limiter_lag((DELTA, DELTA), T, beta)
         limits = limited(base.environment, STIFF, base.theta, base.psi, T, (12.0, 5.657), rho)
-        limiting = replace(assembly, process=replace(assembly.process, F=limits.open, contact=limits))
+        limiting = replace(simulation, process=replace(simulation.process, F=limits.open, contact=limits))
         assert np.abs(late(limiting)).max() < 0.01
 
 

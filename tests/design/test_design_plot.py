@@ -7,11 +7,11 @@ import pytest
 from worlds import PAIR, SOFT
 
 from cli.compare import main
-from controller.coupling import Compliance, NoCoupling, SpringDamper
+from controller.coupling import CASE_I, Compliance, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring
 from controller.loop import Loop
 from design.compare import curves, grid, ideal, judge
-from design.result import CASE_I, DesignFailed
+from design.result import DesignFailed
 from sim.scenario import InputError
 
 T, DELTA = 1.2e-3, 1.37

@@ -15,9 +15,10 @@ from scipy.optimize import minimize_scalar
 from worlds import STIFF, T
 
 from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, Network, Ranges, Spring, UncertainSpring, Wall
+from controller.environment import FIGURE_4, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, rational
+from controller.ranges import Ranges, UncertainSpring
 from design import certificate
 from design.certificate import condition_block, prove, verify
 from design.conditions import (

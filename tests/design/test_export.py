@@ -17,7 +17,7 @@ from controller.coupling import SpringDamper as Gains
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import Loop, force_map
 from controller.lti import Lti
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
 from design.certificate import prove, prove_limiter
 from design.export import process_block, sequential, trial
 from design.files import InputError, one_command
@@ -147,10 +147,10 @@ def test_the_process_of_the_simulator_differs_by_rounding_alone(data):
     block = process_block(Stored.of(PAIR, data))
     test, G = trial(block), block.system
     limits = np.full(2, np.inf)
-    tape = StepBuffer(Process(G, limits, np.zeros(2)), len(test.inputs), plant_states=2)
+    buffer = StepBuffer(Process(G, limits, np.zeros(2)), len(test.inputs), plant_states=2)
     for k, x in enumerate(test.inputs):
-        tape.x[k, :, 0] = x
-        tape.tick(k)
+        buffer.x[k, :, 0] = x
+        buffer.tick(k)
     z = sequential(Lti(G.A, G.B, np.eye(G.order), np.zeros_like(G.B), T), test.inputs)  # states before each tick
     terms = G.order + G.inputs
     gamma = terms * 2.0**-53 / (1 - terms * 2.0**-53)
@@ -159,9 +159,9 @@ def test_the_process_of_the_simulator_differs_by_rounding_alone(data):
     for k in range(len(z)):
         own = 2 * gamma * (np.abs(G.C) @ np.abs(z[k]) + np.abs(G.D) @ np.abs(test.inputs[k]))
         bound = own + sum(carried[k - 1 - i] @ local[i] for i in range(k))
-        assert (np.abs(tape.f[k, :, 0] - test.outputs[k]) <= 1.01 * bound).all()  # 1.01: products of two roundings
+        assert (np.abs(buffer.f[k, :, 0] - test.outputs[k]) <= 1.01 * bound).all()  # 1.01: products of two roundings
     largest = np.abs(test.outputs).max()
-    difference = np.abs(tape.f[: len(z), :, 0] - test.outputs).max()
+    difference = np.abs(buffer.f[: len(z), :, 0] - test.outputs).max()
     print(f"largest difference {difference:.1e} of {largest:.2g} N: {difference / np.spacing(largest):.1f} ulp")
 
 

@@ -104,7 +104,7 @@ def test_where_it_is_not_derived_it_is_refused():
     walled = Network(("tip",), walls=(Wall(("tip", GROUND), 500.0),))
     with pytest.raises(ValueError, match=r"latency and environment\.walls"):
         Loop(T, (0,), (0,), (0,), (1.0,), walled, latency=((0.0, TAU),))
-    with pytest.raises(ValueError, match=r"latency\[1\] is 0 to 0\.0012 s"):
+    with pytest.raises(ValueError, match=r"latency #2 is 0 to 0\.0012 s"):
         change(loop, latency=((0.0, TAU), (0.0, T)))
 
 

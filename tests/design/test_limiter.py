@@ -8,15 +8,16 @@ import pytest
 from worlds import DELTA, PAIR, T
 
 from cli.design import main as design_main
-from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import Network, Ranges, Wall
+from controller.coupling import CASE_I, NoCoupling, SpringDamper
+from controller.environment import Network, Wall
 from controller.loop import DelayRange
 from controller.lti import Lti, Sampled, taps
+from controller.ranges import Ranges
 from design.certificate import lag, prove, prove_limiter, verify
 from design.conditions import least_multiple, this_environment
 from design.frequency import hermitian, on_circle
 from design.multipliers import limiter, limiter_demand, limiter_lag, limiter_requirement
-from design.result import CASE_I, NotProved
+from design.result import NotProved
 from design.spring_damper import design
 from design.stored import Certificate, LimiterCertificate, Stored, load, save, sealed
 from design.transparency import transparency

@@ -8,19 +8,19 @@ import pytest
 
 from cli import compare as command
 from cli.compare import main
+from controller.coupling import CASE_I
 from controller.environment import environment
 from controller.loop import force_map
 from design import compare as limit_curve
-from design.compare import AXES, LADDERS, SHORT, Setting, ladder_row, measured, optimum, remembered, settings
+from design.compare import AXES, LADDERS, SHORT, Point, ladder_row, measured, optimum, points_along, remembered
 from design.conditions import this_environment
 from design.program import LADDER, Options
-from design.result import CASE_I
 from sim.plots import plot_limits
 from sim.scenario import InputError, load
 
 LOOP = load().loop("I")
 SMALL = Options(ladder=LADDER[:1])
-IMPOSSIBLE = Setting(0.0, load().replace(theta=(60, 60), delta=(1e-3, 1e-3)).loop("I"), SMALL)
+IMPOSSIBLE = Point(0.0, load().replace(theta=(60, 60), delta=(1e-3, 1e-3)).loop("I"), SMALL)
 
 
 def run(tmp_path, *options):
@@ -35,12 +35,12 @@ def run(tmp_path, *options):
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("points", [1, 2, 5])
 def test_what_there_is_lies_among_the_points(axis, points):
-    """Values grow, nothing but the axis' own quantity changes, and one setting is the loop as it is."""
-    along = settings(axis, LOOP, SMALL, points)
+    """Values grow, nothing but the axis' own quantity changes, and one point is the loop as it is."""
+    along = points_along(axis, LOOP, SMALL, points)
     values = [s.value for s in along]
     assert values == sorted(set(values))
     assert len(values) <= points
-    assert any(s.loop == LOOP and s.wish == SMALL for s in along)
+    assert any(s.loop == LOOP and s.options == SMALL for s in along)
     for s in along:
         changed = {name for name in LOOP.__struct_fields__ if getattr(s.loop, name) != getattr(LOOP, name)}
         assert changed <= {"damping": {"delta"}, "delay": {"theta", "lam"}, "period": {"T"}, "order": set()}[axis]
@@ -48,7 +48,7 @@ def test_what_there_is_lies_among_the_points(axis, points):
 
 def test_unequal_devices_are_scaled_alike():
     loop = load("three-rigid").loop("I")
-    for s in settings("damping", loop, SMALL, 3, (0.4, 1.6)):
+    for s in points_along("damping", loop, SMALL, 3, (0.4, 1.6)):
         assert min(s.loop.delta) == pytest.approx(s.value, rel=1e-12)
         np.testing.assert_allclose(np.array(s.loop.delta) / loop.delta, s.value / 0.8, rtol=1e-12)
 
@@ -56,13 +56,13 @@ def test_unequal_devices_are_scaled_alike():
 def test_the_reference_keeps_what_it_lacks():
     """Case I stays delay-matched; case II stays ahead."""
     for case, expected in (("I", [(0, 1), (1, 2), (2, 3)]), ("II", [(0, 0)] * 3)):
-        along = settings("delay", load().loop(case), SMALL, 3)
+        along = points_along("delay", load().loop(case), SMALL, 3)
         assert [s.loop.lam for s in along] == expected
         assert [s.loop.theta for s in along] == [(0, 1), (1, 2), (2, 3)]
 
 
 def test_delays_in_seconds_are_never_shortened():
-    along = settings("period", LOOP, SMALL, 6, (0.3e-3, 2.4e-3), "seconds")
+    along = points_along("period", LOOP, SMALL, 6, (0.3e-3, 2.4e-3), "seconds")
     for s in along:
         for samples, before in zip(s.loop.theta, LOOP.theta, strict=True):
             assert samples * s.loop.T >= before * LOOP.T * (1 - 1e-9)
@@ -76,7 +76,7 @@ def test_delays_in_seconds_are_never_shortened():
 
 def test_more_damping_is_never_worse_and_the_figures_are_the_designs_own():
     """The feasible set grows with the damping."""
-    limits_ = [optimum(s) for s in settings("damping", LOOP, SMALL, 3, (1.3, 1.5))]
+    limits_ = [optimum(s) for s in points_along("damping", LOOP, SMALL, 3, (1.3, 1.5))]
     rms = [limit.rms_mismatch_db for limit in limits_]
     assert rms[0] > rms[1] > rms[2]
     for limit in limits_:
@@ -85,7 +85,7 @@ def test_more_damping_is_never_worse_and_the_figures_are_the_designs_own():
 
 
 def test_more_rungs_are_never_worse():
-    rms = [optimum(Setting(n, LOOP, Options(ladder=LADDER[:n]))).rms_mismatch_db for n in (1, 2, 3)]
+    rms = [optimum(Point(n, LOOP, Options(ladder=LADDER[:n]))).rms_mismatch_db for n in (1, 2, 3)]
     assert rms == sorted(rms, reverse=True)
 
 
@@ -99,12 +99,12 @@ def test_a_point_without_a_solution_keeps_its_reason():
 def test_nothing_is_designed_twice():
     calls = []
 
-    def counted(setting):
-        calls.append(setting)
-        return measured(setting, "spring-damper", "any-environment", {})
+    def counted(point):
+        calls.append(point)
+        return measured(point, "spring-damper", "any-environment", {})
 
     recall = remembered(counted, False)
-    along = settings("order", LOOP, Options(), 2)
+    along = points_along("order", LOOP, Options(), 2)
     first, again = (recall(s) for s in along)
     assert len(calls) == 1
     assert first.rms_mismatch_db == again.rms_mismatch_db
@@ -134,9 +134,7 @@ def test_the_command_draws_and_reports(tmp_path):
 
 
 def test_nothing_found_is_exit_code_1(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        command, "optimum", lambda setting: measured(IMPOSSIBLE, "spring-damper", "this-environment", {})
-    )
+    monkeypatch.setattr(command, "optimum", lambda point: measured(IMPOSSIBLE, "spring-damper", "this-environment", {}))
     code, report = run(tmp_path, "--over", "order=1:2", "--points", "2", "--beside", "none")
     assert code == 1
     assert all(row["reason"] for row in report["sweeps"]["order"]["optimal"])
@@ -146,11 +144,11 @@ def test_nothing_found_is_exit_code_1(tmp_path, monkeypatch):
 def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
     calls = []
 
-    def interrupted(setting):
-        calls.append(setting)
+    def interrupted(point):
+        calls.append(point)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return measured(setting, "spring-damper", "any-environment", {})  # what is designed does not matter here
+        return measured(point, "spring-damper", "any-environment", {})  # what is designed does not matter here
 
     monkeypatch.setattr(command, "optimum", interrupted)
     code, report = run(tmp_path, "--over", "damping=1.3:1.5", "--points", "4", "--beside", "none")
@@ -252,15 +250,15 @@ def test_the_ladder_is_a_command(tmp_path, monkeypatch):
 
 def test_a_point_says_what_is_proved_of_it(monkeypatch):
     """Each design's own condition; a proof that fails leaves the point sampled, with the reason."""
-    setting = settings("order", LOOP, SMALL, 1)[0]
-    assert (optimum(setting).proof, optimum(setting).proof_reason) == ("rational", None)
+    point = points_along("order", LOOP, SMALL, 1)[0]
+    assert (optimum(point).proof, optimum(point).proof_reason) == ("rational", None)
     assert measured(IMPOSSIBLE, "spring-damper", "this-environment", {}).proof is None
 
     def hopeless(*arguments):
         raise limit_curve.NotProved("too many states")
 
     monkeypatch.setattr(limit_curve, "prove", hopeless)
-    limit = measured(setting, "spring-damper", "any-environment", {})
+    limit = measured(point, "spring-damper", "any-environment", {})
     assert (limit.proof, limit.proof_reason) == ("sampled", "too many states")
     row = {"optimal": replace(limit, proof="rational"), "any-environment": limit, "this-environment": None}
     assert command._proofs(row) == "sampled: any-environment"

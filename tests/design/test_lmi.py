@@ -3,7 +3,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
-from analysis import analysis
+from analysis import analysis, solve
 from worlds import DELTA, T
 
 from controller.coupling import SpringDamper
@@ -19,7 +19,6 @@ from design.lmi import (
     lemma1,
     lemma2,
     lemma3,
-    solve,
     theta_hat,
     unit_coupling,
     unit_environment,
@@ -66,7 +65,7 @@ def strength(matrix, *storages):
     """The largest s for which `matrix` >= s I with the storages > 0 and of bounded size."""
     s = cp.Variable()
     bounds = [P >> 0 for P in storages] + [cp.trace(P) <= 1e3 for P in storages]
-    solve(cp.Problem(cp.Maximize(s), [matrix >> s * np.eye(matrix.shape[0]), s <= 1, *bounds]), "the test")
+    solve(cp.Problem(cp.Maximize(s), [matrix >> s * np.eye(matrix.shape[0]), s <= 1, *bounds]))
     return float(s.value)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import eig, eigh
 
-from controller.coupling import NoCoupling, SpringDamper
+from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import force_map
 from controller.lti import Lti
@@ -17,7 +17,6 @@ from design.conditions import (
     this_environment,
 )
 from design.frequency import frequencies, hermitian, on_circle, supremum
-from design.result import CASE_I, CASE_II
 
 T, THETA, DELTA = 1.2e-3, (1, 2), (1.37, 1.37)
 E = environment(FIGURE_4, T)

@@ -17,8 +17,9 @@ from cli.validate import main as validate_main
 from controller.coupling import SpringDamper
 from controller.coupling import SpringDamper as StoredSpringDamper
 from controller.delay import VaryingDelay
-from controller.environment import FIGURE_4, Network, Ranges, Spring, UncertainSpring, environment, inside, members
+from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.loop import Loop, force_map
+from controller.ranges import Ranges, UncertainSpring, inside, members
 from design import optimal
 from design.certificate import check_ranges, prove, verify
 from design.coverage import ranges_part

@@ -16,9 +16,10 @@ from cli.validate import main as validate_main
 from controller import coupling as built
 from controller.coupling import SpringDamper
 from controller.delay import LOST, VaryingDelay, ages
-from controller.environment import FIGURE_4, Ranges, UncertainSpring, environment
+from controller.environment import FIGURE_4, environment
 from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Sampled
+from controller.ranges import Ranges, UncertainSpring
 from design import certify
 from design import exact as positive_real
 from design.certificate import condition_block, prove, refuted, verify

@@ -5,6 +5,7 @@ import json
 import cvxpy as cp
 import numpy as np
 import pytest
+from analysis import solve
 from worlds import DELTA, SOFT, STIFF, T
 
 from cli.audit import main
@@ -17,7 +18,6 @@ from design.conditions import this_environment
 from design.coverage import switching_part
 from design.exact import Matrix
 from design.frequency import hermitian
-from design.lmi import solve
 from design.multipliers import half_widths, switching_block, switching_sweep
 from sim.scenario import InputError
 
@@ -80,7 +80,7 @@ def test_the_least_factor_is_that_of_a_convex_solver():
         for v, g in zip(z, G.at(z), strict=True)
     ]
     problem = cp.Problem(cp.Minimize(s), [c + 0j >> 0 for c in conditions])
-    solve(problem, "the least factor")
+    solve(problem)
     assert s.value == pytest.approx(found.requirement.ratio, rel=2e-4)  # a peak 0.5 % off its sample, squared
     np.testing.assert_allclose(
         conditions[0].value,

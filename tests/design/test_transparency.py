@@ -5,12 +5,11 @@ import pytest
 from scipy.integrate import quad
 from worlds import SOFT, STIFF
 
-from controller.coupling import NoCoupling, SpringDamper
+from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import force_map
 from controller.lti import Lti
 from design.frequency import integral
-from design.result import CASE_I
 from design.transparency import decibels, transparency
 
 T, THETA = 1.2e-3, (1, 2)

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from controller.contact import contact
 from controller.coupling import Compliance, InternalModel, SpringDamper
-from controller.environment import GROUND, Network, Ranges, Spring, Wall, frozen_states
+from controller.environment import GROUND, Network, Spring, Wall
 from controller.loop import Loop
 from controller.lti import Lti
+from controller.ranges import Ranges
+from controller.walls import contact
 from design.certificate import assess, prove, verify
 from design.conditions import any_environment, this_environment
 from design.designs import design_by_kind
@@ -62,9 +63,7 @@ def test_what_a_wall_asks(stiffness, g, needs):
     assert given.required[0] == pytest.approx(needs, abs=1e-6)
     found = walls_of(loop, COUPLING)
     assert needs - 5e-4 < found.requirement.required[0] < needs
-    each = [
-        this_environment(loop.at(state).F(COUPLING), loop.delta) for state in frozen_states(loop.environment).values()
-    ]
+    each = [this_environment(loop.at(state).F(COUPLING), loop.delta) for state in loop.environment.frozen()]
     assert found.requirement.ratio > max(r.ratio for r in each)
     if stiffness == 3000.0:
         assert [r.required[0] for r in each] == pytest.approx([1.244099, 1.242139], abs=1e-6)

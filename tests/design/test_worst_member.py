@@ -11,7 +11,8 @@ from worlds import VERTICES_ONLY, environment_by_hand, filter_by_hand
 from cli.check import main as check_main
 from cli.design import _store
 from controller.coupling import ForceFilter, InternalModel
-from controller.environment import FIGURE_4, Member, Network, Ranges, Region, Spring, UncertainSpring, members, regions
+from controller.environment import FIGURE_4, Network, Spring
+from controller.ranges import Member, Ranges, Region, UncertainSpring, members, regions
 from design import optimal
 from design.api import certify
 from design.certificate import check_ranges, prove, verify

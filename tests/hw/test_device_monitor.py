@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from worlds import FakePort
 
+from design.files import plain
 from hw.control import certified_couplings
 from hw.device import Device
 from hw.emulator import Emulator, FaultInjection, info_of, nobody
@@ -327,8 +328,8 @@ def test_an_identification_closes_no_loop_that_could_grow(scenario):
     Rehearsal(session, Emulator(nobody(scenario)), lambda ages: [tune]).run_until_armed(0.6)
     report = outcome("identify", session, recorder, 0)
     assert len(recorder) > 400
-    assert report["growth"] == report["run"]["steady_ticks"] == []
-    assert growths(result_of(recorder, session.units, scenario.T, report)) == []
+    assert report.growth == report.run.steady_ticks == []
+    assert growths(result_of(recorder, session.units, scenario.T, plain(report))) == []
 
 
 def test_an_estop_is_repeated_where_nobody_says_that_it_was_heard(scenario):

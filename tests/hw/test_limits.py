@@ -109,7 +109,7 @@ def test_what_a_device_is_told_is_what_the_limits_say():
 
 
 def test_no_cap_above_twelve_newtons():
-    with pytest.raises(ValueError, match=r"cap\[1\] is 13"):
+    with pytest.raises(ValueError, match=r"cap #2 is 13"):
         SafetyLimits((12.0, 13.0))
 
 

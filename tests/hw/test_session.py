@@ -13,6 +13,7 @@ from cli import bridge
 from cli import replay as replay_command
 from cli import trace as trace_command
 from design.certificate import assess
+from design.files import plain
 from design.stored import Stored
 from design.stored import save as save_coupling
 from hw.control import CertifiedCoupling, LinearController, certified_coupling, certified_couplings, fill, link_delay
@@ -217,10 +218,10 @@ def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
     rehearsal.run_until_armed(1.5)
     link = recorder.link()
     first = int(np.argmax(link["tick"] == rehearsal.emulator.begun_at))
-    assembly = assemble(scenario, rungs[0].chosen.coupling)
-    held = hold(plant(assembly.scene.model), scenario.T)
+    simulation = assemble(scenario, rungs[0].chosen.coupling)
+    held = hold(plant(simulation.scene.model), scenario.T)
     n = len(recorder) - first
-    w, law = outside_forces(scenario, assembly.scene, 0, n), LinearController(assembly.F)
+    w, law = outside_forces(scenario, simulation.scene, 0, n), LinearController(simulation.F)
     s, counts, applied = np.zeros(held.A.shape[0]), [], []
     for k in range(n):
         x = np.round(s[:2] / 1e-6)
@@ -374,7 +375,7 @@ def trace(scenario, rungs, tmp_path_factory):
     rehearsal.run(2.5)
     report = outcome("I", session, recorder, 0)
     out = tmp_path_factory.mktemp("trace")
-    return save(out, session, recorder, report | {"files": []}, plot=True), recorder
+    return save(out, session, recorder, report, plot=True), recorder
 
 
 def test_a_trace_is_one_of_sim_run(trace):
@@ -433,8 +434,8 @@ def test_the_replay_command(trace, capsys):
 
 
 def test_a_trace_of_sim_run_is_no_session(scenario, rungs, tmp_path):
-    assembly = assemble(scenario, rungs[0].chosen.coupling)
-    path = run(assembly, "exact", ticks=10).save_npz(tmp_path / "trace.npz")
+    simulation = assemble(scenario, rungs[0].chosen.coupling)
+    path = run(simulation, "exact", ticks=10).save_npz(tmp_path / "trace.npz")
     with pytest.raises(InputError, match="not of a bridge's session"):
         load(path)
 
@@ -492,13 +493,13 @@ def _meta(**changes):
         ({"meta": lambda a: np.array("[1]")}, "metadata is a list"),
         ({"link_arming": lambda a: a["link_arming"] + 1}, "link_arming does not count"),
         ({"link_arming": lambda a: (a["link_tick"] == a["link_tick"][-1]).astype(int)}, "1 recipes for 2 armings"),
-        ({"meta": _meta(force_step=[0.0, 0.0])}, r"force_step\[0\] is 0"),
+        ({"meta": _meta(force_step=[0.0, 0.0])}, r"force_step #1 is 0"),
         ({"meta": _meta(force_step=[4e-4])}, "force_step has 1 entries"),
         ({"meta": _meta(cap=[30000])}, "cap has 1 entries"),
         ({"meta": _meta(limits={})}, "missing or unknown: cap"),
         ({"meta": _meta(limits_more={"sleew": 1.0})}, "missing or unknown: sleew"),
         ({"meta": _meta(limits="none")}, "Expected `object`, got `str`"),
-        ({"meta": _meta(limits_more={"cap": [100.0, 100.0]})}, r"cap\[0\] is 100"),
+        ({"meta": _meta(limits_more={"cap": [100.0, 100.0]})}, r"cap #1 is 100"),
         ({"meta": _meta(limits_more={"slew": "fast"})}, "Expected `float`, got `str`"),
         ({"meta": _meta(link_delay=9)}, "link_delay is 9, allowed are 1 to 1"),
         ({"meta": _meta(link_delay=-(10**7))}, "link_delay is -10000000"),
@@ -587,23 +588,23 @@ def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, 
     session.stop("enough", session.now)
     rehearsal.run(1e-6 * session.now + 0.2)
     report = outcome("I", session, recorder, 0)
-    ((first, stop),) = report["run"]["steady_ticks"]
+    ((first, stop),) = report.run.steady_ticks
     gain = recorder.link()["gain"]
     assert (gain[first:stop] == 1.0).all()
     assert gain[first - 1] < 1.0
     path = save(tmp_path, session, recorder, report, False)[0]
     assert trace_command.main([str(path), "--json", "-"]) == 0
     (part,) = json.loads(capsys.readouterr().out)["growth"]
-    assert [part] == report["growth"]
+    assert [part] == plain(report)["growth"]
     if settles:
         assert part["reason"].startswith("nothing oscillates")
         return
-    assembly = assemble(scenario, made.chosen.coupling)
-    exact = dominant_mode(close(assembly.plant, assembly.F))
+    simulation = assemble(scenario, made.chosen.coupling)
+    exact = dominant_mode(close(simulation.plant, simulation.F))
     assert part["growth_rate_per_s"] == pytest.approx(exact.growth, abs=2e-3)
     assert part["frequency_hz"] == pytest.approx(exact.frequency_hz, abs=1.0)
     assert part["trend"] == "grows"
-    bridge.print_session(report | {"files": []}, Console(width=200))
+    bridge.print_session(report, Console(width=200))
     assert re.search(r"growth at full gain, arming 1, ticks \d+ to \d+ .*: \+1.48", capsys.readouterr().out)
 
 
@@ -669,7 +670,7 @@ def test_forces_at_the_cap_are_limited_under_the_guarantee_and_replay(scenario, 
     session.record = recorder
     Rehearsal(session, Emulator(lively(scenario)), lambda ages: rungs).run_until_armed(2.0)
     report = outcome("I", session, recorder, 0)
-    assert report["limiter"]["words"].startswith("proved, also while forces are limited to 0.3, 0.2 N")
+    assert report.program["limiter"]["words"].startswith("proved, also while forces are limited to 0.3, 0.2 N")
     asked = np.abs(recorder.link()["asked"])
     assert (asked <= (0.3, 0.2)).all()
     assert (asked == (0.3, 0.2)).any(axis=1).mean() > 1 / 3
@@ -694,7 +695,7 @@ def test_a_budget_under_the_bridge_stands_by_while_the_coupling_is_certified_and
     settings = LinkSettings(measure=100, energy_budget=(0.05, np.inf))
     run = rehearsal_of(scenario, rungs, recorder=recorder, settings=settings)
     run.run_to_the_end(5.0)
-    (part,) = outcome("I", run.session, recorder, 0)["energy_budget"]
+    (part,) = outcome("I", run.session, recorder, 0).energy_budget
     assert part["limited_ticks"] == part["surprises"] == 0
     assert part["ticks"] == len(recorder)
     assert "no passive hand is given more than 0.05 J" in part["guarantee"]
@@ -715,7 +716,7 @@ def test_a_thief_under_the_bridge_is_limited_and_hands_get_no_more_than_the_budg
         run = rehearsal_of(scenario, rungs, *faults, recorder=recorder, settings=settings)
         run.run_to_the_end(2.0)
         report = outcome("I", run.session, recorder, 0)
-        (part,) = report["energy_budget"]
+        (part,) = report.energy_budget
         path = save(tmp_path, run.session, recorder, report, False)[0]
         assert replay(*load(path)).identical
         trace = result_of(recorder, run.session.units, scenario.T, {})

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from dataclasses import fields
 from inspect import signature
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -14,14 +16,15 @@ from worlds import SOFT
 import design
 import hw
 import sim
+from cli.design import main as design_command
 from cli.run import main as run_command
 from cli.validate import main as validate_command
 from controller.coupling import NoCoupling, SpringDamper
-from design import Options, certify, design_coupling, guarantee, transparency_of
-from design.designs import KINDS
+from design import DesignOptions, certify, design_coupling, guarantee, stored, transparency_of
+from design.designs import KINDS, Kind
 from hw import rehearse
 from models.device import RigidDevice
-from sim import InputError, Result, Scenario, load, parse, simulate, validate
+from sim import InputError, Scenario, Trace, load, parse, simulate, validate
 from sim.scenario import SCENARIOS
 
 SHORT = load().replace(duration=0.3)
@@ -70,7 +73,7 @@ def test_the_options_are_those_that_the_designs_take():
     assert set(KINDS["spring-damper"].options) - {"limiter"} < set(signature(spring_damper.design).parameters)
     own = {field.name for field in fields(optimal.program.Options)} - {"ladder"}
     assert set(KINDS["optimal"].options) == {*own, "switching"}
-    assert set(Options.__annotations__) == {name for kind in KINDS.values() for name in kind.options}
+    assert set(DesignOptions.__annotations__) == {name for kind in KINDS.values() for name in kind.options}
 
 
 def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
@@ -116,11 +119,11 @@ def test_a_session_that_is_refused_says_why():
 
 def test_simulate_is_the_commands_run(tmp_path):
     result = simulate(SHORT)
-    assert isinstance(result, Result)
+    assert isinstance(result, Trace)
     assert isinstance(SHORT, Scenario)
     options = ["--case", "none", "--duration", "0.3", "--no-plot", "--no-alternatives", "--out", str(tmp_path)]
     assert run_command([*options, "--json", str(tmp_path / "r.json")]) == 0
-    command = Result.load_npz(tmp_path / "trace.npz")
+    command = Trace.load_npz(tmp_path / "trace.npz")
     for name in ("t", "x", "f", "x_handle", "v_handle", "w"):
         np.testing.assert_array_equal(getattr(result, name), getattr(command, name))
     assert result.meta["stability"] == json.loads((tmp_path / "r.json").read_text())["stability"]
@@ -182,7 +185,7 @@ def test_periods_are_drawn_by_the_seed_that_is_reported():
         (lambda: validate(SHORT, engine="magic"), "engine is 'magic', allowed are exact, mujoco, both"),
         (lambda: validate(SHORT, duration=1e-3), "duration is 0.001, allowed are 0 and 0.0048 s or more"),
         (lambda: validate(SHORT, shards=0), "shards is 0"),
-        (lambda: validate(SHORT.replace(device=(RigidDevice(friction=0.2),) * 2)), r"device\[0\].friction is 0.2 N"),
+        (lambda: validate(SHORT.replace(device=(RigidDevice(friction=0.2),) * 2)), r"device #1.friction is 0.2 N"),
         (lambda: design_coupling(SHORT.loop("I"), "rubber"), "kind is 'rubber', allowed are spring-damper"),
         (lambda: rehearse(SHORT.replace(delta=(0.0, 0.0))), r"delta is \[0.0, 0.0\]: a device without damping"),
         (lambda: rehearse(SHORT, case="none"), "case is 'none', allowed are I, II"),
@@ -254,3 +257,18 @@ def test_help_waits_for_no_library_that_it_does_not_need():
     code = f"import sys\nfrom cli import {commands}\nprint([name for name in {slow} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+def test_a_design_of_ones_own_is_one_function_and_one_row(monkeypatch, tmp_path):
+    """The page's own example: designed by name, certified, proved and stored by the command as any other."""
+    page = (Path(__file__).parents[2] / "docs" / "architecture.md").read_text()
+    snippet = page.split("**A design.**")[1].split("```python\n")[1].split("```")[0]
+    row = page.split("the row\n`")[1].split("` in")[0]
+    own = ModuleType("design.half_stiff")
+    exec("loop = __import__('sim').load('omega-pair').loop('I')\n" + snippet, own.__dict__)
+    own.design = own.half_stiff
+    monkeypatch.setitem(sys.modules, own.__name__, own)
+    name, kind = row.split(": ", 1)
+    monkeypatch.setitem(KINDS, name.strip('"'), eval(kind, {"Kind": Kind}))
+    assert design_command(["--coupling", "half-stiff", "--out", str(tmp_path / "own.json")]) == 0
+    assert stored.load(tmp_path / "own.json").certificate.matrices

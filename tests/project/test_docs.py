@@ -20,7 +20,10 @@ TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
 #: a command that several pages have runs once
 COMMANDS = {s.text: page.name for page in reversed(PAGES) for s in regenerate.steps(TEXTS[page]) if s.kind == "command"}
 IN_ORDER = list(dict.fromkeys(s.text for page in PAGES for s in regenerate.steps(TEXTS[page]) if s.kind == "command"))
-SNIPPETS = {p: [s.text for s in regenerate.steps(TEXTS[p]) if s.kind == "python"] for p in PAGES}
+# code that a page shows of our own files needs their imports
+SNIPPETS = {
+    p: [s.text for s in regenerate.steps(regenerate.SOURCE.sub("", TEXTS[p])) if s.kind == "python"] for p in PAGES
+}
 SHOWN = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.SHOWN.finditer(TEXTS[page])]
 MEASURED = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.MEASURED.finditer(TEXTS[page])]
 #: within a sentence; those of other modules need a port, a display or minutes

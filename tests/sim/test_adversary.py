@@ -11,9 +11,8 @@ from cli import run as run_command
 from cli.suite import Check, rates, shortages, tightness
 from cli.suite import main as suite
 from cli.validate import main
-from controller.coupling import NoCoupling, SpringDamper
+from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from design.conditions import this_environment as real
-from design.result import CASE_I
 from models.device import RigidDevice
 from models.scene import build, plant
 from sim import adversary

@@ -15,7 +15,8 @@ import pytest
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra `dask`)")
 
-from design.result import CASE_I  # noqa: E402
+from controller.coupling import CASE_I  # noqa: E402
+from sim import shards  # noqa: E402
 from sim.crowds import BATCH, MIXED, Findings, Validation  # noqa: E402
 from sim.scenario import (  # noqa: E402
     InputError,
@@ -135,3 +136,19 @@ def test_a_lost_scheduler_leaves_what_is_done(cluster, tmp_path):
     whole = validate(question, table=Table(question, tmp_path, resume=True))
     assert whole.index.size == 12 * BATCH
     assert not whole.lost
+
+
+def test_a_cluster_whose_workers_are_all_lost_is_given_up(cluster, tmp_path, monkeypatch):
+    """Dask itself waits for ever; what is done is kept, and nothing of it is done again."""
+    monkeypatch.setattr(shards, "_LOOK", 0.1)
+    monkeypatch.setattr(shards, "_DESERTED", 0.3)
+    cluster.add_worker("alone")
+    question = replace(QUESTION, humans=12 * BATCH)
+
+    def kill(done: int, total: int) -> None:
+        cluster.workers["alone"].kill()
+
+    found = validate_on_cluster(question, cluster.address, kill, Table(question, tmp_path), patience=60)
+    assert found.lost == f"--dask {cluster.address}: the cluster has had no workers for 0.3 s"
+    assert BATCH <= found.index.size < 12 * BATCH
+    assert len(Table(question, tmp_path, resume=True).missing()) == 12 - found.index.size // BATCH

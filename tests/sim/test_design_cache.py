@@ -1,12 +1,14 @@
 """Designs kept on disk: what is read is proved, and what is not proved is designed again."""
 
+import json
 from functools import partial
 
 import numpy as np
 import pytest
 
 from controller.coupling import SpringDamper
-from sim import couplings
+from design.certificate import assess
+from sim import couplings, design_cache
 from sim.couplings import Chosen, choose
 from sim.scenario import load
 
@@ -26,8 +28,12 @@ def asked(monkeypatch, tmp_path):
     return made
 
 
+SPRING_DAMPERS = [("spring-damper", "any-environment"), ("spring-damper", "this-environment")]
+OWN = load().replace((1.36, 1.36))  # no design of it comes with the package
+
+
 def soft() -> Chosen:
-    return choose(load(), "I", "spring-damper", "any-environment")
+    return choose(OWN, "I", "spring-damper", "any-environment")
 
 
 def stiffness(chosen: Chosen) -> np.ndarray:
@@ -40,7 +46,7 @@ def test_a_design_is_made_once(asked, tmp_path):
     assert len(asked) == 1
     assert again.coupling.form() == first.coupling.form()
     assert (again.kind, again.condition) == (first.kind, first.condition)
-    choose(load(), "II", "spring-damper", "any-environment")  # another loop
+    choose(OWN, "II", "spring-damper", "any-environment")  # another loop
     assert len(asked) == 2
     assert len(list(tmp_path.glob("haptic-loop/*.json"))) == 2
 
@@ -86,5 +92,50 @@ def test_what_the_clock_ended_is_not_kept(asked, monkeypatch):
     hurried = partial(couplings.design_by_kind, seconds=0.0)
     monkeypatch.setattr(couplings, "design_by_kind", hurried)
     for _ in range(2):
-        choose(load(), "I", "optimal")
+        choose(OWN, "I", "optimal")
     assert len(asked) == 2
+
+
+@pytest.mark.parametrize(
+    ("case", "kind", "condition"),
+    [
+        ("I", "spring-damper", "any-environment"),
+        ("I", "spring-damper", "this-environment"),
+        ("II", "spring-damper", "this-environment"),
+    ],
+)
+def test_the_papers_cases_need_no_design_and_are_proved_when_read(asked, case, kind, condition):
+    loop, chosen = load().loop(case), choose(load(), case, kind, condition)
+    assert not asked
+    needs = assess(loop, chosen.coupling)  # which knows nothing of the file
+    assert needs[condition].proof == "rational"
+    assert chosen.known is not None
+    assert chosen.known.required == pytest.approx(needs[condition].required)
+    assert bool(chosen.limiter) == ((kind, condition) == ("spring-damper", "this-environment"))
+
+
+@pytest.mark.parametrize("kind", ["spring-damper", "optimal"])
+def test_a_shipped_file_is_believed_no_more_than_another(asked, tmp_path, monkeypatch, kind):
+    loop = load().loop("I")
+    there = design_cache.shipped(loop, kind, "this-environment")
+    monkeypatch.setattr(design_cache, "_SHIPPED", tmp_path)
+    text, path = there.read_text(), design_cache.shipped(loop, kind, "this-environment")
+    assert path.parent == tmp_path
+    stored = json.loads(text)
+    if kind == "optimal":  # no certificate: nothing but the sweep and a storage function can refuse it
+        stored["coupling"]["R"] = (1.01 * np.array(stored["coupling"]["R"])).tolist()
+    else:
+        stored["coupling"]["K"][0] *= 1.01
+    path.write_text(json.dumps(stored))
+    assert design_cache.find(loop, kind, "this-environment") is None
+    path.write_text(text)
+    assert design_cache.find(loop, kind, "this-environment")
+
+
+def test_every_shipped_file_is_a_design_that_is_asked_for():
+    named = {
+        design_cache.shipped(load().loop(case), kind, condition).name
+        for case in ("I", "II")
+        for kind, condition in (*SPRING_DAMPERS, ("optimal", "this-environment"))
+    }
+    assert {file.name for file in design_cache._SHIPPED.iterdir()} == named

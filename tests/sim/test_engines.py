@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from driven import driven
 
-from controller.coupling import NoCoupling
-from design.result import CASE_I
+from controller.coupling import CASE_I, NoCoupling
 from models.scene import plant
 from sim import engines as mujoco_engine
 from sim import run as loop
@@ -25,13 +24,13 @@ SHORT = load().replace(duration=0.6)
 
 
 @pytest.fixture(scope="module")
-def assembly():
+def simulation():
     return assemble(SHORT, CASE_I)
 
 
 @pytest.fixture(scope="module")
-def exact(assembly):
-    return run(assembly, "exact")
+def exact(simulation):
+    return run(simulation, "exact")
 
 
 def error(record, exact) -> float:
@@ -40,23 +39,24 @@ def error(record, exact) -> float:
 
 
 @pytest.mark.parametrize(("integrator", "substeps", "order"), [("RK4", 1, 4), ("Euler", 8, 1), ("implicitfast", 8, 1)])
-def test_order_of_convergence(assembly, exact, integrator, substeps, order):
+def test_order_of_convergence(simulation, exact, integrator, substeps, order):
     """Halving the step divides the error by 2^order; a tenth of an order is left to the next term."""
     errors = [
-        error(run(assembly, make_engine(assembly, "mujoco", integrator, n)), exact) for n in (substeps, 2 * substeps)
+        error(run(simulation, make_engine(simulation, "mujoco", integrator, n)), exact)
+        for n in (substeps, 2 * substeps)
     ]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2)
 
 
-def test_the_default_is_exact_to_1e_8(assembly):
+def test_the_default_is_exact_to_1e_8(simulation):
     """With the voluntary motion alone: the agreed accuracy of RK4 x 4, far from reached."""
     quiet = assemble(load().replace(tap=None, duration=3.0), CASE_I)
     assert error(run(quiet), run(quiet, "exact")) <= 1e-8
 
 
-def test_exact_engine_against_a_fine_integration(assembly):
+def test_exact_engine_against_a_fine_integration(simulation):
     """The matrix exponential against 20000 steps of classical Runge-Kutta, from a random state."""
-    held, continuous = assembly.plant, plant(assembly.scene.model)
+    held, continuous = simulation.plant, plant(simulation.scene.model)
     rng = np.random.default_rng(0)
     s, u = rng.normal(size=held.A.shape[0]), rng.normal(size=held.B.shape[1])
     expected, h = s.copy(), held.T / 20000
@@ -83,19 +83,19 @@ def test_discrete_integrator_loses_the_unstable_mode():
     assert fooled < 0.05 * truth
 
 
-def test_batch_and_single_agree_bit_for_bit(assembly):
-    scenario, scene = assembly.scenario, assembly.scene
+def test_batch_and_single_agree_bit_for_bit(simulation):
+    scenario, scene = simulation.scenario, simulation.scene
     rng = np.random.default_rng(0)
-    start = 1e-3 * rng.normal(size=(assembly.plant.A.shape[0], 3))
+    start = 1e-3 * rng.normal(size=(simulation.plant.A.shape[0], 3))
 
     def outside(first, ticks):
         return outside_forces(scenario, scene, first, ticks)
 
     def follow(engine, state):
-        return driven(assembly.process, engine, outside, 200, state)
+        return driven(simulation.process, engine, outside, 200, state)
 
     alone = [follow(MujocoEngine(scene, scenario.T), start[:, [i]]) for i in range(3)]
-    # one tape of three would sum the tick's product in another order, so each simulation runs its own
+    # one buffer of three would sum the tick's product in another order, so each simulation runs its own
     batched = [follow(MujocoBatchEngine(scene, scenario.T, nthread=1), start[:, [i]]) for i in range(3)]
     together = follow(MujocoBatchEngine(scene, scenario.T, nsim=3, nthread=2), start)
     for i in range(3):
@@ -141,7 +141,7 @@ def test_a_diverging_run_is_reported_not_reset(engine, capfd, tmp_path, monkeypa
     assert not Path("MUJOCO_LOG.TXT").exists()
 
 
-def test_profiler_clock_is_put_back_and_changes_no_result(assembly, monkeypatch):
+def test_profiler_clock_is_put_back_and_changes_no_result(simulation, monkeypatch):
     pointer = mujoco_engine._profiler_clock()
     assert isinstance(pointer, ctypes.c_void_p)
     before = pointer.value
@@ -150,32 +150,32 @@ def test_profiler_clock_is_put_back_and_changes_no_result(assembly, monkeypatch)
         assert pointer.value is None
     assert pointer.value == before
     monkeypatch.setattr("sim.run.profiler_off", nullcontext)
-    with_clock = run(assembly)
+    with_clock = run(simulation)
     monkeypatch.undo()
-    np.testing.assert_array_equal(with_clock.s, run(assembly).s)
+    np.testing.assert_array_equal(with_clock.s, run(simulation).s)
 
 
-def test_without_the_clock_everything_still_runs(monkeypatch, assembly):
+def test_without_the_clock_everything_still_runs(monkeypatch, simulation):
     monkeypatch.setattr(mujoco_engine, "_profiler_clock", lambda: None)
     with profiler_off() as found:
         assert not found
-    assert run(assembly).s.shape[0] == SHORT.samples
+    assert run(simulation).s.shape[0] == SHORT.samples
 
 
-def test_a_long_trace_lies_on_the_disk(assembly, monkeypatch, tmp_path):
+def test_a_long_trace_lies_on_the_disk(simulation, monkeypatch, tmp_path):
     """The same numbers as in memory; refused where neither has room, with the duration that has."""
-    expected, ticks = run(assembly, "exact"), assembly.scenario.samples
+    expected, ticks = run(simulation, "exact"), simulation.scenario.samples
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(loop, "_SMALL", 0)
     monkeypatch.setattr(loop, "_free_memory", lambda: 400 * ticks)
-    found = run(assembly, "exact")
+    found = run(simulation, "exact")
     for name in ("t", "x", "f", "x_handle", "w", "z", "s"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
     assert not any(tmp_path.iterdir())  # the file has no name, and goes with the trace
     monkeypatch.setattr(loop, "_free_memory", lambda: 200 * ticks)
     with pytest.raises(InputError, match=r"duration: 0.6 s need .* GiB of memory, .* allowed are 0.3 s"):
-        run(assembly, "exact")
+        run(simulation, "exact")
     monkeypatch.setattr(loop, "_free_memory", lambda: 400 * ticks)
     monkeypatch.setattr(loop.shutil, "disk_usage", lambda place: SimpleNamespace(free=1000))
     with pytest.raises(InputError, match=r"duration: .* GiB of .* are free: allowed are"):
-        run(assembly, "exact")
+        run(simulation, "exact")

@@ -10,9 +10,8 @@ import pytest
 from driven import Driven, driven, tick_by_tick
 from scipy.linalg import expm
 
-from controller.coupling import NoCoupling
-from controller.process import Process, StepBuffer
-from design.result import CASE_I
+from controller.coupling import CASE_I, NoCoupling
+from controller.tick import Process, StepBuffer
 from models.device import CompliantDevice
 from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
@@ -42,20 +41,20 @@ def stiff(transmission: float):
     return assemble(SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=transmission),) * 2), CASE_I)
 
 
-def knocked(assembly, engine: Engine, ticks: int, start=None) -> Driven:
+def knocked(simulation, engine: Engine, ticks: int, start=None) -> Driven:
     """A run that the voluntary motion of nobody disturbs: 5 N on both handles for 20 ticks."""
 
     def outside(first, count):
-        w = np.zeros((count, assembly.scene.outside))
-        w[: max(0, 20 - first), list(assembly.scene.tapped)] = 5.0
+        w = np.zeros((count, simulation.scene.outside))
+        w[: max(0, 20 - first), list(simulation.scene.tapped)] = 5.0
         return w
 
-    begin = np.zeros((assembly.plant.A.shape[0], 1)) if start is None else start
-    return driven(assembly.process, engine, outside, ticks, begin)
+    begin = np.zeros((simulation.plant.A.shape[0], 1)) if start is None else start
+    return driven(simulation.process, engine, outside, ticks, begin)
 
 
 @pytest.fixture(scope="module")
-def assembly():
+def simulation():
     return assemble(SCENARIO, CASE_I)
 
 
@@ -112,25 +111,25 @@ def test_a_run_is_the_exact_engines_through_saturation_and_all():
     np.testing.assert_allclose(own.s, exact.s, rtol=1e-9, atol=1e-13)
 
 
-def test_more_substeps_change_nothing(assembly):
-    one, three = (knocked(assembly, make_engine(assembly, "mujoco", EXPONENTIAL, n), 500).s for n in (1, 3))
+def test_more_substeps_change_nothing(simulation):
+    one, three = (knocked(simulation, make_engine(simulation, "mujoco", EXPONENTIAL, n), 500).s for n in (1, 3))
     np.testing.assert_allclose(one, three, rtol=1e-9, atol=1e-13)
 
 
 # ---- where it cannot be exact
 
 
-def test_the_forces_are_mujocos(assembly):
+def test_the_forces_are_mujocos(simulation):
     """Springs changed behind the engine's back show: J is the old one, the accelerations are the new ones'. With a
     wrong J the method is still consistent, of first order: halving the step halves what is left."""
     wrong = 1.5
     errors = []
     for substeps in (8, 16):
-        engine = MujocoEngine(assembly.scene, SCENARIO.T, EXPONENTIAL, substeps)
+        engine = MujocoEngine(simulation.scene, SCENARIO.T, EXPONENTIAL, substeps)
         engine.model.tendon_stiffness[...] *= wrong
-        errors.append(_one_period(assembly.process, engine, assembly.scene.outside))
+        errors.append(_one_period(simulation.process, engine, simulation.scene.outside))
     truth = hold(plant(engine.model), SCENARIO.T).A
-    old = hold(plant(assembly.scene.model), SCENARIO.T).A
+    old = hold(plant(simulation.scene.model), SCENARIO.T).A
     first, second = (np.abs(step - truth).max() for step in errors)
     assert np.abs(old - truth).max() > 5 * first
     assert np.log2(first / second) == pytest.approx(1, abs=0.2)
@@ -139,12 +138,12 @@ def test_the_forces_are_mujocos(assembly):
 def _one_period(process: Process, engine: Engine, outside: int):
     """What an engine does with every basis state."""
     columns = []
-    tape = StepBuffer(process, 1, 8, outside)
+    buffer = StepBuffer(process, 1, 8, outside)
     for unit in 1e-6 * np.eye(8):
-        tape.s[0, :, 0] = unit
-        engine.start(tape)
+        buffer.s[0, :, 0] = unit
+        engine.start(buffer)
         engine.advance(0)
-        columns.append(tape.s[1, :, 0] / 1e-6)
+        columns.append(buffer.s[1, :, 0] / 1e-6)
     return np.stack(columns, axis=1)
 
 
@@ -161,14 +160,14 @@ def test_of_first_order_where_devices_rub():
     assert np.sqrt(np.mean((positions("RK4", 4) - truth) ** 2)) < errors[1] / 30
 
 
-def test_springs_need_mujocos_position_stage(assembly):
+def test_springs_need_mujocos_position_stage(simulation):
     """A tendon's length is found in that stage: mj_forwardSkip without it leaves the old spring forces."""
-    data = mujoco.MjData(assembly.scene.model)
-    mujoco.mj_forward(assembly.scene.model, data)
+    data = mujoco.MjData(simulation.scene.model)
+    mujoco.mj_forward(simulation.scene.model, data)
     data.qpos[0] = 1e-3
-    mujoco.mj_forwardSkip(assembly.scene.model, data, mujoco.mjtStage.mjSTAGE_POS, 1)
+    mujoco.mj_forwardSkip(simulation.scene.model, data, mujoco.mjtStage.mjSTAGE_POS, 1)
     skipped = data.qacc.copy()
-    mujoco.mj_forward(assembly.scene.model, data)
+    mujoco.mj_forward(simulation.scene.model, data)
     # 14500 N/m through 1 mm on a motor of 0.06 kg
     assert data.qacc[0] == pytest.approx(-14.5 / 0.06, rel=1e-9)
     assert skipped[0] == 0.0
@@ -182,20 +181,20 @@ def hands(count: int) -> Crowd:
     return Crowd(np.exp(rng.uniform(np.log([0.01, 0.1, 1.0]), np.log([3.0, 30.0, 2000.0]), (count, 2, 1, 3))))
 
 
-def test_a_batch_is_a_loop_over_single_engines(assembly):
+def test_a_batch_is_a_loop_over_single_engines(simulation):
     """One simulation bit for bit; of several only the sums of their products run in another order."""
     start = 1e-3 * np.random.default_rng(0).normal(size=(8, 3))
 
     def batch(nsim, nthread=1):
-        return MujocoBatchEngine(assembly.scene, SCENARIO.T, EXPONENTIAL, 1, nsim, nthread)
+        return MujocoBatchEngine(simulation.scene, SCENARIO.T, EXPONENTIAL, 1, nsim, nthread)
 
-    single = [tick_by_tick(make_engine(assembly, "mujoco")) for _ in range(3)]
-    alone = [knocked(assembly, engine, 300, start[:, [i]]).s for i, engine in enumerate(single)]
+    single = [tick_by_tick(make_engine(simulation, "mujoco")) for _ in range(3)]
+    alone = [knocked(simulation, engine, 300, start[:, [i]]).s for i, engine in enumerate(single)]
     for i in range(3):
-        np.testing.assert_array_equal(knocked(assembly, batch(1), 300, start[:, [i]]).s, alone[i])
-    together = knocked(assembly, batch(3), 300, start).s
+        np.testing.assert_array_equal(knocked(simulation, batch(1), 300, start[:, [i]]).s, alone[i])
+    together = knocked(simulation, batch(3), 300, start).s
     np.testing.assert_allclose(together, np.concatenate(alone, axis=2), rtol=1e-10, atol=1e-15)
-    np.testing.assert_array_equal(together, knocked(assembly, batch(3, nthread=2), 300, start).s)
+    np.testing.assert_array_equal(together, knocked(simulation, batch(3, nthread=2), 300, start).s)
 
 
 @pytest.mark.parametrize("substeps", [1, 2])
@@ -228,9 +227,9 @@ def test_many_sampled_plants_are_as_exact_as_one():
 # ---- which one, and how many substeps
 
 
-def test_the_default_follows_from_the_scene(assembly):
+def test_the_default_follows_from_the_scene(simulation):
     rubbing = assemble(RUBBING, CASE_I)
-    assert (default_integrator(assembly.scene), default_substeps(assembly, EXPONENTIAL)) == (EXPONENTIAL, 1)
+    assert (default_integrator(simulation.scene), default_substeps(simulation, EXPONENTIAL)) == (EXPONENTIAL, 1)
     assert (default_integrator(rubbing.scene), default_substeps(rubbing, "RK4")) == ("RK4", 4)
     # no rule asks for more on a stiff linear scene, where Runge-Kutta takes 32
     assert default_substeps(stiff(1.45e6), EXPONENTIAL) == 1
@@ -242,9 +241,9 @@ def test_the_default_follows_from_the_scene(assembly):
     assert default_substeps(rubbing, EXPONENTIAL) == 4
 
 
-def test_an_engine_without_a_name_of_its_integrator_takes_the_default(assembly):
+def test_an_engine_without_a_name_of_its_integrator_takes_the_default(simulation):
     rubbing = assemble(RUBBING, CASE_I)
-    for loop, integrator, substeps in ((assembly, EXPONENTIAL, 1), (rubbing, "RK4", 4)):
+    for loop, integrator, substeps in ((simulation, EXPONENTIAL, 1), (rubbing, "RK4", 4)):
         named = knocked(loop, make_engine(loop, "mujoco", integrator, substeps), 100).s
         np.testing.assert_array_equal(knocked(loop, make_engine(loop, "mujoco"), 100).s, named)
 
@@ -258,9 +257,9 @@ def test_an_engine_without_a_name_of_its_integrator_takes_the_default(assembly):
         (lambda a: make_engine(assemble(RUBBING, CASE_I), "exact"), "have Coulomb friction, which the exact engine"),
     ],
 )
-def test_what_is_refused_is_named(assembly, call, message):
+def test_what_is_refused_is_named(simulation, call, message):
     with pytest.raises(ValueError, match=message):
-        call(assembly)
+        call(simulation)
 
 
 def test_a_heavy_hand_on_a_light_handle_needs_no_substeps():
@@ -279,8 +278,8 @@ def cheapest(loop, error, ticks):
     return pick(compare_engines(loop, error, ticks), error)
 
 
-def test_the_cheapest_on_a_smooth_scene_is_one_exponential_step(assembly):
-    found = cheapest(assembly, 1e-9, 500)
+def test_the_cheapest_on_a_smooth_scene_is_one_exponential_step(simulation):
+    found = cheapest(simulation, 1e-9, 500)
     assert (found.integrator, found.substeps) == (EXPONENTIAL, 1)
     assert found.error < 1e-11
     assert found.cpu_s > 0

@@ -75,10 +75,10 @@ def test_a_limit_cycle_neither_grows_nor_decays():
 
 def test_the_exact_engines_growth_without_its_states():
     """The loop without coupling, people moving: its eigenvalue, to the 1e-3 1/s that sim.stability is held to."""
-    assembly = assemble(load().replace(duration=6.0), NoCoupling())
-    exact = dominant_mode(close(assembly.plant, assembly.F)).growth
-    record = run(assembly, "exact")
-    ticks = record.ticks_before_clipping(assembly.process.force_limit)
+    simulation = assemble(load().replace(duration=6.0), NoCoupling())
+    exact = dominant_mode(close(simulation.plant, simulation.F)).growth
+    record = run(simulation, "exact")
+    ticks = record.ticks_before_clipping(simulation.process.force_limit)
     found = growth(record.x[:ticks], T, STEP)
     assert found.growth_rate_per_s == pytest.approx(exact, abs=1e-3)
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from driven import driven
 
-from controller.coupling import NoCoupling, SpringDamper
+from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from design.certificate import assess
-from design.result import CASE_I
 from models.device import CompliantDevice
 from models.human import Human, Link
 from sim.accuracy import limit_cycle

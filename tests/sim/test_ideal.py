@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cli.run import main
-from controller.coupling import NoCoupling, SpringDamper
-from design.result import CASE_I
+from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from sim.accuracy import ForceError, force_error, response
 from sim.run import Simulation, assemble, run
 from sim.scenario import load
@@ -35,15 +34,15 @@ def by_hand(T: float, x: np.ndarray, late: tuple[int, ...]) -> np.ndarray:
     return shifted
 
 
-def record_of(assembly: Simulation, seconds: float) -> Trace:
-    return run(assembly, "exact", ticks=round(seconds / SCENARIO.T))
+def record_of(simulation: Simulation, seconds: float) -> Trace:
+    return run(simulation, "exact", ticks=round(seconds / SCENARIO.T))
 
 
 @pytest.mark.parametrize(("case", "late"), [("I", (1, 2)), ("II", (0, 0))])
 def test_the_ideal_force_is_the_networks_for_the_measured_motion(case, late):
-    assembly = assemble(SCENARIO, CASE_I)
-    record = record_of(assembly, 2.0)
-    alike = force_error(assembly, record, SCENARIO.loop(case).lam)
+    simulation = assemble(SCENARIO, CASE_I)
+    record = record_of(simulation, 2.0)
+    alike = force_error(simulation, record, SCENARIO.loop(case).lam)
     expected = by_hand(SCENARIO.T, record.x, late)
     # 1700 ticks of a lightly damped mass in another order of operations
     np.testing.assert_allclose(alike.ideal, expected, atol=1e-9 * np.abs(expected).max())
@@ -63,10 +62,10 @@ def test_the_response_is_the_convolution_with_the_impulse_response():
 
 def test_a_loop_without_coupling_is_ideal_even_where_its_motors_clip():
     """F = Theta E = Lambda E: what it asks for is exactly right, and it is unstable."""
-    assembly = assemble(SCENARIO.replace(theta=(2, 3)), NoCoupling())
-    record = record_of(assembly, 6.0)
+    simulation = assemble(SCENARIO.replace(theta=(2, 3)), NoCoupling())
+    record = record_of(simulation, 6.0)
     assert np.abs(record.f).max() == 12.0
-    part = force_error(assembly, record, (2, 3)).part()
+    part = force_error(simulation, record, (2, 3)).part()
     assert part["asked_rms_n"] > np.sqrt(np.mean(record.f**2))
     assert part["error_percent"] < 1e-8
 

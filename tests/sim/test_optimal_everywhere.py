@@ -130,10 +130,10 @@ class _Never(Executor):
 def test_the_live_window_runs_it_as_the_simulator_does(files, form):
     scenario, _, path = files[form]
     shown = first_loop(Menu("I", given=str(path)), scenario, GIVEN)
-    running = live.Session(shown, _Never(), (), np.inf)
+    running = live.LiveLoop(shown, _Never(), (), np.inf)
     frame = running.frame(0.25)
     ticks = round(frame.t / scenario.T)
-    record = close_loop(shown.assembly, "exact", ticks=ticks + 1)
+    record = close_loop(shown.simulation, "exact", ticks=ticks + 1)
     np.testing.assert_allclose(frame.history, record.f[:ticks], rtol=0, atol=1e-13)  # sums of ninety states
 
 

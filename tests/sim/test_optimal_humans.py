@@ -82,8 +82,8 @@ def test_the_same_hands_upset_the_loop_without_coupling(scenario):
 @pytest.mark.parametrize("lossless", [False, True], ids=["random", "lossless"])
 def test_mujoco_says_the_same(scenario, lossless):
     """The eigenvalues of MuJoCo's own one-period map, for all of them."""
-    assembly = assemble(load(scenario), optimal())
-    mujoco = dominant_mode(mujoco_loops(held(scenario, lossless), assembly.process)).growth
+    simulation = assemble(load(scenario), optimal())
+    mujoco = dominant_mode(mujoco_loops(held(scenario, lossless), simulation.process)).growth
     assert mujoco.max() < DESTABILISED
     assert not disagree(exact_growth(scenario, lossless), mujoco).any()
 

@@ -8,9 +8,8 @@ import pytest
 
 from cli.run import main
 from cli.validate import main as validate_command
-from controller.coupling import NoCoupling
+from controller.coupling import CASE_I, NoCoupling
 from design import design_coupling
-from design.result import CASE_I
 from models.human import Human, Link, Person, Port, state_space
 from models.scene import variants
 from sim import load, simulate, validate
@@ -200,8 +199,8 @@ def test_its_verdicts_are_those_of_each_hand_alone():
     found = validate(scenario, CASE_I, humans=6, duration=0.0, engine="exact")
     for i in (0, 5):
         hands = Validation(scenario, CASE_I, 0, 20, 1, "exact", 0.0).crowd(i).humans(0)
-        assembly = assemble(scenario.replace(human=hands), CASE_I)
-        assert found.exact[i] == pytest.approx(dominant_mode(close(assembly.plant, assembly.F)).growth, abs=1e-9)
+        simulation = assemble(scenario.replace(human=hands), CASE_I)
+        assert found.exact[i] == pytest.approx(dominant_mode(close(simulation.plant, simulation.F)).growth, abs=1e-9)
 
 
 def test_a_person_may_hold_with_such_hands():
@@ -219,7 +218,7 @@ def test_a_scenario_keeps_it_and_says_what_is_none():
     assert len({held_by(Muscle(mass=m), Muscle()).digest for m in (0.2, 0.3, 0.3)}) == 2
     with pytest.raises(InputError, match="human has 1 entries"):
         held_by(Muscle())
-    with pytest.raises(InputError, match=r"human\[1\] is None, expected a Human, or what has port\(\)"):
+    with pytest.raises(InputError, match=r"human #2 is None, expected a Human, or what has port\(\)"):
         held_by(Muscle(), None)
     with pytest.raises(InputError, match="damping has a negative"):
         held_by(Muscle(), Muscle(damping=-1.0))
@@ -253,9 +252,9 @@ def test_a_measured_hand_and_a_population_from_files(tmp_path):
     run = simulate(SCENARIO.replace(human=people, duration=0.5), CASE_I, engine="exact")
     assert run.meta["stability"]["exact_verdict"] == "stable"
     for text, message in [
-        (space.format(C=-200.0) + chain, "human[0]: impedance: not passive"),
-        (space.format(C='"x"') + chain, "human[0].C[0][0] = 'x': expected `float`"),
-        (chain.replace("mass", "mas") + chain, "human[0].links[0]: object contains unknown field `mas`"),
+        (space.format(C=-200.0) + chain, "human #1: impedance: not passive"),
+        (space.format(C='"x"') + chain, "human #1.C #1 #1 = 'x': expected `float`"),
+        (chain.replace("mass", "mas") + chain, "human #1.links #1: object contains unknown field `mas`"),
     ]:
         file.write_text(text)
         with pytest.raises(InputError) as caught:
@@ -267,8 +266,8 @@ def test_a_measured_hand_and_a_population_from_files(tmp_path):
     assert len(load_humans(python, 2).population.draw(None, 3)) == 3
     for text, message in [
         (drawn.format("[]") + "population = Draw()\n", "population.draw(rng, 2) gives not two humans"),
-        (drawn.format("[1] * n") + "population = Draw()\n", "human[0] is 1, expected a Human"),
-        ("humans, persons = [], [1]\n", "persons[0] is 1, expected a models.human.Person"),
+        (drawn.format("[1] * n") + "population = Draw()\n", "human #1 is 1, expected a Human"),
+        ("humans, persons = [], [1]\n", "persons #1 is 1, expected a models.human.Person"),
     ]:
         python.write_text(text)
         with pytest.raises(InputError) as caught:

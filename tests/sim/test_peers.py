@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from design.result import CASE_I
+from controller.coupling import CASE_I
 from sim.run import assemble, outside_forces
 from sim.scenario import load
 
@@ -31,10 +31,10 @@ ALLOWED = {
 
 @pytest.fixture(scope="module")
 def loop():
-    assembly = assemble(load().replace(duration=0.3), CASE_I)
-    w = outside_forces(assembly.scenario, assembly.scene, 0, assembly.scenario.samples)
-    w[5:30, assembly.scene.tapped[0]] += 1.0
-    return assembly, w, peers.PEERS["exact"](assembly, w)
+    simulation = assemble(load().replace(duration=0.3), CASE_I)
+    w = outside_forces(simulation.scenario, simulation.scene, 0, simulation.scenario.samples)
+    w[5:30, simulation.scene.tapped[0]] += 1.0
+    return simulation, w, peers.PEERS["exact"](simulation, w)
 
 
 def test_every_peer_is_looked_at():
@@ -47,8 +47,8 @@ def test_it_is_the_same_loop(loop, name):
     allowed, needed = ALLOWED[name]
     if needed:
         pytest.importorskip(needed)
-    assembly, w, (z, s, f) = loop
-    others_z, others_s, others_f = peers.PEERS[name](assembly, w)
+    simulation, w, (z, s, f) = loop
+    others_z, others_s, others_f = peers.PEERS[name](simulation, w)
     assert (others_z.shape, others_s.shape, others_f.shape) == (z.shape, s.shape, f.shape)
     m = f.shape[1]
     for own, exact in ((others_s[:, :m], s[:, :m]), (others_f, f)):

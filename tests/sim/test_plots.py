@@ -93,7 +93,7 @@ def test_names_walls_and_curves_that_coincide(drawn):
     wave = np.sin(t / 300)
     f = np.stack([wave, wave, 2 * wave], axis=1)
     touching = wave > 0.5
-    around = plots.Surroundings(("left", "right", "top"), [(0, 0.0005, "wall 1")], touching)
+    around = plots.Contacts(("left", "right", "top"), [(0, 0.0005, "wall 1")], touching)
     figure = drawn(plots.plot_run, trace(f), title="t", frequency_hz=80.0, around=around)
     displacement, force = figure.axes
     assert legend(figure) == [

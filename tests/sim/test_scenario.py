@@ -11,22 +11,22 @@ from sim.scenario import SCENARIOS, InputError, built_in, load, parse
 TEXT = (SCENARIOS / "omega-pair.toml").read_text()
 
 BAD = [
-    ("theta = [1, 2]", "theta = [1, 1.5]", "theta[1] = 1.5: expected `int`, got `float`"),
+    ("theta = [1, 2]", "theta = [1, 1.5]", "theta #2 = 1.5: expected `int`, got `float`"),
     ("theta = [1, 2]", "theta = [1]", "theta has 1 entries, but the environment has 2 contacts"),
-    ("theta = [1, 2]", "theta = [1, -1]", "theta[1] is -1, allowed are 0 to 1000 samples"),
-    ("theta = [1, 2]", "theta = [1, true]", "theta[1] = True: expected `int`"),
+    ("theta = [1, 2]", "theta = [1, -1]", "theta #2 is -1, allowed are 0 to 1000 samples"),
+    ("theta = [1, 2]", "theta = [1, true]", "theta #2 = True: expected `int`"),
     ("psi = [0, 0]", "psi = [0, 0, 0]", "psi has 3 entries"),
-    ("psi = [0, 0]", "psi = [0, 0]\nlam = [2, 2]", "lam[0] is 2, allowed are 0 to theta + psi = 1 samples"),
+    ("psi = [0, 0]", "psi = [0, 0]\nlam = [2, 2]", "lam #1 is 2, allowed are 0 to theta + psi = 1 samples"),
     ("T = 1.2e-3", "T = 1.2", "T is 1.2, allowed are 1e-06 to 0.1 s"),
     ("T = 1.2e-3", "T = nan", "T is nan"),
     ("T = 1.2e-3", "T = '1.2 ms'", "T = '1.2 ms': expected `float`, got `str`"),
     ("T = 1.2e-3", "T == 1", "not valid TOML"),
     ("name = ", "nam = ", "unknown field `nam` (did you mean `name`?)"),
-    ("motor_mass = 0.06 ", "motor_mass = -0.06", "device[0]: motor_mass is -0.06, allowed are 1e-06 to 1000 kg"),
+    ("motor_mass = 0.06 ", "motor_mass = -0.06", "device #1: motor_mass is -0.06, allowed are 1e-06 to 1000 kg"),
     ("motor_mass = 0.06 ", "motor_mas = 0.06", "unknown field `motor_mas` (did you mean `motor_mass`?)"),
     ("damping = 1.37 ", "damping = 1.37\ndelta = 2.0", "delta is 2 N s/m, allowed are values in (0, damping = 1.37]"),
-    ('kind = "compliant" ', 'kind = "soft"', "device[0].kind = 'soft': invalid value 'soft', allowed are 'compliant'"),
-    ("mass = 0.3", "mass = 3e5", "human[0].links[0]: mass is 300000, allowed are 0 to 1000 kg"),
+    ('kind = "compliant" ', 'kind = "soft"', "device #1.kind = 'soft': invalid value 'soft', allowed are 'compliant'"),
+    ("mass = 0.3", "mass = 3e5", "human #1.links #1: mass is 300000, allowed are 0 to 1000 kg"),
     ("frequency = 0.6", "frequency = inf", "frequency is inf"),
     ("stiffness = 800.0", "stiffness = -800.0", "stiffness between contact 1 and mass is -800.0"),
     ("mass = 1.0 }", "mas = 1.0 }", "masses names 'mas', which no spring reaches"),
@@ -110,7 +110,7 @@ def test_replacing_checks_again():
     assert scenario.replace(delta=(2.0, 0.8)).delta == (2.0, 0.8)
     for change, message in [
         ({"theta": (1, 2, 3)}, "theta has 3 entries"),
-        ({"delta": (1.0, -1.0)}, r"delta\[1\] is -1, allowed are 0 to 10000 N s/m"),
+        ({"delta": (1.0, -1.0)}, r"delta #2 is -1, allowed are 0 to 10000 N s/m"),
         ({"delta": (1.0,)}, "delta has 1 entries for 2 channels"),
     ]:
         with pytest.raises(InputError, match=message):
@@ -136,9 +136,9 @@ def test_what_a_script_has_becomes_what_a_file_has():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"theta": (1.5, 1)}, "theta[0] = 1.5: expected `int`, got `float`"),
-        ({"theta": np.array([1.5, 1])}, "theta[0] = 1.5: expected `int`, got `float`"),
-        ({"theta": (True, 1)}, "theta[0] = True: expected `int`, got `bool`"),
+        ({"theta": (1.5, 1)}, "theta #1 = 1.5: expected `int`, got `float`"),
+        ({"theta": np.array([1.5, 1])}, "theta #1 = 1.5: expected `int`, got `float`"),
+        ({"theta": (True, 1)}, "theta #1 = True: expected `int`, got `bool`"),
         ({"theta": 1}, "theta = 1: expected `array`, got `int`"),
         ({"theta": "12"}, "theta = '12': expected `array`, got `str`"),
         ({"theta": {1, 2}}, "theta holds {1, 2} (set), which no scenario can have"),
@@ -147,10 +147,10 @@ def test_what_a_script_has_becomes_what_a_file_has():
         ({"T": 1j}, "T holds 1j (complex), which no scenario can have"),
         ({"name": b"x"}, "name holds b'x' (bytes), which no scenario can have"),
         ({"human": None}, "human: expected `array`, got `null`"),
-        ({"device": ("a", "b")}, "device[0] = 'a': expected `object`, got `str`"),
+        ({"device": ("a", "b")}, "device #1 = 'a': expected `object`, got `str`"),
         ({"delta": 1.0}, "delta = 1.0: expected `array`, got `float`"),
-        ({"delta": (1.0, "x")}, "delta[1] = 'x': expected `float`, got `str`"),
-        ({"delta": (float("nan"), 1.0)}, "delta[0] is nan, allowed are 0 to 10000 N s/m"),
+        ({"delta": (1.0, "x")}, "delta #2 = 'x': expected `float`, got `str`"),
+        ({"delta": (float("nan"), 1.0)}, "delta #1 is nan, allowed are 0 to 10000 N s/m"),
         ({"thta": (1, 1)}, "unknown field `thta` (did you mean `theta`?)"),
     ],
 )
@@ -211,10 +211,10 @@ def test_a_device_of_the_catalogue_with_overrides():
 @pytest.mark.parametrize(
     ("device", "message"),
     [
-        ('"falcon"', "device[0]: nobody publishes damping [N s/m] of falcon: give it beside `device`"),
-        ('["omega.3", "inverse3"]', "device[1]: nobody publishes damping [N s/m] and force_limit [N] of inverse3"),
-        ('["omega.3", "falkon"]', "device[1]: device is 'falkon' (did you mean falcon?), the catalogue has omega.3"),
-        ('[{ device = "falcon", damping = -1.0 }, "omega"]', "device[0]: damping is -1"),
+        ('"falcon"', "device #1: nobody publishes damping [N s/m] of falcon: give it beside `device`"),
+        ('["omega.3", "inverse3"]', "device #2: nobody publishes damping [N s/m] and force_limit [N] of inverse3"),
+        ('["omega.3", "falkon"]', "device #2: device is 'falkon' (did you mean falcon?), the catalogue has omega.3"),
+        ('[{ device = "falcon", damping = -1.0 }, "omega"]', "device #1: damping is -1"),
         ('[{ device = "falcon", damping = 1.0, mas = 1.0 }, "omega"]', "unknown field `mas` (did you mean `mass`?)"),
     ],
 )

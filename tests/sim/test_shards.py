@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from cli.validate import main
-from design.result import CASE_I
+from controller.coupling import CASE_I
 from sim import shards
 from sim.crowds import BATCH, MIXED, Findings, Validation
 from sim.scenario import InputError, load

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from controller.coupling import NoCoupling
-from design.result import CASE_I, CASE_II
+from controller.coupling import CASE_I, CASE_II, NoCoupling
 from sim.run import assemble, run
 from sim.scenario import load
 from sim.stability import NOT_EXCITED, Mode, close, dominant_mode, left_eigenvector, measured_growth, verdict
@@ -15,42 +14,42 @@ from sim.stability import NOT_EXCITED, Mode, close, dominant_mode, left_eigenvec
     [(NoCoupling(), 1.481, 83.98), (CASE_I, -0.939, 83.83), (CASE_II, -1.718, 1.93)],
 )
 def test_exact_and_measured_growth(coupling, growth, frequency):
-    assembly = assemble(load(), coupling)
-    loop = close(assembly.plant, assembly.F)
+    simulation = assemble(load(), coupling)
+    loop = close(simulation.plant, simulation.F)
     mode = dominant_mode(loop)
     assert mode.growth == pytest.approx(growth, abs=1e-3)
     assert mode.frequency_hz == pytest.approx(frequency, abs=1e-2)
-    measured, reason = measured_growth(loop, run(assembly), assembly.process.force_limit)
+    measured, reason = measured_growth(loop, run(simulation), simulation.process.force_limit)
     assert reason is None
     assert measured == pytest.approx(mode.growth, abs=1e-3)
 
 
 def test_the_this_environment_matrix_is_the_loop():
     """Stepping the matrix by hand gives the loop's own record."""
-    assembly = assemble(load().replace(theta=(3, 0), psi=(1, 2), duration=0.5), CASE_I)
-    record = run(assembly, "exact")
-    loop = close(assembly.plant, assembly.F)
+    simulation = assemble(load().replace(theta=(3, 0), psi=(1, 2), duration=0.5), CASE_I)
+    record = run(simulation, "exact")
+    loop = close(simulation.plant, simulation.F)
     xi = np.zeros(loop.A.shape[0])
     for k in range(len(record.s)):
-        np.testing.assert_allclose(xi[: assembly.plant.A.shape[0]], record.s[k], atol=1e-12)
+        np.testing.assert_allclose(xi[: simulation.plant.A.shape[0]], record.s[k], atol=1e-12)
         xi = loop.A @ xi + loop.B @ record.w[k]
 
 
 def test_left_eigenvector():
-    assembly = assemble(load(), NoCoupling())
-    loop = close(assembly.plant, assembly.F)
+    simulation = assemble(load(), NoCoupling())
+    loop = close(simulation.plant, simulation.F)
     left = left_eigenvector(loop).conj()
     np.testing.assert_allclose(left @ loop.A, dominant_mode(loop).eigenvalue * left, atol=1e-9)
 
 
 def test_a_trace_that_says_nothing_gives_a_reason():
-    assembly = assemble(load().replace(duration=0.1), CASE_I)
-    loop = close(assembly.plant, assembly.F)
-    limit = assembly.process.force_limit
-    growth, reason = measured_growth(loop, run(assembly), limit)
+    simulation = assemble(load().replace(duration=0.1), CASE_I)
+    loop = close(simulation.plant, simulation.F)
+    limit = simulation.process.force_limit
+    growth, reason = measured_growth(loop, run(simulation), limit)
     assert growth is None
     assert "only 82 ticks" in reason
-    still = run(assembly, "exact", lambda first, ticks: np.zeros((ticks, assembly.scene.outside)), 300)
+    still = run(simulation, "exact", lambda first, ticks: np.zeros((ticks, simulation.scene.outside)), 300)
     assert measured_growth(loop, still, limit) == (None, NOT_EXCITED)
 
 

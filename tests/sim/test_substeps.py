@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cli.run import main
-from controller.coupling import NoCoupling
-from design.result import CASE_I
+from controller.coupling import CASE_I, NoCoupling
 from models.device import CompliantDevice
 from models.human import Human, Link, Person
 from models.scene import plant
@@ -30,7 +29,7 @@ STIFF = SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=1e6),) *
 
 
 @pytest.fixture(scope="module")
-def assembly():
+def simulation():
     return assemble(SCENARIO, CASE_I)
 
 
@@ -45,23 +44,23 @@ def test_pace_of_known_matrices():
     assert pace(np.zeros((2, 2))) == PlantSpeed(0.0, 0.0)
 
 
-def test_the_default_scenario_needs_no_more_than_four(assembly):
-    assert pace(plant(assembly.scene.model).A).mode == pytest.approx(520.8, abs=0.1)
-    assert default_substeps(assembly) == 4
+def test_the_default_scenario_needs_no_more_than_four(simulation):
+    assert pace(plant(simulation.scene.model).A).mode == pytest.approx(520.8, abs=0.1)
+    assert default_substeps(simulation) == 4
 
 
-def test_the_exact_engine_is_its_own_map(assembly):
-    held = measured_hold(assembly, "exact")
-    np.testing.assert_allclose(held.A, assembly.plant.A, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(held.B, assembly.plant.B, rtol=1e-9, atol=1e-12)
+def test_the_exact_engine_is_its_own_map(simulation):
+    held = measured_hold(simulation, "exact")
+    np.testing.assert_allclose(held.A, simulation.plant.A, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(held.B, simulation.plant.B, rtol=1e-9, atol=1e-12)
 
 
 # `discrete` keeps a memory of its own from step to step, so no map of position and velocity is all of it
 @pytest.mark.parametrize("integrator", sorted(set(INTEGRATORS) - {"discrete"}))
-def test_the_map_is_what_a_run_does(assembly, integrator):
+def test_the_map_is_what_a_run_does(simulation, integrator):
     """Stepping the map closed with the process gives the simulated trace."""
-    record = run(assembly, make_engine(assembly, "mujoco", integrator, 4), ticks=300)
-    held = measured_hold(assembly, "mujoco", integrator, 4)
+    record = run(simulation, make_engine(simulation, "mujoco", integrator, 4), ticks=300)
+    held = measured_hold(simulation, "mujoco", integrator, 4)
     for k in range(299):
         follows = held.A @ record.s[k] + held.B @ np.concatenate([record.w[k], record.f[k]])
         np.testing.assert_allclose(follows, record.s[k + 1], rtol=1e-9, atol=1e-12)

@@ -10,10 +10,10 @@ from worlds import VERTICES_ONLY
 
 from cli import zwidth
 from cli.options import BAD_INPUT, DONE, execute
-from controller.contact import limited
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring
-from controller.process import Process, StepBuffer
+from controller.limiter import limited
+from controller.tick import Process, StepBuffer
 from design.frequency import on_circle
 from models.scene import variants
 from sim.couplings import choose

@@ -11,7 +11,7 @@ from worlds import STIFF
 from cli.run import main
 from cli.validate import main as validate
 from controller.delay import VaryingDelay, ages, realising
-from controller.process import StepBuffer
+from controller.tick import StepBuffer
 from design import stored
 from models.scene import Crowd, plant, variants
 from sim.crowds import draw
@@ -54,23 +54,23 @@ def test_the_product_of_mode_matrices_is_the_simulated_map():
     G = without_theta(ASSEMBLY, STIFF)
     moved = with_delays(ASSEMBLY, STIFF, realising(wanted)[:, :, None])
     states = moved.plant.A.shape[0]
-    tape = StepBuffer(unlimited(moved.process), ticks, states, moved.scene.outside)
-    tape.s[0, :, 0] = rng.normal(size=states)
+    buffer = StepBuffer(unlimited(moved.process), ticks, states, moved.scene.outside)
+    buffer.s[0, :, 0] = rng.normal(size=states)
     engine = ExactEngine(moved.plant, np.full(2, np.inf))
-    engine.start(tape)
+    engine.start(buffer)
     for k in range(ticks):
-        tape.tick(k)
+        buffer.tick(k)
         engine.advance(k)
 
     xi = np.zeros(states + G.order + sum(depth))
-    xi[:states] = tape.s[0, :, 0]
+    xi[:states] = buffer.s[0, :, 0]
     held = own_hold()
     for row in wanted:
         xi = mode_matrix(held, G, depth, row) @ xi
-    size = np.abs(tape.s[:, :, 0]).max()
+    size = np.abs(buffer.s[:, :, 0]).max()
     # both are products of the same 60 matrices up to rounding, 1e-16 each, of numbers up to `size`
-    np.testing.assert_allclose(xi[:states], tape.s[ticks, :, 0], atol=1e-11 * size)
-    np.testing.assert_allclose(xi[states:][: G.order], tape.z[ticks, :, 0], atol=1e-11 * size)
+    np.testing.assert_allclose(xi[:states], buffer.s[ticks, :, 0], atol=1e-11 * size)
+    np.testing.assert_allclose(xi[states:][: G.order], buffer.z[ticks, :, 0], atol=1e-11 * size)
 
 
 def test_constant_delays_give_the_trace_of_the_constant_loop():
@@ -187,7 +187,7 @@ def test_recorded_delays_and_total_loss(tmp_path):
         (["--varying-delay", "2,1"], "varying_delay on channel 1 is 2 to 1"),
         (["--varying-delay", "1-2,1-2,1-2"], "--varying-delay has 3 ranges, expected 2"),
         (["--varying-delay", "a"], "--varying-delay is 'a', expected LO,HI"),
-        (["--varying-delay", "3,4"], "theta[0] is 1, outside of its varying_delay, 3 to 4"),
+        (["--varying-delay", "3,4"], "theta #1 is 1, outside of its varying_delay, 3 to 4"),
         (["--playout"], "--playout without a range of delays"),
         (["--pattern", "random"], "--pattern without a range of delays"),
         (["--varying-delay", "1,2", "--loss", "2"], "varying_delay.loss is 2"),

@@ -13,14 +13,12 @@ import pytest
 from driven import driven
 
 from cli import run as run_command
-from cli.validate import main
-from controller.coupling import NoCoupling, SpringDamper
-from design.result import CASE_I
+from cli.validate import _Traces, main
+from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from models.device import RigidDevice
 from models.human import Person
 from models.scene import Crowd, build, plant, variants
 from sim import crowds as examine_module
-from sim import report as verdict_report
 from sim import shards
 from sim.couplings import choose
 from sim.crowds import BATCH, MIXED, Findings, Validation, crowds, draw
@@ -78,9 +76,9 @@ def test_people_in_both_hands_are_stacked_and_simulated_alike(devices):
         alone = plant(build(devices, people.humans(i), people.persons(i)).model)
         np.testing.assert_allclose(stacked.A[i], alone.A, rtol=1e-12, atol=1e-12 * np.abs(alone.A).max())
         np.testing.assert_allclose(stacked.B[i], alone.B, rtol=1e-13, atol=0)
-    assembly = assemble(scenario, CASE_I)
-    exact = dominant_mode(exact_loops(held_by, assembly.F)).growth
-    np.testing.assert_allclose(dominant_mode(mujoco_loops(held_by, assembly.process)).growth, exact, atol=1e-3)
+    simulation = assemble(scenario, CASE_I)
+    exact = dominant_mode(exact_loops(held_by, simulation.F)).growth
+    np.testing.assert_allclose(dominant_mode(mujoco_loops(held_by, simulation.process)).growth, exact, atol=1e-3)
     # the arms are the same as of people who hold one device each
     np.testing.assert_array_equal(people.links, next(asked(SCENARIO).crowds(range(20)))[1].links)
 
@@ -88,10 +86,10 @@ def test_people_in_both_hands_are_stacked_and_simulated_alike(devices):
 def test_both_engines_simulate_a_person_who_moves_both_hands():
     """RK4 x 4 against the exact solution, voluntary motion and its reaction on the body included."""
     scenario = HELD.replace(duration=1.5)
-    assembly = assemble(scenario, CASE_I)
-    mujoco, exact = run(assembly), run(assembly, "exact")
+    simulation = assemble(scenario, CASE_I)
+    mujoco, exact = run(simulation), run(simulation, "exact")
     assert np.abs(exact.s[:, :2]).max() > 1e-3
-    positions, n = slice(assembly.scene.model.nq), assembly.scene.model.nq
+    positions, n = slice(simulation.scene.model.nq), simulation.scene.model.nq
     np.testing.assert_allclose(mujoco.s[:, positions], exact.s[:, positions], atol=1e-7)
     # speeds ring at the transmissions' 90 Hz after the tap, where RK4 x 4 errs by 1.3e-5 of the fastest one
     np.testing.assert_allclose(mujoco.s[:, n:], exact.s[:, n:], atol=1e-4 * np.abs(exact.s).max())
@@ -131,10 +129,10 @@ def test_batched_eigenvalues_are_those_of_each_loop(coupling, links):
 def test_mujoco_maps_are_the_exact_maps(devices):
     """RK4 x 4 is within 1e-3 1/s of the exact growth for every human: a verdict cannot change but at zero."""
     scenario = SCENARIO.replace(device=devices)
-    assembly = assemble(scenario, CASE_I)
+    simulation = assemble(scenario, CASE_I)
     held_by = variants(devices, crowd(40, 2))
-    exact = dominant_mode(exact_loops(held_by, assembly.F)).growth
-    mujoco = dominant_mode(mujoco_loops(held_by, assembly.process)).growth
+    exact = dominant_mode(exact_loops(held_by, simulation.F)).growth
+    mujoco = dominant_mode(mujoco_loops(held_by, simulation.process)).growth
     np.testing.assert_allclose(mujoco, exact, atol=1e-3)
 
 
@@ -290,10 +288,9 @@ def test_hands_that_had_no_time_to_rest_are_no_verdict(duration):
     """Against the slowest eigenvalue of the same humans, by the exact engine."""
     question = Validation(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
     found = validate(question)
-    traces = verdict_report.validation_part(question, found, True, 1.0)["traces"]
-    assert traces["slowest_decay_s"] == pytest.approx(-1 / found.exact.max())
-    assert traces["settling_decides"] == (duration > 30)
-    assert ("reason" in traces) == (duration < 30)
+    traces = _Traces.of(question, found)
+    assert traces.slowest_decay_s == pytest.approx(-1 / found.exact.max())
+    assert traces.settling_decides == (traces.reason is None) == (duration > 30)
 
 
 @pytest.mark.parametrize(
@@ -319,7 +316,7 @@ def test_bad_calls(options, message, tmp_path):
 def test_a_negative_range_is_refused(tmp_path):
     text = (load.__globals__["SCENARIOS"] / "omega-pair.toml").read_text() + "\n[population]\nmass = [-1.0, 3.0]\n"
     (tmp_path / "s.toml").write_text(text)
-    with pytest.raises(InputError, match=r"mass\[0\] is -1, allowed are"):
+    with pytest.raises(InputError, match=r"mass #1 is -1, allowed are"):
         main(["--scenario", str(tmp_path / "s.toml")])
 
 

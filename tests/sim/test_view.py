@@ -26,8 +26,8 @@ from sim.stability import close, dominant_mode
 from sim.view import film
 from sim.view.events import GIVEN, KEYS, Delay, Menu, Push, Restart, changed, first_loop, parse_script, words
 from sim.view.film import Flat
-from sim.view.session import DAMPING, STIFFNESS, Grip, Pace, Session, gripped
-from sim.view.stage import COLUMNS, Stage, apart, channels, dressed, envelope, keys_help, overlay, places, scale
+from sim.view.session import DAMPING, STIFFNESS, Grip, LiveLoop, Pace, gripped
+from sim.view.stage import COLUMNS, ShownScene, apart, channels, dressed, envelope, keys_help, overlay, places, scale
 from sim.view.window import loop, typed
 
 SCENARIO = load()
@@ -68,7 +68,7 @@ def published():
 
 
 def session(prepared, script="", patience=np.inf):
-    return Session(prepared, Inline(), parse_script(script, 2) if script else (), patience)
+    return LiveLoop(prepared, Inline(), parse_script(script, 2) if script else (), patience)
 
 
 def press(running, *names):
@@ -86,7 +86,7 @@ def test_the_session_is_the_simulation(none):
     for now in np.cumsum(np.random.default_rng(1).uniform(0.001, 0.2, 12)):
         frame = running.frame(now)
     ticks = round(frame.t / SCENARIO.T)
-    record = close_loop(none.assembly, "exact", ticks=ticks + 1)
+    record = close_loop(none.simulation, "exact", ticks=ticks + 1)
     assert np.array_equal(running.state, record.s[ticks])
     assert np.array_equal(frame.history, record.f[:ticks])
     assert np.array_equal(frame.q, record.s[ticks, : frame.q.size])
@@ -106,8 +106,8 @@ def test_frames_tell_the_forces_since_the_last_one(none):
 
 def test_rest_is_where_a_held_position_leads(published):
     """z = A z + B x, and the force is F(1) x; F(1) from the transfer function itself."""
-    F, x = published.assembly.F, np.array([0.01, -0.004])
-    z = published.assembly.process.at_rest(x)
+    F, x = published.simulation.F, np.array([0.01, -0.004])
+    z = published.simulation.process.at_rest(x)
     assert np.allclose(F.A @ z + F.B @ x, z, atol=1e-12)
     # rounding: forces of 10 N as differences of numbers about 1e4 larger
     assert np.allclose(F.C @ z + F.D @ x, F.at(1.0 + 0j).real @ x, atol=1e-8)
@@ -120,7 +120,7 @@ def test_a_switch_keeps_the_plant_and_starts_the_process_at_rest(none):
     assert running.frame(0.5).prepared.label == "published"
     alone.frame(0.5)
     assert np.array_equal(running.state, alone.state)  # position and velocity, although it moves
-    F, x = running.prepared.assembly.F, before.q[:2]
+    F, x = running.prepared.simulation.F, before.q[:2]
     force = running.frame(0.5 + 1.01 * SCENARIO.T).history[-1]
     assert np.allclose(force, F.at(1.0 + 0j).real @ x, atol=1e-8)
 
@@ -146,7 +146,7 @@ def test_a_process_that_runs_away_starts_again():
     soft = SpringDamper(np.array([879.0, 552.0]), np.array([0.39, 0.52]))  # the design for psi = 0
     before = first_loop(Menu("I"), SCENARIO, "published")
     prepared = changed(replace(before, chosen=Chosen("spring-damper", soft, "any-environment")), Delay("psi", 1))
-    assert np.abs(prepared.assembly.F.poles()).max() > 1.6
+    assert np.abs(prepared.simulation.F.poles()).max() > 1.6
     running = session(prepared)
     noted = [running.frame(t).note for t in (1.0, 2.0, 3.0)]  # 1.63^k passes 1e308 at k = 1450, 1.7 s
     assert "ran away, beyond all numbers: restarted from rest" in noted[1]
@@ -182,7 +182,7 @@ def test_keys_that_cannot_be_met_leave_the_loop_running(none):
 
 def test_the_loop_goes_on_while_a_coupling_is_made(none):
     later = Later()
-    running = Session(none, later)
+    running = LiveLoop(none, later)
     press(running, "7", "Up")
     frame = running.frame(0.1)
     assert (frame.t > 0.09, frame.prepared.label, frame.note) == (True, "none", "theta+1: being made")
@@ -241,7 +241,7 @@ def test_the_mouse_is_one_more_passive_hand(none):
     human = SCENARIO.human[0].links[0]
     firmer = Human((Link(human.mass, human.damping + DAMPING, human.stiffness + STIFFNESS),))
     scene = build(SCENARIO.device, (firmer, SCENARIO.human[1]))
-    expected, held = hold(plant(scene.model), SCENARIO.T), gripped(none.assembly.scene, 0, SCENARIO.T)
+    expected, held = hold(plant(scene.model), SCENARIO.T), gripped(none.simulation.scene, 0, SCENARIO.T)
     # both are one matrix exponential of the same matrix, whose entries reach 1e5
     assert np.allclose(held.A, expected.A, rtol=0, atol=1e-10)
     assert np.allclose(held.B, expected.B, rtol=0, atol=1e-12)
@@ -249,24 +249,24 @@ def test_the_mouse_is_one_more_passive_hand(none):
 
 def test_the_mouse_draws_the_handle_and_lets_it_go():
     soft = replace_theta(first_loop(Menu("I"), SCENARIO, "published"), (0, 0))
-    assert dominant_mode(close(gripped(soft.assembly.scene, 1, SCENARIO.T), soft.assembly.F)).growth < 0
+    assert dominant_mode(close(gripped(soft.simulation.scene, 1, SCENARIO.T), soft.simulation.F)).growth < 0
     running, quiet = session(soft), session(soft)
-    handle = soft.assembly.scene.handles[1]
+    handle = soft.simulation.scene.handles[1]
     for k in range(1, 30):
         drawn = running.frame(k / 20, Grip(1, 0.03))
         still = quiet.frame(k / 20)
     assert drawn.q[handle] > still.q[handle] + 0.005
-    assert drawn.push[1] == pytest.approx(Grip(1, 0.03).force(soft.assembly.scene, running.state))
+    assert drawn.push[1] == pytest.approx(Grip(1, 0.03).force(soft.simulation.scene, running.state))
     assert not running.frame(1.5).push.any()
 
 
 def test_the_viewer_s_selection_is_a_grip(none):
-    stage = Stage(none.assembly.scene, none.assembly.process.force_limit)
+    stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     q = np.array([0.001, 0.002, 0.003, 0.004])
     stage.show(q)
     perturb = mujoco.MjvPerturb()
     assert stage.grip(perturb) is None
-    motor, handle = stage.model.body("device_2/motor").id, none.assembly.scene.handles[1]
+    motor, handle = stage.model.body("device_2/motor").id, none.simulation.scene.handles[1]
     perturb.select, perturb.active = motor, int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
     perturb.refselpos[:] = stage.data.xpos[motor] + (0.02, 0.5, 0.1)  # dragged 20 mm along the device
     assert stage.grip(perturb) == Grip(1, pytest.approx(q[handle] + 0.02))
@@ -380,8 +380,8 @@ class FakeWindow:
 
 def test_the_window_s_loop_without_the_window(none):
     """Frames come at 60 Hz of an injected clock, the mouse reaches the session, the words reach the window."""
-    running = Session(none, Inline())
-    stage = Stage(none.assembly.scene, none.assembly.process.force_limit)
+    running = LiveLoop(none, Inline())
+    stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     window, time = FakeWindow(40, stage), [100.0]
 
     def sleep(seconds):
@@ -407,13 +407,13 @@ def test_the_window_s_loop_without_the_window(none):
 
 
 def test_the_window_s_loop_ends_when_it_should(none):
-    stage = Stage(none.assembly.scene, none.assembly.process.force_limit)
+    stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     window, time = FakeWindow(1000, stage), [0.0]
 
     def sleep(seconds):
         time[0] += 0.1
 
-    loop(Session(none, Inline()), stage, window, lambda: time[0], sleep, until=0.55)
+    loop(LiveLoop(none, Inline()), stage, window, lambda: time[0], sleep, until=0.55)
     assert window.synced == 7
 
 
@@ -454,7 +454,7 @@ def test_a_film_is_the_same_every_time(tmp_path, capsys):
 
 def test_flat_pictures_show_where_things_are(none):
     """The first device's handle, by its colour: it moves as many pixels as its position says."""
-    painter = Flat(none.assembly.scene, none.assembly.process.force_limit)
+    painter = Flat(none.simulation.scene, none.simulation.process.force_limit)
     frame = session(none).frame(0.05)
 
     def middle(q):
@@ -477,7 +477,7 @@ def backend():
 
 def test_pictures_by_opengl(backend, none):
     """The scene above, the forces below; the handles move with the positions."""
-    stage = Stage(none.assembly.scene, none.assembly.process.force_limit)
+    stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     painter = film.Offscreen(stage, backend)
     try:
         frame = session(none).frame(0.05)

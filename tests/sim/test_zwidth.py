@@ -10,11 +10,11 @@ import pytest
 
 from cli import zwidth
 from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
-from controller.contact import contact
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall, environment
 from controller.loop import Loop, force_map
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
+from controller.walls import contact
 from design.frequency import on_circle, suprema
 from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Link
@@ -267,10 +267,10 @@ def test_many_processes_are_each_as_alone(walls):
     for k in range(20):
         together.s[k, 0] = x[k]
         together.tick(k)
-        for i, tape in enumerate(alone):
-            tape.s[k, 0] = x[k, i]
-            tape.tick(k)
-            np.testing.assert_allclose(together.f[k, :, i], tape.f[k, :, 0], rtol=1e-9, atol=1e-12)
+        for i, buffer in enumerate(alone):
+            buffer.s[k, 0] = x[k, i]
+            buffer.tick(k)
+            np.testing.assert_allclose(together.f[k, :, i], buffer.f[k, :, 0], rtol=1e-9, atol=1e-12)
     assert np.abs(together.f).max() > 0.1
     assert walls != "limited" or (np.abs(together.f[:20]) == 0.5).mean() > 0.2
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from controller.contact import contact
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall, environment
 from controller.loop import force_map
 from controller.lti import Lti
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
+from controller.walls import contact
 
 T = 1e-3
 NONE = np.zeros(1)
@@ -16,12 +16,12 @@ NONE = np.zeros(1)
 
 def drive(process: Process, x: np.ndarray) -> np.ndarray:
     """Forces for given displacements (ticks, m), tick by tick."""
-    tape = StepBuffer(process, len(x), x.shape[1])
+    buffer = StepBuffer(process, len(x), x.shape[1])
     for k, row in enumerate(x):
-        tape.x[k] = row[:, None]
-        tape.tick(k)
-    tape.saturate(len(x))
-    return tape.f[: len(x), :, 0]
+        buffer.x[k] = row[:, None]
+        buffer.tick(k)
+    buffer.saturate(len(x))
+    return buffer.f[: len(x), :, 0]
 
 
 def wall(K: float, B: float = 0.0) -> Lti:
@@ -82,26 +82,26 @@ def test_the_coupling_is_spring_and_damper_in_parallel():
 def test_many_simulations_are_each_one_alone():
     F = force_map(environment(FIGURE_4, T), SpringDamper([900.0, 500.0], [0.4, 0.5]), [1, 2], [0, 1])
     x = np.random.default_rng(1).normal(size=(20, 2, 5))
-    tape = StepBuffer(process(F), 20, 2, nsim=5)
+    buffer = StepBuffer(process(F), 20, 2, nsim=5)
     for k in range(20):
-        tape.x[k] = x[k]
-        tape.tick(k)
+        buffer.x[k] = x[k]
+        buffer.tick(k)
     for i in range(5):
         # the product's summation order may differ with the number of columns
-        np.testing.assert_allclose(tape.f[:20, :, i], drive(process(F), x[:, :, i]), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(buffer.f[:20, :, i], drive(process(F), x[:, :, i]), rtol=1e-9, atol=1e-9)
 
 
 def test_rewinding_continues_the_run():
     F = force_map(environment(FIGURE_4, T), SpringDamper([900.0, 500.0], [0.4, 0.5]), [1, 2], [0, 0])
     x = np.random.default_rng(2).normal(size=(20, 2))
-    tape = StepBuffer(process(F), 10, 2)
+    buffer = StepBuffer(process(F), 10, 2)
     parts = []
     for stretch in (x[:7], x[7:17], x[17:]):
         for k, row in enumerate(stretch):
-            tape.x[k] = row[:, None]
-            tape.tick(k)
-        parts.append(tape.f[: len(stretch), :, 0].copy())
-        tape.rewind(len(stretch))
+            buffer.x[k] = row[:, None]
+            buffer.tick(k)
+        parts.append(buffer.f[: len(stretch), :, 0].copy())
+        buffer.rewind(len(stretch))
     np.testing.assert_allclose(np.concatenate(parts), drive(process(F), x), rtol=1e-12)
 
 
@@ -112,11 +112,11 @@ def test_encoders_round_to_whole_steps():
 
 def test_encoders_do_not_move_the_device():
     """What the loop sees is rounded, where the device is stays: else a free device would creep from step to step."""
-    tape = StepBuffer(process(wall(1000.0), step=1e-3), 2, 2)
-    tape.x[0] = 0.6e-3
-    tape.tick(0)
-    assert tape.f[0, 0, 0] == pytest.approx(1.0)
-    assert tape.x[0, 0, 0] == 0.6e-3
+    buffer = StepBuffer(process(wall(1000.0), step=1e-3), 2, 2)
+    buffer.x[0] = 0.6e-3
+    buffer.tick(0)
+    assert buffer.f[0, 0, 0] == pytest.approx(1.0)
+    assert buffer.x[0, 0, 0] == 0.6e-3
 
 
 @pytest.mark.parametrize(

@@ -10,12 +10,13 @@ from worlds import SOFT
 
 from cli.accuracy import main as accuracy
 from cli.run import main
-from controller.contact import Complementarity, contact
+from controller.complementarity import Complementarity
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
 from controller.loop import force_map
 from controller.lti import SingularLoop
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
+from controller.walls import contact
 from design.audit import report, requirement
 from design.certificate import assess, prove
 from design.conditions import this_environment
@@ -42,12 +43,12 @@ def walled(network: Network, coupling, theta, psi) -> Process:
 
 
 def drive(process: Process, x: np.ndarray) -> StepBuffer:
-    """The tape after displacements (ticks, m, nsim)."""
-    tape = StepBuffer(process, len(x), x.shape[1], nsim=x.shape[2])
+    """The buffer after displacements (ticks, m, nsim)."""
+    buffer = StepBuffer(process, len(x), x.shape[1], nsim=x.shape[2])
     for k, row in enumerate(x):
-        tape.x[k] = row
-        tape.tick(k)
-    return tape
+        buffer.x[k] = row
+        buffer.tick(k)
+    return buffer
 
 
 def wander(ticks: int, channels: int, nsim: int, seed: int = 0) -> np.ndarray:
@@ -157,10 +158,10 @@ def test_walls_between_nodes_keep_the_whole_environment_passive():
     process = walled(network, NoCoupling(), (0, 0), (0, 0))
     x = wander(3000, 2, 10)
     x -= x[0]
-    tape = drive(process, x)
-    energy = np.cumsum((tape.f[1:3000] * np.diff(x, axis=0)).sum(axis=1), axis=0)
+    buffer = drive(process, x)
+    energy = np.cumsum((buffer.f[1:3000] * np.diff(x, axis=0)).sum(axis=1), axis=0)
     assert energy.min() > -1e-12 * energy.max()
-    depths = process.contact.depths(tape.z) > 0
+    depths = process.contact.depths(buffer.z) > 0
     assert ((depths[1:] & ~depths[:-1]).sum(axis=(0, 2)) > 50).all()  # every wall is hit
 
 

@@ -9,8 +9,9 @@
 
 With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
 Steps 2, 3 and 5 are linear: they are ONE state-space block, and a tick is one matrix product
-[f; z+] = [C D; A B] [z; x] for any number of simulations at once. Walls that touch and forces that are limited ask for
-a small complementarity problem more (controller.contact); a force that is clipped is what the actuators make of it.
+[f; z+] = [C D; A B] [z; x] for any number of simulations at once. Walls that touch (controller.walls) and forces that
+are limited (controller.limiter) ask for a small complementarity problem more; a force that is clipped is what the
+actuators make of it.
 Where delays vary, Theta is not in the block: its forces pass through a line that holds (controller.delay).
 """
 
@@ -23,10 +24,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from controller.contact import Contact, Limiter, State
 from controller.delay import HeldLine, Ticks, packet_delays
 from controller.environment import Wall
+from controller.limiter import Limiter
 from controller.lti import Array, Lti, ReadOnly, frozen
+from controller.walls import Contact, State
 
 _CALM = 1 - 1e-9  # of the limiter's forces: above that they are being limited
 
@@ -46,7 +48,7 @@ class Net(Protocol):
         ...
 
     def part(self) -> dict[str, Any]:
-        """What it did so far, as plain data."""
+        """What it has done so far, as plain data."""
         ...
 
 
@@ -211,7 +213,7 @@ class StepBuffer:
             self.net.apply(self.first + k, self.force[k])
 
     def ticking(self) -> Callable[[int], object]:
-        """`tick` by the shortest way that does it here."""
+        """The shortest function that does `tick` for this process."""
         return self._shortest or self.tick
 
     @cached_property

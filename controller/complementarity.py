@@ -1,0 +1,178 @@
+"""What a tick solves where it is not linear: complementarity problems with one solution, of walls and of limits."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from controller.lti import Array, ReadOnly, SingularLoop, frozen
+
+_LEAST_MINOR = 1e-12  # of a matrix whose diagonal is one: what is smaller counts as singular
+_MOST_CANDIDATES = 27  # three channels, or two with a wall: beyond, the sets are not listed but pivoted through
+GROUNDED = 1e-10  # of the largest diagonal entry: what makes a singular matrix regular for pivoting
+PIVOT_ROUNDING = 1e-12  # of the numbers that are subtracted
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem(ReadOnly):
+    """Complementarity in the forces of a tick; M says what each does to the ways along which all of them push."""
+
+    M: Array  # (n, n)
+
+    @cached_property
+    def _diagonal(self) -> Array:
+        return np.diag(self.M)[:, None].copy()
+
+    @cached_property
+    def _separate(self) -> bool:
+        """Whether no force moves another one's way within the tick."""
+        return np.count_nonzero(self.M - np.diag(np.diag(self.M))) == 0
+
+
+@dataclass(frozen=True, eq=False)
+class Complementarity(_Problem):
+    """p >= 0, M p - q >= 0, p'(M p - q) = 0: one solution for every q if M has positive principal minors.
+
+    Raises SingularLoop where it has not.
+    """
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "M", frozen(self.M, 2))
+        _ = self._candidates
+
+    def solve(self, q: Array) -> Array:
+        """p for every column of q, (w, nsim)."""
+        diagonal = self._diagonal
+        if self._separate:
+            return np.maximum(q, 0.0) / diagonal
+        forces = (self._candidates @ q).reshape(-1, *q.shape)
+        # rounding leaves the right set some 1e-16 short of either sign, every other set more
+        short = np.minimum(forces * diagonal, np.matmul(self.M, forces) - q).min(axis=1)
+        best = np.take_along_axis(forces, short.argmax(axis=0)[None, None, :], axis=0)[0]
+        return np.maximum(best, 0.0)
+
+    @cached_property
+    def _candidates(self) -> Array:
+        """q to p, if exactly the walls of a set push: for every set, stacked, (2^w w, w)."""
+        w, maps = len(self.M), []
+        for pushing in itertools.product((False, True), repeat=w):
+            chosen = np.ix_(pushing, pushing)
+            part, inverse = self.M[chosen], np.zeros((w, w))
+            if not np.linalg.det(part / np.abs(self.M).max(initial=1e-300)) > 0:
+                which = [i + 1 for i, on in enumerate(pushing) if on]
+                raise SingularLoop(f"the forces of walls {which} are not determined: {part.tolist()}")
+            inverse[chosen] = np.linalg.inv(part)
+            maps.append(inverse)
+        return np.concatenate(maps)
+
+
+@dataclass(frozen=True, eq=False)
+class BoxProblem(_Problem):
+    """f = q - M v with lower <= f <= upper, v >= 0 where f is at its upper limit, <= 0 at its lower, 0 in between.
+
+    There is exactly one solution for every q where M has positive principal minors. Sets on which M is singular, as of
+    an environment that nothing holds, are passed over: f is unique all the same. Raises SingularLoop where a minor is
+    negative.
+    """
+
+    lower: Array  # (n,) -inf where there is no limit
+    upper: Array  # (n,) > lower
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "M", frozen(self.M, 2))
+        for name in ("lower", "upper"):
+            object.__setattr__(self, name, frozen(getattr(self, name), 1, name))
+        if not (self.lower < self.upper).all():
+            raise ValueError(f"limits are {self.lower.tolist()} to {self.upper.tolist()}, expected lower < upper")
+        _ = self.regular
+
+    def solve(self, q: Array) -> tuple[Array, Array]:
+        """(v, f) for every column of q, both (n, nsim); what is at a limit is exactly there."""
+        lower, upper = self.lower[:, None], self.upper[:, None]
+        if self._separate:
+            f = np.minimum(np.maximum(q, lower), upper)
+            return np.divide(q - f, self._diagonal, out=np.zeros_like(q), where=q != f), f
+        v = self._listed(q) if self._candidates else self._pivoted(q)
+        f = np.where(v > 0, upper, np.where(v < 0, lower, q - self.M @ v))
+        return v, np.minimum(np.maximum(f, lower), upper)
+
+    @cached_property
+    def regular(self) -> bool:
+        """Whether all principal minors are positive; of more than ten unknowns, those of order one."""
+        n = len(self.M)
+        scale = np.sqrt(np.maximum(np.abs(np.diag(self.M)), 1e-300))
+        unit, regular = self.M / scale / scale[:, None], True
+        for size in range(1, n + 1) if n <= 10 else (1,):
+            for chosen in itertools.combinations(range(n), size):
+                minor = np.linalg.det(unit[np.ix_(chosen, chosen)])
+                if minor < -_LEAST_MINOR:
+                    which = [i + 1 for i in chosen]
+                    raise SingularLoop(f"limited forces {which} are not determined: {self.M.tolist()}")
+                regular &= bool(minor > _LEAST_MINOR)
+        return regular
+
+    @cached_property
+    def _candidates(self) -> list[tuple[Array, Array, Array]]:
+        """(signs, bounds, q - bounds to v) of every set of active limits; none where there are too many."""
+        n = len(self.M)
+        kinds = [
+            [0.0, *[1.0] * bool(np.isfinite(b)), *[-1.0] * bool(np.isfinite(a))]
+            for a, b in zip(self.lower, self.upper, strict=True)
+        ]
+        if np.prod([len(kind) for kind in kinds]) > _MOST_CANDIDATES:
+            return []
+        scale, found = np.sqrt(np.maximum(np.abs(np.diag(self.M)), 1e-300)), []
+        for signs in map(np.array, itertools.product(*kinds)):
+            active = np.flatnonzero(signs)
+            chosen = np.ix_(active, active)
+            if np.linalg.det((self.M / scale / scale[:, None])[chosen]) > _LEAST_MINOR:
+                inverse = np.zeros((n, n))
+                inverse[chosen] = np.linalg.inv(self.M[chosen])
+                bounds = np.where(signs > 0, self.upper, np.where(signs < 0, self.lower, 0.0))
+                found.append((signs[:, None], bounds[:, None], inverse))
+        return found
+
+    def _listed(self, q: Array) -> Array:
+        """v of the set that is least violated: rounding leaves the right one some 1e-16 short, every other more."""
+        lower, upper = self.lower[:, None], self.upper[:, None]
+        best, least = np.zeros_like(q), np.full(q.shape[1], -np.inf)
+        for signs, bounds, inverse in self._candidates:
+            v = inverse @ (q - bounds)
+            f = q - self.M @ v
+            room = np.where(signs == 0, np.minimum(upper - f, f - lower), signs * v * self._diagonal).min(axis=0)
+            better = room > least
+            best = np.where(better, np.where(signs * v > 0, v, 0.0), best)
+            least = np.where(better, room, least)
+        return best
+
+    def _pivoted(self, q: Array) -> Array:
+        """v by switching limits on and off, all that are wrong at once and, should that go round, the first only.
+
+        Switching the first alone ends for every M with positive principal minors. Index n is switched only when the
+        others are right for it; then uniqueness shows on which side of its limit the solution lies, so n takes each
+        of its three states at most once. The same holds of n - 1 in between, and so on.
+        """
+        n, k = q.shape
+        M = self.M if self.regular else self.M + GROUNDED * self._diagonal.max() * np.eye(n)
+        lower, upper, one = self.lower[:, None], self.upper[:, None], np.eye(n)
+        signs, v, left = np.zeros((n, k)), np.zeros((n, k)), np.arange(k)
+        for turn in range(4 * n + 3**n):
+            s, at = signs[:, left], q[:, left]
+            active = (s != 0).T
+            matrix = np.where(active[:, :, None], np.where(active[:, None, :], M, 0.0), one)
+            missing = np.where(s > 0, at - upper, np.where(s < 0, at - lower, 0.0))
+            v[:, left] = now = np.linalg.solve(matrix, missing.T[..., None])[..., 0].T
+            f = at - M @ now
+            tiny = PIVOT_ROUNDING * (np.abs(at) + np.abs(M) @ np.abs(now))
+            high, low = (s == 0) & (f > upper + tiny), (s == 0) & (f < lower - tiny)
+            wrong = high | low | (s * now * self._diagonal < -tiny)
+            if turn >= 4 * n:
+                wrong &= np.cumsum(wrong, axis=0) == 1
+            signs[:, left] = np.where(wrong, np.where(high, 1.0, np.where(low, -1.0, 0.0)), s)
+            left = left[wrong.any(axis=0)]
+            if not left.size:
+                return np.where(signs * v > 0, v, 0.0)
+        raise SingularLoop(f"limited forces are not determined: {self.M.tolist()}")

@@ -1,0 +1,240 @@
+"""Environments that are not known exactly: ranges of a network's parameters, their vertices, and points inside.
+
+The vertices are the environments in which every uncertain parameter is at an end of its range, and every contact
+that may be absent is there or not. An absent spring stays in its network with neither stiffness nor damping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from math import prod
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from controller.environment import GROUND, MOST_AMOUNT, Network, Spring
+from controller.lti import Array
+
+_Range = tuple[float, float]
+
+_MOST_VERTICES = 128  # each is a world of the design and a proof
+
+
+class UncertainSpring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The ranges of one spring's parameters; where no range is given the environment's own value holds."""
+
+    between: tuple[str, str]
+    stiffness: _Range | None = None  # [N/m]
+    damping: _Range | None = None  # [N s/m]
+    absent: bool = False  # the spring may also be missing altogether: a contact lost, or not made yet
+
+    def __post_init__(self) -> None:
+        for name, unit in (("stiffness", "N/m"), ("damping", "N s/m")):
+            _check_range(f"{name} between {' and '.join(self.between)}", getattr(self, name), unit)
+
+
+class Ranges(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Ranges of a network's parameters, each independent of the others."""
+
+    springs: tuple[UncertainSpring, ...] = ()
+    masses: dict[str, _Range] = {}  # [kg], by node
+
+    def __post_init__(self) -> None:
+        for node, limits in self.masses.items():
+            _check_range(f"mass of {node!r}", limits, "kg")
+
+
+@dataclass(frozen=True)
+class Member:
+    """One environment within ranges."""
+
+    name: str
+    network: Any  # a Network where ranges are, any Environment where none are
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A part of the ranges in which only numbers vary: every contact is either present or absent."""
+
+    low: Array  # (n,) the ends of the ranges
+    high: Array  # (n,)
+    at: Callable[[str, Array], Member]  # a name, and a point between low and high
+
+
+def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
+    """The environment itself, then the vertices of the ranges that differ from it.
+
+    Raises ValueError naming the field where the ranges do not fit the network, or have more than 128 vertices.
+    """
+    nominal = Member("the nominal environment", network)
+    parts = _parts(network, ranges)
+    count = prod(len(part.corners) for part in parts)
+    if count > _MOST_VERTICES:
+        raise ValueError(
+            f"ranges have {count} vertices, allowed are {_MOST_VERTICES}: leave out the ranges that matter least, "
+            "each halves the number"
+        )
+    corners = (c for c in product(*(part.corners for part in parts)) if c != tuple(part.own for part in parts))
+    vertices = (_member(f"vertex {i}", network, parts, corner) for i, corner in enumerate(corners, start=1))
+    return (nominal, *vertices)
+
+
+def regions(network: Network, ranges: Ranges) -> tuple[Region, ...]:
+    """The ranges as one region for every way in which its contacts can be there or absent."""
+    parts = _parts(network, ranges)
+    return tuple(_region(network, parts, states) for states in product(*(part.states for part in parts)))
+
+
+def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Member, ...]:
+    """`count` environments drawn from the ranges: every parameter evenly, a contact that may be absent as often as not.
+
+    The first are the same whatever the count.
+    """
+    parts, rng = _parts(network, ranges), np.random.default_rng(seed)
+    return tuple(_member(f"sample {i}", network, parts, [p.draw(rng) for p in parts]) for i in range(1, count + 1))
+
+
+@dataclass(frozen=True)
+class _State:
+    """One state of an uncertain part, present or absent: its ranges in that state, and the part at given values."""
+
+    ranges: tuple[_Range, ...]  # those of some width
+    value: Callable[[Sequence[float]], Spring | float]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One uncertain part: its values at each of its vertices, and between them."""
+
+    place: str  # a spring's ends, or a node
+    corners: tuple[Spring | float, ...]
+    own: Spring | float  # as it is in the environment
+    draw: Callable[[np.random.Generator], Spring | float]
+    states: tuple[_State, ...]  # there, or absent
+
+    def label(self, value: Spring | float) -> str:
+        if not isinstance(value, Spring):
+            return f"{self.place} {value:.4g} kg"
+        if not (value.stiffness or value.damping):
+            return f"{self.place} absent"
+        return f"{self.place} {value.stiffness:.4g} N/m, {value.damping:.4g} N s/m"
+
+
+def _parts(network: Network, ranges: Ranges) -> list[_Part]:
+    if not (ranges.springs or ranges.masses):
+        raise ValueError("ranges are empty: give springs or masses whose parameters have ranges")
+    named = [frozenset(one.between) for one in ranges.springs]
+    for one, ends in zip(ranges.springs, named, strict=True):
+        if named.count(ends) > 1:
+            raise ValueError(f"ranges.springs names {' and '.join(one.between)} twice")
+    return [
+        *(_spring_part(network, one) for one in ranges.springs),
+        *(_mass_part(network, *m) for m in ranges.masses.items()),
+    ]
+
+
+def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
+    a, b = uncertain.between
+    field = f"ranges.springs between {a} and {b}"
+    for node in (a, b):
+        if node not in (*network.nodes(), GROUND):
+            raise ValueError(f"{field}: there is no node {node!r}; nodes: {', '.join(network.nodes())}, ground")
+    found = [spring for spring in network.springs if set(spring.between) == {a, b}]
+    if len(found) > 1:
+        raise ValueError(f"{field}: the environment has {len(found)} springs there, expected one")
+    nothing = Spring((a, b), 0.0, 0.0)
+    if found:
+        own, present = found[0], found[0]
+        _check_inside(field, uncertain, own)
+    elif uncertain.absent and uncertain.stiffness:
+        own, present = nothing, nothing
+    else:
+        raise ValueError(f"{field}: no spring is there; one that may come to be needs a stiffness and absent = true")
+    stiffness = uncertain.stiffness or (present.stiffness, present.stiffness)
+    damping = uncertain.damping or (present.damping, present.damping)
+    if not uncertain.absent and stiffness[0] == stiffness[1] and damping[0] == damping[1]:
+        raise ValueError(f"{field}: nothing is uncertain; give stiffness or damping a range, or absent = true")
+    pairs = dict.fromkeys(product(stiffness, damping))
+    corners = [Spring(own.between, k, d) for k, d in pairs]
+    absent = Spring(own.between, 0.0, 0.0)
+    if uncertain.absent and absent not in corners:
+        corners.append(absent)
+
+    def draw(rng: np.random.Generator) -> Spring:
+        k, d, coin = rng.uniform(stiffness[0], stiffness[1]), rng.uniform(damping[0], damping[1]), rng.random()
+        return absent if uncertain.absent and coin < 0.5 else Spring(own.between, k, d)
+
+    states = [_spring_state(own.between, stiffness, damping)]
+    if uncertain.absent:
+        states.append(_State((), lambda _: absent))
+    return _Part(f"{a}-{b}", tuple(corners), own, draw, tuple(states))
+
+
+def _spring_state(between: tuple[str, str], stiffness: _Range, damping: _Range) -> _State:
+    """A spring that is present; a range of no width is not a coordinate."""
+    free = [low < high for low, high in (stiffness, damping)]
+
+    def value(point: Sequence[float]) -> Spring:
+        given = iter(point)
+        k, d = (next(given) if f else limits[0] for f, limits in zip(free, (stiffness, damping), strict=True))
+        return Spring(between, float(k), float(d))
+
+    return _State(tuple(r for f, r in zip(free, (stiffness, damping), strict=True) if f), value)
+
+
+def _mass_part(network: Network, node: str, limits: _Range) -> _Part:
+    if node not in network.nodes():
+        raise ValueError(f"ranges.masses names {node!r}, which no spring reaches; nodes: {', '.join(network.nodes())}")
+    own = network.masses.get(node, 0.0)
+    _require_inside(f"ranges.masses.{node}", limits, own, "kg")
+    if limits[0] == limits[1]:
+        raise ValueError(f"ranges.masses.{node} is {limits[0]:g} to {limits[1]:g} kg: nothing is uncertain")
+    state = _State((limits,), lambda point: float(point[0]))
+    return _Part(node, limits, own, lambda rng: rng.uniform(limits[0], limits[1]), (state,))
+
+
+def _region(network: Network, parts: Sequence[_Part], states: Sequence[_State]) -> Region:
+    low, high = np.array([r for state in states for r in state.ranges], dtype=float).reshape(-1, 2).T
+    ends = np.cumsum([len(state.ranges) for state in states])[:-1]
+
+    def at(name: str, point: Array) -> Member:
+        values = [s.value(x.tolist()) for s, x in zip(states, np.split(point, ends), strict=True)]
+        return _member(name, network, parts, values)
+
+    return Region(low, high, at)
+
+
+def _member(name: str, network: Network, parts: Sequence[_Part], values: Sequence[Spring | float]) -> Member:
+    springs, masses = list(network.springs), dict(network.masses)
+    for part, value in zip(parts, values, strict=True):
+        if not isinstance(value, Spring):
+            masses[part.place] = value
+        elif part.own in springs:
+            springs[springs.index(part.own)] = value
+        else:
+            springs.append(value)
+    labels = "; ".join(part.label(value) for part, value in zip(parts, values, strict=True))
+    return Member(f"{name} ({labels})", Network(network.contacts, tuple(springs), masses))
+
+
+def _check_inside(field: str, uncertain: UncertainSpring, own: Spring) -> None:
+    for name, unit in (("stiffness", "N/m"), ("damping", "N s/m")):
+        limits = getattr(uncertain, name)
+        if limits:
+            _require_inside(f"{field}: {name}", limits, getattr(own, name), unit)
+
+
+def _require_inside(field: str, limits: _Range, own: float, unit: str) -> None:
+    if not limits[0] <= own <= limits[1]:
+        raise ValueError(
+            f"{field} is {limits[0]:g} to {limits[1]:g} {unit}, which leaves out the environment's own {own:g}"
+        )
+
+
+def _check_range(field: str, limits: _Range | None, unit: str) -> None:
+    if limits is not None and not 0 <= limits[0] <= limits[1] <= MOST_AMOUNT[unit]:
+        expected = f"[least, most] in {unit}, 0 <= least <= most <= {MOST_AMOUNT[unit]:g}"
+        raise ValueError(f"{field} is {list(limits)}, expected {expected}")

@@ -1,0 +1,60 @@
+"""Checks of the arguments of functions for scripts: what is wrong is said in one line that names the argument."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import operator
+from collections.abc import Collection, Iterable
+from typing import Any
+
+
+def of_kind(name: str, value: Any, kind: type, expected: str) -> None:
+    """Raises TypeError where `value` is no `kind`."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} is {shown(value)}, expected {expected}")
+
+
+def whole(name: str, value: Any, low: int, high: float = math.inf) -> int:
+    """A whole number from `low` to `high`, numpy's too. Raises TypeError, ValueError."""
+    span = f"{low} to {high}" if high < math.inf else f"{low} or more"
+    allowed = f"whole numbers, {span}"
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise TypeError(f"{name} is {shown(value)}, allowed are {allowed}") from None
+    if isinstance(value, bool):
+        raise TypeError(f"{name} is {shown(value)}, allowed are {allowed}")
+    if not low <= number <= high:
+        raise ValueError(f"{name} is {number}, allowed are {span}")
+    return number
+
+
+def number(name: str, value: Any, expected: str = "a number") -> float:
+    """A float, numpy's too. Raises TypeError."""
+    if isinstance(value, bool | str | bytes) or not hasattr(value, "__float__") or getattr(value, "ndim", 0):
+        raise TypeError(f"{name} is {shown(value)}, expected {expected}")
+    return float(value)
+
+
+def one_of(name: str, value: Any, allowed: Collection[str]) -> None:
+    """Raises ValueError."""
+    if not isinstance(value, str) or value not in allowed:
+        raise ValueError(f"{name} is {value!r}, allowed are {', '.join(allowed)}")
+
+
+def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:
+    """Raises TypeError for an option that `what` does not have."""
+    for option in options:
+        if option not in allowed:
+            close = difflib.get_close_matches(option, allowed, n=1)
+            hint = f" (did you mean {close[0]}?)" if close else ""
+            raise TypeError(f"{option} is no option of {what}{hint}, allowed are {', '.join(allowed)}")
+
+
+def shown(value: Any) -> str:
+    """The value, shortened, with its type."""
+    text = repr(value)
+    if len(text) > 60 or "\n" in text:
+        return f"a {type(value).__name__}"
+    return text if value is None else f"{text} ({type(value).__name__})"

@@ -1,0 +1,150 @@
+"""Linear matrix inequalities: known optima, another solver, and a solver that is never believed."""
+
+import subprocess
+import sys
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from analysis import solve
+
+from design import cone
+from design.cone import LADDER, Block, Problem
+from design.lmi import symmetric_from
+from design.result import DesignFailed, Infeasible
+
+#: the least trace of X >= M is that of M
+M = np.array([[2.0, 1.0], [1.0, 2.0]])
+LEAST_TRACE = Problem(np.array([1.0, 0.0, 1.0]), [Block.of(lambda v: symmetric_from(v, 2) - M, range(3))])
+
+
+def hermitian(rng, *shape):
+    H = rng.normal(size=(*shape, shape[-1])) + 1j * rng.normal(size=(*shape, shape[-1]))
+    return (H + np.conj(np.swapaxes(H, -1, -2))) / 2
+
+
+def with_known_optimum(rng, p, shapes):
+    """(problem, x): of every block a random space is in S(x), the rest in the multiplier Z; c_a = <slope_a, Z>."""
+    x, cost, blocks = rng.normal(size=p), np.zeros(p), []
+    for count, n, complex_ in shapes:
+        taking = np.sort(rng.choice(p, max(1, 2 * p // 3), replace=False))
+        slopes = hermitian(rng, taking.size, count, n)
+        slopes = slopes if complex_ else slopes.real
+        basis = np.linalg.qr(hermitian(rng, count, n) if complex_ else hermitian(rng, count, n).real)[0]
+        of_S = np.arange(n) < rng.integers(0, n, (count, 1))
+        sizes = rng.uniform(0.5, 2, (count, n))
+        S, Z = ((basis * (sizes * part)[:, None]) @ np.conj(np.swapaxes(basis, 1, 2)) for part in (of_S, ~of_S))
+        cost[taking] += np.einsum("akij,kji->a", slopes, Z).real
+        blocks.append(Block(S - np.tensordot(x[taking], slopes, axes=1), slopes, taking.tolist()))
+    return Problem(cost, blocks), x
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_known_optimum_is_found(seed):
+    """Complementary S(x) and Z, with Z in the dual's set, prove x optimal; cvxpy finds the same value."""
+    rng = np.random.default_rng(seed)
+    problem, x = with_known_optimum(rng, 7, [(3, 4, True), (1, 5, False), (4, 1, False), (2, 2, True)])
+    found = problem.solve("it")
+    assert problem.cost @ found == pytest.approx(problem.cost @ x, rel=1e-6, abs=1e-6)
+    assert problem.violation(found) < 1e-7
+    v = cp.Variable(7)
+    constraints = []
+    for block in problem.blocks:
+        for k, constant in enumerate(block.constant):
+            matrix = constant + sum(v[a] * slope[k] for a, slope in zip(block.unknowns, block.slopes, strict=True))
+            constraints.append((matrix if len(constant) == 1 else (matrix + matrix.H) / 2) >> 0)
+    other = solve(cp.Problem(cp.Minimize(problem.cost @ v), constraints))
+    assert problem.cost @ found == pytest.approx(other, rel=1e-5, abs=1e-5)
+
+
+def answering(monkeypatch, *answers):
+    """Let Clarabel's first answers be these: an error, or what becomes of (x, status)."""
+    original, calls = cone._clarabel, []
+
+    def wrapped(problem, options):
+        calls.append(options)
+        if len(calls) > len(answers):
+            return original(problem, options)
+        answer = answers[len(calls) - 1]
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer(*original(problem, options))
+
+    monkeypatch.setattr(cone, "_clarabel", wrapped)
+    return calls
+
+
+class PanicException(BaseException):
+    """What pyo3 raises when Rust panics."""
+
+
+def test_an_easy_problem_takes_one_rung(monkeypatch):
+    calls = answering(monkeypatch)
+    assert LEAST_TRACE.solve("it") == pytest.approx([2.0, 1.0, 2.0], abs=1e-6)
+    assert len(calls) == 1
+
+
+WRONG = {
+    "panic": PanicException("index out of bounds"),
+    "status": lambda x, status: (x, "NumericalError"),
+    "values": lambda x, status: (x * np.nan, status),
+    "lie": lambda x, status: (x - 1.0, status),
+}
+
+
+@pytest.mark.parametrize("answer", WRONG.values(), ids=WRONG)
+def test_a_broken_rung_is_skipped(answer, monkeypatch):
+    calls = answering(monkeypatch, answer, answer)
+    assert LEAST_TRACE.solve("it") == pytest.approx([2.0, 1.0, 2.0], abs=1e-6)
+    assert len({tuple(sorted(options)) for options in calls}) == 3
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(), TypeError("a bug of ours")])
+def test_what_is_not_the_solvers_fault_passes_through(error, monkeypatch):
+    answering(monkeypatch, error)
+    with pytest.raises(type(error)):
+        LEAST_TRACE.solve("it")
+
+
+def test_a_failure_carries_the_problem_and_what_was_tried(monkeypatch):
+    answering(monkeypatch, *[WRONG["lie"]] * len(LADDER))
+    with pytest.raises(DesignFailed, match="the thing could not be solved") as caught:
+        LEAST_TRACE.solve("the thing")
+    assert caught.value.problem is LEAST_TRACE
+    assert len(caught.value.results) == len(LADDER)
+    assert "violated by" in caught.value.results[0].reason
+    assert "\n" not in str(caught.value)
+
+
+def bounds(*of):
+    """One unknown, between bounds."""
+    return Problem(np.array([1.0]), [Block.of(lambda v, f=f: np.array([[f(v[0])]]), [0]) for f in of])
+
+
+def test_infeasible_is_told_apart():
+    with pytest.raises(Infeasible, match="the request has no solution"):
+        bounds(lambda x: x - 1, lambda x: -x).solve("the request")
+
+
+def test_unbounded_is_a_failure():
+    with pytest.raises(DesignFailed, match="DualInfeasible"):
+        bounds(lambda x: -x).solve("the request")
+
+
+def test_an_optimum_that_the_caller_refuses_is_not_used():
+    answers = iter([False, True])
+    LEAST_TRACE.solve("it", accept=lambda x: next(answers))
+    assert next(answers, None) is None
+    with pytest.raises(DesignFailed, match="could not be solved"):
+        LEAST_TRACE.solve("it", accept=lambda x: False)
+
+
+def test_a_design_loads_no_modelling_language(tmp_path):
+    """With its exact proof; nor do runs, those who judge, and the other designs."""
+    words = ["--condition", "any-environment", "--out", str(tmp_path / "coupling.json")]
+    code = f"""if True:
+        import sys, cli.design, sim.run, design.coverage, design.fixed_order
+        cli.design.main({words})
+        sys.exit("cvxpy" in sys.modules)
+    """
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
