@@ -6,6 +6,7 @@ python tests/forked.py FOLDER     designs that runs ask for are kept in FOLDER; 
 from __future__ import annotations
 
 import atexit
+import fcntl
 import functools
 import hashlib
 import json
@@ -24,36 +25,49 @@ ROOT = Path(__file__).parents[1]
 
 
 def share_designs(folder: Path, patch=setattr) -> None:
-    """One design for all tests and processes that ask for the same one: seconds each, and the same at every time.
+    """What commands work out again and again, seconds each, once for all tests and processes that ask for the same.
 
-    What makes them, design.designs and the modules behind it, is as it was.
+    That is: designs, bounds, the price of a wrong model, what limited forces ask, and how the couplings beside a run's
+    own are judged. What makes them, design.designs and the modules behind it, is as it was.
     """
     import cli.design
-    from design import api, bound, compare, designs
-    from sim import couplings
+    from design import api, bound, compare, coverage, designs, optimal
+    from sim import alternatives, couplings
 
-    for module in (cli.design, api, compare, couplings):
-        patch(module, "design_by_kind", _remembering(folder, designs.design_by_kind))
-    for module in (cli.design, compare):
-        patch(module, "bound", _remembering(folder, bound.bound))
+    for made, modules in (
+        (designs.design_by_kind, (cli.design, api, bound, compare, couplings)),
+        (bound.bound, (cli.design, compare)),
+        (optimal.spread, (optimal,)),
+        (coverage.limiter_requirement, (coverage,)),
+        (alternatives.assess, (alternatives,)),
+    ):
+        for module in modules:
+            patch(module, made.__name__, _remembering(folder, made))
 
 
 def _remembering(folder: Path, make):
     """The same function, with its results kept in the folder; failures and loops without a digest are not."""
     from design.stored import digest
 
-    def remembered(loop, *asked, **named):
-        plain = [x for x in asked if not callable(x)], sorted((k, x) for k, x in named.items() if not callable(x))
+    def named(part) -> str:
+        return digest(part.form()) if hasattr(part, "form") else repr(part)
+
+    @functools.wraps(make)
+    def remembered(loop, *asked, **options):
+        plain = [named(x) for x in asked if not callable(x)]
+        plain += sorted(f"{k}={named(x)}" for k, x in options.items() if not callable(x))
         try:
             loop_and_asked = digest(loop), make.__name__, plain
         except TypeError:  # an environment of a test's own class
-            return make(loop, *asked, **named)
+            return make(loop, *asked, **options)
         file = folder / hashlib.sha256(repr(loop_and_asked).encode()).hexdigest()
-        if not file.exists():
-            made = make(loop, *asked, **named)
-            part = file.with_suffix(f".{os.getpid()}")
-            part.write_bytes(pickle.dumps(made))
-            part.rename(file)
+        with file.with_suffix(".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # whoever asks meanwhile waits for the one that is at it
+            if not file.exists():
+                made = make(loop, *asked, **options)
+                part = file.with_suffix(".part")
+                part.write_bytes(pickle.dumps(made))
+                part.rename(file)
         return pickle.loads(file.read_bytes())
 
     return remembered
