@@ -40,6 +40,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
         (optimal.spread, (optimal,)),
         (coverage.limiter_requirement, (coverage,)),
         (alternatives.assess, (alternatives,)),
+        (api.instead, (api,)),
     ):
         for module in modules:
             patch(module, made.__name__, _remembering(folder, made))
