@@ -9,6 +9,7 @@ import atexit
 import fcntl
 import functools
 import hashlib
+import inspect
 import json
 import os
 import pickle
@@ -50,15 +51,10 @@ def _remembering(folder: Path, make):
     """The same function, with its results kept in the folder; failures and loops without a digest are not."""
     from design.stored import digest
 
-    def named(part) -> str:
-        return digest(part.form()) if hasattr(part, "form") else repr(part)
-
     @functools.wraps(make)
     def remembered(loop, *asked, **options):
-        plain = [named(x) for x in asked if not callable(x)]
-        plain += sorted(f"{k}={named(x)}" for k, x in options.items() if not callable(x))
         try:
-            loop_and_asked = digest(loop), make.__name__, plain
+            loop_and_asked = digest(loop), make.__name__, _asked(make, loop, *asked, **options)
         except TypeError:  # an environment of a test's own class
             return make(loop, *asked, **options)
         file = folder / hashlib.sha256(repr(loop_and_asked).encode()).hexdigest()
@@ -72,6 +68,21 @@ def _remembering(folder: Path, make):
         return pickle.loads(file.read_bytes())
 
     return remembered
+
+
+def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
+    """What a call asks of the loop, defaults by their values, in words that two equal calls share."""
+    from design.designs import usual_condition
+    from design.program import DEFAULT
+    from design.stored import digest
+
+    call = inspect.signature(make).bind(loop, *asked, **options)
+    call.apply_defaults()
+    words = {name: x for name, x in call.arguments.items() if name != "loop" and not callable(x)}
+    if make.__name__ == "design_by_kind":
+        words["condition"] = words["condition"] or usual_condition(loop, words["kind"])
+        words |= (vars(DEFAULT) if words["kind"] == "optimal" else {}) | words.pop("options")
+    return sorted((name, digest(x.form()) if hasattr(x, "form") else repr(x)) for name, x in words.items())
 
 
 @functools.cache
