@@ -18,6 +18,7 @@ from design import coverage
 from design.audit import LONGEST_DELAY
 from design.bound import MOST, NO_BOUND, bound
 from design.certificate import SAMPLES, RangesCheck, assess, check_ranges, lag, prove, switching_requirement
+from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
@@ -25,7 +26,6 @@ from design.guarantees import ANY, HERE, switching_guarantee
 from design.optimal import Optimal, robustness_parts, widest_ranges
 from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import Design, DesignFailed, NotProved, listed
-from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts
 from sim.scenario import InputError, Scenario
@@ -250,7 +250,10 @@ def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[s
     elif best.objective == 0:
         limit["reason"] = "the mismatch is zero: there is nothing to bound"
     else:
-        limit["rms_mismatch_db"] = bound(loop, args.band_hz or BAND_HZ, near=best.coupling).rms_db
+        least = bound(loop, args.band_hz or BAND_HZ)
+        gap = best.figures.rms_mismatch_db - least.rms_db
+        found = {"rms_mismatch_db": least.rms_db, "gap_db": gap}
+        limit |= found if least.rms else {"reason": "the bound is zero: nothing is known to be lost"}
     return {
         "bound": limit,
         "rendered_stiffness": best.g,
@@ -347,8 +350,8 @@ def _best_rows(part: dict[str, Any]) -> render.Rows:
     """Rows that only an optimal coupling has."""
     limit = part["bound"]
     climbed = ", ".join(f"{rung['mismatch_db']:.2f}" for rung in part["ladder"])
-    bounded = f"no linear coupling can be better than {limit['rms_mismatch_db'] or 0:.2f} dB rms"
-    yield "bound", limit.get("reason") or bounded
+    bounded = "no linear coupling can be better than {rms_mismatch_db:.2f} dB rms, {gap_db:.2f} dB less than this one"
+    yield "bound", limit.get("reason") or bounded.format(**limit)
     yield "rendered stiffness", render.optional(part["rendered_stiffness"], "{:.3f} of the environment's")
     yield "ladder [dB]", climbed or None
 

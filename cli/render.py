@@ -24,7 +24,8 @@ from rich.text import Text
 from controller.loop import Loop
 from controller.older import REPORTS, with_older
 from design.files import nobody_reads, plain, printable, write_json
-from design.result import DesignFailed, listed
+from design.files import unseen as unseen
+from design.result import CONDITIONS, DesignFailed, listed
 
 # ----------------------------------------------------------------------------------------------------
 # The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
@@ -193,11 +194,6 @@ def several(rows: Callable[[Any], Rows], json: str = "key") -> Any:
     return field(metadata={"rows": rows, "json": json})
 
 
-def unseen(json: str = "key", default: Any = MISSING) -> Any:
-    """A field that no table shows."""
-    return field(default=default, metadata={"json": json})
-
-
 def rows_of(report: Any) -> Rows:
     """The figures of a report as rows; those that are None are left out."""
     for one in fields(report):
@@ -219,9 +215,6 @@ def rows_of(report: Any) -> Rows:
 # Phrases that several reports share.
 
 
-ORDER = ("this-environment", "any-environment")  # of conditions in a table
-
-
 def certified(part: Mapping[str, Any]) -> str:
     """Whether it is, and whether that is proved in exact arithmetic."""
     if not part["certified"]:
@@ -238,7 +231,7 @@ def needs(part: Mapping[str, Any], digits: int = 6) -> str:
 def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> Rows:
     """What each condition needs, and whether that is proved exactly, where no other row says it."""
     for name, part in certificates.items():
-        if name in ORDER:
+        if name in CONDITIONS:
             word = certified(part) if proof else certified(part | {"proof": None})
             yield f"damping, {name}", f"needs {needs(part, digits)}: {word}"
 

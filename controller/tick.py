@@ -4,7 +4,7 @@
           1  x = encoder positions, sampled                (the plant's state just before kT)
           2  u = x - V f_e ;  f_e = Psi E u                (the algebraic loop was solved at construction)
           3  f = Theta f_e
-          4  hold -clip(f, +-force_limit) on the actuators, advance the plant by T
+          4  f = clip(f, +-force_limit); hold -f on the actuators, advance the plant by T
           5  commit the discrete states                    (the plant's state just after kT)
 
 With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
@@ -29,6 +29,8 @@ from controller.environment import Wall
 from controller.limiter import Limiter
 from controller.lti import Array, Lti, ReadOnly, frozen
 from controller.walls import Contact, State
+
+Stretch = Callable[[int], None]  # so many ticks from row 0 on
 
 _CALM = 1 - 1e-9  # of the limiter's forces: above that they are being limited
 
@@ -107,6 +109,11 @@ class Process(ReadOnly):
         """The linear force maps that the process switches between, by the walls that touch: F alone without walls."""
         return self.contact.frozen() if self.contact else {(): self.F}
 
+    def applied(self, force: Array, out: Array | None = None) -> Array:
+        """What the actuators make of forces (.., m, nsim) [N] that are asked of them."""
+        high = self.force_limit[:, None]
+        return np.maximum(np.minimum(force, high, out=out), -high, out=out)
+
     @property
     def linear(self) -> Array:
         """[f; z+] of a tick by its [z; x], (m + order, order + m), while no wall touches and no force is limited."""
@@ -155,12 +162,17 @@ class StepBuffer:
         self.net = process.net(nsim) if process.net else None
         self.first = 0  # the tick of row 0
         self._straight = nsim == 1 and not (self._quantised or process.walls or self._line or self.net)
-        #: whether to try the next ticks by the linear law alone: nothing can bend it but a limiter that now rests
+        #: whether to try the next ticks by the linear law alone: nothing can bend it but limits that are far now
         self.calm = self._straight
-        limiter, self._sent = process.limiter, []
-        if self._straight and limiter:
-            places = zip(limiter.sent_rows.tolist(), limiter.limit.tolist(), strict=True)
-            self._sent = [(self.after[:, row, 0], limit) for row, limit in places]
+        limiter, bounds = process.limiter, []
+        if limiter:
+            bounds += zip(limiter.sent_rows.tolist(), limiter.limit.tolist(), strict=True)
+        within = limiter and self.net is None and (limiter.limit <= process.force_limit).all()
+        #: whether a force may leave the tick that is more than the actuators have
+        self.clips = not within and bool((process.force_limit < np.inf).any())
+        if self.clips:
+            bounds += enumerate(process.force_limit.tolist())
+        self._bounds = bounds if self._straight else []
 
     # views are made once, and only those that are used: making one costs as much as a small product
 
@@ -189,16 +201,20 @@ class StepBuffer:
         """[f; z+] of each tick."""
         return list(self.after)
 
+    @property
+    def limited(self) -> bool:
+        """Whether the limiter or the actuators may limit a force, so that a stretch is taken back."""
+        return bool(self._bounds)
+
     def linear_until(self, ticks: int, most: float = 1.0) -> int:
-        """The first of these ticks in which a force asks for more than `most` of what the limiter gives, else `ticks`.
+        """The first of these ticks in which a force asks for more than `most` of what there is, else `ticks`.
 
         Not a number counts as such.
         """
-        for forces, limit in self._sent:
-            sent, limit = forces[:ticks], most * limit
-            if not (sent.max() <= limit and sent.min() >= -limit):
-                within = [np.abs(forces[:ticks]) <= most * limit for forces, limit in self._sent]
-                return int(np.all(within, axis=0).argmin())
+        asked = [(self.after[:ticks, row, 0], most * limit) for row, limit in self._bounds]
+        for forces, limit in asked:
+            if not (forces.max() <= limit and forces.min() >= -limit):
+                return int(np.all([np.abs(forces) <= limit for forces, limit in asked], axis=0).argmin())
         return ticks
 
     def tick(self, k: int) -> None:
@@ -211,6 +227,8 @@ class StepBuffer:
             self._line.carry(self.first + k, self.force[k])
         if self.net is not None:
             self.net.apply(self.first + k, self.force[k])
+        if self.clips:
+            self.process.applied(self.force[k], self.force[k])
 
     def ticking(self) -> Callable[[int], object]:
         """The shortest function that does `tick` for this process."""
@@ -221,21 +239,24 @@ class StepBuffer:
         """`tick` where it is one product, and one look at the forces that a limiter may limit."""
         if self._quantised or self._line is not None or self.net is not None:
             return None
-        transition, seen, after = self._transition, self.law_input, self.law_output
-        limiter = self.process.limiter
-        if limiter is None or limiter.walls or self._memory.shape[1] > 1:
+        transition, seen, after, process = self._transition, self.law_input, self.law_output, self.process
+        if not self._bounds:
+            if self.clips:
+                return None
             return lambda k: transition(seen[k], after[k])
         # a single simulation spends its time in calls: its forces are looked at without numpy, of two channels by name
-        linear, first = self.process.linear.dot, self._width - self.process.channels
-        forces = [self._memory[first + i :: self._width, 0].data for i in limiter.sent_rows]
-        sent = list(zip(forces, (-limiter.limit).tolist(), limiter.limit.tolist(), strict=True))
-        (one, low, high), (other, lowest, highest), *others = sent if len(sent) > 1 else 2 * sent
+        linear, force, clips = process.linear.dot, self.force, self.clips
+        first = self._width - process.channels
+        asked = [(self._memory[first + i :: self._width, 0].data, -limit, limit) for i, limit in self._bounds]
+        (one, low, high), (other, lowest, highest), *others = asked if len(asked) > 1 else 2 * asked
 
         def tick(k: int) -> None:
             linear(seen[k], after[k])
             within = low <= one[k] <= high and lowest <= other[k] <= highest
-            if not within or (others and not all(least <= force[k] <= most for force, least, most in others)):
+            if not within or (others and not all(least <= asked[k] <= most for asked, least, most in others)):
                 transition(seen[k], after[k])
+                if clips:
+                    process.applied(force[k], force[k])
 
         return tick
 
@@ -247,14 +268,49 @@ class StepBuffer:
         m = self.process.channels
         return np.concatenate([row[:-m], self.process.measured(row[-m:].T).T])
 
-    def saturate(self, ticks: int) -> None:
-        """Turn the forces of the first `ticks` rows from asked for into applied, as the actuators did."""
-        limit = self.process.force_limit[:, None]
-        np.clip(self.f[:ticks], -limit, limit, out=self.f[:ticks])
-
     def rewind(self, ticks: int) -> None:
         """Start a new stretch where this one stood after `ticks` ticks."""
         self.calm = self.calm or (self._straight and self.linear_until(ticks, _CALM) == ticks)
         self.z[0] = self.z[ticks]
         self.s[0] = self.s[ticks]
         self.first += ticks
+
+
+class FusedTicks:
+    """The plant's step and the law at its end in one product a tick: [f; s; z+] of the next one.
+
+    A row of the memory is [w, f, s, z+, a] of a tick, where `further` entries a are the engine's own.
+    """
+
+    def __init__(self, buffer: StepBuffer, step: Array, further: int = 0) -> None:
+        """`step` makes the next s of the last entries of a row, (states, entries)."""
+        law, outside, states = buffer.process.linear, buffer.w.shape[1], len(step)
+        m, nz = buffer.process.channels, buffer.process.F.order
+        self._places = places = np.cumsum([outside, m, states, nz, further])
+        self.memory = memory = np.zeros((buffer.ticks + 1, places[-1]))
+        start, z = places[-1] - step.shape[1], slice(places[2] - places[-1], step.shape[1] - further)
+        seen = np.zeros((nz + m, step.shape[1]))
+        seen[:nz, z], seen[nz:] = np.eye(nz), step[:m]
+        after = law @ seen
+        self.product = np.vstack([after[:m], step, after[m:]]).dot
+        self.held, self.before = list(memory[:, : places[1]]), list(memory[:, start:])
+        self.next, self.states = list(memory[1:, places[0] : places[3]]), memory[1:, places[1] : places[2]]
+        self.further = list(memory[:, places[3] :])
+        self._buffer, self._law = buffer, law.dot
+
+    def begin(self, ticks: int) -> None:
+        """Take the first row of the buffer, with the law there, and the outside forces."""
+        buffer, memory, (outside, to_f, to_s, to_z, _) = self._buffer, self.memory, self._places
+        m = to_f - outside
+        self._law(buffer.rows[0, : to_z - to_s + m], buffer.after[0])
+        memory[:ticks, :outside] = buffer.w[:ticks, :, 0]
+        memory[0, outside:to_f], memory[0, to_s:to_z] = np.split(buffer.after[0, :, 0], [m])
+        memory[0, to_f:to_s] = buffer.s[0, :, 0]
+
+    def end(self, ticks: int) -> None:
+        """Write what the ticks came to, and the plant's state after them."""
+        buffer, (outside, to_f, to_s, to_z, _) = self._buffer, self._places
+        rows, m = self.memory[1 : ticks + 1], to_f - outside
+        buffer.s[1 : ticks + 1, :, 0] = rows[:, to_f:to_s]
+        buffer.after[1:ticks, :m, 0] = rows[:-1, outside:to_f]
+        buffer.after[1:ticks, m:, 0] = rows[:-1, to_s:to_z]

@@ -20,6 +20,8 @@ from design.result import DesignFailed, Infeasible
 
 #: Largest negative eigenvalue that is taken for rounding; problems are posed in units where 1 is large.
 _TOLERANCE = 1e-4
+#: Entries of a triangle, and how many times the unknowns of its block, from which on Clarabel is the slower one.
+_LARGE, _MANY = 300, 4
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ LADDER = (
     _Settings("as given", {"equilibrate_enable": False, "chordal_decomposition_enable": False}),
     _Settings("loose", {**_LOOSE, "static_regularization_constant": 1e-7}),
 )
+INTERIOR = _Settings("interior")  # our own method, for large blocks in few unknowns
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,12 @@ class Block:
     def at(self, x: Array) -> Array | Complex:
         return self.constant + np.tensordot(x[list(self.unknowns)], self.slopes, axes=1)
 
+    @property
+    def large(self) -> bool:
+        """Whether Clarabel, whose work grows with the square of a triangle's entries, is slower than `_interior`."""
+        rows = self.constant.shape[-1] * (2 if np.iscomplexobj(self.constant) else 1)
+        return rows * (rows + 1) // 2 > max(_LARGE, _MANY * len(self.unknowns))
+
     def rows(self) -> tuple[Array, Array]:
         """(k, r) and (q, k, r) real: the lower triangles row by row, such that inner products stay the same."""
         constant, slopes = (_real(part) for part in (self.constant, self.slopes))
@@ -93,13 +102,15 @@ class Problem:
     blocks: Sequence[Block]
 
     def solve(
-        self, what: str, accept: Callable[[Array], bool] | None = None, ladder: Sequence[_Settings] = LADDER
+        self, what: str, accept: Callable[[Array], bool] | None = None, ladder: Sequence[_Settings] | None = None
     ) -> Array:
         """The optimal x (p,), verified. `what` names the problem in the message of an error.
 
         Raises Infeasible when two settings agree that there is no solution and none found one, DesignFailed otherwise.
         """
         attempts: list[Attempt] = []
+        if ladder is None:
+            ladder = (INTERIOR,) if any(block.large for block in self.blocks) else LADDER
         for settings in ladder:
             x, attempt = self._attempt(settings, accept)
             if attempt.reason is None:
@@ -122,7 +133,7 @@ class Problem:
         started = time.perf_counter()
         x, status, reason = np.full(len(self.cost), np.nan), "panic", None
         try:
-            x, status = _clarabel(self, settings.options)
+            x, status = _interior(self) if settings is INTERIOR else _clarabel(self, settings.options)
         except BaseException as error:  # Clarabel's Rust panics are not Exceptions
             if type(error).__name__ != "PanicException":
                 raise
@@ -133,7 +144,7 @@ class Problem:
 
     def _doubt(self, x: Array, status: str, accept: Callable[[Array], bool] | None) -> str | None:
         """Why x may not be used, or None."""
-        if status not in ("Solved", "AlmostSolved"):
+        if status not in ("Solved", "AlmostSolved"):  # in Clarabel's words
             return f"the solver reports {status}"
         if not np.isfinite(x).all():
             return "an unknown has no finite value"
@@ -166,3 +177,112 @@ def _clarabel(problem: Problem, options: Mapping[str, Any]) -> tuple[Array, str]
     nothing, rows = scipy.sparse.csc_matrix((p, p)), scipy.sparse.vstack(slopes, format="csc")
     found = clarabel.DefaultSolver(nothing, problem.cost, -rows, np.concatenate(constants), cones, settings).solve()
     return np.array(found.x), str(found.status)
+
+
+# ----------------------------------------------------------------------------------------------------
+# A primal-dual interior-point method for large blocks in few unknowns.
+#
+# The S = constant + slopes x >= 0 have multipliers Z >= 0 with <slope_a, Z> = cost_a, and S Z = 0 at the optimum. S Z =
+# mu I is linearised to dZ = mu/S - Z - Z dS/S, made Hermitian (Helmberg, Kojima, Monteiro), and <slope_a, Z + dZ> =
+# cost_a leaves as many equations as there are unknowns. A first direction with mu = 0 says how small mu may become, and
+# what the product dZ dS leaves (Mehrotra). Neither S nor Z need satisfy its equation at the start.
+
+_GAP = 1e-9  # relative gap and violations at which the iteration ends
+_ENOUGH = 1e-6  # .. and at which its best point counts where rounding ends it before
+_MOST_STEPS = 60
+_KEPT = 0.98  # of the way to the boundary
+
+
+_Parts = list[Any]  # a stack of Hermitian matrices for each block
+
+
+def _interior(problem: Problem) -> tuple[Array, str]:
+    """(x, status in Clarabel's words)."""
+    blocks, cost, x = problem.blocks, problem.cost, np.zeros(len(problem.cost))
+    size = max(np.abs(part).max(initial=1.0) for block in blocks for part in (block.constant, block.slopes, cost))
+    S: _Parts = [10 * size * (np.zeros_like(block.constant) + np.eye(block.constant.shape[-1])) for block in blocks]
+    Z, best, least = S, x, np.inf
+    for _ in range(_MOST_STEPS):
+        missing = [block.at(x) - s for block, s in zip(blocks, S, strict=True)]
+        wrong = cost - _inner(problem, Z)
+        gap = abs(cost @ x + sum(_product(block.constant, z) for block, z in zip(blocks, Z, strict=True)))
+        far = max(np.abs(part).max() / size for part in (wrong, *missing))
+        if (error := max(far, gap / (1 + abs(cost @ x)))) < least:
+            best, least = x, error
+        if not _GAP < error < least / _ENOUGH:
+            break
+        try:
+            newton = _Newton(problem, S, Z, missing, wrong)
+        except np.linalg.LinAlgError:  # rounding
+            break
+        mu = sum(map(_product, S, Z)) / sum(s.shape[0] * s.shape[1] for s in S)
+        _, dS, dZ, of_S, of_Z = newton.direction(0.0, [0.0] * len(S))
+        gains = (_product(s + of_S * ds, z + of_Z * dz) for s, ds, z, dz in zip(S, dS, Z, dZ, strict=True))
+        left = np.clip(sum(gains) / sum(map(_product, S, Z)), 0.0, 1.0)
+        dx, dS, dZ, of_S, of_Z = newton.direction(left**3 * mu, [dz @ ds for dz, ds in zip(dZ, dS, strict=True)])
+        x = x + of_S * dx
+        S = [_hermitian(s + of_S * ds) for s, ds in zip(S, dS, strict=True)]
+        Z = [_hermitian(z + of_Z * dz) for z, dz in zip(Z, dZ, strict=True)]
+    return best, "Solved" if least < _ENOUGH else "NumericalError"
+
+
+class _Newton:
+    """The linearised equations at (S, Z), which miss the blocks' values and the costs by `missing` and `wrong`.
+
+    Raises LinAlgError where S, Z or the equations are singular to rounding.
+    """
+
+    def __init__(self, problem: Problem, S: _Parts, Z: _Parts, missing: _Parts, wrong: Array) -> None:
+        self._problem, self._Z, self._missing, self._wrong = problem, Z, missing, wrong
+        self._roots = [[np.linalg.inv(np.linalg.cholesky(part)) for part in parts] for parts in (S, Z)]
+        self._inverse = [_adjoint(root) @ root for root in self._roots[0]]
+        normal = np.zeros((wrong.size, wrong.size))
+        for block, z, inverse in zip(problem.blocks, Z, self._inverse, strict=True):
+            slopes = block.slopes.reshape(len(block.slopes), -1)
+            turned = (z @ block.slopes @ inverse).reshape(slopes.shape)
+            normal[np.ix_(block.unknowns, block.unknowns)] += np.real(slopes.conj() @ turned.T)
+        self._scale = 1 / np.sqrt(np.where(np.diag(normal) > 0, np.diag(normal), 1.0))
+        unit = self._scale[:, None] * (normal + normal.T) / 2 * self._scale
+        self._factor = scipy.linalg.cho_factor(unit + 1e-14 * np.eye(wrong.size))
+
+    def direction(self, mu: float, left: _Parts) -> tuple[Array, _Parts, _Parts, float, float]:
+        """(dx, dS, dZ, the longest steps in S and Z, up to 1) towards S Z = mu I, where dZ dS will be `left`."""
+        right = _inner(self._problem, self._change(self._missing, mu, left)) - self._wrong
+        dx = self._scale * scipy.linalg.cho_solve(self._factor, self._scale * right)
+        blocks = zip(self._problem.blocks, self._missing, strict=True)
+        dS = [missing + np.tensordot(dx[list(block.unknowns)], block.slopes, axes=1) for block, missing in blocks]
+        dZ = self._change(dS, mu, left)
+        return dx, dS, dZ, _longest(self._roots[0], dS), _longest(self._roots[1], dZ)
+
+    def _change(self, dS: _Parts, mu: float, left: _Parts) -> _Parts:
+        """dZ, from dS."""
+        parts = zip(self._Z, dS, left, self._inverse, strict=True)
+        return [_hermitian(mu * inverse - z - (z @ ds + more) @ inverse) for z, ds, more, inverse in parts]
+
+
+def _inner(problem: Problem, Z: _Parts) -> Array:
+    """<slope_a, Z> of every unknown."""
+    total = np.zeros(len(problem.cost))
+    for block, z in zip(problem.blocks, Z, strict=True):
+        total[list(block.unknowns)] += np.real(block.slopes.reshape(len(block.slopes), -1).conj() @ z.ravel())
+    return total
+
+
+def _longest(roots: _Parts, steps: _Parts) -> float:
+    """The share of the steps, up to 1, that leaves every matrix positive; `roots` are their inverse roots."""
+    pairs = zip(roots, steps, strict=True)
+    least = min(np.linalg.eigvalsh(root @ step @ _adjoint(root)).min() for root, step in pairs)
+    return min(1.0, _KEPT / max(-least, 1e-300))
+
+
+def _adjoint(X: Any) -> Any:
+    return np.conj(np.swapaxes(X, -1, -2))
+
+
+def _hermitian(X: Any) -> Any:
+    return (X + _adjoint(X)) / 2
+
+
+def _product(X: Any, Y: Any) -> float:
+    """<X, Y> of Hermitian matrices."""
+    return float(np.real(np.vdot(X, Y)))

@@ -18,7 +18,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from io import BytesIO
 from math import prod
 from pathlib import Path
@@ -300,6 +300,11 @@ def _fill(file: BinaryIO, content: Callable[[BinaryIO], None] | bytes | str) -> 
         content(file)
     else:
         file.write(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
+
+
+def unseen(json: str = "key", default: Any = MISSING) -> Any:
+    """A field of a report that no table shows; in JSON as `figure` in cli/render.py has it, or `no` key."""
+    return field(default=default, metadata={"json": json})
 
 
 def plain(report: Any) -> Any:

@@ -23,12 +23,12 @@ from controller.ranges import Ranges
 from design import program
 from design.certificate import prove, prove_limiter
 from design.conditions import this_environment as requirement_of
+from design.coupling_file import Certificate, LimiterCertificate
 from design.designs import design_by_kind
 from design.environments import Searched, in_each, ratio_in, search_ranges, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.result import Design, DesignFailed, NotProved, finite
 from design.robustness import at, ranges_around, robustness, robustness_part, vertices
-from design.stored import Certificate, LimiterCertificate
 from design.transparency import Transparency, decibels, transparency
 
 _MINIMISED = {"rms": "rms_mismatch", "sup": "relative_mismatch"}
@@ -40,7 +40,7 @@ _HOPELESS = 0.9  # relative mismatch from which on the climb is compared with ot
 _TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
 _MOST_STATES = 200  # of the loop, up to which a rung is tried: half a minute with five devices
 _MOST_PROOFS = 30 * 112**2.7  # and (environments) states^2.7: a minute
-_MOST_WORK = 7e6  # (channels x unknowns)^2 up to which a rung is tried
+_MOST_WORK = 1.2e7  # (channels x unknowns)^2 up to which a rung is tried
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def _compromise(loop: Loop, around: Sequence[Network], options: program.Options)
 
     By sweeps, without proofs: what it costs, not a coupling to run. Raises DesignFailed where there is none.
     """
-    taps, poles = options.ladder[: 2 if loop.channels <= program.RICH else 1][-1]
+    taps, poles = options.ladder[: 2 if loop.channels <= 2 else 1][-1]
     climb = _Climb.of(loop.at(loop.environment), options)
     others = [at(loop, network) for network in around]
     more = tuple(program.Case(there, there.E(), (program.this_environment(there),), 0.0) for there in others)

@@ -210,11 +210,11 @@ def design(
     raise ValueError(f"condition is {condition!r}, expected 'any-environment' or 'this-environment'")
 
 
-#: Digits that gains keep in a loop of many devices, finer than RESERVE: with all of them exact proofs take minutes.
-_DIGITS = 5
+#: Digits that gains keep in a loop of more devices, finer than RESERVE: with all of them exact proofs take minutes.
+_DIGITS, _FEW = 5, 12
 _SWEEPS = 150  # take as long as a search for gains in this environment
-#: Devices whose search ends within half a minute: matrix inequalities cost their sixth power, eigenvalues their third.
-_MOST_ANY, _MOST_LIMITED = 16, 12
+#: Devices whose search ends within half a minute.
+_MOST_ANY, _MOST_LIMITED = 48, 12
 
 
 def _require_few(loop: Loop, most: int, what: str) -> None:
@@ -263,9 +263,18 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
         frequencies.append(peak)
         if abs(before - norm) < _SETTLED * norm and norm < (1 + _SETTLED) * bound:
             break
-    coupling = _coupling(loop, gains)
+    coupling = _short(_coupling(loop, gains))
+    if loop.channels > _FEW:
+        norm, _ = shaping.norm(coupling.compliance(loop.T))
     requirement = _verified(loop, coupling, phi)
     return Design(coupling, "any-environment", "loop-norm", norm, requirement, sdps, time.perf_counter() - started, phi)
+
+
+def _short(coupling: SpringDamper) -> SpringDamper:
+    """The gains of many devices, in so few digits that a proof stays short."""
+    if coupling.K.size <= _FEW:
+        return coupling
+    return SpringDamper(*([float(f"{v:.{_DIGITS}g}") for v in gains] for gains in (coupling.K, coupling.B)))
 
 
 def _for_this_environment(
@@ -302,10 +311,8 @@ def _for_this_environment(
             f"delta = {loop.delta}"
         )
         raise DesignFailed(None, (), line)
-    coupling = SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B))
-    if loop.channels > _MOST_LIMITED:
-        K, B = ([float(f"{v:.{_DIGITS}g}") for v in gains] for gains in (coupling.K, coupling.B))
-        coupling = SpringDamper(K, B)
+    coupling = _short(SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B)))
+    if loop.channels > _FEW:
         rms = transparency(loop.F(coupling), loop.E(), loop.lam, band).rms_mismatch
     requirement = this_environment(loop.F(coupling), loop.delta, loop.T_max)
     return Design(coupling, "this-environment", "rms", rms, requirement, searches, time.perf_counter() - started)

@@ -33,12 +33,12 @@ from typing import Self
 import numpy as np
 
 from controller.lti import Array
-from hw.device import RUNNING, Device
+from hw.device_state import RUNNING, Device
 from hw.protocol import PROTOCOL, Force, Info, Phase, distance
 from models.device import require
+from models.hold import hold
 from models.human import Human, Link
 from models.scene import build, plant
-from sim.engines import hold
 from sim.run import outside_forces
 from sim.scenario import InputError, Scenario
 

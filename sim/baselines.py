@@ -17,10 +17,11 @@ from controller.coupling import NoCoupling
 from controller.lti import Array
 from controller.tick import StepBuffer
 from design.result import DesignFailed
+from models.hold import hold
 from models.scene import Crowd, variants
 from sim.accuracy import force_error
 from sim.couplings import Chosen, choose, limits_of
-from sim.engines import ExactBatchEngine, hold
+from sim.engines import ExactEngine
 from sim.passivity_layer import BASELINES, Classic, EnergyNet, netted
 from sim.run import Simulation, assemble, run, run_blocks
 from sim.scenario import Scenario
@@ -151,6 +152,6 @@ def _left_alone(simulation: Simulation) -> tuple[int, float]:
         return False
 
     outside = plants.B.shape[-1] - m
-    engine = ExactBatchEngine(plants, process.force_limit)
+    engine = ExactEngine(plants)
     run_blocks(process, engine, lambda first, count: np.zeros((count, outside)), ticks, start, look)
     return int((fastest > SLOW).sum()), float(fastest.max())

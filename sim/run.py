@@ -27,20 +27,10 @@ from controller.lti import Array, Lti
 from controller.tick import Net, Process, StepBuffer
 from controller.timing import Timing
 from controller.walls import contact
+from models.hold import HeldPlant, hold
 from models.scene import Scene, build, plant
-from sim.engines import (
-    EXPONENTIAL,
-    LEAST,
-    Engine,
-    ExactEngine,
-    ExactTimedEngine,
-    HeldPlant,
-    MujocoEngine,
-    default_integrator,
-    hold,
-    profiler_off,
-    quiet_warnings,
-)
+from sim.engines import Engine, ExactEngine, ExactTimedEngine
+from sim.mujoco_engines import EXPONENTIAL, LEAST, MujocoEngine, default_integrator, profiler_off, quiet_warnings
 from sim.scenario import InputError, Scenario
 from sim.trace import Trace
 
@@ -162,8 +152,6 @@ def run(
         interrupted = True
     n, m, handles = simulation.scene.model.nq, process.channels, list(simulation.scene.handles)
     z, s, w, f = np.split(record[:done], np.cumsum(widths)[:3], axis=1)
-    for force, limit in zip(f.T, process.force_limit, strict=True):
-        np.clip(force, -limit, limit, out=force)  # from asked for into applied
     for part in (record, z, s, w, f):
         part.setflags(write=False)
     return Trace(
@@ -244,8 +232,8 @@ def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
         buffer.calm = False
     tick, advance = buffer.ticking(), engine.advance
     for k in range(done, ticks):
-        tick(k)  # sample x, compute f and z+
-        advance(k)  # limit f, hold -f on the actuators for T, move the plant
+        tick(k)  # sample x, compute f and z+, limit f
+        advance(k)  # hold -f on the actuators for T, move the plant
 
 
 def beginnings(T: float, timing: Timing | None, first: int, ticks: int) -> Array:
@@ -289,10 +277,9 @@ def make_engine(
     if engine == "exact":
         if simulation.friction:
             raise ValueError("the devices have Coulomb friction, which the exact engine, being linear, does not model")
-        limit = simulation.process.force_limit
         if simulation.timing and T is None:
-            return ExactTimedEngine(plant(simulation.scene.model), simulation.timing, limit)
-        return ExactEngine(simulation.plant, limit)
+            return ExactTimedEngine(plant(simulation.scene.model), simulation.timing)
+        return ExactEngine(simulation.plant)
     integrator = integrator or default_integrator(simulation.scene)
     count = substeps if substeps is not None else 1 if integrator == EXPONENTIAL else LEAST
     if T is not None:

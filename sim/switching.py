@@ -31,9 +31,11 @@ from design.certificate import switching_requirement
 from design.coverage import switching_part
 from design.guarantees import switching_guarantee
 from design.result import Requirement
+from models.hold import HeldPlant, hold
 from models.scene import Scene, Variants
 from sim.couplings import Chosen
-from sim.engines import Engine, ExactBatchEngine, ExactTimedEngine, HeldPlant, MujocoBatchEngine, hold
+from sim.engines import Engine, ExactEngine, ExactTimedEngine
+from sim.mujoco_engines import MujocoBatchEngine
 from sim.run import Simulation
 from sim.scenario import Scenario
 from sim.stability import impulse_forces, impulse_growth, unlimited
@@ -134,7 +136,7 @@ def greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Vary
     lo, hi = (np.array(side)[:, None] for side in (varying.lo, varying.hi))
     depth = int(hi.max()) + 1
     buffer = StepBuffer(replace(process, force_limit=free, delays=None), 1, states, scene.outside, nsim)
-    engine = ExactBatchEngine(plants, free)
+    engine = ExactEngine(plants)
     engine.start(buffer)
     pushed = impulse_forces(scene, process.F.T, 0, ticks)
     sent, age = np.zeros((depth, m, nsim)), np.broadcast_to(hi, (m, nsim))
@@ -232,9 +234,9 @@ def switched_crowd(
             process = replace(free, delays=_crowd_delays(scenario, free, scene, plants, index, seed, ticks))
         endless = unlimited(process)
         if timing:
-            moved: Engine = ExactTimedEngine(held_by.plants(), timing, endless.force_limit)
+            moved: Engine = ExactTimedEngine(held_by.plants(), timing)
         else:
-            moved = ExactBatchEngine(plants, endless.force_limit)
+            moved = ExactEngine(plants)
         exact, _ = impulse_growth(endless, moved, scene, states, ticks, nsim)
         if not mujoco:
             return Switched(exact, np.full(nsim, np.nan))

@@ -25,7 +25,6 @@ def driven(
     kept = []
 
     def look(buffer: StepBuffer, first: int, count: int) -> None:
-        buffer.saturate(count)
         if last is None or first + count > ticks - last:
             kept.append([rows[:count].copy() for rows in (buffer.z, buffer.s, buffer.f)])
 

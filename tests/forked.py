@@ -49,7 +49,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
 
 def _remembering(folder: Path, make):
     """The same function, with its results kept in the folder; failures and loops without a digest are not."""
-    from design.stored import digest
+    from design.coupling_file import digest
 
     @functools.wraps(make)
     def remembered(loop, *asked, **options):
@@ -72,9 +72,9 @@ def _remembering(folder: Path, make):
 
 def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
     """What a call asks of the loop, defaults by their values, in words that two equal calls share."""
+    from design.coupling_file import digest
     from design.designs import usual_condition
     from design.program import DEFAULT
-    from design.stored import digest
 
     call = inspect.signature(make).bind(loop, *asked, **options)
     call.apply_defaults()
@@ -82,6 +82,8 @@ def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
     if make.__name__ == "design_by_kind":
         words["condition"] = words["condition"] or usual_condition(loop, words["kind"])
         words |= (vars(DEFAULT) if words["kind"] == "optimal" else {}) | words.pop("options")
+    if make.__name__ == "bound" and loop.channels <= 2:
+        del words["near"]  # of no use to it there
     return sorted((name, digest(x.form()) if hasattr(x, "form") else repr(x)) for name, x in words.items())
 
 

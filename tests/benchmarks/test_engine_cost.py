@@ -16,20 +16,15 @@ import pytest
 from controller.coupling import CASE_I
 from controller.tick import StepBuffer
 from models.device import CompliantDevice
+from models.hold import hold
 from models.scene import plant, variants
 from sim.crowds import crowds
-from sim.engines import (
-    EXPONENTIAL,
-    ExactBatchEngine,
-    MujocoBatchEngine,
-    discretised,
-    hold,
-    profiler_off,
-)
+from sim.engines import ExactEngine
+from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, discretised, profiler_off
 from sim.run import assemble, make_engine, run, run_block
 from sim.scenario import load
 from sim.stability import exact_growth
-from sim.stepping import default_substeps, measured_hold, pace, simulated_growth
+from sim.step_choice import default_substeps, measured_hold, pace, simulated_growth
 
 pytestmark = pytest.mark.benchmark(group="engines")
 ROUNDS = 9
@@ -153,9 +148,9 @@ def test_many_hands(benchmark):
     simulation = assemble(scenario, CASE_I)
     ((_, crowd),) = crowds(scenario.population, scenario.channels, 0, range(nsim), 1)
     held_by = variants(scenario.device, crowd)
-    plants, limit = hold(held_by.plants(), scenario.T), simulation.process.force_limit
+    plants = hold(held_by.plants(), scenario.T)
     batches = {
-        "exact": ExactBatchEngine(plants, limit),
+        "exact": ExactEngine(plants),
         "exponential x 1": MujocoBatchEngine(held_by.scene, scenario.T, EXPONENTIAL, 1, nsim, 1, held_by.fields),
         "RK4 x 4": MujocoBatchEngine(held_by.scene, scenario.T, "RK4", 4, nsim, 1, held_by.fields),
     }

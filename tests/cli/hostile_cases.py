@@ -12,7 +12,7 @@ import numpy as np
 
 from controller.coupling import SpringDamper
 from design.certificate import prove
-from design.stored import Stored, save
+from design.coupling_file import Stored, save
 from sim.scenario import SCENARIOS, load
 
 BUT = 2  # exit code of bad input

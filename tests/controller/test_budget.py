@@ -10,8 +10,8 @@ from controller.coupling import SpringDamper
 from controller.environment import FIGURE_4, Network, Spring, environment, environment_of
 from controller.lti import Lti
 from design import design_coupling
+from models.hold import hold as hold_input
 from models.scene import Crowd, variants
-from sim.engines import hold as hold_input
 from sim.scenario import load
 
 T = 1.2e-3

@@ -22,10 +22,12 @@ from design.certificate import assess, prove
 from design.conditions import this_environment
 from design.guarantees import MAKING
 from models.device import CompliantDevice
+from models.hold import hold
 from models.human import Population
 from models.scene import variants
 from sim.crowds import crowds
-from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold
+from sim.engines import ExactEngine
+from sim.mujoco_engines import MujocoBatchEngine
 from sim.run import assemble, run, run_blocks
 from sim.scenario import SCENARIOS, InputError, load, parse
 
@@ -184,7 +186,7 @@ def test_random_hands_on_walls_come_to_rest_under_any_environment(name, humans, 
     ((_, crowd),) = crowds(Population(damping=(0.3, 30.0)), 2, 0, range(humans), 1)
     sets = variants(scenario.device, crowd)
     if name == "exact":
-        engine = ExactBatchEngine(hold(sets.plants(), scenario.T), loop.process.force_limit)
+        engine = ExactEngine(hold(sets.plants(), scenario.T))
     else:
         engine = MujocoBatchEngine(sets.scene, scenario.T, nsim=humans, fields=sets.fields)
     n = sets.scene.model.nv

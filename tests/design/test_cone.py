@@ -9,7 +9,7 @@ import pytest
 from analysis import solve
 
 from design import cone
-from design.cone import LADDER, Block, Problem
+from design.cone import INTERIOR, LADDER, Block, Problem
 from design.lmi import symmetric_from
 from design.result import DesignFailed, Infeasible
 
@@ -24,27 +24,33 @@ def hermitian(rng, *shape):
 
 
 def with_known_optimum(rng, p, shapes):
-    """(problem, x): of every block a random space is in S(x), the rest in the multiplier Z; c_a = <slope_a, Z>."""
+    """(problem, x): of every block a random space is in S(x), the rest in the multiplier Z; c_a = <slope_a, Z>.
+
+    All slopes together are positive, and every x_a is bounded, so that both sets have an interior.
+    """
     x, cost, blocks = rng.normal(size=p), np.zeros(p), []
     for count, n, complex_ in shapes:
         taking = np.sort(rng.choice(p, max(1, 2 * p // 3), replace=False))
         slopes = hermitian(rng, taking.size, count, n)
         slopes = slopes if complex_ else slopes.real
+        slopes[0] += np.eye(n) - slopes.sum(axis=0)
         basis = np.linalg.qr(hermitian(rng, count, n) if complex_ else hermitian(rng, count, n).real)[0]
         of_S = np.arange(n) < rng.integers(0, n, (count, 1))
         sizes = rng.uniform(0.5, 2, (count, n))
         S, Z = ((basis * (sizes * part)[:, None]) @ np.conj(np.swapaxes(basis, 1, 2)) for part in (of_S, ~of_S))
         cost[taking] += np.einsum("akij,kji->a", slopes, Z).real
         blocks.append(Block(S - np.tensordot(x[taking], slopes, axes=1), slopes, taking.tolist()))
+    blocks.append(Block.of(lambda v: np.diag([*(9 - v), *(9 + v)]), range(p)))
     return Problem(cost, blocks), x
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_a_known_optimum_is_found(seed):
+@pytest.mark.parametrize("ladder", [LADDER, (INTERIOR,)], ids=["Clarabel", "interior"])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_known_optimum_is_found(seed, ladder):
     """Complementary S(x) and Z, with Z in the dual's set, prove x optimal; cvxpy finds the same value."""
     rng = np.random.default_rng(seed)
     problem, x = with_known_optimum(rng, 7, [(3, 4, True), (1, 5, False), (4, 1, False), (2, 2, True)])
-    found = problem.solve("it")
+    found = problem.solve("it", ladder=ladder)
     assert problem.cost @ found == pytest.approx(problem.cost @ x, rel=1e-6, abs=1e-6)
     assert problem.violation(found) < 1e-7
     v = cp.Variable(7)
@@ -55,6 +61,14 @@ def test_a_known_optimum_is_found(seed):
             constraints.append((matrix if len(constant) == 1 else (matrix + matrix.H) / 2) >> 0)
     other = solve(cp.Problem(cp.Minimize(problem.cost @ v), constraints))
     assert problem.cost @ found == pytest.approx(other, rel=1e-5, abs=1e-5)
+
+
+def test_a_large_block_is_not_for_clarabel(monkeypatch):
+    """60 complex rows, whose triangle has 7260 real entries, and the equations of Clarabel their square."""
+    calls = answering(monkeypatch)
+    problem, x = with_known_optimum(np.random.default_rng(0), 5, [(1, 60, True)])
+    assert problem.cost @ problem.solve("it") == pytest.approx(problem.cost @ x, rel=1e-6)
+    assert not calls
 
 
 def answering(monkeypatch, *answers):

@@ -10,7 +10,7 @@ from cli.accuracy import main
 from controller.coupling import NoCoupling
 from models.device import RigidDevice
 from sim import accuracy as yardstick
-from sim.accuracy import credible_part, mark_front
+from sim.accuracy import credible, mark_front
 from sim.run import assemble, run
 from sim.scenario import InputError, load
 
@@ -62,15 +62,15 @@ def test_a_run_says_up_to_when_its_devices_could_have_done_it():
     scenario = load()
     simulation = assemble(scenario, NoCoupling())
     trace = run(simulation, "exact")
-    part = credible_part(simulation, trace)
+    part = credible(simulation, trace)
     force = 14500 * np.abs(trace.x - trace.x_handle)
     speed = np.abs(np.gradient(trace.x, scenario.T, axis=0))
-    assert part["transmission_force_n"] == pytest.approx(force.max(axis=0))
-    assert part["motor_speed_m_per_s"] == pytest.approx(speed.max(axis=0), rel=0.1)  # 14 samples a period
-    assert part["until_s"] == trace.t[np.argmax((force > 36).any(axis=1))] == pytest.approx(7.35)
-    assert "transmission carries up to 253 N (credible: 36)" in part["reason"]
+    assert part.transmission_force_n == pytest.approx(force.max(axis=0))
+    assert part.motor_speed_m_per_s == pytest.approx(speed.max(axis=0), rel=0.1)  # 14 samples a period
+    assert part.until_s == trace.t[np.argmax((force > 36).any(axis=1))] == pytest.approx(7.35)
+    assert "transmission carries up to 253 N (credible: 36)" in part.reason
     stiff = tuple(msgspec.structs.replace(d, credible_force=300.0, credible_speed=10.0) for d in scenario.device)
-    assert credible_part(assemble(scenario.replace(device=stiff), NoCoupling()), trace)["until_s"] is None
+    assert credible(assemble(scenario.replace(device=stiff), NoCoupling()), trace).until_s is None
     rigid = assemble(scenario.replace(device=(RigidDevice(), RigidDevice())), NoCoupling())
-    part = credible_part(rigid, run(rigid, "exact", ticks=100))
-    assert (part["transmission_force_n"], part["until_s"]) == ([None] * 2, None)
+    part = credible(rigid, run(rigid, "exact", ticks=100))
+    assert (part.transmission_force_n, part.until_s) == ([None] * 2, None)

@@ -14,10 +14,10 @@ from cli.validate import main
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from design.conditions import this_environment as real
 from models.device import RigidDevice
+from models.hold import hold
 from models.scene import build, plant
 from sim import adversary
 from sim.adversary import DESTABILISED, attempts, search
-from sim.engines import hold
 from sim.run import assemble
 from sim.scenario import load
 from sim.stability import close, dominant_mode

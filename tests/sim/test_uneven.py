@@ -14,10 +14,12 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.delay import VaryingDelay
 from controller.timing import Periods, Timing
 from design.files import InputError
+from models.hold import at_the_latch, hold
 from models.scene import Plant, plant
-from sim import load, uneven
+from sim import load
+from sim.checks import uneven
 from sim.crowds import Validation, examine
-from sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine, at_the_latch, hold
+from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
 from sim.run import assemble, make_engine, run
 from sim.stability import close, dominant_mode
 
