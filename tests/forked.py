@@ -36,8 +36,8 @@ def share_designs(folder: Path, patch=setattr) -> None:
     from sim import alternatives, couplings
 
     for made, modules in (
-        (designs.design_by_kind, (cli.design, api, bound, compare, couplings)),
-        (bound.bound, (cli.design, compare)),
+        (designs.design_by_kind, (cli.design, api, bound, compare, coverage, couplings)),
+        (bound.bound, (bound, compare)),
         (optimal.spread, (optimal,)),
         (coverage.limiter_requirement, (coverage,)),
         (alternatives.assess, (alternatives,)),

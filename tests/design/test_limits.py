@@ -139,7 +139,7 @@ def test_the_command_draws_and_reports(tmp_path):
 
 
 def test_nothing_found_is_exit_code_1(tmp_path, monkeypatch, impossible):
-    monkeypatch.setattr(command, "optimum", lambda point: impossible)
+    monkeypatch.setattr(limit_curve, "optimum", lambda point: impossible)
     code, report = run(tmp_path, "--over", "order=1:2", "--points", "2", "--beside", "none")
     assert code == 1
     assert all(row["reason"] for row in report["sweeps"]["order"]["optimal"])
@@ -155,7 +155,7 @@ def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return measured(point, "spring-damper", "any-environment", {})  # what is designed does not matter here
 
-    monkeypatch.setattr(command, "optimum", interrupted)
+    monkeypatch.setattr(limit_curve, "optimum", interrupted)
     code, report = run(tmp_path, "--over", "damping=1.3:1.5", "--points", "4", "--beside", "none")
     assert code == 130
     assert report["interrupted"]
