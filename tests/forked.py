@@ -36,7 +36,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
     from sim import alternatives, couplings
 
     for made, modules in (
-        (designs.design_by_kind, (cli.design, api, bound, compare, coverage, couplings)),
+        (designs.design_by_kind, (cli.design, api, compare, coverage, couplings)),
         (bound.bound, (bound, compare)),
         (optimal.spread, (optimal,)),
         (coverage.limiter_requirement, (coverage,)),
