@@ -25,7 +25,7 @@ from design.gain_search import STIFFEST
 from design.guarantees import ANY
 from design.optimal import Optimal, robustness_parts, widest_ranges
 from design.program import DEFAULT, OBJECTIVES, Options
-from design.result import Design, DesignFailed, listed
+from design.result import Design, listed
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts
 from sim.scenario import InputError, Scenario
@@ -132,7 +132,7 @@ def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     words = {"full": "diagonal"}  # --full says that it is not
     known = dict.fromkeys(("limiter", "full", *(name for design in KINDS.values() for name in design.options)))
     found = {name: getattr(args, name, None) for name in known}
-    given = {name: value for name, value in found.items() if value is not None and value is not False}
+    given = {name: value for name, value in found.items() if options.given(value)}
     if kind == "spring-damper" and args.limiter is not None:
         given["limiter"] = args.limiter
     for name in given:
@@ -150,13 +150,8 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
     asked = asked_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
         asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
-    try:
-        with render.designing(loop, args.coupling, args.condition) as heard:
-            return design_by_kind(loop, args.coupling, args.condition, heard, **asked)
-    except DesignFailed:
-        raise
-    except ValueError as error:
-        raise InputError(options.as_option(error, args)) from None
+    with options.refused(args=args), render.designing(loop, args.coupling, args.condition) as heard:
+        return design_by_kind(loop, args.coupling, args.condition, heard, **asked)
 
 
 # ----------------------------------------------------------------------------------------------------
