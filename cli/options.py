@@ -26,14 +26,13 @@ from threadpoolctl import threadpool_limits
 
 from controller import older
 from controller.delay import LOST, VaryingDelay
-from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
 from controller.lti import SingularLoop
 from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
 from design.result import CONDITIONS, DesignFailed
 from models.device import MOST_DAMPING
-from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load, load_humans
+from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -274,13 +273,7 @@ def add_human_option(parser: argparse.ArgumentParser, more: str = "") -> None:
 
 def with_humans(args: argparse.Namespace, scenario: Scenario) -> Scenario:
     """The scenario in the hands that --human names. Raises InputError."""
-    if args.human is None:
-        return scenario
-    people = load_humans(args.human, scenario.channels)
-    who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
-    if people.population is not None:
-        who["population"] = people.population
-    return scenario.replace(**who)
+    return scenario if args.human is None else held_by(scenario, args.human)
 
 
 def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: str = "spring-damper") -> None:
@@ -358,10 +351,8 @@ def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     """The loop of the one channel that --rigid is about. Raises InputError where options name more of them."""
     for name in ("theta", "psi", "delta"):
         per_channel(f"--rigid is one channel: --{name}", getattr(args, name) or (0,), 1)
-    theta, psi = scenario.theta[:1], scenario.psi[:1] if args.psi else (0,)
-    late, T_max = scenario.latency and scenario.latency[:1], scenario.longest_period
     with refused():
-        return Loop(scenario.T, theta, psi, theta, scenario.delta[:1], RIGID_WALL, T_max=T_max, latency=late)
+        return scenario.before_a_rigid_wall(scenario.psi[:1] if args.psi else (0,))
 
 
 # ----------------------------------------------------------------------------------------------------
