@@ -22,9 +22,10 @@ from design.designs import KINDS, design_by_kind, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
 from design.guarantees import ANY, HERE, switching_guarantee
-from design.optimal import Optimal, robustness_parts, widest_ranges
+from design.optimal import Optimal, robustness_parts
 from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import Design, DesignFailed, NotProved, listed
+from design.robustness import ranges_around
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts
@@ -46,7 +47,7 @@ def main(argv: list[str]) -> int:
     judged = _judged(args, scenario, loop, design)
     stored = _store(loop, design, judged.whole, out, judged.limits.certificate)
     report = _reported(args, loop, design, judged, stored)
-    render.publish(args, report, _tables(scenario, report), (report.best or {}).get("notes", args.notes))
+    render.publish(args, report, _tables(scenario, report))
     holds = report.certificate["certified"] and (judged.promise == ANY or not judged.whole or judged.proved)
     return options.DONE if holds and (report.switching or report.certificate)["certified"] else options.DOES_NOT_HOLD
 
@@ -123,13 +124,13 @@ _OPTIONS = {"full": "diagonal"} | {
 
 def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     """The scenario's loop with the range of delays that --varying-delay gives. Raises InputError."""
-    loop, args.notes = scenario.loop(args.case), []
+    loop = scenario.loop(args.case)
     if args.ranges is not None:
         if loop.ranges or loop.environment.walls:
             raise InputError(f"--ranges and {'[ranges]' if loop.ranges else 'environment.walls'}: give one of them")
         try:
-            around, note = widest_ranges(loop, args.ranges)
-            loop, args.notes = msgspec.structs.replace(loop, ranges=around), [note] if note else []
+            loop = msgspec.structs.replace(loop, ranges=ranges_around(loop.network, args.ranges))
+            loop.members()
         except ValueError as error:
             raise InputError(f"--ranges {args.ranges:g}: {error}") from None
     args.condition = args.condition or usual_condition(loop, args.coupling)
@@ -258,7 +259,6 @@ def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[s
         "bound": limit,
         "rendered_stiffness": best.g,
         "ladder": [asdict(rung) for rung in best.ladder],
-        "notes": args.notes,
     }
 
 
