@@ -13,7 +13,7 @@ from sim.couplings import NAMES, choose, limits_of
 from sim.mujoco_engines import EXPONENTIAL
 from sim.run import Simulation, assemble
 from sim.scenario import InputError, require_even_ticks, require_linear
-from sim.stepping import NEUTRAL, default_substeps, step_radius
+from sim.step_choice import NEUTRAL, default_substeps, step_radius
 
 _MOST_STEPS = 3_000_000  # of a row: a minute or two
 _HEADS = ("setting", "position", "growth", "verdict", "cycle N", "Hz", "real")

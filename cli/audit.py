@@ -20,7 +20,7 @@ from design.audit import LONGEST_DELAY, report
 from design.certificate import check_ranges
 from design.coverage import ranges_rows
 from design.designs import KINDS
-from design.result import listed
+from design.result import CONDITIONS, listed
 from models.device import CATALOGUE, Listed, listed_device
 from sim.couplings import check_stored, fitted, read_coupling
 from sim.report import encoder_steps
@@ -206,8 +206,8 @@ def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange |
 
 
 def _tables(outcome: dict[str, Any]) -> list[Table]:
-    parts = [outcome[condition] for condition in render.ORDER]
-    table = Table("", *render.ORDER, title=_verdict(outcome), title_justify="left")
+    parts = [outcome[condition] for condition in CONDITIONS]
+    table = Table("", *CONDITIONS, title=_verdict(outcome), title_justify="left")
     for name, cell in _ROWS.items():
         table.add_row(name, *(cell(part) for part in parts))
     if not outcome["ranges"]:
@@ -261,7 +261,7 @@ _ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
 
 def _remarks(outcome: dict[str, Any]) -> list[str]:
     lines = [f"{note}." for note in outcome["notes"]]
-    for condition in render.ORDER:
+    for condition in CONDITIONS:
         part = outcome[condition]
         sensitivity = part["sensitivity"].get("reason") if part["certified"] else None
         reasons = {"": part.get("reason"), ", stiffest K": part["stiffest"].get("reason"), ", sensitivity": sensitivity}

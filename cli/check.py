@@ -11,11 +11,11 @@ from rich.table import Table
 
 from cli import options, render
 from design.certificate import Verdict, lag, verify, violated_between
+from design.coupling_file import Stored, SwitchingProof
 from design.coverage import search_part, search_words
 from design.environments import Searched, search_ranges
 from design.guarantees import HERE, RANGES, switching_guarantee
 from design.result import listed
-from design.stored import Stored, SwitchingProof
 from sim.couplings import read_coupling
 from sim.scenario import InputError
 

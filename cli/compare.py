@@ -23,10 +23,9 @@ from controller import older
 from controller.loop import Loop
 from controller.lti import Array
 from design import compare
-from design.certificate import CONDITIONS
 from design.compare import AXES, FEEL_HZ, LADDERS, Demands, LadderRow, Limit, Perceived, Point, optimum, points_along
 from design.program import Options
-from design.result import DesignFailed, certificate_part, finite
+from design.result import CONDITIONS, DesignFailed, certificate_part, finite
 from design.robustness import robustness_part
 from design.transparency import transparency
 from sim import baselines, report
@@ -74,7 +73,7 @@ def _parser() -> options.Parser:
     )
     curve.add_argument("--keep", choices=("samples", "seconds"), default="samples", help="delays, as the period varies")
     beside = "spring-dampers drawn: none, any-environment, this-environment or both (default both)"
-    curve.add_argument("--beside", type=_beside, default=CONDITIONS, metavar="NAME", help=beside)
+    curve.add_argument("--beside", type=_beside, default=tuple(CONDITIONS), metavar="NAME", help=beside)
     optimal = parser.add_argument_group("the optimal coupling of --over")
     add_optimal_options(optimal)
     options.add_output_options(parser, picture=True)
@@ -82,7 +81,7 @@ def _parser() -> options.Parser:
 
 
 def _beside(text: str) -> tuple[str, ...]:
-    return {"none": (), "both": CONDITIONS}[text] if text in ("none", "both") else (options.condition(text),)
+    return {"none": (), "both": tuple(CONDITIONS)}[text] if text in ("none", "both") else (options.condition(text),)
 
 
 #: options -> the modes that take them
@@ -251,10 +250,10 @@ def _guarantees(report: _Couplings) -> Table:
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
     title = f"{damping} of {_list(available)} N s/m · {report.scenario}, case {report.case}"
-    heads = ("coupling", "this-env.", "at Hz", "at 10 %", "any-env.", "at Hz", "sup dB", "rms dB")  # render.ORDER
+    heads = ("coupling", "this-env.", "at Hz", "at 10 %", "any-env.", "at Hz", "sup dB", "rms dB")  # as CONDITIONS
     rows = []
     for coupling in report.couplings:
-        parts = [coupling.conditions[condition] for condition in render.ORDER]
+        parts = [coupling.conditions[condition] for condition in CONDITIONS]
         needs = [(_needs(p, available[0] if alike else 1.0), p["binding_frequency_hz"]) for p in parts]
         asked = [cell for need, hz in needs for cell in (need, render.optional(hz, "{:.4g}"))]
         asked.insert(2, _robust(coupling.robustness, available[0] if alike else 1.0))

@@ -18,6 +18,7 @@ from design import coverage
 from design.audit import LONGEST_DELAY
 from design.bound import MOST, NO_BOUND, bound
 from design.certificate import SAMPLES, RangesCheck, assess, check_ranges, lag, prove, switching_requirement
+from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
@@ -26,7 +27,6 @@ from design.optimal import Optimal, robustness_parts
 from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import Design, DesignFailed, NotProved, listed
 from design.robustness import ranges_around
-from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts
 from sim.scenario import InputError, Scenario

@@ -17,6 +17,7 @@ from cli import options, render
 from controller.coupling import SpringDamperForm
 from controller.lti import Array
 from design.certificate import Verdict, verify
+from design.coupling_file import Stored
 from design.export import (
     ExportedBlock,
     NothingToExport,
@@ -31,7 +32,6 @@ from design.export import (
 from design.files import out_file, write
 from design.guarantees import HERE, RANGES, switching_guarantee
 from design.result import listed
-from design.stored import Stored
 from sim.couplings import read_coupling
 from sim.scenario import InputError
 

@@ -44,14 +44,14 @@ class Judged:
     ) -> Judged:
         """With the parts as plain data; forces are limited as the scenario's devices limit them."""
         return cls(
-            whole,
-            requirements,
-            limits,
-            report.coupling_part(kind, coupling, loop.T),
-            report.certificates_part(requirements),
-            guarantee_of(requirements, loop, bool(whole and whole.proved)),
-            whole and ranges_part(whole),
-            limits.part([device.force_limit for device in scenario.device]),
+            whole=whole,
+            requirements=requirements,
+            limits=limits,
+            coupling=report.coupling_part(kind, coupling, loop.T),
+            certificates=report.certificates_part(requirements),
+            promise=guarantee_of(requirements, loop, bool(whole and whole.proved)),
+            ranges=whole and ranges_part(whole),
+            limiter=limits.part([device.force_limit for device in scenario.device]),
         )
 
     @property

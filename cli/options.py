@@ -30,7 +30,7 @@ from controller.loop import Loop
 from controller.lti import SingularLoop
 from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
-from design.result import DesignFailed
+from design.result import CONDITIONS, DesignFailed
 from models.device import MOST_DAMPING
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load, load_humans
 
@@ -147,8 +147,8 @@ def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 def condition(text: str) -> str:
     """A condition by its name, or by the name that it had before."""
     name = older.CONDITIONS.get(text, text)
-    if name not in older.CONDITIONS.values():
-        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(older.CONDITIONS.values())}")
+    if name not in CONDITIONS:
+        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)}")
     return name
 
 
@@ -269,10 +269,10 @@ def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: s
     add_condition_option(parser)
 
 
-def add_condition_option(parser: argparse._ActionsContainer, what: str = "that the certificate is about") -> None:
+def add_condition_option(parser: argparse._ActionsContainer, what: str = "the condition of the certificate") -> None:
     """--condition."""
-    names = ",".join(older.CONDITIONS.values())
-    help_ = f"{what}: {' or '.join(older.CONDITIONS.values())} (default: the coupling's own)"
+    names = ",".join(CONDITIONS)
+    help_ = f"{what}: {' or '.join(CONDITIONS)} (default: the coupling's own)"
     parser.add_argument("--condition", type=condition, metavar=f"{{{names}}}", help=help_)
 
 

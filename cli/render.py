@@ -25,7 +25,7 @@ from controller.loop import Loop
 from controller.older import REPORTS, with_older
 from design.files import nobody_reads, plain, printable, write_json
 from design.files import unseen as unseen
-from design.result import DesignFailed, listed
+from design.result import CONDITIONS, DesignFailed, listed
 
 # ----------------------------------------------------------------------------------------------------
 # The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
@@ -215,9 +215,6 @@ def rows_of(report: Any) -> Rows:
 # Phrases that several reports share.
 
 
-ORDER = ("this-environment", "any-environment")  # of conditions in a table
-
-
 def certified(part: Mapping[str, Any]) -> str:
     """Whether it is, and whether that is proved in exact arithmetic."""
     if not part["certified"]:
@@ -234,7 +231,7 @@ def needs(part: Mapping[str, Any], digits: int = 6) -> str:
 def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> Rows:
     """What each condition needs, and whether that is proved exactly, where no other row says it."""
     for name, part in certificates.items():
-        if name in ORDER:
+        if name in CONDITIONS:
             word = certified(part) if proof else certified(part | {"proof": None})
             yield f"damping, {name}", f"needs {needs(part, digits)}: {word}"
 

@@ -16,7 +16,7 @@ from controller.lti import Array
 from design.files import write
 from design.guarantees import ANY, CAVEATS, MAKING
 from design.optimal import robustness_parts
-from design.result import finite, listed
+from design.result import CONDITIONS, finite, listed
 from design.transparency import BAND_HZ, transparency
 from sim import accuracy, report
 from sim import passivity_layer as layer
@@ -27,7 +27,7 @@ from sim.mujoco_engines import INTEGRATORS
 from sim.run import ENGINES, beginnings
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, ExactVerdict, Stability, stability_of
-from sim.stepping import MOST
+from sim.step_choice import MOST
 
 
 def main(argv: list[str]) -> int:
@@ -54,27 +54,26 @@ def _parser() -> options.Parser:
     parser = options.Parser(
         "sim.run", "Close the loop once and report stability, transparency and error.", "python -m sim.run --case none"
     )
+    add = parser.add_argument
     options.add_loop_options(parser)
     options.add_varying_delay_options(parser)
     options.add_coupling_options(parser, f"{', '.join(NAMES)}, as baselines {', '.join(layer.BASELINES)}")
     options.add_energy_budget_option(parser)
-    parser.add_argument("--engine", choices=ENGINES, default="mujoco", help="MuJoCo, or the exact solution")
-    steppers = "of MuJoCo (default exponential, RK4 where devices rub)"
-    parser.add_argument("--integrator", choices=tuple(INTEGRATORS), help=steppers)
+    add("--engine", choices=ENGINES, default="mujoco", help="MuJoCo (default), or the exact solution")
+    steppers = "integrator of MuJoCo (default exponential, RK4 where devices rub)"
+    add("--integrator", choices=tuple(INTEGRATORS), help=steppers)
     steps = "MuJoCo steps per period (default: what the plant asks)"
-    parser.add_argument("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
-    parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help="default: the scenario's")
-    asked = (
-        "relative rms of the positions: compare engines and steps on this scene, run with the cheapest that keeps it"
-    )
-    parser.add_argument("--error", type=options.number(1e-18, 1.0), metavar="E", help=asked)
+    add("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
+    add("--duration", type=options.number(), metavar="SECONDS", help="simulated time (default: the scenario's)")
+    asked = "compare engines and steps on this scene, run with the cheapest that keeps this relative rms error"
+    add("--error", type=options.number(1e-18, 1.0), metavar="E", help=asked)
     check = "run RK4 beside the exponential engine, with which it shares no matrix"
-    parser.add_argument("--cross-check", action="store_true", help=check)
+    add("--cross-check", action="store_true", help=check)
     options.add_human_option(parser)
     options.add_band_option(parser)
     options.add_limiter_option(parser)
     vertex = "simulate at this vertex of the scenario's ranges (default 0: nominal)"
-    parser.add_argument("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
+    add("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
     options.add_output_options(parser, picture=True)
     beside = parser.add_argument_group("the same devices and hands with other couplings")
     beside.add_argument("--no-alternatives", action="store_true", help="no table of them, which takes a second or two")
@@ -139,12 +138,11 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun
 def _side_by_side(others: list[Alternative], path: Path, names: tuple[str, ...]) -> Path:
     from sim.plots import Panel, plot_side_by_side
 
-    shown = [other for other in others if other.trace is not None and other.coupling != "published"]
-    panels = []
-    for other in shown:
-        assert other.trace is not None
-        assert other.ideal is not None
-        panels.append(Panel(_panel_title(other), other.trace, other.ideal, other.until_s))
+    panels = [
+        Panel(_panel_title(other), other.trace, other.ideal, other.until_s)
+        for other in others
+        if other.trace is not None and other.ideal is not None and other.coupling != "published"
+    ]
     return plot_side_by_side(panels, path, names)
 
 
@@ -450,7 +448,7 @@ def _beside(report: _Report) -> Any:
             cells.append((other.name, "", "", f"not possible: {other.reason}", "", ""))
             continue
         same = own == (other.coupling, other.condition) or own[0] == other.coupling != "spring-damper"
-        needs = (_share(other.needs(condition), "never") for condition in render.ORDER)
+        needs = (_share(other.needs(condition), "never") for condition in CONDITIONS)
         grows = other.growth_rate_per_s is None or other.growth_rate_per_s > MARGINAL
         error = "grows" if grows else render.optional(other.force_error_percent, "{:.3g} %")
         felt = _share(other.dc_ratio, "-")

@@ -28,7 +28,7 @@ from cli import options, render, suite_report
 from controller.coupling import NoCoupling
 from controller.lti import SingularLoop
 from design.files import folder, write, write_json
-from design.result import DesignFailed, finite
+from design.result import CONDITIONS, DesignFailed, finite
 from hw.control import certified_couplings
 from hw.emulator import Emulator
 from hw.faults import person, rehearse_faults
@@ -37,15 +37,15 @@ from hw.monitor import LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import session_for
 from sim.adversary import Attack, attempts
-from sim.challenges import challenges
+from sim.checks.challenges import challenges
+from sim.checks.hard import cases, measure
+from sim.checks.random_loops import proofs, traces
+from sim.checks.uneven import HANDS, uneven_ticks
 from sim.couplings import choose
 from sim.crowds import Validation
-from sim.hard import cases, measure
-from sim.random_loops import proofs, traces
 from sim.scenario import InputError, load
 from sim.shards import as_worker, validate
 from sim.stability import unstable
-from sim.uneven import HANDS, uneven_ticks
 
 # ----------------------------------------------------------------------------------------------------
 # Checks of our own: what they measure, row by row.
@@ -209,7 +209,7 @@ def accuracy(report: dict[str, Any]) -> list[_Part]:
 
 def _gain_map(report: dict[str, Any]) -> list[_Part]:
     """Of sim.zwidth."""
-    contradicted = sum(report[name]["contradicted_cells"] for name in render.ORDER)
+    contradicted = sum(report[name]["contradicted_cells"] for name in CONDITIONS)
     return [_Part("", (), (), f"{contradicted} certified cells that a hand destabilises")]
 
 

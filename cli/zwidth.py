@@ -22,10 +22,9 @@ from cli import options, render
 from cli.judged import judge
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
-from design.certificate import CONDITIONS
 from design.files import write
 from design.guarantees import CAVEATS
-from design.result import certificate_part
+from design.result import CONDITIONS, certificate_part
 from sim import zwidth
 from sim.couplings import NAMES, Chosen, choose
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
@@ -50,7 +49,7 @@ def _designed_rows(fixed: dict[str, Any], limited: list[float] | None) -> render
     needs = "; ".join(
         f"{name} needs {100 / designed['certificates'][name]['margin']:.4g} % of the damping "
         f"({designed['certificates'][name]['proof']})"
-        for name in render.ORDER
+        for name in CONDITIONS
         if designed["certificates"][name]["margin"]
     )
     yield "coupling", f"{fixed['coupling']['kind']}, fixed"

@@ -11,10 +11,10 @@ from controller.loop import Loop
 from controller.lti import Lti
 from design.arguments import known, of_kind, one_of, shown
 from design.certificate import assess, check_ranges, switching_requirement
+from design.coupling_file import Stored
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import guarantee_of
 from design.result import Condition, Design, Requirement
-from design.stored import Stored
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 _Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]

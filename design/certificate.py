@@ -22,12 +22,12 @@ from controller.loop import Loop
 from controller.lti import Array, Lti, SingularLoop, TooLong, rational, within
 from controller.ranges import Member, inside, number_of_vertices
 from design import conditions, multipliers
+from design.coupling_file import Certificate, Guarantee, LimiterCertificate, Stored, SwitchingProof, digest, sealed
 from design.environments import Progress, Searched, in_each, search_ranges, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
 from design.frequency import frequencies, on_circle, rounding
 from design.guarantees import LATE, no_compliance, switching_guarantee
 from design.result import Condition, NotProved, Requirement, refusal
-from design.stored import Certificate, Guarantee, LimiterCertificate, Stored, SwitchingProof, digest, sealed
 
 # ----------------------------------------------------------------------------------------------------
 # An exact proof that no switching of the delays within a loop's range is dangerous: made, stored, proved again.
@@ -532,9 +532,6 @@ def _multiplier(loop: Loop, certificate: Certificate) -> list[Fraction] | None:
         return [Fraction(value) for value in rows[0]]
     except (IndexError, ValueError, ZeroDivisionError):
         raise NotProved(f"{name} is no row of rational numbers") from None
-
-
-CONDITIONS: tuple[Condition, ...] = ("any-environment", "this-environment")
 
 
 def assess(

@@ -20,12 +20,12 @@ from controller.lti import Array, Lti
 from design import conditions
 from design.bound import MOST, NO_BOUND, bound
 from design.certificate import any_environment_of, prove
+from design.coupling_file import digest
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
 from design.program import LADDER, Options
 from design.result import Condition, Design, DesignFailed, NotProved, Requirement, finite
 from design.robustness import robustness_part
-from design.stored import digest
 from design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------

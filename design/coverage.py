@@ -14,10 +14,10 @@ from controller.lti import Lti
 from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter
 from design.conditions import this_environment
+from design.coupling_file import LimiterCertificate
 from design.environments import SEARCH, Searched, worst
 from design.multipliers import BETA, SwitchingSweep, limiter_refusal, limiter_requirement
 from design.result import NotProved, Requirement, certificate_part, finite
-from design.stored import LimiterCertificate
 from design.transparency import decibels, transparency
 
 _OWN_PROOF = "by a proof of its own, for this environment"

@@ -16,7 +16,7 @@ from controller.limiter import Limiter
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.certificate import lag
-from design.stored import Stored
+from design.coupling_file import Stored
 
 # ----------------------------------------------------------------------------------------------------
 # What is exported: one state-space block, the order in which its sums are taken, and a test vector in that order.

@@ -21,12 +21,12 @@ from controller.lti import Array
 from design import program
 from design.certificate import prove, prove_limiter
 from design.conditions import this_environment as requirement_of
+from design.coupling_file import Certificate, LimiterCertificate
 from design.designs import design_by_kind
 from design.environments import Searched, in_each, ratio_in, search_ranges, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.result import Design, DesignFailed, NotProved, finite
 from design.robustness import at, robustness, robustness_part, vertices
-from design.stored import Certificate, LimiterCertificate
 from design.transparency import Transparency, decibels, transparency
 
 _MINIMISED = {"rms": "rms_mismatch", "sup": "relative_mismatch"}

@@ -33,7 +33,7 @@ from typing import Self
 import numpy as np
 
 from controller.lti import Array
-from hw.device import RUNNING, Device
+from hw.device_state import RUNNING, Device
 from hw.protocol import PROTOCOL, Force, Info, Phase, distance
 from models.device import require
 from models.hold import hold

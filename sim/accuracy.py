@@ -22,7 +22,7 @@ from sim.mujoco_engines import EXPONENTIAL, default_integrator
 from sim.run import Simulation, make_engine, run
 from sim.scenario import InputError
 from sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode
-from sim.stepping import NEUTRAL, default_substeps, measured_hold, simulated_growth, step_radius
+from sim.step_choice import NEUTRAL, default_substeps, measured_hold, simulated_growth, step_radius
 from sim.trace import Trace
 
 # ---- beside the exact engine

@@ -20,7 +20,7 @@ from sim.passivity_layer import EnergyNet, Plugged, Wanted, netted
 from sim.run import ENGINES, Progress, Simulation, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
 from sim.stability import stability_of
-from sim.stepping import MOST, settle
+from sim.step_choice import MOST, settle
 from sim.switching import Period, switching
 from sim.trace import Trace
 

@@ -28,7 +28,7 @@ from sim.crowds import crowds
 from sim.mujoco_engines import MujocoBatchEngine, profiler_off, quiet_warnings
 from sim.run import run_block
 from sim.stability import close
-from sim.stepping import pace
+from sim.step_choice import pace
 from sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen
 
 Cells = NDArray[np.intp]

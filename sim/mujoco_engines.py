@@ -2,7 +2,7 @@
 
     exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: accelerations by one mj_forward a step,
                   J from the compiled model's matrices; exact on a linear scene, whatever its stiffness and the step
-    RK4, ..       steps of MuJoCo's own integrators, whose number per period sim.stepping decides
+    RK4, ..       steps of MuJoCo's own integrators, whose number per period sim.step_choice decides
 
 The exponential engine shares J with the exact one, so it checks forces and assembly, not the stepping in time: for that
 there is RK4.

@@ -30,11 +30,11 @@ from controller.tick import Process
 from controller.walls import contact
 from design import conditions
 from design.audit import check_loop, edge
-from design.certificate import CONDITIONS, any_environment_of
+from design.certificate import any_environment_of
 from design.coverage import covered_limits
 from design.guarantees import LATE
 from design.lmi import least_phi
-from design.result import DesignFailed, Requirement, refusal
+from design.result import CONDITIONS, DesignFailed, Requirement, refusal
 from models.device import Device
 from models.human import Population
 from sim import limit_cycles
@@ -107,7 +107,7 @@ class CouplingSweep(_Sweep):
     @property
     def conditions(self) -> tuple[str, ...]:
         """What is asked of every cell."""
-        return CONDITIONS
+        return tuple(CONDITIONS)
 
     @property
     def refusals(self) -> dict[str, str]:
@@ -246,7 +246,7 @@ class EnvironmentSweep(_Sweep):
     @property
     def conditions(self) -> tuple[str, ...]:
         """What is asked of every cell."""
-        return (*CONDITIONS, MODEL_KEPT) if self._kept else CONDITIONS
+        return (*CONDITIONS, MODEL_KEPT) if self._kept else tuple(CONDITIONS)
 
     @property
     def refusals(self) -> dict[str, str]:

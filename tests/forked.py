@@ -40,7 +40,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
 
 def _remembering(folder: Path, make):
     """The same function, with its results kept in the folder; failures and loops without a digest are not."""
-    from design.stored import digest
+    from design.coupling_file import digest
 
     def remembered(loop, *asked, **named):
         plain = [x for x in asked if not callable(x)], sorted((k, x) for k, x in named.items() if not callable(x))

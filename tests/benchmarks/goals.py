@@ -24,7 +24,7 @@ from sim.couplings import choose, limits_of
 from sim.mujoco_engines import EXPONENTIAL
 from sim.run import assemble
 from sim.stability import exact_growth
-from sim.stepping import simulated_growth
+from sim.step_choice import simulated_growth
 
 ROUNDS = 9
 COMMANDS = {

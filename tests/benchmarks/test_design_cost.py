@@ -10,8 +10,8 @@ from design import fixed_order as ccl
 from design import optimal, spring_damper
 from design.audit import report
 from design.certificate import assess, prove, verify
+from design.coupling_file import Stored
 from design.program import LADDER, Options
-from design.stored import Stored
 from design.transparency import decibels
 from sim.scenario import load
 

@@ -24,7 +24,7 @@ from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, discretised, prof
 from sim.run import assemble, make_engine, run, run_block
 from sim.scenario import load
 from sim.stability import exact_growth
-from sim.stepping import default_substeps, measured_hold, pace, simulated_growth
+from sim.step_choice import default_substeps, measured_hold, pace, simulated_growth
 
 pytestmark = pytest.mark.benchmark(group="engines")
 ROUNDS = 9

@@ -35,7 +35,7 @@ from cli import options
 from cli.main import COMMANDS
 from controller.coupling import SpringDamper
 from design.certificate import prove
-from design.stored import Stored, save
+from design.coupling_file import Stored, save
 from sim.scenario import SCENARIOS, load
 
 SECONDS = 20  # of processor time that a case may take

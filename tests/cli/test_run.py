@@ -12,8 +12,8 @@ import pytest
 from cli.run import main
 from controller.coupling import SpringDamper
 from design.certificate import prove
+from design.coupling_file import Stored, save
 from design.designs import design_by_kind
-from design.stored import Stored, save
 from sim import couplings
 from sim import run as loop
 from sim.scenario import InputError, load

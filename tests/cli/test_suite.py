@@ -72,7 +72,7 @@ def test_the_report_begins_with_verdicts_and_every_number_has_its_command(tmp_pa
 
 
 def test_a_check_that_fails_fails_the_suite_and_the_rest_is_done(tmp_path, quick, monkeypatch):
-    monkeypatch.setattr("sim.hard.CLOSE", 0.0)  # as if the rule were wrong
+    monkeypatch.setattr("sim.checks.hard.CLOSE", 0.0)  # as if the rule were wrong
     assert main(["--humans", "5", "--out", str(tmp_path)]) == 1
     text = (tmp_path / "report.md").read_text()
     assert "**1 of 2 checks hold; not: hard.**" in text

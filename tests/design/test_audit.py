@@ -16,7 +16,7 @@ from controller.environment import FIGURE_4, GROUND, RIGID_WALL, Network, Spring
 from controller.loop import Loop
 from controller.lti import Lti
 from controller.ranges import Ranges
-from design import certificate, frequency, stored
+from design import certificate, coupling_file, frequency
 from design.api import certify
 from design.audit import MOST_EXTRA_SAMPLES, edge, remedies, report, requirement, stiffest, tolerance
 from design.guarantees import ANY, CAVEATS, guarantee_of
@@ -80,8 +80,8 @@ def test_a_coupling_before_a_rigid_wall_is_proved_and_stored_like_any_other(thet
     assert guarantee_of(needs, loop) == ((ANY if theta == 0 else "a rigid wall only") if proved else None)
     if proved:
         made = certificate.prove(loop, coupling, "this-environment")
-        stored.save(stored.Stored.of(loop, coupling, made), tmp_path / "wall.json")
-        again = stored.load(tmp_path / "wall.json")
+        coupling_file.save(coupling_file.Stored.of(loop, coupling, made), tmp_path / "wall.json")
+        again = coupling_file.load(tmp_path / "wall.json")
         assert again.loop == loop
         assert certificate.verify(again).proved
 
@@ -270,10 +270,10 @@ def test_gains_of_a_device_name_their_source(run):
 def files(tmp_path):
     """A spring-damper for the default scenario, the same as a state space, and a file that is none."""
     loop = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
-    stored.save(stored.Stored.of(loop, SAFE), tmp_path / "gains.json")
-    stored.save(stored.Stored(loop, Compliance(SAFE.compliance(T)).form()), tmp_path / "space.json")
+    coupling_file.save(coupling_file.Stored.of(loop, SAFE), tmp_path / "gains.json")
+    coupling_file.save(coupling_file.Stored(loop, Compliance(SAFE.compliance(T)).form()), tmp_path / "space.json")
     unstable = Compliance(Lti(1.1 * np.eye(2), np.eye(2), np.eye(2), np.eye(2), T))
-    stored.save(stored.Stored.of(loop, unstable), tmp_path / "unstable.json")
+    coupling_file.save(coupling_file.Stored.of(loop, unstable), tmp_path / "unstable.json")
     (tmp_path / "broken.json").write_text("{")
 
 

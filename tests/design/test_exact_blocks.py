@@ -27,10 +27,10 @@ from design.conditions import (
     delayed_environment_block,
     this_environment_demand,
 )
+from design.coupling_file import Stored, digest, sealed
 from design.exact import find_storage, prove_positive_real
 from design.multipliers import SwitchingSweep, limiter_demand, switching_block, walls_demand
 from design.result import NotProved, from_ratio
-from design.stored import Stored, digest, sealed
 
 CLOSE = 1e-6  # relative, on either side of a limit
 change = msgspec.structs.replace

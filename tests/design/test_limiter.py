@@ -15,11 +15,11 @@ from controller.lti import Lti, Sampled, taps
 from controller.ranges import Ranges
 from design.certificate import lag, prove, prove_limiter, verify
 from design.conditions import least_multiple, this_environment
+from design.coupling_file import Certificate, LimiterCertificate, Stored, load, save, sealed
 from design.frequency import hermitian, on_circle
 from design.multipliers import limiter, limiter_demand, limiter_lag, limiter_requirement
 from design.result import NotProved
 from design.spring_damper import design
-from design.stored import Certificate, LimiterCertificate, Stored, load, save, sealed
 from design.transparency import transparency
 from sim.scenario import InputError
 

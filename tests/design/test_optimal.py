@@ -21,13 +21,13 @@ from design.barrier import Block, Program, centre
 from design.bound import _causal, bound
 from design.certificate import verify
 from design.conditions import this_environment
+from design.coupling_file import Stored, save
+from design.coupling_file import load as load_file
 from design.environments import ratio_in
 from design.frequency import hermitian, on_circle
 from design.optimal import design, spread
 from design.program import MARGIN, Options, Span, span_of, static_weight
 from design.robustness import ranges_around, robustness, vertices
-from design.stored import Stored, save
-from design.stored import load as load_file
 from design.transparency import transparency
 from sim.scenario import load
 

@@ -22,10 +22,10 @@ from controller.loop import Loop, force_map
 from controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices
 from design import optimal
 from design.certificate import check_ranges, prove, verify
+from design.coupling_file import Stored, digest, load, save, sealed
 from design.coverage import ranges_part
 from design.program import Options
 from design.result import NotProved
-from design.stored import Stored, digest, load, save, sealed
 from sim import scenario
 from sim.scenario import SCENARIOS, InputError, parse
 

@@ -9,10 +9,10 @@ from cli.design import main
 from controller.coupling import SpringDamper
 from controller.delay import VaryingDelay
 from design.api import design_coupling
+from design.coupling_file import load as load_stored
 from design.multipliers import switching_sweep
 from design.result import DesignFailed
 from design.spring_damper import design
-from design.stored import load as load_stored
 from models.scene import Crowd, variants
 from sim.run import assemble
 from sim.scenario import InputError, load

@@ -24,12 +24,12 @@ from design import certify
 from design import exact as positive_real
 from design.certificate import condition_block, prove, refuted, verify
 from design.conditions import this_environment
+from design.coupling_file import Certificate, Stored, digest, load, save, sealed
 from design.exact import Matrix
 from design.files import InputError
 from design.frequency import hermitian
 from design.multipliers import switching_block, switching_sweep
 from design.result import NotProved
-from design.stored import Certificate, Stored, digest, load, save, sealed
 from hw.control import certified_couplings
 from sim.scenario import load as scenario_of
 

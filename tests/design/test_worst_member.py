@@ -16,11 +16,11 @@ from controller.ranges import Member, Ranges, Region, UncertainSpring, members, 
 from design import optimal
 from design.api import certify
 from design.certificate import check_ranges, prove, verify
+from design.coupling_file import Stored, load, save
 from design.coverage import ranges_part, ranges_rows
 from design.environments import search
 from design.program import Options
 from design.result import Design
-from design.stored import Stored, load, save
 from sim import scenario
 from sim.scenario import SCENARIOS
 

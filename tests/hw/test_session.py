@@ -13,18 +13,18 @@ from cli import bridge
 from cli import replay as replay_command
 from cli import trace as trace_command
 from design.certificate import assess
+from design.coupling_file import Stored
+from design.coupling_file import save as save_coupling
 from design.files import plain
-from design.stored import Stored
-from design.stored import save as save_coupling
 from hw.control import CertifiedCoupling, LinearController, certified_coupling, certified_couplings, fill, link_delay
 from hw.emulator import Emulator, FaultInjection
 from hw.faults import CASES, Fault, at, lively, person, rehearse_case
+from hw.haptic_device import Driver, SerialDevice
 from hw.limits import SafetyLimits, SafetyStop, Stage, Units
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import Command, Decoder, Force, Hello, Phase, State, Stop, encode
 from hw.recording import Recorder, digest, load, outcome, recipes_of, replay, result_of, save, save_npz, steady_ticks
 from hw.rehearsal import Rehearsal
-from hw.seam import Driver, SerialDevice
 from hw.session import Session
 from models.hold import hold
 from models.scene import plant

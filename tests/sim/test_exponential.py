@@ -23,7 +23,7 @@ from sim.mujoco_engines import EXPONENTIAL, INTEGRATORS, MujocoBatchEngine, Mujo
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, load
 from sim.stability import exact_growth
-from sim.stepping import check_substeps, default_substeps, measured_hold, pace, simulated_growth
+from sim.step_choice import check_substeps, default_substeps, measured_hold, pace, simulated_growth
 
 SCENARIO = load()
 RUBBING = SCENARIO.replace(device=(CompliantDevice(friction=0.5),) * 2)

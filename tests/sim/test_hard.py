@@ -12,19 +12,19 @@ from design.certificate import assess
 from models.device import CompliantDevice
 from models.human import Human, Link
 from sim.accuracy import limit_cycle
-from sim.hard import cases, devices, measure, nominal
+from sim.checks.hard import cases, devices, measure, nominal
 from sim.mujoco_engines import EXPONENTIAL
 from sim.run import assemble, make_engine, outside_forces, run, run_blocks
 from sim.scenario import InputError, load
 from sim.stability import exact_growth
-from sim.stepping import default_substeps, simulated_growth
+from sim.step_choice import default_substeps, simulated_growth
 
 CLOSED_LOOP = SpringDamper(np.array([7806.0, 3137.0]), np.array([0.105, 1.68]))
 
 
 @pytest.mark.parametrize("hard", cases(), ids=lambda hard: hard.name)
 def test_a_setting_fails_and_the_rule_holds(hard):
-    """By GROWTH and POSITION of sim.hard; the rule's own choice has the exact verdict, and growth within 1e-2 1/s."""
+    """By its GROWTH and POSITION; the rule's own choice has the exact verdict, and growth within 1e-2 1/s."""
     row = measure(hard)
     assert row.holds, row
 

@@ -11,8 +11,8 @@ from worlds import SOFT
 from cli.run import main
 from controller.coupling import SpringDamper
 from design.certificate import assess, prove, prove_limiter
+from design.coupling_file import Stored, save
 from design.coverage import covered_limits
-from design.stored import Stored, save
 from sim.api import simulate
 from sim.couplings import choose, limits_of
 from sim.run import assemble, make_engine, run

@@ -14,7 +14,7 @@ from sim.mujoco_engines import INTEGRATORS
 from sim.run import assemble, make_engine, run
 from sim.scenario import SCENARIOS, InputError, load
 from sim.stability import exact_growth
-from sim.stepping import (
+from sim.step_choice import (
     PlantSpeed,
     check_substeps,
     default_substeps,

@@ -12,7 +12,7 @@ from cli.run import main
 from cli.validate import main as validate
 from controller.delay import VaryingDelay, ages, realising
 from controller.tick import StepBuffer
-from design import stored
+from design import coupling_file
 from models.hold import HeldPlant
 from models.scene import Crowd, plant, variants
 from sim.crowds import draw
@@ -154,7 +154,7 @@ def test_both_engines_meet_the_same_delays(tmp_path):
 
 
 def test_the_adversarial_pattern_shows_growth(tmp_path):
-    stored.save(stored.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
+    coupling_file.save(coupling_file.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     options = ["--coupling", str(tmp_path / "stiff.json"), "--varying-delay", "1,2", "--pattern", "adversarial"]
     report = run(tmp_path, *options, "--duration", "1", "--engine", "exact")
     assert report["stability"]["verdict"] == "unstable"
@@ -222,7 +222,7 @@ def validated(tmp_path, *options):
 
 def test_random_humans_under_the_worst_switching(tmp_path):
     """The constants' design fails for most humans, the switching-proof one for none; 0 and 1 are what is claimed."""
-    stored.save(stored.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
+    coupling_file.save(coupling_file.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     code, stiff = validated(tmp_path, "--pattern", "adversarial", "--coupling", str(tmp_path / "stiff.json"))
     assert stiff["unstable"]["exact"] >= 10
     assert not stiff["covered"]

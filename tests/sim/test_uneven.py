@@ -16,7 +16,8 @@ from controller.timing import Periods, Timing
 from design.files import InputError
 from models.hold import at_the_latch, hold
 from models.scene import Plant, plant
-from sim import load, uneven
+from sim import load
+from sim.checks import uneven
 from sim.crowds import Validation, examine
 from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
 from sim.run import assemble, make_engine, run

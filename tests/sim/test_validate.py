@@ -13,7 +13,7 @@ import pytest
 from driven import driven
 
 from cli import run as run_command
-from cli.validate import _Traces, main
+from cli.validate import main
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from models.device import RigidDevice
 from models.hold import hold
@@ -28,6 +28,7 @@ from sim.run import assemble, run
 from sim.scenario import InputError, load
 from sim.shards import validate
 from sim.stability import close, disagree, dominant_mode, exact_loops, impulse_forces, mujoco_loops, unstable
+from sim.verdicts import Traces
 
 SCENARIO = load()
 TWO = "[[human]]\nlinks = [{mass = 1.0, damping = 0, stiffness = 0}]\n" * 2
@@ -289,7 +290,7 @@ def test_hands_that_had_no_time_to_rest_are_no_verdict(duration):
     """Against the slowest eigenvalue of the same humans, by the exact engine."""
     question = Validation(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
     found = validate(question)
-    traces = _Traces.of(question, found)
+    traces = Traces.of(question, found)
     assert traces.slowest_decay_s == pytest.approx(-1 / found.exact.max())
     assert traces.settling_decides == (traces.reason is None) == (duration > 30)
 

@@ -23,7 +23,7 @@ from models.human import Human, Population, Voluntary
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, Scenario
 from sim.stability import NOT_EXCITED, disagree, stability_of
-from sim.stepping import settle
+from sim.step_choice import settle
 
 _TOO_CLOSE = 1e-4  # of the damping: a proof needs some room
 _HANDS = Population()
