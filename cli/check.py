@@ -17,7 +17,6 @@ from design.environments import Searched, search_ranges
 from design.guarantees import HERE, RANGES, switching_guarantee
 from design.result import listed
 from sim.couplings import read_coupling
-from sim.scenario import InputError
 
 
 @dataclass(frozen=True)
@@ -57,16 +56,14 @@ def main(argv: list[str]) -> int:
     options.check_json(args)
     begin = time.perf_counter()
     stored = read_coupling(args.coupling)
-    try:
+    with options.refused(f"{args.coupling}: "):
         verdict = verify(stored)
-    except (ValueError, ArithmeticError) as error:
-        raise InputError(f"{args.coupling}: {error}") from None
     searched = _searched(stored) if verdict.proved else None
     if searched and not searched.worst[0].ratio < 1:
         verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
     checked = _checked(stored, verdict, searched, time.perf_counter() - begin)
     render.publish(args, render.plain(checked), [_table(checked)])
-    return options.DONE if verdict.proved else options.DOES_NOT_HOLD
+    return options.exit_code(verdict.proved)
 
 
 def _parser() -> options.Parser:

@@ -16,7 +16,8 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -26,7 +27,7 @@ from threadpoolctl import threadpool_limits
 from controller import older
 from controller.delay import LOST, VaryingDelay
 from controller.environment import RIGID_WALL
-from controller.loop import Loop
+from controller.loop import DelayRange, Loop
 from controller.lti import SingularLoop
 from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
@@ -37,6 +38,7 @@ from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load, l
 DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
 _Number = TypeVar("_Number", int, float)
+_Given = TypeVar("_Given")
 _OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # of the types below
 
 
@@ -83,25 +85,28 @@ def several(
     kind: Callable[[str], _Number], least: float = -math.inf, most: float = math.inf, unit: str = ""
 ) -> Callable[[str], tuple[_Number, ...]]:
     """Numbers within these limits, separated by commas; `per_channel` makes them one for each channel."""
+    expected = f"{'whole numbers' if kind is int else 'numbers'} separated by commas"
 
     def read(text: str) -> tuple[_Number, ...]:
-        try:
-            values = tuple(kind(part) for part in text.split(","))
-        except ValueError:
-            what = "whole numbers" if kind is int else "numbers"
-            raise argparse.ArgumentTypeError(f"is {text!r}, expected {what} separated by commas") from None
-        return tuple(_within(value, least, most, unit) for value in values)
+        return tuple(_within(value, least, most, unit) for (value,) in _parts(text, kind, expected))
 
     return read
 
 
+def _parts(text: str, kind: Callable[[str], _Number], expected: str, within: str = "") -> list[list[_Number]]:
+    """The numbers between commas, and between what stands `within` a part."""
+    try:
+        return [[kind(word) for word in (part.split(within) if within else [part])] for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}") from None
+
+
 def pair(text: str) -> tuple[float, float]:
     """Two numbers separated by a comma."""
-    try:
-        first, second = (float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"is {text!r}, expected two numbers separated by a comma") from None
-    return first, second
+    found = _parts(text, float, expected := "two numbers separated by a comma")
+    if len(found) != 2:
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
+    return found[0][0], found[1][0]
 
 
 def _band_of(text: str) -> tuple[float, float]:
@@ -123,24 +128,19 @@ def energy_budget(text: str) -> tuple[float, float]:
 
 def delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
     """'1,2' as one range for all channels, '1-2,0-3' as one per channel [samples]."""
-    parts = [part.split("-") for part in text.split(",")]
-    if len(parts) == 2 and all(len(part) == 1 for part in parts):
-        parts = [[parts[0][0], parts[1][0]]]
-    try:
-        return tuple((int(lo), int(hi)) for lo, hi in parts)
-    except ValueError:
-        expected = "LO,HI or LO-HI,LO-HI,.. in whole samples"
-        raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}") from None
+    parts = _parts(text, int, expected := "LO,HI or LO-HI,LO-HI,.. in whole samples", "-")
+    if [len(part) for part in parts] == [1, 1]:
+        return ((parts[0][0], parts[1][0]),)
+    if any(len(part) != 2 for part in parts):
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
+    return tuple((lo, hi) for lo, hi in parts)
 
 
 def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
     """'130e-6' as 0 to 0.13 ms, '100e-6:130e-6' as a range of its own; one for all, or one per channel [s]."""
-    try:
-        parts = [[float(word) for word in part.split(":")] for part in text.split(",")]
-    except ValueError:
-        parts = [[]]
-    if not all(len(part) in (1, 2) for part in parts):
-        raise argparse.ArgumentTypeError(f"is {text!r}, expected S or LO:HI in seconds, one or one per channel")
+    parts = _parts(text, float, expected := "S or LO:HI in seconds, one or one per channel", ":")
+    if any(len(part) > 2 for part in parts):
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
     return tuple((0.0, part[0]) if len(part) == 1 else (part[0], part[1]) for part in parts)
 
 
@@ -173,23 +173,33 @@ def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
     raise argparse.ArgumentTypeError(f"is {shown}, allowed are {span}{unit}")
 
 
-def per_channel(option: str, values: tuple[_Number, ...], channels: int) -> tuple[_Number, ...]:
+@contextmanager
+def refused(name: str = "") -> Iterator[None]:
+    """What is refused within is bad input: InputError, with this name in front of what was said."""
+    try:
+        yield
+    except (InputError, DesignFailed):
+        raise
+    except (ValueError, ArithmeticError) as error:
+        raise InputError(f"{name}{error}") from None
+
+
+def per_channel(option: str, values: tuple[_Given, ...], channels: int, what: str = "entries") -> tuple[_Given, ...]:
     """One value for each channel; a single one serves all. Raises InputError."""
     values = values * channels if len(values) == 1 else values
     if len(values) != channels:
         expected = "one" if channels == 1 else f"{channels} (one per channel) or 1"
-        raise InputError(f"{option} has {len(values)} entries, expected {expected}")
+        raise InputError(f"{option} has {len(values)} {what}, expected {expected}")
     return values
 
 
-def ranges_per_channel(
-    option: str, pairs: tuple[tuple[int, int], ...], channels: int
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """(least, largest) delays of every channel [samples]; a single range serves all. Raises InputError."""
-    if len(pairs) not in (1, channels):
-        raise InputError(f"{option} has {len(pairs)} ranges, expected {channels} (one per channel) or 1")
-    lo, hi = zip(*(pairs * channels if len(pairs) == 1 else pairs), strict=True)
-    return lo, hi
+def delay_range(pairs: tuple[tuple[int, int], ...], channels: int, most: int) -> DelayRange:
+    """What --varying-delay says, as a range of delays on every channel. Raises InputError."""
+    lo, hi = zip(*per_channel("--varying-delay", pairs, channels, "ranges"), strict=True)
+    if any(not 0 <= a <= b <= most for a, b in zip(lo, hi, strict=True)):
+        asked = ",".join(f"{a}-{b}" for a, b in pairs)
+        raise InputError(f"--varying-delay is {asked}, expected 0 <= LO <= HI <= {most} samples")
+    return DelayRange(lo, hi)
 
 
 def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) -> tuple[_Number, ...]:
@@ -346,20 +356,10 @@ def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     """The loop of the one channel that --rigid is about. Raises InputError where options name more of them."""
     for name in ("theta", "psi", "delta"):
         per_channel(f"--rigid is one channel: --{name}", getattr(args, name) or (0,), 1)
-    theta, psi, late = scenario.theta[:1], scenario.psi[:1] if args.psi else (0,), scenario.latency
-    try:
-        return Loop(
-            scenario.T,
-            theta,
-            psi,
-            theta,
-            scenario.delta[:1],
-            RIGID_WALL,
-            T_max=scenario.longest_period,
-            latency=late and late[:1],
-        )
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    theta, psi = scenario.theta[:1], scenario.psi[:1] if args.psi else (0,)
+    late, T_max = scenario.latency and scenario.latency[:1], scenario.longest_period
+    with refused():
+        return Loop(scenario.T, theta, psi, theta, scenario.delta[:1], RIGID_WALL, T_max=T_max, latency=late)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -397,7 +397,8 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
     if args.pattern is not None:
         changes |= _pattern(args.pattern, scenario.channels)
     if args.varying_delay is not None:
-        changes["lo"], changes["hi"] = ranges_per_channel("--varying-delay", args.varying_delay, scenario.channels)
+        pairs = per_channel("--varying-delay", args.varying_delay, scenario.channels, "ranges")
+        changes["lo"], changes["hi"] = zip(*pairs, strict=True)
     if args.loss is not None:
         changes["loss"] = args.loss
     if args.playout:
@@ -409,60 +410,62 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
             option = "--playout" if args.playout else "--pattern"
             raise InputError(f"{option} without a range of delays: give --varying-delay LO,HI")
         changes |= {"lo": scenario.theta, "hi": scenario.theta}
-    try:
+    with refused():
         old = scenario.varying_delay
         varying = msgspec.structs.replace(old, **changes) if old else VaryingDelay(**changes)
-    except ValueError as error:
-        raise InputError(str(error)) from None
     theta = varying.hi if varying.playout and args.theta is None else scenario.theta
     return scenario.replace(theta=theta, varying_delay=varying)
 
 
 def _periods(text: str) -> Periods:
-    """Of two numbers, or of a file of one column [s]; # begins a comment. Raises InputError."""
-    try:
+    """Of two numbers, or of a file of one column [s]. Raises InputError."""
+    with refused("--period: "):
         if "," in text and not Path(text).is_file():
             least, most = numbers("--period", text, float, 2)
             return Periods(least, most)
-        lines = Path(text).read_text(encoding="utf-8").splitlines()
-        words = [(n, line.split("#")[0].strip()) for n, line in enumerate(lines, start=1)]
-        return Periods(
-            recorded=tuple(numbers(f"--period {text}, line {n}:", word, float, 1)[0] for n, word in words if word)
-        )
-    except OSError as error:
-        raise InputError(f"--period {text}: {error.strerror}; give MIN,MAX in seconds or a file") from None
-    except UnicodeDecodeError:
-        raise InputError(f"--period {text}: not a text file in UTF-8") from None
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"--period: {error}") from None
+        rows = _rows("--period", text, float, 1, "; give MIN,MAX in seconds or a file")
+        return Periods(recorded=tuple(row[0] for row in rows))
 
 
 def _pattern(name: str, channels: int) -> dict[str, Any]:
     if name in _DRAWN:
         return {"pattern": name, "recorded": ()}
-    rows = _recorded(name, channels)
+    rows = _rows("--pattern", name, int, channels, f"; give a file or one of: {', '.join(_DRAWN)}")
     arrived = [[n for n in column if n != LOST] or [0] for column in zip(*rows, strict=True)]
     lo, hi = (tuple(side(column) for column in arrived) for side in (min, max))
     return {"pattern": "recorded", "recorded": rows, "lo": lo, "hi": hi}
 
 
-def _recorded(name: str, channels: int) -> tuple[tuple[int, ...], ...]:
-    """Rows of delays, separated by commas or blanks; one column serves all channels; # begins a comment."""
-    text = read_text(name, f"--pattern {name}", f"; give a file or one of: {', '.join(_DRAWN)}")
+def _rows(
+    option: str, path: str, kind: Callable[[str], _Number], columns: int, hint: str
+) -> tuple[tuple[_Number, ...], ...]:
+    """Numbers of a file, between commas or blanks; one column serves all; # begins a comment. Raises InputError."""
     rows = []
-    for line_number, line in enumerate(text.splitlines(), start=1):
-        words = line.split("#")[0].replace(",", " ").split()
-        if words:
-            rows.append(numbers(f"--pattern {name}, line {line_number}:", ",".join(words), int, channels))
+    for n, line in enumerate(read_text(path, f"{option} {path}", hint).splitlines(), start=1):
+        if words := line.split("#")[0].replace(",", " ").split():
+            rows.append(numbers(f"{option} {path}, line {n}:", ",".join(words), kind, columns))
     if not rows:
-        raise InputError(f"--pattern {name}: holds no delays")
+        raise InputError(f"{option} {path}: holds no numbers")
     return tuple(rows)
 
 
 # ----------------------------------------------------------------------------------------------------
 # Running a command.
+
+
+def until_interrupted(rows: Iterable[_Given]) -> tuple[list[_Given], bool]:
+    """What was done until the keyboard ended it, and whether it did."""
+    done: list[_Given] = []
+    try:
+        done.extend(rows)
+    except KeyboardInterrupt:
+        return done, True
+    return done, False
+
+
+def exit_code(holds: bool, interrupted: bool = False) -> int:
+    """Of a command that has reported what it found."""
+    return INTERRUPTED if interrupted else DONE if holds else DOES_NOT_HOLD
 
 
 def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> NoReturn:

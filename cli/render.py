@@ -123,6 +123,9 @@ def designing(loop: Loop | None = None, kind: str | None = None, condition: str 
 # A whole report: files, tables, lines below them, JSON.
 
 
+_Drawing = Callable[[Any], Callable[[Any, Path], Path]]  # from sim.plots the function that draws
+
+
 def publish(
     args: argparse.Namespace,
     report: Any,
@@ -149,6 +152,16 @@ def publish(
         screen.print("files: " + ", ".join(outcome["files"]), soft_wrap=True)
     if args.json:
         write_json(args.json, outcome)
+
+
+def pictures(args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, _Drawing]) -> list[Path]:
+    """Pictures of a report, by file what draws it; with --no-plot none, and matplotlib is not loaded."""
+    if args.no_plot:
+        return []
+    from sim import plots
+
+    outcome = plain(report)
+    return [drawing(plots)(outcome, folder / file) for file, drawing in drawn.items()]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -178,6 +191,12 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
     for row in rows:
         table.add_row(*row)
     return table
+
+
+def columns(title: str, cells: Mapping[str, _Form], records: Iterable[Any], left: Sequence[int] = (0,)) -> Table:
+    """A table of records: under each head a format of the record `r`, or what a function says of it."""
+    rows = [[str(form(r)) if callable(form) else form.format(r=r) for form in cells.values()] for r in records]
+    return grid(title, list(cells), rows, left)
 
 
 def figure(name: str, form: _Form = "{}", default: Any = MISSING, json: str = "key", absent: str | None = None) -> Any:

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -156,7 +156,7 @@ class StepBuffer:
         shifted = self._memory[width - m :][: ticks * width].reshape(ticks, width, nsim)
         #: (ticks, m + order, nsim): [f; z+] of each tick
         self.after = shifted[:, : m + nz]
-        self._transition = transition or process.transition()
+        self._given = transition
         self._quantised = bool((process.encoder_step > 0).any())
         self._line = None if process.delays is None else HeldLine(process.delays, nsim)
         self.net = process.net(nsim) if process.net else None
@@ -173,6 +173,11 @@ class StepBuffer:
         if self.clips:
             bounds += enumerate(process.force_limit.tolist())
         self._bounds = bounds if self._straight else []
+        self._asked = [(self.after[:, row, 0], limit) for row, limit in self._bounds]
+
+    @cached_property
+    def _transition(self) -> Callable[[Array, Array], object]:
+        return self._given or self.process.transition()
 
     # views are made once, and only those that are used: making one costs as much as a small product
 
@@ -211,10 +216,11 @@ class StepBuffer:
 
         Not a number counts as such.
         """
-        asked = [(self.after[:ticks, row, 0], most * limit) for row, limit in self._bounds]
-        for forces, limit in asked:
-            if not (forces.max() <= limit and forces.min() >= -limit):
-                return int(np.all([np.abs(forces) <= limit for forces, limit in asked], axis=0).argmin())
+        for forces, limit in self._asked:
+            sent, limit = forces[:ticks], most * limit
+            if not (sent.max() <= limit and sent.min() >= -limit):
+                within = [np.abs(forces[:ticks]) <= most * limit for forces, limit in self._asked]
+                return int(np.all(within, axis=0).argmin())
         return ticks
 
     def tick(self, k: int) -> None:
@@ -277,40 +283,35 @@ class StepBuffer:
 
 
 class FusedTicks:
-    """The plant's step and the law at its end in one product a tick: [f; s; z+] of the next one.
+    """The plant's step and the law at its end in one product a tick: [f; z+; s] of the next one.
 
-    A row of the memory is [w, f, s, z+, a] of a tick, where `further` entries a are the engine's own.
+    A row of the memory is [w, f, z+, s, a] of a tick, where the entries a are the engine's own. The next s is
+    A s + B [w; f] + G a; without B the product reads a row from z+ on.
     """
 
-    def __init__(self, buffer: StepBuffer, step: Array, further: int = 0) -> None:
-        """`step` makes the next s of the last entries of a row, (states, entries)."""
-        law, outside, states = buffer.process.linear, buffer.w.shape[1], len(step)
+    def __init__(self, buffer: StepBuffer, A: Array, B: Array | None = None, G: Array | None = None) -> None:
+        law, outside, states = buffer.process.linear, buffer.w.shape[1], len(A)
         m, nz = buffer.process.channels, buffer.process.F.order
-        self._places = places = np.cumsum([outside, m, states, nz, further])
-        self.memory = memory = np.zeros((buffer.ticks + 1, places[-1]))
-        start, z = places[-1] - step.shape[1], slice(places[2] - places[-1], step.shape[1] - further)
-        seen = np.zeros((nz + m, step.shape[1]))
-        seen[:nz, z], seen[nz:] = np.eye(nz), step[:m]
-        after = law @ seen
-        self.product = np.vstack([after[:m], step, after[m:]]).dot
-        self.held, self.before = list(memory[:, : places[1]]), list(memory[:, start:])
-        self.next, self.states = list(memory[1:, places[0] : places[3]]), memory[1:, places[1] : places[2]]
-        self.further = list(memory[:, places[3] :])
-        self._buffer, self._law = buffer, law.dot
+        B, G = (np.empty((states, 0)) if part is None else part for part in (B, G))
+        step = np.hstack([B, np.zeros((states, nz)), A, G])
+        seen = np.vstack([np.eye(nz, step.shape[1], B.shape[1]), step[:m]])  # [z+; x] of the next tick
+        self.product = np.vstack([law @ seen, step]).dot
+        to_z, to_s, to_a = np.cumsum([outside + m, nz, states]).tolist()
+        memory = np.zeros((buffer.ticks + 1, to_a + G.shape[1]))
+        self.held, self.before = list(memory[:, :to_z]), list(memory[:, to_z - B.shape[1] :])
+        self.next, self.states = list(memory[1:, outside:to_a]), memory[1:, to_s:to_a]
+        self.further = list(memory[:, to_a:])
+        self._w, self._after, self._s = memory[:, :outside], memory[:, outside:to_s], memory[:, to_s:to_a]
+        self._buffer, self._law = buffer, partial(law.dot, buffer.rows[0, : nz + m], buffer.after[0])
 
     def begin(self, ticks: int) -> None:
         """Take the first row of the buffer, with the law there, and the outside forces."""
-        buffer, memory, (outside, to_f, to_s, to_z, _) = self._buffer, self.memory, self._places
-        m = to_f - outside
-        self._law(buffer.rows[0, : to_z - to_s + m], buffer.after[0])
-        memory[:ticks, :outside] = buffer.w[:ticks, :, 0]
-        memory[0, outside:to_f], memory[0, to_s:to_z] = np.split(buffer.after[0, :, 0], [m])
-        memory[0, to_f:to_s] = buffer.s[0, :, 0]
+        buffer = self._buffer
+        self._law()
+        self._w[:ticks] = buffer.w[:ticks, :, 0]
+        self._after[0], self._s[0] = buffer.after[0, :, 0], buffer.s[0, :, 0]
 
     def end(self, ticks: int) -> None:
         """Write what the ticks came to, and the plant's state after them."""
-        buffer, (outside, to_f, to_s, to_z, _) = self._buffer, self._places
-        rows, m = self.memory[1 : ticks + 1], to_f - outside
-        buffer.s[1 : ticks + 1, :, 0] = rows[:, to_f:to_s]
-        buffer.after[1:ticks, :m, 0] = rows[:-1, outside:to_f]
-        buffer.after[1:ticks, m:, 0] = rows[:-1, to_s:to_z]
+        self._buffer.after[1:ticks, :, 0] = self._after[1:ticks]
+        self._buffer.s[1 : ticks + 1, :, 0] = self._s[1 : ticks + 1]

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -65,7 +64,7 @@ def position_error(
 
 
 #: (engine, integrator, substeps) that are compared; the first is the reference
-SETTINGS = (
+_SETTINGS = (
     ("exact", None, None),
     ("mujoco", EXPONENTIAL, 1),
     *(("mujoco", "RK4", n) for n in (1, 2, 3, 4, 8)),
@@ -73,10 +72,26 @@ SETTINGS = (
     *(("mujoco", "implicitfast", n) for n in (1, 4, 12)),
     *(("mujoco", "discrete", n) for n in (4, 12)),
 )
-Row = dict[str, Any]
-
 _REPEATS = 3  # the least of their times is the cost
 _TAIL = 4000  # ticks in which a limit cycle is measured
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one setting of an engine costs and how wrong it is; null where a figure does not exist."""
+
+    engine: str
+    integrator: str | None
+    substeps: int | None
+    position_relative_rms: float | None
+    growth_rate_error: float  # [1/s] the larger of the loop with and without the coupling
+    verdict_correct: bool  # of both
+    cycle_amplitude_n: float | None  # of the limit cycle without coupling
+    cycle_frequency_hz: float | None
+    cycle_amplitude_error: float | None  # relative
+    cycle_frequency_error_hz: float | None
+    wall_s_per_simulated_s: float
+    pareto: bool = False  # see `with_front`
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,29 +115,53 @@ def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
     return _Reference(coupled, uncoupled, run(coupled, "exact"), cycle)
 
 
+def measure_all(
+    coupled: Simulation, uncoupled: Simulation, default: int, progress: Callable[[int, int], None]
+) -> tuple[list[Row], list[str], bool]:
+    """Rows of every setting that is stable on this plant, the reasons of those that are not, and whether it was ended.
+
+    `default` is the number of substeps that RK4 takes where nobody says it.
+    """
+    rows: list[Row] = []
+    skipped: list[str] = []
+    settings = list(dict.fromkeys((*_SETTINGS, ("mujoco", "RK4", default))))
+    try:
+        truth = reference(coupled, uncoupled)
+        for done, (engine, integrator, substeps) in enumerate(settings):
+            progress(done, len(settings))
+            try:
+                if integrator and substeps and step_radius(coupled, integrator, substeps) > 1 + NEUTRAL:
+                    raise InputError("outside the stable region")
+                rows.append(measure(truth, engine, integrator, substeps))
+            except ValueError as error:
+                skipped.append(f"{integrator} x {substeps}: {error}")
+    except KeyboardInterrupt:
+        return with_front(rows), skipped, True
+    return with_front(rows), skipped, False
+
+
 def measure(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
     """One row: errors of position [-], growth [1/s] and limit cycle [-], [Hz], and the cost of that very run."""
-    row: Row = {"engine": engine, "integrator": integrator, "substeps": substeps}
     settings = (engine, integrator, substeps)
     trace, wall = _timed(truth.coupled, *settings)
     for _ in range(_REPEATS - 1):
         wall = min(wall, _timed(truth.coupled, *settings)[1])
-    row["position_relative_rms"] = position_error(trace, truth.trace, truth.coupled).position_relative_rms
-    row |= _growth(truth, *settings) | _cycle(truth, *settings)
-    row["wall_s_per_simulated_s"] = wall / (trace.t.size * truth.coupled.scenario.T)
-    return row
+    position = position_error(trace, truth.trace, truth.coupled).position_relative_rms
+    share = wall / (trace.t.size * truth.coupled.scenario.T)
+    return Row(*settings, position, *_growth(truth, *settings), *_cycle(truth, *settings), share)
 
 
-def mark_front(rows: list[Row]) -> None:
+def with_front(rows: Sequence[Row]) -> list[Row]:
     """Set `pareto`: no other row of that kind of engine is at least as good in cost and both errors, and better in one.
 
     The exact engine is on it by itself: only a linear plant has one.
     """
-    points = np.array([_point(row) for row in rows])
+    points, marked = np.array([_point(row) for row in rows]), []
     for i, row in enumerate(rows):
-        rivals = points[[other["engine"] == row["engine"] for other in rows]]
+        rivals = points[[other.engine == row.engine for other in rows]]
         beaten = ((rivals <= points[i]).all(axis=1) & (rivals < points[i]).any(axis=1)).any()
-        row["pareto"] = bool(np.isfinite(points[i]).all() and row["verdict_correct"] and not beaten)
+        marked.append(replace(row, pareto=bool(np.isfinite(points[i]).all() and row.verdict_correct and not beaten)))
+    return marked
 
 
 def limit_cycle(trace: Trace, channel: int) -> tuple[float, float]:
@@ -144,7 +183,7 @@ def _timed(simulation: Simulation, engine: str, integrator: str | None, substeps
     return trace, time.perf_counter() - begin
 
 
-def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
+def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> tuple[float, bool]:
     """The larger growth-rate error of the two loops, and whether both verdicts are right."""
     errors, right = [], True
     for simulation in (truth.coupled, truth.uncoupled):
@@ -152,24 +191,26 @@ def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: in
         own, exact = dominant_mode(close(held, simulation.F)).growth, exact_growth(simulation)
         errors.append(float(own - exact))
         right &= bool(unstable(own) == unstable(exact))
-    return {"growth_rate_error": max(errors, key=abs), "verdict_correct": right}
+    return max(errors, key=abs), right
 
 
-def _cycle(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
-    names = ("cycle_amplitude_n", "cycle_frequency_hz", "cycle_amplitude_error", "cycle_frequency_error_hz")
+def _cycle(
+    truth: _Reference, engine: str, integrator: str | None, substeps: int | None
+) -> tuple[float, float, float, float] | tuple[None, None, None, None]:
+    """Amplitude and frequency of the limit cycle, and their errors."""
     if truth.cycle is None:
-        return dict.fromkeys(names)
+        return None, None, None, None
     channel, amplitude, frequency = truth.cycle
     trace = run(truth.uncoupled, make_engine(truth.uncoupled, engine, integrator, substeps))
     if trace.diverged:
-        return dict.fromkeys(names)
+        return None, None, None, None
     own, turns = limit_cycle(trace, channel)
-    return dict(zip(names, (own, turns, own / amplitude - 1, turns - frequency), strict=True))
+    return own, turns, own / amplitude - 1, turns - frequency
 
 
 def _point(row: Row) -> Array:
-    position = np.inf if row["position_relative_rms"] is None else row["position_relative_rms"]
-    return np.array([row["wall_s_per_simulated_s"], position, abs(row["growth_rate_error"])])
+    position = np.inf if row.position_relative_rms is None else row.position_relative_rms
+    return np.array([row.wall_s_per_simulated_s, position, abs(row.growth_rate_error)])
 
 
 # ---- how long a run can be believed

@@ -26,7 +26,7 @@ from sim.scenario import Scenario, load
 from sim.stability import exact_growth, unstable
 from sim.trace import Trace
 
-#: (kind, condition) in the order of a table; the optimal one is quick for so many channels
+#: (kind, condition) in the order of a table
 _ROWS = (
     ("none", None),
     ("published", None),
@@ -34,7 +34,7 @@ _ROWS = (
     ("spring-damper", "this-environment"),
     ("optimal", "this-environment"),
 )
-_QUICK = 2
+_QUICK, _SHORT = 2, 200  # channels of an optimal one, samples of delay in all for any environment: more take long
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +88,12 @@ def alternatives(
     if scenario.switches:
         return []
     case = "I" if case == "none" else case
-    rows = [row for row in _ROWS if _possible(scenario, case, *row)]
+    present = (own[0].kind, own[0].condition) if own else None
+    rows = [row for row in _ROWS if row == present or _possible(scenario, case, *row)]
     made = []
-    for i, (kind, condition) in enumerate(rows):
+    for i, row in enumerate(rows):
         progress(i, len(rows))
-        same = own if own and (own[0].kind, own[0].condition) == (kind, condition) else None
-        made.append(_alternative(scenario, case, kind, condition, same))
+        made.append(_alternative(scenario, case, *row, own if row == present else None))
     return made
 
 
@@ -101,6 +101,8 @@ def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -
     if kind == "published":
         return scenario.loop(case) == load().loop(case)
     if condition == "this-environment" and scenario.ranges:
+        return False
+    if condition == "any-environment" and sum(scenario.theta) + sum(scenario.psi) > _SHORT:
         return False
     return kind != "optimal" or (scenario.channels <= _QUICK and not scenario.environment.walls)
 

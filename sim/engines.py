@@ -73,8 +73,7 @@ class ExactEngine(_Exact):
         self.advance, self.stretch = advance, self._fused(buffer) if straight else None
 
     def _fused(self, buffer: StepBuffer) -> Stretch:
-        A, B = np.split(self._plant, [len(self._plant)], axis=1)
-        fused = FusedTicks(buffer, np.hstack([B, A, np.zeros((len(A), buffer.process.F.order))]))
+        fused = FusedTicks(buffer, *np.split(self._plant, [len(self._plant)], axis=1))
         product, before, after = fused.product, fused.before, fused.next
 
         def stretch(ticks: int) -> None:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -31,7 +31,7 @@ from controller.tick import FusedTicks, StepBuffer, Stretch
 from controller.timing import Timing
 from design.files import InputError
 from models.hold import Product, exponential_step, product_of
-from models.scene import Scene, Variants, impeded, plant
+from models.scene import Scene, Variants, impeded
 
 if TYPE_CHECKING:
     import mujoco
@@ -177,7 +177,6 @@ class MujocoEngine:
         self.model = discretised(scene, T, integrator, substeps)
         self.data = mujoco.MjData(self.model)
         self._warnings = self.data.warning.number
-        self.advance: Callable[[int], None]  # from `start` on
         self.stretch: Stretch | None = None
         moves = cache(lambda h: exponential_step(_rates(scene, None), h)[0])
         self._whole = moves if integrator == EXPONENTIAL and substeps == 1 else None
@@ -200,17 +199,21 @@ class MujocoEngine:
     def start(self, buffer: StepBuffer) -> None:
         self._buffer, self.stretch, access = buffer, None, self._access
         access.put(buffer, 0)
-        self.advance = access.ticks(buffer, self._timing)
+        self.__dict__.pop("advance", None)
         if buffer.calm and not self._timing and not (self._rubs and buffer.limited):
             if self._whole:
                 self.stretch = self._fused(buffer, self._whole(access.T))
             elif not access.move:
                 self.stretch = self._stepped(buffer)
 
+    @cached_property
+    def advance(self) -> Callable[[int], None]:
+        """From `start` on; made when a tick is asked for alone."""
+        return self._access.ticks(self._buffer, self._timing)
+
     def _fused(self, buffer: StepBuffer, move: Array) -> Stretch:
-        access, further = self._access, len(self._access.qacc)
-        none = np.zeros((len(move), buffer.process.F.order))
-        fused = FusedTicks(buffer, np.hstack([move[:, :-further], none, move[:, -further:]]), further)
+        access, states = self._access, len(move)
+        fused = FusedTicks(buffer, move[:, :states], G=move[:, states:])
         ctrl, state, qacc, forward = access.ctrl, access.state, access.qacc, access.forward
         product, held, before, after, rates = fused.product, fused.held, fused.before, fused.next, fused.further
         shaped = list(fused.states.reshape(-1, *state.shape))
@@ -314,14 +317,17 @@ class MujocoBatchEngine:
 def _rates(scene: Scene, fields: Mapping[str, Array] | None) -> Array:
     """J of s' = J s + .., (nsim or 1, 2n, 2n), from the matrices of the compiled model, or of every variant of it."""
     if not fields:
-        return plant(scene.model).A[None]
+        return scene.plant.A[None]
     nsim = len(next(iter(fields.values())))
     same = {name: np.tile(getattr(scene.model, name).astype(float), (nsim, 1)) for name in _MECHANICAL}
     return Variants(scene, {**same, **fields}).plants().A
 
 
 def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
-    """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T."""
+    """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T.
+
+    Of the exponential one it is the scene's own where nothing rubs: accelerations alone know no step.
+    """
     import mujoco
 
     if integrator not in INTEGRATORS:
@@ -330,6 +336,8 @@ def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoc
         raise ValueError(f"substeps is {substeps}, allowed are whole numbers from 1")
     if impeded(scene.model):
         raise InputError("a human has an impedance (A, B, C, D), which MuJoCo does not simulate: use the exact engine")
+    if integrator == default_integrator(scene) == EXPONENTIAL:
+        return scene.model
     model = copy(scene.model)
     model.opt.timestep = T / substeps
     model.opt.integrator = getattr(mujoco.mjtIntegrator, INTEGRATORS[integrator])

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,7 +29,7 @@ from controller.tick import Net, Process, StepBuffer
 from controller.timing import Timing
 from controller.walls import contact
 from models.hold import HeldPlant, hold
-from models.scene import Scene, build, plant
+from models.scene import Scene, build
 from sim.engines import Engine, ExactEngine, ExactTimedEngine
 from sim.mujoco_engines import EXPONENTIAL, LEAST, MujocoEngine, default_integrator, profiler_off, quiet_warnings
 from sim.scenario import InputError, Scenario
@@ -43,8 +44,8 @@ Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 _COPIES = 4  # of a trace, at most, from the run to its report
 _SMALL = 1e8  # [bytes] of a trace for which the free memory is not looked up
 _COLUMNS = 50  # numbers a tick that the report of a trace on the disk takes in memory
-_BLOCK = 1024  # ticks between two looks at the clock, the keyboard and the numbers
-_AHEAD = 8  # blocks for which outside forces are asked at once
+_BLOCK = 512  # ticks between two looks at the keyboard and the numbers: what a block needs stays in the cache
+_AHEAD = 16  # blocks for which outside forces are asked at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,7 @@ class Simulation:
         """The same in periods T, with forces that latch at ticks: what integrators and their steps are judged on."""
         if self.timing is None:
             return self
-        return replace(self, plant=hold(plant(self.scene.model), self.scenario.T), timing=None)
+        return replace(self, plant=hold(self.scene.plant, self.scenario.T), timing=None)
 
     @property
     def felt(self) -> Lti:
@@ -104,7 +105,7 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
         walled = contact(network, coupling, *delays, scenario.T) if network.walls else None
     F = walled.open if walled else force_map(E, coupling, *delays)
     scene = build(scenario.device, scenario.human, scenario.person)
-    usual = hold(plant(scene.model), scenario.T, scenario.usual_latency)
+    usual = hold(scene.plant, scenario.T, scenario.usual_latency)
     timing = scenario.timing(seed, scenario.samples)
     return Simulation(scenario, E, F, Process(F, limits, steps, walled), scene, usual, timing)
 
@@ -150,7 +151,7 @@ def run(
         run_blocks(process, engine, outside, ticks, start, keep, _BLOCK)
     except KeyboardInterrupt:  # what was finished is kept
         interrupted = True
-    n, m, handles = simulation.scene.model.nq, process.channels, list(simulation.scene.handles)
+    n, m, handles = simulation.scene.model.nq, process.channels, simulation.scene.handles
     z, s, w, f = np.split(record[:done], np.cumsum(widths)[:3], axis=1)
     for part in (record, z, s, w, f):
         part.setflags(write=False)
@@ -158,8 +159,8 @@ def run(
         t=beginnings(scenario.T, simulation.timing, 0, done),
         x=process.measured(s[:, :m]),
         f=f,
-        x_handle=s[:, handles],
-        v_handle=s[:, n:][:, handles],
+        x_handle=_columns(s, handles),
+        v_handle=_columns(s[:, n:], handles),
         w=w,
         z=z,
         s=s,
@@ -167,6 +168,12 @@ def run(
         interrupted=interrupted,
         net=net,
     )
+
+
+def _columns(rows: Array, which: tuple[int, ...]) -> Array:
+    """These columns, which are no copy where they lie side by side."""
+    together = slice(which[0], which[-1] + 1)
+    return rows[:, together] if which == tuple(range(which[0], which[-1] + 1)) else rows[:, list(which)]
 
 
 def _room(width: int, ticks: int, T: float) -> Array:
@@ -254,9 +261,9 @@ def outside_forces(
         for human, column in zip(scenario.human, scene.pushed, strict=True):
             w[:, column] += human.voluntary_force(t)
     if tap := scenario.tap:
-        begin, end = (np.round(time / scenario.T, 9) for time in (tap.start, tap.start + tap.duration))
-        k = np.round(t / scenario.T, 9) if timing else np.arange(first, first + ticks)
-        w[(k >= begin) & (k < end), scene.tapped[tap.channel - 1]] += tap.force
+        places = np.round(t / scenario.T, 9) if timing else range(first, first + ticks)
+        ends = [bisect_left(places, round(time / scenario.T, 9)) for time in (tap.start, tap.start + tap.duration)]
+        w[slice(*ends), scene.tapped[tap.channel - 1]] += tap.force
     return w
 
 
@@ -278,7 +285,7 @@ def make_engine(
         if simulation.friction:
             raise ValueError("the devices have Coulomb friction, which the exact engine, being linear, does not model")
         if simulation.timing and T is None:
-            return ExactTimedEngine(plant(simulation.scene.model), simulation.timing)
+            return ExactTimedEngine(simulation.scene.plant, simulation.timing)
         return ExactEngine(simulation.plant)
     integrator = integrator or default_integrator(simulation.scene)
     count = substeps if substeps is not None else 1 if integrator == EXPONENTIAL else LEAST

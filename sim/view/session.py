@@ -23,7 +23,7 @@ from controller.lti import Array, SingularLoop
 from controller.tick import StepBuffer
 from design.result import DesignFailed
 from models.hold import HeldPlant, hold
-from models.scene import Plant, Scene, plant
+from models.scene import Plant, Scene
 from sim.engines import ExactEngine
 from sim.run import outside_forces, run_block
 from sim.scenario import InputError
@@ -83,7 +83,7 @@ class Grip:
 
 def gripped(scene: Scene, channel: int, T: float) -> HeldPlant:
     """The plant with the hand's spring and damper on a handle, its end at rest."""
-    free, joint, n = plant(scene.model), scene.handles[channel], scene.model.nq
+    free, joint, n = scene.plant, scene.handles[channel], scene.model.nq
     A, at_handle = free.A.copy(), free.B[:, scene.tapped[channel]]
     A[:, joint] -= STIFFNESS * at_handle
     A[:, n + joint] -= DAMPING * at_handle

@@ -55,7 +55,7 @@ def engines() -> None:
     for name, (_, integrator, count) in settings.items():
         times, ratios = np.array(used[name]).T
         trace = looped(simulation, *settings[name])
-        position = position_error(trace, exact, simulation)["position_relative_rms"]
+        position = position_error(trace, exact, simulation).position_relative_rms
         growth = simulated_growth(simulation, integrator, count) - exact_growth(simulation) if integrator else 0.0
         print(
             f"| {name} | {1e3 * np.median(times):.0f} ms | {np.median(slow / times):.1f} x as fast as RK4 x 4 | "

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import forked
 import msgspec
 import numpy as np
 import pytest
@@ -213,9 +214,9 @@ def test_bad_input_is_one_line_on_stderr_and_exit_code_2(tmp_path):
 
 
 def test_what_cannot_be_designed_is_exit_code_1(tmp_path):
-    process = command("--psi", "1", "--condition", "any-environment", cwd=tmp_path)
-    _, err = process.communicate()
-    assert process.returncode == 1
+    done = forked.run(["python", "-m", "sim.run", "--psi", "1", "--condition", "any-environment"], tmp_path)
+    err = done.stderr
+    assert done.returncode == 1
     assert "Theorem 4 admits no coupling" in err
     assert "use " not in err  # what was not run is not proposed
     assert err.count("\n") == 1

@@ -17,7 +17,7 @@ from controller.loop import force_map
 from controller.lti import SingularLoop
 from controller.tick import Process, StepBuffer
 from controller.walls import contact
-from design.audit import report, requirement
+from design.audit import audit, requirement
 from design.certificate import assess, prove
 from design.conditions import this_environment
 from design.guarantees import MAKING
@@ -264,7 +264,7 @@ def test_a_stiffer_coupling_is_promised_for_walls_that_make_and_break():
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
     assert requirement(loop, coupling, "this-environment").certified
     assert not requirement(loop, coupling, "any-environment").certified
-    assert report(loop, coupling)["promise"] == MAKING
+    assert audit(loop, coupling).promise == MAKING
     stiff = SpringDamper([1772.0], [0.453])
     assert not requirement(loop, stiff, "this-environment").certified
     assert all(this_environment(state.F(stiff), loop.delta).certified for state in loop.frozen())

@@ -13,6 +13,7 @@ from controller.environment import Network, Wall
 from controller.loop import DelayRange
 from controller.lti import Lti, Sampled, taps
 from controller.ranges import Ranges
+from design import multipliers
 from design.certificate import lag, prove, prove_limiter, verify
 from design.conditions import least_multiple, this_environment
 from design.coupling_file import Certificate, LimiterCertificate, Stored, load, save, sealed
@@ -132,6 +133,18 @@ def test_no_multiplier_on_a_grid_is_better():
     grid = product(np.linspace(0.1, 0.6, 6), np.linspace(0.4, 0.9, 6))
     others = [limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG, ((a,), (b,))).requirement.ratio for a, b in grid]
     assert min(others) >= best * (1 - 1e-6)
+
+
+def test_for_many_devices_no_multiplier_is_sought(monkeypatch):
+    """The search grows with the fourth power of their number; at c = 0 one sweep is left, which asks for more."""
+    best = limiter_requirement(PAIR, BUILT)
+    monkeypatch.setattr(multipliers, "_MOST_SEARCHED", 1)
+    monkeypatch.setattr(multipliers._LimiterSearch, "least", None)
+    simple = limiter_requirement(PAIR, BUILT)
+    assert simple.c == ((0.0,), (0.0,))
+    assert simple.requirement.required[0] == pytest.approx(required(BUILT, simple.c))
+    assert simple.requirement.required[0] >= best.requirement.required[0]
+    assert limiter_requirement(PAIR, BUILT, c=best.c).requirement.required == pytest.approx(best.requirement.required)
 
 
 def test_unequal_weights_need_enough_lag():

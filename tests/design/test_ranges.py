@@ -352,7 +352,18 @@ def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, 
     assert (code, checked["promise"], checked["vertices"]) == (0, "these ranges", 3)
 
     out = ["--out", str(tmp_path / "out"), *common]
-    at_vertex = ["--coupling", str(file), "--vertex", "3", "--engine", "exact", "--duration", "1", "--no-plot"]
+    at_vertex = [
+        "--coupling",
+        str(file),
+        "--vertex",
+        "3",
+        "--engine",
+        "exact",
+        "--duration",
+        "1",
+        "--no-plot",
+        "--no-alternatives",
+    ]
     code, run = told(run_main, *at_vertex, *out)
     assert (code, run["promise"]) == (0, "these ranges")
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")

@@ -315,7 +315,7 @@ def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, m
 def test_a_design_for_a_range_without_its_theta_is_refused(tmp_path):
     options = ["--condition", "this-environment", "--varying-delay", "2,3", "--out", str(tmp_path / "c.json")]
     with pytest.raises(
-        ValueError, match=r"--varying-delay is 2-3: theta is \[1, 2\], outside of its varying_delay, \[2, 3\] samples"
+        ValueError, match=r"--varying-delay: theta is \[1, 2\], outside of its varying_delay, \[2, 3\] samples"
     ):
         design_main(options)
 

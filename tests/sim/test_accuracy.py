@@ -10,7 +10,7 @@ from cli.accuracy import main
 from controller.coupling import NoCoupling
 from models.device import RigidDevice
 from sim import accuracy as yardstick
-from sim.accuracy import credible, mark_front
+from sim.accuracy import Row, credible, with_front
 from sim.run import assemble, run
 from sim.scenario import InputError, load
 
@@ -45,11 +45,10 @@ def test_figures(report):
 
 
 def test_the_front_is_what_nothing_beats():
-    names = ("engine", "wall_s_per_simulated_s", "position_relative_rms", "growth_rate_error", "verdict_correct")
     values = [("a", 1, 1, 1, True), ("a", 2, 0.5, -0.5, True), ("a", 3, 0.5, -0.6, True), ("b", 9, 9, 9, True)]
-    rows = [dict(zip(names, value, strict=True)) for value in (*values, ("a", 0.5, 2, 2, False))]
-    mark_front(rows)
-    np.testing.assert_array_equal([row["pareto"] for row in rows], [True, True, False, True, False])
+    cycle, values = (None,) * 4, (*values, ("a", 0.5, 2, 2, False))
+    rows = [Row(kind, None, None, p, g, right, *cycle, wall) for kind, wall, p, g, right in values]
+    assert [row.pareto for row in with_front(rows)] == [True, True, False, True, False]
 
 
 def test_bad_duration():

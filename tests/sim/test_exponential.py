@@ -4,6 +4,9 @@
 the position that the fastest spring turns it into.
 """
 
+from copy import copy
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -117,7 +120,8 @@ def test_the_forces_are_mujocos(simulation):
     wrong = 1.5
     errors = []
     for substeps in (8, 16):
-        engine = MujocoEngine(simulation.scene, SCENARIO.T, EXPONENTIAL, substeps)
+        scene = replace(simulation.scene, model=copy(simulation.scene.model))
+        engine, _ = MujocoEngine(scene, SCENARIO.T, EXPONENTIAL, substeps), scene.plant
         engine.model.tendon_stiffness[...] *= wrong
         errors.append(_one_period(simulation.process, engine, simulation.scene.outside))
     truth = hold(plant(engine.model), SCENARIO.T).A
@@ -324,7 +328,7 @@ def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
     assert (sound.integrator, sound.substeps, sound.agrees) == ("RK4", 4, True)
     assert sound.position_relative_rms < 1e-6  # of RK4 x 4 here
     assert abs(sound.growth_rate_difference_per_s) < 1e-3
-    monkeypatch.setattr(mujoco_engines, "_rates", lambda scene, fields: 1.001 * plant(scene.model).A[None])
+    monkeypatch.setattr(mujoco_engines, "_rates", lambda scene, fields: 1.001 * scene.plant.A[None])
     wrong = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), EXPONENTIAL, 1)
     assert wrong.position_relative_rms > 30 * sound.position_relative_rms
     assert abs(wrong.growth_rate_difference_per_s) > 1e-3

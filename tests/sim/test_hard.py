@@ -86,7 +86,7 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
     start = np.concatenate([rng.uniform(-0.5, 0.5, (n // 2, 200)), rng.uniform(-10, 10, (n // 2, 200))])
     start = np.hstack([start, start[:, :near] / 5])
     start[2:4], start[6:8] = start[:2], start[4:6]  # the transmissions start unstretched
-    late = driven(loop.process, make_engine(loop, "exact"), quiet(loop), 40_000, start)
+    late = driven(loop.process, make_engine(loop, "exact"), quiet(loop), 40_000, start, last=1000)
     clipped = (np.abs(late.f[-1000:]) >= loop.process.force_limit[:, None]).any(axis=(0, 1))
     last = late.s[-1000:, 1]
     strongest = last[:, last.std(axis=0).argmax()]
