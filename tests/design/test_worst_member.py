@@ -9,12 +9,11 @@ import pytest
 from worlds import VERTICES_ONLY, environment_by_hand, filter_by_hand
 
 from cli.check import main as check_main
-from cli.design import _store
 from controller.coupling import ForceFilter, InternalModel
 from controller.environment import FIGURE_4, Network, Spring
 from controller.ranges import Member, Ranges, Region, UncertainSpring, members, regions
 from design import optimal
-from design.api import certify
+from design.api import certify, store
 from design.certificate import check_ranges, prove, verify
 from design.coupling_file import Stored, load, save
 from design.coverage import ranges_part, ranges_rows
@@ -190,7 +189,7 @@ def test_fewer_samples_do_not_make_it_a_guarantee():
 def test_its_file_is_stored_for_the_environment_alone(known, tmp_path):
     assert known.at_members[0].certified
     design = Design(VERTICES_ONLY, "this-environment", "rms", 0.07, known.at_members[0], 1, 0.0)
-    assert _store(RANGED, design, known, tmp_path / "c.json")["proof"] == "rational"
+    assert store(RANGED, design, tmp_path / "c.json", known).proof == "rational"
     stored = load(tmp_path / "c.json")
     assert (stored.loop.ranges, stored.certificate.guarantee) == (None, "this environment")
 
