@@ -121,8 +121,8 @@ def design(
     rungs: list[_Rung] = []
     hurried = False
     for taps, poles in options.ladder:
-        if rungs and not climb.room(taps, poles):
-            break
+        if rungs and not climb.room(taps, poles, rungs[-1].states):
+            continue
         found, rung = climb.rung(taps, poles, best)
         rungs.append(rung)
         progress(rung)
@@ -246,15 +246,15 @@ class _Climb:
     def span(self, taps: int, poles: int) -> program.Span:
         return program.span_of(self.cases[0].E, taps, poles, self.options.band_hz[1])
 
-    def room(self, taps: int, poles: int) -> bool:
-        """Whether a rung is tried: by its size, which is the same on a busy machine."""
+    def room(self, taps: int, poles: int, before: int) -> bool:
+        """Whether a rung is tried: by its size in states, which is the same on a busy machine, beside the one before."""
         span, loop = self.span(taps, poles), self.loop
         m = loop.channels
         own = int((span.used.sum(axis=1) > 0)[:, :m].sum())
         states = own + (len(span.used) - own // m if m > program.FULL else 0)
         states += self.cases[0].E.order + sum(loop.theta) + sum(loop.psi)
         proofs = len(self.cases) * states**2.7  # what they take, in seconds
-        return states <= _MOST_STATES and (m * span.unknowns) ** 2 <= _MOST_WORK and proofs <= _MOST_PROOFS
+        return before < states <= _MOST_STATES and (m * span.unknowns) ** 2 <= _MOST_WORK and proofs <= _MOST_PROOFS
 
     def rung(self, taps: int, poles: int, before: Optimal | None) -> tuple[Optimal, _Rung]:
         """The optimum over a basis, scaled until every sweep passes, and proved where there are no ranges."""
