@@ -247,7 +247,7 @@ class _Climb:
         return program.span_of(self.cases[0].E, taps, poles, self.options.band_hz[1])
 
     def room(self, taps: int, poles: int, before: int) -> bool:
-        """Whether a rung is tried: by its size in states, which is the same on a busy machine, beside the one before."""
+        """Whether a rung is tried: by its states, as many on a busy machine, which are more than `before`."""
         span, loop = self.span(taps, poles), self.loop
         m = loop.channels
         own = int((span.used.sum(axis=1) > 0)[:, :m].sum())
