@@ -16,7 +16,7 @@ from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.loop import DelayRange, Loop
 from controller.older import AUDITS, with_older
-from design.audit import LONGEST_DELAY, Audit, Help, Judged, audit
+from design.audit import LONGEST_DELAY, Audit, ConditionAudit, Help, audit
 from design.certificate import check_ranges
 from design.coverage import ranges_rows
 from design.designs import KINDS
@@ -230,7 +230,7 @@ def _stiffest(K: Sequence[float | None]) -> str:
 
 
 #: name of a row -> what stands in it, given what one condition says
-_ROWS: dict[str, Callable[[Judged], str]] = {
+_ROWS: dict[str, Callable[[ConditionAudit], str]] = {
     "needs damping": lambda c: f"{render.needs(c.certificate)}: {render.certified(c.certificate | {'proof': None})}",
     "margin": lambda c: render.optional(c.certificate["margin"], "{:.5g}"),
     "binds at": lambda c: render.optional(c.certificate["binding_frequency_hz"], "{:.5g} Hz"),

@@ -410,10 +410,8 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     loop = scenario.loop(args.case)
     if min(loop.delta) <= 0:
         raise InputError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
-    try:
+    with options.refused(args=args):
         wish = Options(**asked_of(args, "optimal"))
-    except ValueError as error:
-        raise InputError(options.as_option(error, args)) from None
     plan, out = _plan(args, loop, wish), options.out_folder(args, "compare")
     begin = time.perf_counter()
     with render.progress("designing") as move:
