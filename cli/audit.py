@@ -43,7 +43,7 @@ class _Report:
     gains: str | None  # the source of a device's gains
     audit: Audit = render.unseen("beside")
     encoder: dict[str, Any] | None = render.unseen()
-    notes: list[str] = render.unseen()
+    notes: tuple[str, ...] = render.unseen()
     wall_s: float = render.unseen()
 
 
@@ -67,6 +67,9 @@ def main(argv: list[str]) -> int:
         whole = check_ranges(loop, coupling, args.seed, progress=move)
     with options.refused():
         found = audit(loop, coupling, switching, whole)
+    notes = ()
+    if args.coupling:  # what its file is worth in the loop that is audited
+        notes = check_stored(read_coupling(args.coupling), scenario.loop(args.case).switching(switching)).notes
     report = _Report(
         args.case,
         None if args.rigid else scenario.name,
@@ -74,7 +77,7 @@ def main(argv: list[str]) -> int:
         args.source if args.device else None,
         found,
         None if args.rigid else encoder_steps(scenario, args.case, coupling),
-        _notes(args, scenario, switching),
+        notes,
         time.perf_counter() - begin,
     )
     render.publish(args, with_older(render.plain(report), AUDITS), _tables(found), _remarks(report), out)
@@ -183,14 +186,6 @@ def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
     if not span.contains(DelayRange(loop.theta, loop.theta)):
         raise InputError(f"--varying-delay is {span}, expected a range around theta = {listed(loop.theta)} (--theta)")
     return span
-
-
-def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange | None) -> list[str]:
-    """What the coupling's file is worth in the loop that is audited."""
-    if args.coupling is None:
-        return []
-    loop = scenario.loop(args.case)
-    return list(check_stored(read_coupling(args.coupling), loop.switching(switching)).notes)
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -23,9 +23,10 @@ from design.designs import KINDS, design_by_kind, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
 from design.guarantees import ANY
-from design.optimal import Optimal, robustness_parts, widest_ranges
+from design.optimal import Optimal, robustness_parts
 from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import Design, listed
+from design.robustness import ranges_around
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts
 from sim.scenario import InputError, Scenario
@@ -46,7 +47,7 @@ def main(argv: list[str]) -> int:
     judged = _judged(args, scenario, loop, design)
     stored = store(loop, design, out, judged.whole, judged.limits.certificate)
     report = _reported(args, loop, design, judged, stored)
-    render.publish(args, report, _tables(scenario, report), (report.best or {}).get("notes", args.notes))
+    render.publish(args, report, _tables(scenario, report))
     holds = report.certificate["certified"] and (judged.promise == ANY or not judged.whole or judged.proved)
     return options.exit_code(holds and (report.switching or report.certificate)["certified"])
 
@@ -101,13 +102,13 @@ def _percent(text: str) -> float:
 
 def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     """The scenario's loop with the range of delays that --varying-delay gives. Raises InputError."""
-    loop, args.notes = scenario.loop(args.case), []
+    loop = scenario.loop(args.case)
     if args.ranges is not None:
         if loop.ranges or loop.environment.walls:
             raise InputError(f"--ranges and {'[ranges]' if loop.ranges else 'environment.walls'}: give one of them")
         with options.refused(f"--ranges {args.ranges:g}: "):
-            around, note = widest_ranges(loop, args.ranges)
-            loop, args.notes = msgspec.structs.replace(loop, ranges=around), [note] if note else []
+            loop = msgspec.structs.replace(loop, ranges=ranges_around(loop.network, args.ranges))
+            loop.members()
     args.condition = args.condition or usual_condition(loop, args.coupling)
     if args.varying_delay is not None:
         if not _for_switching(args):
@@ -201,7 +202,7 @@ def _worth(args: argparse.Namespace, loop: Loop, design: Design) -> tuple[dict[s
         limit = best and bound_part(loop, best, best.figures.rms_mismatch_db, args.band_hz or BAND_HZ)
     if best is None:
         return robust, None
-    return robust, {"bound": limit, "rendered_stiffness": best.g, "ladder": best.ladder, "notes": args.notes}
+    return robust, {"bound": limit, "rendered_stiffness": best.g, "ladder": best.ladder}
 
 
 # ----------------------------------------------------------------------------------------------------

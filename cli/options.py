@@ -18,6 +18,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -70,14 +71,23 @@ class Parser(argparse.ArgumentParser):
 # Types of options.
 
 
-def number(least: float = -math.inf, most: float = math.inf, unit: str = "") -> Callable[[str], float]:
-    """A number within these limits."""
-    return _one(float, least, most, unit)
+def _one(
+    kind: Callable[[str], _Number], least: float = -math.inf, most: float = math.inf, unit: str = ""
+) -> Callable[[str], _Number]:
+    """A number of this kind within these limits."""
+
+    def read(text: str) -> _Number:
+        try:
+            value = kind(text)
+        except ValueError:
+            what = "a whole number" if kind is int else "a number"
+            raise argparse.ArgumentTypeError(f"is {text!r}, expected {what}") from None
+        return _within(value, least, most, unit)
+
+    return read
 
 
-def whole(least: float = -math.inf, most: float = math.inf, unit: str = "") -> Callable[[str], int]:
-    """A whole number within these limits."""
-    return _one(int, least, most, unit)
+number, whole = partial(_one, float), partial(_one, int)  # (least, most, unit)
 
 
 def several(
@@ -151,18 +161,6 @@ def condition(text: str) -> str:
     return name
 
 
-def _one(kind: Callable[[str], _Number], least: float, most: float, unit: str) -> Callable[[str], _Number]:
-    def read(text: str) -> _Number:
-        try:
-            value = kind(text)
-        except ValueError:
-            what = "a whole number" if kind is int else "a number"
-            raise argparse.ArgumentTypeError(f"is {text!r}, expected {what}") from None
-        return _within(value, least, most, unit)
-
-    return read
-
-
 def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
     if least <= value <= most:  # False for nan
         return value
@@ -217,7 +215,7 @@ def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) 
     """Numbers that stand within a longer text, a single one for all. Raises InputError with `option` in front."""
     try:
         if count == 1 and "," not in text:
-            return (_one(kind, -math.inf, math.inf, "")(text),)
+            return (_one(kind)(text),)
         return per_channel(option, several(kind)(text), count)
     except argparse.ArgumentTypeError as error:
         raise InputError(f"{option} {error}") from None

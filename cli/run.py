@@ -50,7 +50,7 @@ def main(argv: list[str]) -> int:
     if args.side_by_side:
         files.append(_side_by_side(others, out / "couplings.png", scenario.environment.contacts))
     render.publish(args, report, _tables(scenario, report), report.remarks, out, files)
-    return options.INTERRUPTED if done.trace.interrupted else options.DONE
+    return options.exit_code(True, done.trace.interrupted)
 
 
 def _parser() -> options.Parser:
@@ -227,8 +227,8 @@ def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
     if report.alternatives:
         shown.append(_beside(report))
     if report.reproducibility:
-        cells = [(row.what, row.paper, row.here, row.why) for row in report.reproducibility]
-        shown.append(render.grid("beside the paper", ("", "paper", "here", "why"), cells, range(4)))
+        cells = {"": "{r.what}", "paper": "{r.paper}", "here": "{r.here}", "why": "{r.why}"}
+        shown.append(render.columns("beside the paper", cells, report.reproducibility, range(4)))
     return shown
 
 
@@ -280,15 +280,15 @@ def _speed(run: Ran) -> str:
 
 def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> Any:
     """Every engine and step on this scene; the one that ran is marked."""
-    cells = []
-    for row in engines:
-        mark = " *" if (row.integrator, row.substeps) == (run.integrator, run.substeps) else ""
-        error = render.optional(finite(row.position_relative_rms), "{:.1e}")
-        right = "right" if row.verdict_correct else "[red]WRONG[/]"
-        speed = f"{run.duration_s / row.cpu_s:.0f}" if row.cpu_s else "-"  # too short for the clock
-        cells.append((row.name + mark, error, right, f"{row.cpu_s:.3f}", speed))
-    heads = ("engine x steps", "position error", "verdict", "CPU s", "x real time")
-    return render.grid("speed against error on this scene (*: the cheapest that keeps --error, this run)", heads, cells)
+    cells: dict[str, Any] = {
+        "engine x steps": lambda r: r.name + " *" * ((r.integrator, r.substeps) == (run.integrator, run.substeps)),
+        "position error": lambda r: render.optional(finite(r.position_relative_rms), "{:.1e}"),
+        "verdict": lambda r: "right" if r.verdict_correct else "[red]WRONG[/]",
+        "CPU s": "{r.cpu_s:.3f}",
+        "x real time": lambda r: f"{run.duration_s / r.cpu_s:.0f}" if r.cpu_s else "-",  # too short for the clock
+    }
+    title = "speed against error on this scene (*: the cheapest that keeps --error, this run)"
+    return render.columns(title, cells, engines)
 
 
 def _beside(report: RunReport) -> Any:

@@ -48,11 +48,9 @@ def main(argv: list[str]) -> int:
     title = f"{scenario.title(args.case)}: coupling {chosen.kind}"
     lines = [*([f"Delays that vary: {report.switching.met['covers']}."] if report.switching else []), *report.remarks]
     render.publish(args, report, [render.facts(title, render.rows_of(report), ("", ""))], lines, out, files)
-    if report.interrupted:
-        return options.INTERRUPTED
-    if report.unfinished:
+    if report.unfinished and not report.interrupted:
         return options.UNFINISHED
-    return options.DONE if report.holds else options.DOES_NOT_HOLD
+    return options.exit_code(bool(report.holds), report.interrupted)
 
 
 def _parser() -> options.Parser:
