@@ -31,8 +31,9 @@ class Engine(Protocol):
         """Take the plant state of row 0 as the state at the first tick."""
         ...
 
-    def advance(self, k: int, /) -> None:
-        """Hold the plant input of row k, forces within their limits, for T; write the plant state of row k + 1."""
+    @property
+    def advance(self) -> Callable[[int], None]:
+        """k: hold the plant input of row k, forces within their limits, for T; write the plant state of row k + 1."""
         ...
 
     def troubled(self) -> bool:
