@@ -78,10 +78,9 @@ class ExactEngine(_Exact):
         product, before, after = fused.product, fused.before, fused.next
 
         def stretch(ticks: int) -> None:
-            fused.begin(ticks)
-            for k in range(ticks):
-                product(before[k], after[k])
-            fused.end(ticks)
+            for count in fused.parts(ticks):
+                for k in range(count):
+                    product(before[k], after[k])
 
         return stretch
 

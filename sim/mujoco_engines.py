@@ -220,14 +220,13 @@ class MujocoEngine:
         shaped = list(fused.states.reshape(-1, *state.shape))
 
         def stretch(ticks: int) -> None:
-            fused.begin(ticks)
-            for inputs, rate, now, then, moved in zip(held[:ticks], rates, before, after, shaped, strict=False):
-                ctrl[...] = inputs
-                forward()
-                rate[...] = qacc
-                product(now, then)
-                state[...] = moved
-            fused.end(ticks)
+            for count in fused.parts(ticks):
+                for inputs, rate, now, then, moved in zip(held[:count], rates, before, after, shaped, strict=False):
+                    ctrl[...] = inputs
+                    forward()
+                    rate[...] = qacc
+                    product(now, then)
+                    state[...] = moved
 
         return stretch
 

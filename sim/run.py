@@ -44,8 +44,8 @@ Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 _COPIES = 4  # of a trace, at most, from the run to its report
 _SMALL = 1e8  # [bytes] of a trace for which the free memory is not looked up
 _COLUMNS = 50  # numbers a tick that the report of a trace on the disk takes in memory
-_BLOCK = 512  # ticks between two looks at the keyboard and the numbers: what a block needs stays in the cache
-_AHEAD = 32  # blocks for which outside forces are asked at once
+_BLOCK = 2048  # ticks between two looks at the clock, the keyboard and the numbers
+_AHEAD = 8  # blocks for which outside forces are asked at once
 
 
 @dataclass(frozen=True, eq=False)
