@@ -16,7 +16,7 @@ from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.loop import DelayRange, Loop
 from controller.older import AUDITS, with_older
-from design.audit import LONGEST_DELAY, Audit, Help, Judged, audit
+from design.audit import LONGEST_DELAY, Audit, ConditionAudit, Help, audit
 from design.certificate import check_ranges
 from design.coverage import ranges_rows
 from design.designs import KINDS
@@ -43,7 +43,7 @@ class _Report:
     gains: str | None  # the source of a device's gains
     audit: Audit = render.unseen("beside")
     encoder: dict[str, Any] | None = render.unseen()
-    notes: list[str] = render.unseen()
+    notes: tuple[str, ...] = render.unseen()
     wall_s: float = render.unseen()
 
 
@@ -67,6 +67,9 @@ def main(argv: list[str]) -> int:
         whole = check_ranges(loop, coupling, args.seed, progress=move)
     with options.refused():
         found = audit(loop, coupling, switching, whole)
+    notes = ()
+    if args.coupling:  # what its file is worth in the loop that is audited
+        notes = check_stored(read_coupling(args.coupling), scenario.loop(args.case).switching(switching)).notes
     report = _Report(
         args.case,
         None if args.rigid else scenario.name,
@@ -74,7 +77,7 @@ def main(argv: list[str]) -> int:
         args.source if args.device else None,
         found,
         None if args.rigid else encoder_steps(scenario, args.case, coupling),
-        _notes(args, scenario, switching),
+        notes,
         time.perf_counter() - begin,
     )
     render.publish(args, with_older(render.plain(report), AUDITS), _tables(found), _remarks(report), out)
@@ -185,14 +188,6 @@ def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
     return span
 
 
-def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange | None) -> list[str]:
-    """What the coupling's file is worth in the loop that is audited."""
-    if args.coupling is None:
-        return []
-    loop = scenario.loop(args.case)
-    return list(check_stored(read_coupling(args.coupling), loop.switching(switching)).notes)
-
-
 # ----------------------------------------------------------------------------------------------------
 # The report as a table, and what it does not cover.
 
@@ -230,7 +225,7 @@ def _stiffest(K: Sequence[float | None]) -> str:
 
 
 #: name of a row -> what stands in it, given what one condition says
-_ROWS: dict[str, Callable[[Judged], str]] = {
+_ROWS: dict[str, Callable[[ConditionAudit], str]] = {
     "needs damping": lambda c: f"{render.needs(c.certificate)}: {render.certified(c.certificate | {'proof': None})}",
     "margin": lambda c: render.optional(c.certificate["margin"], "{:.5g}"),
     "binds at": lambda c: render.optional(c.certificate["binding_frequency_hz"], "{:.5g} Hz"),

@@ -69,9 +69,7 @@ def main(argv: list[str]) -> int:
     render.console(args).print("files: " + ", ".join(files), soft_wrap=True)
     if args.json:
         write_json(args.json, plain(report) | {"files": files})
-    if set(live.signals) - {signal.SIGUSR1}:
-        return options.INTERRUPTED
-    return options.DONE if session.stage == Stage.FINISHED else options.DOES_NOT_HOLD
+    return options.exit_code(session.stage == Stage.FINISHED, bool(set(live.signals) - {signal.SIGUSR1}))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -150,9 +148,8 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
 
 def print_session(report: SessionReport, console: Console) -> None:
     """The log, then what the link did."""
-    rows = [(f"{one.t_s:.3f} s", _colour(one.stage), one.cause) for one in report.session.log]
-    title = f"case {report.case} · {report.scenario}"
-    console.print(render.grid(title, ("after", "stage", "cause"), rows, left=(1, 2)))
+    cells = {"after": "{r.t_s:.3f} s", "stage": lambda r: _colour(r.stage), "cause": "{r.cause}"}
+    console.print(render.columns(f"case {report.case} · {report.scenario}", cells, report.session.log, left=(1, 2)))
     link = report.link
     if link.age_us:
         ages = ", ".join(f"{name} {us / 1000:.2f} ms" for name, us in link.age_us.items())

@@ -11,7 +11,6 @@ import argparse
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,16 +18,14 @@ from rich.table import Table
 
 from cli import options, render
 from cli.design import add_optimal_options, asked_of
-from controller import older
 from controller.loop import Loop
 from controller.lti import Array
 from design import compare
-from design.compare import AXES, FEEL_HZ, LADDERS, Demands, LadderRow, Limit, Perceived, Point, points_along
+from design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
 from design.program import Options
-from design.result import CONDITIONS, DesignFailed, certificate_part
-from design.robustness import robustness_part
-from design.transparency import transparency
-from sim import baselines, report
+from design.result import CONDITIONS, DesignFailed
+from sim import baselines
+from sim.compare_report import ComparedCoupling, Comparison
 from sim.couplings import NAMES, Chosen, choose
 from sim.scenario import InputError, Scenario
 
@@ -115,53 +112,13 @@ def _check_mode(args: argparse.Namespace, parser: options.Parser) -> None:
 # Couplings over frequency.
 
 
-@dataclass(frozen=True, eq=False)
-class _Shown:
-    """One coupling, with all that the pictures show of it."""
-
-    name: str
-    states: int
-    transparency: dict[str, Any]
-    robustness: dict[str, Any] | None
-    curves: compare.Curves = render.unseen("beside")
-    coupling: dict[str, Any] = render.unseen("beside")
-    conditions: dict[str, dict[str, Any]] = render.unseen("beside")
-
-
-@dataclass(frozen=True, eq=False)
-class _Couplings:
-    """Couplings over frequency; SI units, null where a figure is infinite or does not exist."""
-
-    case: str
-    scenario: str
-    seed: int
-    T_s: float
-    theta: tuple[int, ...]
-    psi: tuple[int, ...]
-    lam: tuple[int, ...]
-    available_damping: tuple[float, ...]
-    frequency_hz: Array
-    sigma_E: Array
-    ideal: Perceived
-    couplings: list[_Shown]
-    notes: list[str]
-
-
 def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
     names = args.coupling or (("none",) if args.case == "none" else ("none", "spring-damper"))
     out = options.out_folder(args, "compare")
     chosen, failed = _chosen(scenario, args, names)
-    loop = scenario.loop(args.case)
-    judged = {name: compare.judge(loop, c.coupling, c.phi) for name, c in chosen.items()}
-    hz = compare.grid(loop, list(judged.values()))
-    shown = [_shown(loop, name, c, judged[name], hz) for name, c in chosen.items()]
-    parts = [(c.name, condition, c.conditions[condition]) for c in shown for condition in CONDITIONS]
-    notes = [*(f"{name}: {note}" for name, c in chosen.items() for note in c.notes), *failed]
-    notes += [f"{name}, {condition}: {part['reason']}" for name, condition, part in parts if "reason" in part]
-    about = args.case, scenario.name, args.seed, loop.T, loop.theta, loop.psi, loop.lam, loop.delta
-    report = _Couplings(*about, hz, *compare.ideal(loop, hz), shown, notes)
+    report = Comparison.of(scenario, args.case, chosen, failed, args.seed)
     files = render.pictures(args, report, out, _PICTURES)
-    render.publish(args, report, [_guarantees(report), _feel(report)], notes, out, files)
+    render.publish(args, report, [_guarantees(report), _feel(report)], report.notes, out, files)
     return options.exit_code(not failed)
 
 
@@ -210,33 +167,14 @@ def _named(name: str) -> tuple[str, str | None]:
         return name, None  # a file may have a colon in its name
 
 
-def _shown(loop: Loop, name: str, chosen: Chosen, judged: Demands, hz: Array) -> _Shown:
-    curves, conditions = compare.curves(loop, judged, hz), {}
-    for key, requirement in judged.requirements.items():
-        demand = curves.demands[key]
-        part = certificate_part(requirement) | {"ratio": requirement.ratio, "demand": demand}
-        if demand is None and not requirement.reason:
-            part["reason"] = f"this coupling is no V in feedback around the environment: no curve for {key}"
-        conditions[key] = part
-    return _Shown(
-        Path(name).name,
-        judged.F.order,
-        report.transparency_part(transparency(judged.F, loop.E(), loop.lam)),
-        robustness_part(loop, chosen.coupling),
-        curves,
-        report.coupling_part(chosen.kind, chosen.coupling, loop.T),
-        older.with_older(conditions, older.CONDITIONS),
-    )
-
-
-def _guarantees(report: _Couplings) -> Table:
+def _guarantees(report: Comparison) -> Table:
     """Required damping [N s/m] where all devices have the same, else as a multiple of what each has."""
     available = report.available_damping
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
     title = f"{damping} of {_list(available)} N s/m · {report.scenario}, case {report.case}"
     scale = available[0] if alike else 1.0
-    cells: dict[str, Callable[[_Shown], str]] = {
+    cells: dict[str, Callable[[ComparedCoupling], str]] = {
         "coupling": lambda c: c.name,
         "this-env.": lambda c: _needs(c.conditions["this-environment"], scale),
         "at Hz": lambda c: _binds(c.conditions["this-environment"]),
@@ -267,7 +205,7 @@ def _robust(part: dict[str, Any] | None, scale: float = 1.0) -> str:
     return "infinite" if need is None else f"{scale * need:.4g}"
 
 
-def _feel(report: _Couplings) -> Table:
+def _feel(report: Comparison) -> Table:
     columns = [(what, unit, hz) for what, unit in (("stiffness", "N/m"), ("damping", "N s/m")) for hz in FEEL_HZ]
     heads = ["coupling", *(f"{what}\n{unit}, {hz:g} Hz" for what, unit, hz in columns)]
     named = {"ideal (E)": report.ideal, **{c.name: c.curves.perceived for c in report.couplings}}
@@ -410,10 +348,8 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     loop = scenario.loop(args.case)
     if min(loop.delta) <= 0:
         raise InputError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
-    try:
+    with options.refused(args=args):
         wish = Options(**asked_of(args, "optimal"))
-    except ValueError as error:
-        raise InputError(options.as_option(error, args)) from None
     plan, out = _plan(args, loop, wish), options.out_folder(args, "compare")
     begin = time.perf_counter()
     with render.progress("designing") as move:

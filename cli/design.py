@@ -23,9 +23,10 @@ from design.designs import KINDS, design_by_kind, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
 from design.guarantees import ANY
-from design.optimal import Optimal, robustness_parts, widest_ranges
+from design.optimal import Optimal, robustness_parts
 from design.program import DEFAULT, OBJECTIVES, Options
-from design.result import Design, DesignFailed, listed
+from design.result import Design, listed
+from design.robustness import ranges_around
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts
 from sim.scenario import InputError, Scenario
@@ -46,7 +47,7 @@ def main(argv: list[str]) -> int:
     judged = _judged(args, scenario, loop, design)
     stored = store(loop, design, out, judged.whole, judged.limits.certificate)
     report = _reported(args, loop, design, judged, stored)
-    render.publish(args, report, _tables(scenario, report), (report.best or {}).get("notes", args.notes))
+    render.publish(args, report, _tables(scenario, report))
     holds = report.certificate["certified"] and (judged.promise == ANY or not judged.whole or judged.proved)
     return options.exit_code(holds and (report.switching or report.certificate)["certified"])
 
@@ -76,7 +77,6 @@ def _parser() -> options.Parser:
     add_optimal_options(optimal)
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
     parser.add_argument("--samples", type=options.whole(0, 10_000), metavar="N", help=samples)
-    ccl.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
     options.add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case or scenario>.json)")
     return parser
 
@@ -102,13 +102,13 @@ def _percent(text: str) -> float:
 
 def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     """The scenario's loop with the range of delays that --varying-delay gives. Raises InputError."""
-    loop, args.notes = scenario.loop(args.case), []
+    loop = scenario.loop(args.case)
     if args.ranges is not None:
         if loop.ranges or loop.environment.walls:
             raise InputError(f"--ranges and {'[ranges]' if loop.ranges else 'environment.walls'}: give one of them")
         with options.refused(f"--ranges {args.ranges:g}: "):
-            around, note = widest_ranges(loop, args.ranges)
-            loop, args.notes = msgspec.structs.replace(loop, ranges=around), [note] if note else []
+            loop = msgspec.structs.replace(loop, ranges=ranges_around(loop.network, args.ranges))
+            loop.members()
     args.condition = args.condition or usual_condition(loop, args.coupling)
     if args.varying_delay is not None:
         if not _for_switching(args):
@@ -129,19 +129,15 @@ def _for_switching(args: argparse.Namespace) -> bool:
 
 def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     """What is asked of a design, in its own words. Raises InputError for options of another coupling."""
-    words = {"full": "diagonal"}  # --full says that it is not
-    known = dict.fromkeys(("limiter", "full", *(name for design in KINDS.values() for name in design.options)))
-    found = {name: getattr(args, name, None) for name in known}
-    given = {name: value for name, value in found.items() if value is not None and value is not False}
+    known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
+    given = {name: value for name in known if options.given(value := getattr(args, name, None))}
     if kind == "spring-damper" and args.limiter is not None:
         given["limiter"] = args.limiter
     for name in given:
-        taking = [other for other, design in KINDS.items() if words.get(name, name) in design.options]
+        taking = [other for other, design in KINDS.items() if name in design.options]
         if kind not in taking:
             shown = name.removesuffix("_hz").replace("_", "-")
             raise InputError(f"--{shown} is for --coupling {' or '.join(taking)}, not {kind}")
-    if given.pop("full", False):
-        given["diagonal"] = False
     return given
 
 
@@ -150,13 +146,8 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
     asked = asked_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
         asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
-    try:
-        with render.designing(loop, args.coupling, args.condition) as heard:
-            return design_by_kind(loop, args.coupling, args.condition, heard, **asked)
-    except DesignFailed:
-        raise
-    except ValueError as error:
-        raise InputError(options.as_option(error, args)) from None
+    with options.refused(args=args), render.designing(loop, args.coupling, args.condition) as heard:
+        return design_by_kind(loop, args.coupling, args.condition, heard, **asked)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -211,7 +202,7 @@ def _worth(args: argparse.Namespace, loop: Loop, design: Design) -> tuple[dict[s
         limit = best and bound_part(loop, best, best.figures.rms_mismatch_db, args.band_hz or BAND_HZ)
     if best is None:
         return robust, None
-    return robust, {"bound": limit, "rendered_stiffness": best.g, "ladder": best.ladder, "notes": args.notes}
+    return robust, {"bound": limit, "rendered_stiffness": best.g, "ladder": best.ladder}
 
 
 # ----------------------------------------------------------------------------------------------------

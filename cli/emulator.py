@@ -25,10 +25,8 @@ def main(argv: list[str]) -> int:
         raise InputError(f"--duration is {args.duration:g}, allowed are numbers above 0 up to 1000000 s")
     if args.parent not in (0, os.getppid()):
         raise InputError(f"--parent is {args.parent}, but this process is a child of {os.getppid()}")
-    try:
+    with options.refused("the scenario cannot stand behind a serial link: "):
         emulator = Emulator(nobody(scenario) if args.nobody else scenario, faults, coulomb=args.coulomb)
-    except ValueError as error:
-        raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
     terminal, stops = Terminal(), []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, frame: stops.append(received))

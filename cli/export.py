@@ -79,6 +79,9 @@ def main(argv: list[str]) -> int:
     test = trial(block, args.seed)
     write(path, content(args.format, block, test, path.name))
 
+    forces = "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
+    if block.limiter:
+        forces = f"limited to {listed(block.limiter.limit)} N by the limiter"
     exported = _Exported(
         args.format,
         block.name,
@@ -89,7 +92,7 @@ def main(argv: list[str]) -> int:
         _Proof(verdict.proved, verdict.reason),
         block.system.order**2 + 2 * block.system.order * block.system.inputs + block.system.inputs**2,
         block.limiter and block.limiter.limit,
-        _forces(block) if args.process else None,
+        forces if args.process else None,
         {"ticks": len(test.inputs), "seed": args.seed, "largest_output": np.abs(test.outputs).max()},
     )
     title = f"{block.name} as {args.format}"
@@ -112,12 +115,6 @@ def _parser() -> options.Parser:
     parser.add_argument("--force-limit", type=options.several(float, 1e-3, 1e6, "N"), metavar="N,N,..", help=limit)
     options.add_output_options(parser, "FILE", "the file (default out/export/<coupling>-<what>.<suffix>)")
     return parser
-
-
-def _forces(block: ExportedBlock) -> str:
-    if block.limiter:
-        return f"limited to {listed(block.limiter.limit)} N by the limiter"
-    return "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
 
 
 def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> ExportedBlock:

@@ -91,9 +91,7 @@ def main(argv: list[str]) -> int:
         tables = [_table(e, scenario, i) for i, e in enumerate(report.axes)]
         files.append(write(out / "devices.toml", "\n".join(tables)))
     render.publish(args, report, [_figures(report)], report.lines(), out, files)
-    if sittings[-1].signals:
-        return options.INTERRUPTED
-    return options.DONE if report.bounded else options.DOES_NOT_HOLD
+    return options.exit_code(report.bounded, bool(sittings[-1].signals))
 
 
 def _parser() -> argparse.ArgumentParser:

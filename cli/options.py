@@ -18,6 +18,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -26,14 +27,13 @@ from threadpoolctl import threadpool_limits
 
 from controller import older
 from controller.delay import LOST, VaryingDelay
-from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
 from controller.lti import SingularLoop
 from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
 from design.result import CONDITIONS, DesignFailed
 from models.device import MOST_DAMPING
-from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load, load_humans
+from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -71,14 +71,23 @@ class Parser(argparse.ArgumentParser):
 # Types of options.
 
 
-def number(least: float = -math.inf, most: float = math.inf, unit: str = "") -> Callable[[str], float]:
-    """A number within these limits."""
-    return _one(float, least, most, unit)
+def _one(
+    kind: Callable[[str], _Number], least: float = -math.inf, most: float = math.inf, unit: str = ""
+) -> Callable[[str], _Number]:
+    """A number of this kind within these limits."""
+
+    def read(text: str) -> _Number:
+        try:
+            value = kind(text)
+        except ValueError:
+            what = "a whole number" if kind is int else "a number"
+            raise argparse.ArgumentTypeError(f"is {text!r}, expected {what}") from None
+        return _within(value, least, most, unit)
+
+    return read
 
 
-def whole(least: float = -math.inf, most: float = math.inf, unit: str = "") -> Callable[[str], int]:
-    """A whole number within these limits."""
-    return _one(int, least, most, unit)
+number, whole = partial(_one, float), partial(_one, int)  # (least, most, unit)
 
 
 def several(
@@ -152,18 +161,6 @@ def condition(text: str) -> str:
     return name
 
 
-def _one(kind: Callable[[str], _Number], least: float, most: float, unit: str) -> Callable[[str], _Number]:
-    def read(text: str) -> _Number:
-        try:
-            value = kind(text)
-        except ValueError:
-            what = "a whole number" if kind is int else "a number"
-            raise argparse.ArgumentTypeError(f"is {text!r}, expected {what}") from None
-        return _within(value, least, most, unit)
-
-    return read
-
-
 def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
     if least <= value <= most:  # False for nan
         return value
@@ -173,15 +170,27 @@ def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
     raise argparse.ArgumentTypeError(f"is {shown}, allowed are {span}{unit}")
 
 
+def given(value: Any) -> bool:
+    """Whether the value of an option says that the option was given; 0 does."""
+    return value is not None and value is not False
+
+
 @contextmanager
-def refused(name: str = "") -> Iterator[None]:
-    """What is refused within is bad input: InputError, with this name in front of what was said."""
+def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[None]:
+    """What is refused within is bad input: InputError, with this name in front of what was said.
+
+    Of `args` the option's name takes the place of the argument's that a message begins with.
+    """
     try:
         yield
     except (InputError, DesignFailed):
         raise
     except (ValueError, ArithmeticError) as error:
-        raise InputError(f"{name}{error}") from None
+        text = str(error)
+        argument = text.partition(" ")[0]
+        if given(getattr(args, argument, None)):
+            text = f"--{argument.replace('_', '-')}{text[len(argument) :]}"
+        raise InputError(f"{name}{text}") from None
 
 
 def per_channel(option: str, values: tuple[_Given, ...], channels: int, what: str = "entries") -> tuple[_Given, ...]:
@@ -206,7 +215,7 @@ def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) 
     """Numbers that stand within a longer text, a single one for all. Raises InputError with `option` in front."""
     try:
         if count == 1 and "," not in text:
-            return (_one(kind, -math.inf, math.inf, "")(text),)
+            return (_one(kind)(text),)
         return per_channel(option, several(kind)(text), count)
     except argparse.ArgumentTypeError as error:
         raise InputError(f"{option} {error}") from None
@@ -239,15 +248,13 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     scenario = load(args.scenario)
     if args.scenario in older.SCENARIOS:
         print(f"scenario {args.scenario} is called {scenario.name} now", file=sys.stderr)
-    given = {name: getattr(args, name) for name in ("theta", "psi", "lam") if getattr(args, name) is not None}
-    changes: dict[str, Any] = {name: per_channel(f"--{name}", n, scenario.channels) for name, n in given.items()}
-    for name in ("T", "T_max"):
-        if getattr(args, name) is not None:
-            changes[name] = getattr(args, name)
-    if args.latency is not None:
-        changes["latency"] = per_channel("--latency", args.latency, scenario.channels)
-    delta = None if args.delta is None else per_channel("--delta", args.delta, scenario.channels)
-    return scenario.replace(delta, **changes) if changes or delta else scenario
+    names = ("theta", "psi", "lam", "latency", "delta", "T", "T_max")
+    said = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    changes: dict[str, Any] = {
+        name: value if name in ("T", "T_max") else per_channel(f"--{name}", value, scenario.channels)
+        for name, value in said.items()
+    }
+    return scenario.replace(**changes) if changes else scenario
 
 
 def add_band_option(parser: argparse._ActionsContainer) -> None:
@@ -264,13 +271,7 @@ def add_human_option(parser: argparse.ArgumentParser, more: str = "") -> None:
 
 def with_humans(args: argparse.Namespace, scenario: Scenario) -> Scenario:
     """The scenario in the hands that --human names. Raises InputError."""
-    if args.human is None:
-        return scenario
-    people = load_humans(args.human, scenario.channels)
-    who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
-    if people.population is not None:
-        who["population"] = people.population
-    return scenario.replace(**who)
+    return scenario if args.human is None else held_by(scenario, args.human)
 
 
 def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: str = "spring-damper") -> None:
@@ -338,14 +339,6 @@ def place(args: argparse.Namespace) -> str:
     return Path(args.scenario).stem + ("" if args.case == "I" else f"-{args.case}")
 
 
-def as_option(error: ValueError, args: argparse.Namespace) -> str:
-    """The message of a design about its argument, with the option's name in the argument's place."""
-    text = str(error)
-    name, _, _ = text.partition(" ")
-    given = getattr(args, name, None)
-    return text if given is None or given is False else f"--{name.replace('_', '-')}{text[len(name) :]}"
-
-
 def add_rigid_option(parser: argparse.ArgumentParser) -> None:
     """A rigid wall in place of the environment."""
     wall = "a rigid wall in place of the environment; one channel, the scenario's first"
@@ -356,10 +349,8 @@ def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     """The loop of the one channel that --rigid is about. Raises InputError where options name more of them."""
     for name in ("theta", "psi", "delta"):
         per_channel(f"--rigid is one channel: --{name}", getattr(args, name) or (0,), 1)
-    theta, psi = scenario.theta[:1], scenario.psi[:1] if args.psi else (0,)
-    late, T_max = scenario.latency and scenario.latency[:1], scenario.longest_period
     with refused():
-        return Loop(scenario.T, theta, psi, theta, scenario.delta[:1], RIGID_WALL, T_max=T_max, latency=late)
+        return scenario.before_a_rigid_wall(scenario.psi[:1] if args.psi else (0,))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -399,10 +390,7 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
     if args.varying_delay is not None:
         pairs = per_channel("--varying-delay", args.varying_delay, scenario.channels, "ranges")
         changes["lo"], changes["hi"] = zip(*pairs, strict=True)
-    if args.loss is not None:
-        changes["loss"] = args.loss
-    if args.playout:
-        changes["playout"] = True
+    changes |= {name: value for name in ("loss", "playout") if given(value := getattr(args, name))}
     if not changes:
         return scenario
     if scenario.varying_delay is None and "lo" not in changes:

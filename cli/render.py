@@ -194,9 +194,12 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
 
 
 def columns(title: str, cells: Mapping[str, _Form], records: Iterable[Any], left: Sequence[int] = (0,)) -> Table:
-    """A table of records: under each head a format of the record `r`, or what a function says of it."""
+    """A table of records: under each head a format of the record `r`, or what a function says of it.
+
+    A head that stands there twice has a blank behind it once.
+    """
     rows = [[str(form(r)) if callable(form) else form.format(r=r) for form in cells.values()] for r in records]
-    return grid(title, list(cells), rows, left)
+    return grid(title, [head.strip() for head in cells], rows, left)
 
 
 def figure(name: str, form: _Form = "{}", default: Any = MISSING, json: str = "key", absent: str | None = None) -> Any:

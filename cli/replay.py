@@ -50,4 +50,4 @@ def main(argv: list[str]) -> int:
         identical=compared.identical,
     )
     render.publish(args, report, [render.facts(args.trace, render.rows_of(report))])
-    return options.DONE if compared.identical else options.DOES_NOT_HOLD
+    return options.exit_code(compared.identical)

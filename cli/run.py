@@ -4,29 +4,30 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cli import options, render
 from cli.judged import Judged, judge
+from cli.judged import rows as judged_rows
 from controller.environment import GROUND
 from controller.loop import Loop
-from controller.lti import Array
 from design.files import write
-from design.guarantees import ANY, CAVEATS, MAKING
+from design.guarantees import ANY
 from design.optimal import robustness_parts
 from design.result import CONDITIONS, finite, listed
-from design.transparency import BAND_HZ, transparency
-from sim import accuracy, report
+from design.transparency import BAND_HZ
+from sim import accuracy
 from sim import passivity_layer as layer
 from sim.alternatives import Alternative, alternatives
 from sim.api import ScenarioRun, run_scenario
 from sim.couplings import NAMES, Chosen, choose
 from sim.mujoco_engines import INTEGRATORS
-from sim.run import ENGINES, beginnings
+from sim.run import ENGINES
+from sim.run_report import Ran, RunReport, run_report
 from sim.scenario import InputError, Scenario
-from sim.stability import MARGINAL, ExactVerdict, Stability, stability_of
+from sim.stability import MARGINAL, ExactVerdict
 from sim.step_choice import MOST
 
 
@@ -42,12 +43,14 @@ def main(argv: list[str]) -> int:
     done = _run(args, simulated, chosen, judged.limits.rho)  # sample, compute, limit, hold, advance
     same = args.limiter is None and not scenario.ranges and args.case != "none"
     others = _alternatives(args, scenario, done, (chosen, judged.requirements, judged.limits) if same else None)
-    report = _reported(args, scenario, chosen, judged, done, environment, others)
+    robustness = _robustness(chosen, scenario.loop(args.case), judged)
+    asked = {"seed": args.seed, "band_hz": args.band_hz or BAND_HZ, "check": args.cross_check}
+    report = run_report(scenario, args.case, chosen, judged, done, environment, others, robustness, **asked)
     files = _save(args, out, done, report)
     if args.side_by_side:
         files.append(_side_by_side(others, out / "couplings.png", scenario.environment.contacts))
     render.publish(args, report, _tables(scenario, report), report.remarks, out, files)
-    return options.INTERRUPTED if done.trace.interrupted else options.DONE
+    return options.exit_code(True, done.trace.interrupted)
 
 
 def _parser() -> options.Parser:
@@ -155,175 +158,6 @@ def _panel_title(other: Alternative) -> str:
     return f"{'no coupling' if other.coupling == 'none' else other.name + kind}\n{felt}; {guarantee}"
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Ran:
-    """How the loop was run."""
-
-    engine: str
-    integrator: str | None
-    substeps: int | None
-    duration_s: float
-    samples: int
-    wall_s: float
-    real_time_factor: float
-    theta: tuple[int, ...]
-    psi: tuple[int, ...]
-    lam: tuple[int, ...]
-    T_s: float
-    timing: dict[str, Any] | None
-    seed: int
-    engines: tuple[accuracy.EngineChoice, ...] | None  # compared for --error
-    cross_check: accuracy.CrossCheck | None
-    interrupted: bool
-    scenario_digest: str
-    encoder_step_m: Array
-    steady_ticks: list[list[int]]
-    environment: str
-
-    def speed(self) -> str:
-        engine = self.engine + (f" {self.integrator} x {self.substeps}" if self.integrator else "")
-        return f"{self.wall_s:.2f} s for {self.duration_s:g} s: {self.real_time_factor:.2g} x real time ({engine})"
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Report:
-    """The result of a run; parts that it does not have are null."""
-
-    case: str
-    scenario: str
-    certificate: dict[str, Any]
-    judged: Judged = render.unseen("beside")
-    encoder: dict[str, Any] | None
-    transparency: dict[str, Any]
-    stability: Stability
-    varying_delay: dict[str, Any] | None
-    run: _Ran
-    error: accuracy.PositionError
-    credible: accuracy.Credible
-    ideal_force: accuracy.ForceError
-    energy_budget: dict[str, Any] | None
-    baseline: dict[str, Any] | None
-    robustness: dict[str, Any] = render.unseen("beside")
-    alternatives: list[Alternative]
-    reproducibility: tuple[report.PaperRow, ...]
-    remarks: tuple[str, ...]
-
-    @property
-    def switched(self) -> bool:
-        """Whether the delays switch, so that no eigenvalue says whether the loop grows."""
-        return "verdict" in (self.varying_delay or {})
-
-    def rows(self) -> render.Rows:
-        """Of its table."""
-        coupling, stability, run, ratio = self.judged.coupling, self.stability, self.run, self.transparency["dc_ratio"]
-        how = "switching" if self.switched else "simulated trace"
-        if run.timing and "impulse" in (stability.reason or ""):
-            how = "uneven ticks"
-        measured = render.optional(stability.growth_rate_per_s, "{:+.4f} 1/s")
-        if coupling["K"]:
-            yield "coupling K / B", f"{listed(coupling['K'], 5)} N/m / {listed(coupling['B'], 5)} N s/m"
-        if coupling.get("stiffness"):
-            yield "coupling, static", f"{listed(coupling['stiffness'], 5)} N/m"
-        yield from self.judged.rows()
-        yield "transparency error", render.transparency_error(self.transparency)
-        yield from render.robustness_rows(self.robustness)
-        apart = render.optional(self.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
-        yield "force error", f"{apart}, before the force limits" if apart else f"- ({self.ideal_force.reason})"
-        yield "rendered stiffness", f"{100 * ratio:.1f} %" if ratio else "-"
-        yield from _net_rows(self.energy_budget, self.baseline)
-        yield "growth, eigenvalues", _growth(stability)
-        yield f"growth, {how}", f"{measured}: {render.verdict(stability.verdict)}"
-        yield render.timing_row(run.timing)
-        yield from render.delay_rows(self.varying_delay) if self.varying_delay else ()
-        if contact := stability.contact:
-            yield "contact", f"made {contact.made} times, lasting {contact.ticks} of {run.samples} ticks"
-            for state in contact.frozen:
-                name = f"wall{'s' * (len(state.touching) > 1)} {', '.join(map(str, state.touching))}"
-                yield f"growth, {name if state.touching else 'no wall'} touching", _growth(state)
-        yield "simulated in", run.environment if self.judged.ranges else None
-        yield "force limits", self.judged.limiter["words"]
-        yield "limited ticks", f"{stability.clipped_ticks} of {run.samples}"
-        yield "speed", run.speed()
-        size = render.optional(self.error.position_max_m, "{:.1e} m at most")
-        yield "position error", render.optional(self.error.position_relative_rms, "{:.1e} relative rms, " + size)
-        yield "cross-check", run.cross_check and _crossed(run.cross_check)
-
-    def notes(self) -> list[str]:
-        """What a reader must know to read the figures rightly."""
-        lines, promise = [], self.judged.promise
-        certificates = {name: self.judged.certificates[name] for name in ("any-environment", "this-environment")}
-        name = "any-environment" if self.certificate["condition"] == "any-environment" else "this-environment"
-        part = certificates[name]
-        if not part["certified"] and "reason" not in part:
-            worst = max(n / a for n, a in zip(part["required_damping"], part["available_damping"], strict=True))
-            condition = f"the {name} condition" + (" (the paper's Theorem 4)" if name == "any-environment" else "")
-            what = "The loop without" if self.judged.coupling["kind"] == "none" else "This"
-            needs = f"it needs {worst:.3g} times the damping that the devices guarantee"
-            lines.append(f"{what} coupling fails {condition}: {needs}.")
-        if contact := self.stability.contact:
-            covered = {ANY: "any-environment", MAKING: "this-environment"}.get(promise or "", "no certificate")
-            softer = f", and any walls with K + 2 B/T up to {listed(contact.slopes_n_per_m)} N/m"
-            softer = softer if promise == MAKING else ""
-            lines.append(f"Contact that makes and breaks: {covered} covers it in this loop{softer}.")
-        reasons = {
-            "stability": self.stability.reason,
-            "error": self.error.reason,
-            "transparency": self.transparency.get("reason"),
-            "credible": self.credible.reason,
-            **{name: part.get("reason") for name, part in certificates.items()},
-        }
-        lines += [f"{name}: {reason}." for name, reason in reasons.items() if reason]
-        if self.varying_delay:
-            lines.append(f"Delays that vary: {self.varying_delay['covers']}.")
-        if self.encoder:
-            lines.append(f"{self.encoder['words'][0].upper()}{self.encoder['words'][1:]}.")
-        return [*lines, CAVEATS]
-
-
-def _reported(
-    args: argparse.Namespace,
-    scenario: Scenario,
-    chosen: Chosen,
-    judged: Judged,
-    run: ScenarioRun,
-    environment: str,
-    others: list[Alternative],
-) -> _Report:
-    """The report of a run."""
-    simulation, trace, loop = run.simulation, run.trace, scenario.loop(args.case)
-    covered = any(requirement.certified for requirement in judged.requirements.values())
-    delays, grows = report.delays_part(simulation, chosen, run.period, trace.t.size, covered), None
-    if delays and simulation.scenario.switches:
-        stability = report.switched_stability(simulation, trace, delays)
-        grows = stability.verdict == "unstable"
-    else:
-        stability = stability_of(simulation, trace)
-    net = trace.net.part() if trace.net else None
-    budget, any_environment = net if net and net["guarantee"] else None, judged.requirements["any-environment"]
-    felt = transparency(simulation.felt, simulation.E, loop.lam, args.band_hz or BAND_HZ)
-    found = _Report(
-        case=args.case,
-        scenario=scenario.name,
-        certificate=judged.certificates[chosen.condition],
-        judged=judged,
-        encoder=report.encoder_steps(scenario, args.case, chosen.coupling),
-        transparency=report.transparency_part(felt),
-        stability=stability,
-        varying_delay=delays,
-        run=_ran(args, run, loop.lam, environment),
-        error=accuracy.position_error(trace, run.exact, simulation, grows),
-        credible=accuracy.credible(simulation, trace),
-        ideal_force=accuracy.force_error(run.ran, trace, loop.lam),
-        energy_budget=budget and budget | {"idle": layer.idle(simulation, any_environment, budget)},
-        baseline=None if budget else net,
-        robustness=_robustness(chosen, loop, judged),
-        alternatives=others,
-        reproducibility=report.beside_the_paper(simulation.scenario, args.case, stability, judged.coupling),
-        remarks=(*run.remarks, *chosen.notes),
-    )
-    return replace(found, remarks=(*found.remarks, *found.notes()))
-
-
 def _robustness(chosen: Chosen, loop: Loop, judged: Judged) -> dict[str, Any]:
     """What a wrong model of the environment costs a guarantee for this environment alone."""
     alone = chosen.condition == "this-environment" and judged.certificates[chosen.condition]["certified"]
@@ -333,35 +167,7 @@ def _robustness(chosen: Chosen, loop: Loop, judged: Judged) -> dict[str, Any]:
         return robustness_parts(loop, chosen.coupling)
 
 
-def _ran(args: argparse.Namespace, run: ScenarioRun, lam: tuple[int, ...], environment: str) -> _Ran:
-    simulation, trace, steps = run.simulation, run.trace, (run.integrator, run.substeps)
-    scenario, process, samples = simulation.scenario, simulation.process, trace.t.size
-    duration = float(beginnings(scenario.T, simulation.timing, samples, 1)[0])
-    return _Ran(
-        engine=args.engine,
-        integrator=run.integrator,
-        substeps=run.substeps,
-        duration_s=duration,
-        samples=samples,
-        wall_s=run.wall_s,
-        real_time_factor=duration / run.wall_s,
-        theta=scenario.theta,
-        psi=scenario.psi,
-        lam=lam,
-        T_s=scenario.T,
-        timing=report.timing_part(simulation.timing, scenario),
-        seed=args.seed,
-        engines=run.choices or None,
-        cross_check=accuracy.cross_check(run.ran, trace, *steps) if args.cross_check else None,
-        interrupted=trace.interrupted,
-        scenario_digest=scenario.digest,
-        encoder_step_m=process.encoder_step,
-        steady_ticks=[[0, trace.ticks_before_clipping(process.force_limit)]],
-        environment=environment,
-    )
-
-
-def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: _Report) -> list[Path]:
+def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
     result, stability = replace(run.trace, meta=render.plain(report)), report.stability
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", run.simulation.scene.xml))
@@ -396,7 +202,7 @@ def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
     return found, (contact.depths(run.trace.z)[:, : len(network.walls)] > 0).any(axis=1)
 
 
-def _title(what: str, report: _Report) -> str:
+def _title(what: str, report: RunReport) -> str:
     """Of the picture."""
     stability, kind = report.stability, report.judged.coupling["kind"]
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
@@ -413,33 +219,79 @@ def _title(what: str, report: _Report) -> str:
 # The report as tables.
 
 
-def _tables(scenario: Scenario, report: _Report) -> list[Any]:
+def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
     title = f"{scenario.title(report.case)}: coupling {report.judged.coupling['kind']}"
-    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *report.rows()], ("", ""))]
+    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(report)], ("", ""))]
     if report.run.engines:
         shown.append(_speed_against_error(report.run, report.run.engines))
     if report.alternatives:
         shown.append(_beside(report))
     if report.reproducibility:
-        cells = [(row.what, row.paper, row.here, row.why) for row in report.reproducibility]
-        shown.append(render.grid("beside the paper", ("", "paper", "here", "why"), cells, range(4)))
+        cells = {"": "{r.what}", "paper": "{r.paper}", "here": "{r.here}", "why": "{r.why}"}
+        shown.append(render.columns("beside the paper", cells, report.reproducibility, range(4)))
     return shown
 
 
-def _speed_against_error(run: _Ran, engines: Sequence[accuracy.EngineChoice]) -> Any:
+def _rows(report: RunReport) -> render.Rows:
+    """Of its table."""
+    coupling, stability, run, ratio = (
+        report.judged.coupling,
+        report.stability,
+        report.run,
+        report.transparency["dc_ratio"],
+    )
+    how = "switching" if report.switched else "simulated trace"
+    if run.timing and "impulse" in (stability.reason or ""):
+        how = "uneven ticks"
+    measured = render.optional(stability.growth_rate_per_s, "{:+.4f} 1/s")
+    if coupling["K"]:
+        yield "coupling K / B", f"{listed(coupling['K'], 5)} N/m / {listed(coupling['B'], 5)} N s/m"
+    if coupling.get("stiffness"):
+        yield "coupling, static", f"{listed(coupling['stiffness'], 5)} N/m"
+    yield from judged_rows(report.judged)
+    yield "transparency error", render.transparency_error(report.transparency)
+    yield from render.robustness_rows(report.robustness)
+    apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
+    yield "force error", f"{apart}, before the force limits" if apart else f"- ({report.ideal_force.reason})"
+    yield "rendered stiffness", f"{100 * ratio:.1f} %" if ratio else "-"
+    yield from _net_rows(report.energy_budget, report.baseline)
+    yield "growth, eigenvalues", _growth(stability)
+    yield f"growth, {how}", f"{measured}: {render.verdict(stability.verdict)}"
+    yield render.timing_row(run.timing)
+    yield from render.delay_rows(report.varying_delay) if report.varying_delay else ()
+    if contact := stability.contact:
+        yield "contact", f"made {contact.made} times, lasting {contact.ticks} of {run.samples} ticks"
+        for state in contact.frozen:
+            name = f"wall{'s' * (len(state.touching) > 1)} {', '.join(map(str, state.touching))}"
+            yield f"growth, {name if state.touching else 'no wall'} touching", _growth(state)
+    yield "simulated in", run.environment if report.judged.ranges else None
+    yield "force limits", report.judged.limiter["words"]
+    yield "limited ticks", f"{stability.clipped_ticks} of {run.samples}"
+    yield "speed", _speed(run)
+    size = render.optional(report.error.position_max_m, "{:.1e} m at most")
+    yield "position error", render.optional(report.error.position_relative_rms, "{:.1e} relative rms, " + size)
+    yield "cross-check", run.cross_check and _crossed(run.cross_check)
+
+
+def _speed(run: Ran) -> str:
+    engine = run.engine + (f" {run.integrator} x {run.substeps}" if run.integrator else "")
+    return f"{run.wall_s:.2f} s for {run.duration_s:g} s: {run.real_time_factor:.2g} x real time ({engine})"
+
+
+def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> Any:
     """Every engine and step on this scene; the one that ran is marked."""
-    cells = []
-    for row in engines:
-        mark = " *" if (row.integrator, row.substeps) == (run.integrator, run.substeps) else ""
-        error = render.optional(finite(row.position_relative_rms), "{:.1e}")
-        right = "right" if row.verdict_correct else "[red]WRONG[/]"
-        speed = f"{run.duration_s / row.cpu_s:.0f}" if row.cpu_s else "-"  # too short for the clock
-        cells.append((row.name + mark, error, right, f"{row.cpu_s:.3f}", speed))
-    heads = ("engine x steps", "position error", "verdict", "CPU s", "x real time")
-    return render.grid("speed against error on this scene (*: the cheapest that keeps --error, this run)", heads, cells)
+    cells: dict[str, Any] = {
+        "engine x steps": lambda r: r.name + " *" * ((r.integrator, r.substeps) == (run.integrator, run.substeps)),
+        "position error": lambda r: render.optional(finite(r.position_relative_rms), "{:.1e}"),
+        "verdict": lambda r: "right" if r.verdict_correct else "[red]WRONG[/]",
+        "CPU s": "{r.cpu_s:.3f}",
+        "x real time": lambda r: f"{run.duration_s / r.cpu_s:.0f}" if r.cpu_s else "-",  # too short for the clock
+    }
+    title = "speed against error on this scene (*: the cheapest that keeps --error, this run)"
+    return render.columns(title, cells, engines)
 
 
-def _beside(report: _Report) -> Any:
+def _beside(report: RunReport) -> Any:
     """The price of each guarantee; the run's own coupling is marked where it is one of them."""
     own = report.judged.coupling["kind"], report.certificate["condition"]
     cells = []

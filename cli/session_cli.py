@@ -228,10 +228,8 @@ def _rehearsed(
 ) -> _Held:
     """The session in virtual time; the emulated person arms once and holds the deadman."""
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
-    try:
+    with options.refused("the scenario cannot stand behind a serial link: "):
         emulator = Emulator(alone or options.scenario_from(args), faults, coulomb=coulomb)
-    except ValueError as error:
-        raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
     with progress("rehearsing") as move:
 
         def planned(ages: Ages) -> Sequence[Armable]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any
@@ -299,21 +299,17 @@ def _verdict_table(suite: Suite) -> list[str]:
     return _cells(("verdict", "check", "answer", "reproduce with"), rows)
 
 
-def _section(check: Answer) -> list[str]:
-    lines = [f"## {check.asks}", "", "```sh", check.command, "```", ""]
+def _section(check: Answer) -> Iterator[str]:
     verdict = "Holds" if check.holds else "Does not hold"
-    lines += [
-        f"{verdict} (exit code {check.exit_code}, {check.wall_s:.1f} s). {check.trouble or ''}".rstrip(),
-        "",
-    ]
+    ended = f"{verdict} (exit code {check.exit_code}, {check.wall_s:.1f} s). {check.trouble or ''}".rstrip()
+    yield from (f"## {check.asks}", "", "```sh", check.command, "```", "", ended, "")
     if check.printed:
-        lines += ["```text", check.printed.rstrip(), "```", ""]
+        yield from ("```text", check.printed.rstrip(), "```", "")
     for part in check.parts if not check.printed else ():
-        lines += [f"### {part.title}", ""] if part.title else []
-        lines += [*_cells(part.columns, part.rows), ""]
+        yield from (f"### {part.title}", "") if part.title else ()
+        yield from (*_cells(part.columns, part.rows), "")
     for picture in check.pictures:
-        lines += [f"![{check.asks}]({picture})", ""]
-    return lines
+        yield from (f"![{check.asks}]({picture})", "")
 
 
 def _cells(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

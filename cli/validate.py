@@ -48,11 +48,9 @@ def main(argv: list[str]) -> int:
     title = f"{scenario.title(args.case)}: coupling {chosen.kind}"
     lines = [*([f"Delays that vary: {report.switching.met['covers']}."] if report.switching else []), *report.remarks]
     render.publish(args, report, [render.facts(title, render.rows_of(report), ("", ""))], lines, out, files)
-    if report.interrupted:
-        return options.INTERRUPTED
-    if report.unfinished:
+    if report.unfinished and not report.interrupted:
         return options.UNFINISHED
-    return options.DONE if report.holds else options.DOES_NOT_HOLD
+    return options.exit_code(bool(report.holds), report.interrupted)
 
 
 def _parser() -> options.Parser:
@@ -244,6 +242,20 @@ class _Report:
     remarks: Sequence[str]
 
 
+def _varying(
+    question: Validation, chosen: Chosen, findings: Findings, certified: bool
+) -> tuple[verdicts.Growing | None, verdicts.Growing | None]:
+    """How many hands grow while delays vary, and while ticks do; None where they do not vary."""
+    scenario, switching, timing = question.scenario, None, None
+    if scenario.varying_delay:
+        covered = report.delay_range_part(scenario.varying_delay) | certified_part(scenario, chosen, certified)
+        switching = verdicts.Growing.of(findings, covered)
+    if scenario.uneven:
+        met = report.timing_part(scenario.timing(question.seed, max(1, question.ticks)), scenario) or {}
+        timing = verdicts.Growing.of(findings, met | {"covered": certified})
+    return switching, timing
+
+
 def _reported(
     args: argparse.Namespace,
     chosen: Chosen,
@@ -260,13 +272,7 @@ def _reported(
     mode = worst_mode(assemble(scenario, chosen.coupling))
     own = _Own(args.human or scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
     energy = verdicts.EnergyAudit.of(question, findings) if certified and question.ticks else None
-    switching = timing = None
-    if scenario.varying_delay:
-        covered = report.delay_range_part(scenario.varying_delay) | certified_part(scenario, chosen, certified)
-        switching = verdicts.Growing.of(findings, covered)
-    if scenario.uneven:
-        met = report.timing_part(scenario.timing(args.seed, max(1, question.ticks)), scenario) or {}
-        timing = verdicts.Growing.of(findings, met | {"covered": certified})
+    switching, timing = _varying(question, chosen, findings, certified)
     worst, drawn = (w and verdicts.Attacked.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))
     also = all(part.holds for part in (own, energy, switching, timing, worst, drawn) if part)
     traces = verdicts.Traces.of(question, findings) if question.ticks and any_done else None

@@ -53,7 +53,7 @@ def main(argv: list[str]) -> int:
         render.console(args).print(line, soft_wrap=True)
     if args.json:
         write_json(args.json, report)
-    return options.INTERRUPTED if ended.interrupted else options.DONE
+    return options.exit_code(True, ended.interrupted)
 
 
 @dataclass(frozen=True)

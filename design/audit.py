@@ -313,7 +313,7 @@ class _Loop:
 
 
 @dataclass(frozen=True)
-class Judged:
+class ConditionAudit:
     """What one condition says, and how far the coupling is from its edge."""
 
     certificate: dict[str, Any] = field(metadata={"json": "beside"})
@@ -337,7 +337,7 @@ class Audit:
 
     coupling: _Coupling
     loop: _Loop
-    conditions: dict[str, Judged] = field(metadata={"json": "beside"})
+    conditions: dict[str, ConditionAudit] = field(metadata={"json": "beside"})
     switching: dict[str, Any] | None
     ranges: dict[str, Any] | None
     certified: bool
@@ -391,9 +391,9 @@ def _in_time(loop: Loop, coupling: Coupling, search: Callable[[], _Found], witho
         return search()
 
 
-def _judged(loop: Loop, coupling: Coupling, needs: Requirement) -> Judged:
+def _judged(loop: Loop, coupling: Coupling, needs: Requirement) -> ConditionAudit:
     unknown = (None,) * loop.channels
-    return Judged(
+    return ConditionAudit(
         certificate_part(needs),
         _in_time(
             loop, coupling, lambda: stiffest(loop, coupling, needs.condition), lambda why: _Stiffest(unknown, why)

@@ -20,7 +20,7 @@ from controller.coupling import (
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti, SingularLoop, TooLong, rational, within
-from controller.ranges import Member, inside
+from controller.ranges import Member, inside, number_of_vertices
 from design import conditions, multipliers
 from design.coupling_file import Certificate, Guarantee, LimiterCertificate, Stored, SwitchingProof, digest, sealed
 from design.environments import Progress, Searched, in_each, search_ranges, worst
@@ -601,6 +601,7 @@ class RangesCheck:
     at_members: tuple[Requirement, ...]
     samples: tuple[Member, ...]
     at_samples: tuple[Requirement, ...]
+    vertices: int  # of the ranges: of more than 128 so many are members
     searched: Searched
     at_found: Requirement  # at the worst environment that the search has found
     seed: int
@@ -652,7 +653,16 @@ def check_ranges(
     at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)
     (at_found,) = in_each(loop, coupling, [searched.worst[0].member])
     check = RangesCheck(
-        members, tuple(at_members), drawn, tuple(at_samples), searched, at_found, seed, certificate, reason
+        members,
+        tuple(at_members),
+        drawn,
+        tuple(at_samples),
+        number_of_vertices(loop.network, loop.ranges),
+        searched,
+        at_found,
+        seed,
+        certificate,
+        reason,
     )
     if certificate and not check.proved:
         place, requirement = check.worst_found

@@ -175,8 +175,8 @@ def _cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) 
 
 
 _WHAT_IS_PROVED = (
-    f"proved at the vertices; between them searched, not proved ({SEARCH}); every environment is frozen: nothing is "
-    "proved of one that changes while it is touched"
+    f"proved at the vertices, of more than 128 at so many; between them searched, not proved ({SEARCH}); "
+    "every environment is frozen: nothing is proved of one that changes while it is touched"
 )
 
 
@@ -185,6 +185,7 @@ def ranges_part(check: RangesCheck) -> dict[str, Any]:
     member, requirement = check.worst
     part: dict[str, Any] = {
         "vertices": len(check.members) - 1,
+        "all_vertices": check.vertices,
         "vertices_certified": sum(r.certified for r in check.at_members[1:]),
         "required_damping": [finite(d) for d in requirement.required],
         "available_damping": list(requirement.available),
@@ -207,6 +208,7 @@ def search_part(searched: Searched) -> dict[str, Any]:
         "worst_ratio": finite(worst.ratio),
         "worst": worst.member.name,
         "violated": not worst.ratio < 1,
+        "ended_by_clock": searched.ended,
     }
 
 
@@ -214,7 +216,8 @@ def search_words(part: dict[str, Any]) -> str:
     """The result of the search between the vertices, in one line."""
     found = "[red]violated[/]" if part["violated"] else "no violation found"
     ratio = "no damping is enough" if part["worst_ratio"] is None else f"worst ratio {part['worst_ratio']:.4f}"
-    return f"searched, not proved: {found}, {ratio} in {part['environments']} points, at {part['worst']}"
+    ended = ", until its time was over" if part["ended_by_clock"] else ""
+    return f"searched, not proved: {found}, {ratio} in {part['environments']} points{ended}, at {part['worst']}"
 
 
 def _inside_part(check: RangesCheck) -> dict[str, Any]:
@@ -237,9 +240,10 @@ def ranges_rows(part: dict[str, Any]) -> list[tuple[str, str]]:
     most = f"{max(ratios):.4f} of the damping" if ratios else "no damping is enough"
     exact = part["proof"] == "rational"
     proof = "[green]proved exactly[/] at all" if exact else f"[red]not proved[/]: {part['reason']}"
-    found, count = part["inside"], part["vertices"]
+    found, count, every = part["inside"], part["vertices"], part["all_vertices"]
+    of = f", of all {every}: any three parameters have all their ends among them" if every > count + 1 else ""
     rows = [
-        ("ranges, vertices", f"{part['vertices_certified']} of {count} certified, {proof}"),
+        ("ranges, vertices", f"{part['vertices_certified']} of {count} certified, {proof}{of}"),
         ("ranges, worst vertex", f"{most}, at {part['worst']}"),
         ("ranges, between", search_words(part["search"])),
     ]

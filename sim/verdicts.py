@@ -115,7 +115,7 @@ class Traces:
         stable, duration = ~unstable(findings.exact), question.ticks * question.scenario.T
         decay = largest(-1 / findings.exact[findings.exact < 0])
         decides = decay is None or duration >= _SETTLING * decay
-        slow = f"the slowest mode decays in {decay:.3g} s: in {duration:g} s its hands need not be slower"
+        slow = f"the slowest mode decays in {decay or 0:.3g} s: in {duration:g} s its hands need not be slower"
         return cls(
             duration_s=duration,
             clipped_runs=int((findings.clipped > 0).sum()),

@@ -82,8 +82,6 @@ def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
     if make.__name__ == "design_by_kind":
         words["condition"] = words["condition"] or usual_condition(loop, words["kind"])
         words |= (vars(DEFAULT) if words["kind"] == "optimal" else {}) | words.pop("options")
-    if make.__name__ == "bound" and loop.channels <= 2:
-        del words["near"]  # of no use to it there
     return sorted((name, digest(x.form()) if hasattr(x, "form") else repr(x)) for name, x in words.items())
 
 

@@ -276,7 +276,7 @@ REFUSED = {
         --duration 1e-9 | --duration -1 | --latency 2e-3 | --T-max 1e-4 | --period 1e-3""",
     "design": """--ranges 0 | --ranges -5 | --ranges 101% | --ranges 1e9 | --ranges 10%% | --samples 5
         --ranges 10 --varying-delay 0,2 | --limiter --no-limiter | --best --coupling ccl | --best --order 2
-        --method inner | --compare | --objective sup | --full | --order 0 --coupling ccl
+        --method inner | --compare | --objective sup | --order 0 --coupling ccl
         --order 1e9 --coupling ccl | --high-gain 0 | --high-gain 2 | --seconds -1 --best | --band 1,0 --best
         --latency 1e-3 --varying-delay 0,2""",
     "audit": """--device nix | --devices --K 5 | --rigid | --rigid --K 5 --B 0 --theta 1,2 | --rigid --K 5 --B 0 --psi 1

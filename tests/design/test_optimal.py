@@ -25,7 +25,7 @@ from design.coupling_file import Stored, save
 from design.coupling_file import load as load_file
 from design.environments import ratio_in
 from design.frequency import hermitian, on_circle
-from design.optimal import design, spread, widest_ranges
+from design.optimal import design, spread
 from design.program import MARGIN, Options, Span, span_of, static_weight
 from design.robustness import ranges_around, robustness, vertices
 from design.transparency import transparency
@@ -284,19 +284,6 @@ def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
     for network in vertices(loop.environment).values():
         assert this_environment(loop.at(network).F(found.coupling), loop.delta).certified
     assert nominal.figures.rms_mismatch < found.figures.rms_mismatch < 10 ** (1 / 20) * nominal.figures.rms_mismatch
-
-
-def test_more_ranges_than_can_be_proved_leave_those_that_matter_least(monkeypatch):
-    loop = loop_of("o06")
-    assert (
-        len(msgspec.structs.replace(loop, ranges=widest_ranges(loop, 10.0)[0]).members()) == 129
-    )  # with the nominal one
-    monkeypatch.setattr("design.optimal._MOST_RANGES", 6)
-    kept, note = widest_ranges(loop, 10.0)
-    assert len(kept.springs) + len(kept.masses) == 6
-    assert len(msgspec.structs.replace(loop, ranges=kept).members()) == 65
-    assert "7 ranges have 128 vertices" in note
-    assert widest_ranges(loop_of("n3"), 10.0)[1] is None
 
 
 @pytest.mark.parametrize("objective", ["rms", "sup"])
