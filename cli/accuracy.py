@@ -2,26 +2,38 @@
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from cli import options, render
 from controller.coupling import NoCoupling
-from sim.accuracy import SETTINGS, Row, mark_front, measure, reference
+from sim.accuracy import Row, measure_all
 from sim.couplings import NAMES, choose, limits_of
-from sim.engines import EXPONENTIAL
-from sim.run import Simulation, assemble
+from sim.mujoco_engines import EXPONENTIAL
+from sim.run import assemble
 from sim.scenario import InputError, require_even_ticks, require_linear
-from sim.stepping import NEUTRAL, default_substeps, step_radius
+from sim.step_choice import default_substeps
 
 _MOST_STEPS = 3_000_000  # of a row: a minute or two
-_HEADS = ("setting", "position", "growth", "verdict", "cycle N", "Hz", "real")
 _LEGEND = (
     "position: relative rms error; growth: error [1/s], the larger of the loop with and without the coupling",
     "cycle: standard deviation [N] and frequency of the limit cycle without coupling, once it is sustained",
     "real: simulated seconds per second; * nothing of the same kind is both faster and nearer",
 )
+
+
+@dataclass(frozen=True)
+class _Report:
+    """Every engine and step on one loop."""
+
+    case: str
+    scenario: str
+    coupling: str
+    seed: int
+    default_substeps: int
+    rows: list[Row]
+    skipped: list[str]
+    interrupted: bool
 
 
 def main(argv: list[str]) -> int:
@@ -38,31 +50,20 @@ def main(argv: list[str]) -> int:
     lag = limits_of(scenario, chosen, limiter=args.limiter).rho
     coupled, uncoupled = assemble(scenario, chosen.coupling, lag), assemble(scenario, NoCoupling())
     default = max(default_substeps(loop, "RK4") for loop in (coupled, uncoupled))
-
     if scenario.samples * default > _MOST_STEPS:
         longest = _MOST_STEPS // default * scenario.T
         raise InputError(f"--duration: RK4 needs {default} steps a tick here; allowed are up to {longest:.3g} s")
-    rows, skipped, interrupted = _rows(coupled, uncoupled, default)
-    mark_front(rows)
-    outcome: dict[str, Any] = {
-        "case": args.case,
-        "scenario": scenario.name,
-        "coupling": chosen.kind,
-        "seed": args.seed,
-        "default_substeps": default,
-        "rows": rows,
-        "skipped": skipped,
-        "interrupted": interrupted,
-    }
-    title = f"speed against error · {scenario.title(args.case)}, {chosen.kind}"
-    table = render.grid(title, _HEADS, map(_cells, rows))
-    lines = [*(f"not measured: {reason}" for reason in skipped), *_LEGEND]
-    render.publish(args, outcome, [table], lines, out, _picture(args, rows, out))
-    if interrupted:
-        return options.INTERRUPTED
+    with render.progress("measuring") as move:
+        measured = measure_all(coupled, uncoupled, default, move)
+    report = _Report(args.case, scenario.name, chosen.kind, args.seed, default, *measured)
+    drawn = {"accuracy.png": lambda plots: plots.plot_accuracy} if report.rows else {}
+    files = render.pictures(args, report.rows, out, drawn)
+    table = render.columns(f"speed against error · {scenario.title(args.case)}, {chosen.kind}", _CELLS, report.rows)
+    lines = [*(f"not measured: {reason}" for reason in report.skipped), *_LEGEND]
+    render.publish(args, report, [table], lines, out, files)
     defaults = ((EXPONENTIAL, 1), ("RK4", default))
-    right = all(r["verdict_correct"] for r in rows if (r["integrator"], r["substeps"]) in defaults)
-    return options.DONE if right else options.DOES_NOT_HOLD
+    right = all(row.verdict_correct for row in report.rows if (row.integrator, row.substeps) in defaults)
+    return options.exit_code(right, report.interrupted)
 
 
 def _parser() -> options.Parser:
@@ -77,43 +78,17 @@ def _parser() -> options.Parser:
     return parser
 
 
-def _rows(coupled: Simulation, uncoupled: Simulation, default: int) -> tuple[list[Row], list[str], bool]:
-    """Rows of every setting that is stable on this plant and the reasons of those that are not."""
-    rows: list[Row] = []
-    skipped: list[str] = []
-    settings = list(dict.fromkeys((*SETTINGS, ("mujoco", "RK4", default))))
-    with render.progress("measuring") as move:
-        try:
-            truth = reference(coupled, uncoupled)
-            for done, (engine, integrator, substeps) in enumerate(settings):
-                move(done, len(settings))
-                try:
-                    if integrator and substeps and step_radius(coupled, integrator, substeps) > 1 + NEUTRAL:
-                        raise InputError("outside the stable region")
-                    rows.append(measure(truth, engine, integrator, substeps))
-                except ValueError as error:
-                    skipped.append(f"{integrator} x {substeps}: {error}")
-        except KeyboardInterrupt:
-            return rows, skipped, True
-    return rows, skipped, False
+def _name(row: Row) -> str:
+    setting = f"{row.integrator} x {row.substeps}" if row.integrator else row.engine
+    return setting + (" *" if row.pareto else "")
 
 
-def _picture(args: argparse.Namespace, rows: list[Row], out: Path) -> list[Path]:
-    if args.no_plot or not rows:
-        return []
-    from sim.plots import plot_accuracy
-
-    return [plot_accuracy(rows, out / "accuracy.png")]
-
-
-def _cells(row: Row) -> tuple[str, ...]:
-    name = f"{row['integrator']} x {row['substeps']}" if row["integrator"] else row["engine"]
-    return (
-        name + (" *" if row["pareto"] else ""),
-        render.optional(row["position_relative_rms"], "{:.1e}"),
-        render.optional(row["growth_rate_error"], "{:+.1e}"),
-        "right" if row["verdict_correct"] else "[red]WRONG[/]",
-        render.optional(row["cycle_amplitude_n"], "{:.4f}"),
-        render.optional(row["cycle_frequency_hz"], "{:.3f}"),
-        f"{1 / row['wall_s_per_simulated_s']:.0f}",
-    )
+_CELLS: dict[str, str | Callable[[Row], str]] = {
+    "setting": _name,
+    "position": lambda r: render.optional(r.position_relative_rms, "{:.1e}"),
+    "growth": "{r.growth_rate_error:+.1e}",
+    "verdict": lambda r: "right" if r.verdict_correct else "[red]WRONG[/]",
+    "cycle N": lambda r: render.optional(r.cycle_amplitude_n, "{:.4f}"),
+    "Hz": lambda r: render.optional(r.cycle_frequency_hz, "{:.3f}"),
+    "real": lambda r: f"{1 / r.wall_s_per_simulated_s:.0f}",
+}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,12 @@ from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.loop import DelayRange, Loop
 from controller.older import AUDITS, with_older
-from design.audit import LONGEST_DELAY, report
+from design.audit import LONGEST_DELAY, Audit, ConditionAudit, Help, audit
 from design.certificate import check_ranges
 from design.coverage import ranges_rows
 from design.designs import KINDS
-from design.result import listed
-from models.device import CATALOGUE, Listed, listed_device
+from design.result import CONDITIONS, listed
+from models.device import CATALOGUE, listed_device
 from sim.couplings import check_stored, fitted, read_coupling
 from sim.report import encoder_steps
 from sim.scenario import InputError, Scenario
@@ -31,6 +31,20 @@ _EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
   python -m design.audit --case I --K 879,552 --B 0.39,0.52 --varying-delay 1,2
   python -m design.audit --device falcon --delta 0.5
   python -m design.audit --devices"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Report:
+    """An audit and where its numbers come from; SI units, null with a "reason" where a figure does not exist."""
+
+    case: str
+    scenario: str | None
+    device: dict[str, Any] | None
+    gains: str | None  # the source of a device's gains
+    audit: Audit = render.unseen("beside")
+    encoder: dict[str, Any] | None = render.unseen()
+    notes: tuple[str, ...] = render.unseen()
+    wall_s: float = render.unseen()
 
 
 def main(argv: list[str]) -> int:
@@ -51,25 +65,23 @@ def main(argv: list[str]) -> int:
     begin = time.perf_counter()
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
         whole = check_ranges(loop, coupling, args.seed, progress=move)
-    try:
-        judged = report(loop, coupling, switching, whole)
-    except ValueError as error:
-        raise InputError(str(error)) from None
-    outcome = {
-        "case": args.case,
-        "scenario": None if args.rigid else scenario.name,
-        "device": args.device and {"name": args.device, **_device_part(CATALOGUE[args.device])},
-        "gains": args.source if args.device else None,
-        **judged,
-        "encoder": None if args.rigid else encoder_steps(scenario, args.case, coupling),
-        "notes": _notes(args, scenario, switching),
-        "wall_s": time.perf_counter() - begin,
-    }
-    outcome = with_older(outcome, AUDITS)
-    render.publish(args, outcome, _tables(outcome), _remarks(outcome), out)
-    proof = outcome["switching"]
-    holds = outcome["certified"] and (proof is None or proof["certified"])
-    return options.DONE if holds else options.DOES_NOT_HOLD
+    with options.refused():
+        found = audit(loop, coupling, switching, whole)
+    notes = ()
+    if args.coupling:  # what its file is worth in the loop that is audited
+        notes = check_stored(read_coupling(args.coupling), scenario.loop(args.case).switching(switching)).notes
+    report = _Report(
+        args.case,
+        None if args.rigid else scenario.name,
+        {"name": args.device, **render.plain(CATALOGUE[args.device])} if args.device else None,
+        args.source if args.device else None,
+        found,
+        None if args.rigid else encoder_steps(scenario, args.case, coupling),
+        notes,
+        time.perf_counter() - begin,
+    )
+    render.publish(args, with_older(render.plain(report), AUDITS), _tables(found), _remarks(report), out)
+    return options.exit_code(found.certified and (found.switching is None or found.switching["certified"]))
 
 
 def _parser() -> options.Parser:
@@ -96,15 +108,13 @@ def _with_device(args: argparse.Namespace) -> argparse.Namespace:
     """The options, with the catalogue's numbers where none are given; `source` allows its gains. Raises InputError."""
     if not args.device:
         return args
-    try:
+    with options.refused("--"):
         name, device = listed_device(args.device)
-    except ValueError as error:
-        raise InputError(f"--{error}") from None
     found: dict[str, Any] = {"device": name, "source": None}
     if args.delta is None:
         if device.damping is None:
             raise InputError(f"--device {name}: nobody publishes its damping: give --delta, as measured by hw.identify")
-        found["delta"] = (device.damping[0].value,)
+        found["delta"] = (device.damping.least,)
     gained = args.coupling or args.case == "none" or (args.K and args.B)
     if device.stiffness and device.framework_damping and not gained:
         found["source"] = f"K and B: {device.stiffness.source}; T: the 1 kHz that haptic loops customarily run at"
@@ -119,33 +129,20 @@ _FRAMEWORK_LOOP: dict[str, Any] = {"T": 1e-3, "theta": (0,), "rigid": True}
 _UNITS = {"damping": 1.0, "mass": 1e3, "force_limit": 1.0, "encoder_step": 1e6, "friction": 1.0, "stiffness": 1.0}
 
 
-def _device_part(device: Listed) -> dict[str, Any]:
-    """The published numbers of a device with their sources; null where none is published."""
-    part: dict[str, Any] = {"title": device.title}
-    for name in (*_UNITS, "framework_damping"):
-        fact = getattr(device, name)
-        if name == "damping" and fact:
-            part[name] = {"least": fact[0].value, "most": fact[1].value, "source": fact[0].source}
-        else:
-            part[name] = fact and asdict(fact)
-    return part
-
-
 def _list_devices(args: argparse.Namespace) -> int:
     """Print the catalogue."""
-    parts = {name: _device_part(device) for name, device in CATALOGUE.items()}
-    sources = [part[field]["source"] for part in parts.values() for field in part if field != "title" and part[field]]
-    numbered = {source: i for i, source in enumerate(dict.fromkeys(sources), start=1)}
+    parts: dict[str, dict[str, Any]] = render.plain(CATALOGUE)
+    facts = [fact for part in parts.values() for fact in part.values() if isinstance(fact, dict)]
+    numbered = {source: i for i, source in enumerate(dict.fromkeys(fact["source"] for fact in facts), start=1)}
 
-    def cell(part: dict[str, Any], field: str) -> str:
-        fact = part[field]
+    def cell(fact: dict[str, Any] | None, scale: float) -> str:
         if fact is None:
             return "unknown"
-        value = fact["least"] if field == "damping" else fact["value"]
-        return f"{value * _UNITS[field]:g}[{numbered[fact['source']]}]"
+        value: float = fact["value"] if "value" in fact else fact["least"]
+        return f"{value * scale:g}[{numbered[fact['source']]}]"
 
     heads = ("device", "damping N s/m", "mass g", "force N", "encoder um", "friction N", "CHAI3D N/m")
-    rows = [(name, *(cell(part, field) for field in _UNITS)) for name, part in parts.items()]
+    rows = [(name, *(cell(part[field], scale) for field, scale in _UNITS.items())) for name, part in parts.items()]
     title = "what is published: the last column is the stiffness that CHAI3D allows"
     lines = [f"[{i}] {source}" for source, i in numbered.items()]
     lines.append("What is unknown is given beside `device` in a scenario, or with --delta: hw.identify measures it.")
@@ -185,58 +182,38 @@ def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
     """
     if args.varying_delay is None:
         return loop.varying_delay
-    lo, hi = options.ranges_per_channel("--varying-delay", args.varying_delay, loop.channels)
-    for i, (least, n, largest) in enumerate(zip(lo, loop.theta, hi, strict=True)):
-        if not 0 <= least <= n <= largest <= LONGEST_DELAY:
-            allowed = f"0 <= LO <= theta = {n} <= HI <= {LONGEST_DELAY} samples (--theta gives another)"
-            raise InputError(f"--varying-delay on channel {i + 1} is {least} to {largest}, expected {allowed}")
-    return DelayRange(lo, hi)
-
-
-def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange | None) -> list[str]:
-    """What the coupling's file is worth in the loop that is audited."""
-    if args.coupling is None:
-        return []
-    loop = scenario.loop(args.case)
-    return list(check_stored(read_coupling(args.coupling), loop.switching(switching)).notes)
+    span = options.delay_range(args.varying_delay, loop.channels, LONGEST_DELAY)
+    if not span.contains(DelayRange(loop.theta, loop.theta)):
+        raise InputError(f"--varying-delay is {span}, expected a range around theta = {listed(loop.theta)} (--theta)")
+    return span
 
 
 # ----------------------------------------------------------------------------------------------------
 # The report as a table, and what it does not cover.
 
 
-def _tables(outcome: dict[str, Any]) -> list[Table]:
-    parts = [outcome[condition] for condition in render.ORDER]
-    table = Table("", *render.ORDER, title=_verdict(outcome), title_justify="left")
+def _tables(found: Audit) -> list[Table]:
+    parts = [found.conditions[condition] for condition in CONDITIONS]
+    table = Table("", *CONDITIONS, title=_verdict(found), title_justify="left")
     for name, cell in _ROWS.items():
-        table.add_row(name, *(cell(part) for part in parts))
-    if not outcome["ranges"]:
+        table.add_row(name, *map(cell, parts))
+    if not found.ranges:
         return [table]
-    return [table, render.facts("the ranges around the environment", ranges_rows(outcome["ranges"]), left=True)]
+    return [table, render.facts("the ranges around the environment", ranges_rows(found.ranges), left=True)]
 
 
-def _verdict(outcome: dict[str, Any]) -> str:
-    coupling = outcome["coupling"]
-    gains = f" K {listed(coupling['K'])} N/m, B {listed(coupling['B'])} N s/m" if coupling["K"] else ""
-    verdict = f"[green]certified[/] for {outcome['promise']}" if outcome["certified"] else "[red]not certified[/]"
-    if outcome["promise"] and not outcome["certified"]:
-        verdict += f" for the ranges, only for {outcome['promise']}"
-    return f"{coupling['kind']}{gains}: {verdict}"
+def _verdict(found: Audit) -> str:
+    coupling, promise = found.coupling, found.promise
+    gains = f" K {listed(coupling.K)} N/m, B {listed(coupling.B or ())} N s/m" if coupling.K else ""
+    verdict = f"[green]certified[/] for {promise}" if found.certified else "[red]not certified[/]"
+    if promise and not found.certified:
+        verdict += f" for the ranges, only for {promise}"
+    return f"{coupling.kind}{gains}: {verdict}"
 
 
-def _needs(part: dict[str, Any]) -> str:
-    word = "[green]certified[/]" if part["certified"] else "[red]not certified[/]"
-    return f"{render.needs(part)}: {word}"
-
-
-def _error(key: str, sign: str) -> Callable[[dict[str, Any]], str]:
-    """A relative error in percent, rounded down so that what is printed is tolerated."""
-
-    def cell(part: dict[str, Any]) -> str:
-        error = part["sensitivity"][key]
-        return "-" if error is None else f"{sign}{math.floor(1e4 * error) / 100:.2f} %"
-
-    return cell
+def _percent(error: float | None, sign: str) -> str:
+    """A relative error, rounded down so that what is printed is tolerated."""
+    return render.optional(error and math.floor(1e4 * error) / 100, sign + "{:.2f} %")
 
 
 def _stiffest(K: Sequence[float | None]) -> str:
@@ -247,53 +224,57 @@ def _stiffest(K: Sequence[float | None]) -> str:
     return ", ".join(f"{math.floor(k / unit) * unit:.5g}" for k, unit in units) + " N/m"
 
 
-#: name of a row -> what stands in it, given the part of a condition
-_ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
-    "needs damping": _needs,
-    "margin": lambda part: render.optional(part["margin"], "{:.5g}"),
-    "binds at": lambda part: render.optional(part["binding_frequency_hz"], "{:.5g} Hz"),
-    "stiffest K here": lambda part: _stiffest(part["stiffest"]["K"]),
-    "delta error": _error("delta_error", "-"),
-    "T error": _error("T_error", "+"),
-    "spare samples": lambda part: render.optional(part["sensitivity"]["extra_samples"], "{:.5g}"),
+#: name of a row -> what stands in it, given what one condition says
+_ROWS: dict[str, Callable[[ConditionAudit], str]] = {
+    "needs damping": lambda c: f"{render.needs(c.certificate)}: {render.certified(c.certificate | {'proof': None})}",
+    "margin": lambda c: render.optional(c.certificate["margin"], "{:.5g}"),
+    "binds at": lambda c: render.optional(c.certificate["binding_frequency_hz"], "{:.5g} Hz"),
+    "stiffest K here": lambda c: _stiffest(c.stiffest.K),
+    "delta error": lambda c: _percent(c.sensitivity.delta_error, "-"),
+    "T error": lambda c: _percent(c.sensitivity.T_error, "+"),
+    "spare samples": lambda c: render.optional(c.sensitivity.extra_samples, "{:.5g}"),
 }
 
 
-def _remarks(outcome: dict[str, Any]) -> list[str]:
-    lines = [f"{note}." for note in outcome["notes"]]
-    for condition in render.ORDER:
-        part = outcome[condition]
-        sensitivity = part["sensitivity"].get("reason") if part["certified"] else None
-        reasons = {"": part.get("reason"), ", stiffest K": part["stiffest"].get("reason"), ", sensitivity": sensitivity}
-        lines += [f"{condition}{of}: {reason}." for of, reason in reasons.items() if reason]
-    if not outcome["certified"]:
-        lines += _proposed(outcome["helps"])
-    if (part := outcome["switching"]) is not None:
-        lines += _switching_remarks(part)
-    if part := outcome["encoder"]:
-        lines.append(f"{part['words'][0].upper()}{part['words'][1:]}.")
-    return [*lines, outcome["not_covered"]]
+def _remarks(report: _Report) -> Iterator[str]:
+    found = report.audit
+    yield from (f"{note}." for note in report.notes)
+    for condition in CONDITIONS:
+        part = found.conditions[condition]
+        sensitivity = part.sensitivity.reason if part.certificate["certified"] else None
+        reasons = {
+            "": part.certificate.get("reason"),
+            ", stiffest K": part.stiffest.reason,
+            ", sensitivity": sensitivity,
+        }
+        yield from (f"{condition}{of}: {reason}." for of, reason in reasons.items() if reason)
+    if not found.certified:
+        yield from _proposed(found.helps)
+    if found.switching:
+        yield from _switching_remarks(found.switching)
+    if part := report.encoder:
+        yield f"{part['words'][0].upper()}{part['words'][1:]}."
+    yield found.not_covered
 
 
-def _proposed(helps: Sequence[dict[str, Any]]) -> list[str]:
+def _proposed(helps: Sequence[Help]) -> Iterator[str]:
     """Changes that were certified, the one that leaves most damping over first."""
-    enough = sorted((each for each in helps if each["certified"]), key=lambda each: max(each["required_damping"]))
+    enough = sorted((each for each in helps if each.certified), key=lambda each: max(each.required_damping))
     if not enough:
-        return ["What helps: no single change of delay, damper or period was found to; a design finds other gains."]
-    return [
-        f"What helps: {each['change']} ({each['condition']} then needs "
-        f"{listed(each['required_damping'])} N s/m, certified)."
-        for each in enough
-    ]
+        yield "What helps: no single change of delay, damper or period was found to; a design finds other gains."
+    for each in enough:
+        needs = f"{each.condition} then needs {listed(each.required_damping)} N s/m, certified"
+        yield f"What helps: {each.change} ({needs})."
 
 
-def _switching_remarks(part: dict[str, Any]) -> list[str]:
+def _switching_remarks(part: dict[str, Any]) -> Iterator[str]:
     span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
-    needs = f"needs {render.needs(part)}: {render.certified(part)}"
-    lines = [f"Any switching of the delays ({span} samples) {needs}."]
+    yield f"Any switching of the delays ({span} samples) needs {render.needs(part)}: {render.certified(part)}."
     if "playout" not in part:
-        return [*lines, f"any switching: {part['reason']}."]
+        yield f"any switching: {part['reason']}."
+        return
     buffered = part["playout"]
     enough = "certified" if buffered["certified"] else "not certified"
-    played = f"{listed(buffered['required_damping'])} N s/m: {enough}"
-    return [*lines, f"A playout buffer to the constant {listed(part['hi'])} needs {played}.", part["not_covered"]]
+    needs = f"{listed(buffered['required_damping'])} N s/m: {enough}"
+    yield f"A playout buffer to the constant {listed(part['hi'])} needs {needs}."
+    yield part["not_covered"]

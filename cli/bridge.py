@@ -16,17 +16,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from cli import options, render
-from cli.session_cli import (
-    add_link_options,
-    add_safety_options,
-    check_link,
-    hold_session,
-    host_clocked,
-    limits_from,
-    steady_scenario,
-)
-from design.certificate import CONDITIONS
+from cli import options, render, session_cli
 from design.files import plain, write_json
 from design.guarantees import CAVEATS, LATE
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
@@ -43,11 +33,11 @@ _LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
 def main(argv: list[str]) -> int:
     """One session. 0: it ended as planned, 1: refused, stopped, lost or e-stop, 130: interrupted, after a ramp."""
     args = _parser().parse_args(argv)
-    scenario, settings = steady_scenario(args, "hw.bridge"), check_link(args)
+    scenario, settings = session_cli.steady_scenario(args, "hw.bridge"), session_cli.check_link(args)
     seconds = scenario.duration if args.duration is None else args.duration
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
-    at_once = args.latch == "arrival" or host_clocked(args)  # a host that is the clock writes a force when it has it
+    at_once = args.latch == "arrival" or session_cli.host_clocked(args)  # a host that is the clock sends at once
     if at_once and args.condition == "any-environment":
         raise InputError(f"--latch arrival with --condition {args.condition}: {LATE}")
     if args.energy_budget and at_once:
@@ -56,7 +46,7 @@ def main(argv: list[str]) -> int:
         raise InputError("--energy-budget is 0 J: encoders are tested by a small force at arming, give it 0.01 or so")
     settings = replace(settings, rereference=not args.no_rereference, energy_budget=args.energy_budget)
     settings = replace(settings, deadman=args.deadman == "device")
-    session = session_for(scenario, settings, **limits_from(args, scenario))
+    session = session_for(scenario, settings, **session_cli.limits_from(args, scenario))
     session.record = recorder = Recorder(scenario.channels)
     out = options.out_folder(args, "bridge")
 
@@ -67,7 +57,7 @@ def main(argv: list[str]) -> int:
         print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         return programs
 
-    live = hold_session(args, session, plan, seconds, out)
+    live = session_cli.hold_session(args, session, plan, seconds, out)
     report = outcome(args.case, session, recorder, live.dropped, args.pace)
     try:  # first, for a disk may be full
         print_session(report, render.console(args))
@@ -79,9 +69,7 @@ def main(argv: list[str]) -> int:
     render.console(args).print("files: " + ", ".join(files), soft_wrap=True)
     if args.json:
         write_json(args.json, plain(report) | {"files": files})
-    if set(live.signals) - {signal.SIGUSR1}:
-        return options.INTERRUPTED
-    return options.DONE if session.stage == Stage.FINISHED else options.DOES_NOT_HOLD
+    return options.exit_code(session.stage == Stage.FINISHED, bool(set(live.signals) - {signal.SIGUSR1}))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -91,11 +79,11 @@ def _parser() -> argparse.ArgumentParser:
         "python -m hw.bridge --rehearse --case I --duration 2",
     )
     options.add_loop_options(parser)
-    add_link_options(parser)
-    add_safety_options(parser)
+    session_cli.add_link_options(parser)
+    session_cli.add_safety_options(parser)
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
-    parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
+    options.add_condition_option(parser)
     latch = "when forces act: at whole ticks (default), or as soon as they arrive, certified for the latency measured"
     parser.add_argument("--latch", choices=("tick", "arrival"), default="tick", help=latch)
     options.add_energy_budget_option(parser)
@@ -148,20 +136,20 @@ def _link(link: int, scenario: Scenario) -> str:
 
 def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
     """How long ticks are, and what one longer than the certificate counts with may cost."""
-    least, most = (1e-3 * side(ages.ticks, default=1e6 * scenario.T) for side in (min, max))
+    least, most = (f"{1e-3 * side(ages.ticks, default=1e6 * scenario.T):.4g}" for side in (min, max))
+    span = least if least == most else f"{least} to {most}"
     longest = 1e3 * (scenario.T_max or scenario.T)
     cost = overlong_tick(caps, scenario.delta)
     return (
-        f"ticks of the device last {least:.4g} to {most:.4g} ms, certified are up to {longest:.4g} ms; one longer tick "
+        f"ticks of the device last {span} ms, certified up to {longest:.4g} ms; one longer tick "
         f"may give a hand at most {cost:.3g} mJ for every ms that it lasts (at the force cap)"
     )
 
 
 def print_session(report: SessionReport, console: Console) -> None:
     """The log, then what the link did."""
-    rows = [(f"{one.t_s:.3f} s", _colour(one.stage), one.cause) for one in report.session.log]
-    title = f"case {report.case} · {report.scenario}"
-    console.print(render.grid(title, ("after", "stage", "cause"), rows, left=(1, 2)))
+    cells = {"after": "{r.t_s:.3f} s", "stage": lambda r: _colour(r.stage), "cause": "{r.cause}"}
+    console.print(render.columns(f"case {report.case} · {report.scenario}", cells, report.session.log, left=(1, 2)))
     link = report.link
     if link.age_us:
         ages = ", ".join(f"{name} {us / 1000:.2f} ms" for name, us in link.age_us.items())

@@ -11,13 +11,12 @@ from rich.table import Table
 
 from cli import options, render
 from design.certificate import Verdict, lag, verify, violated_between
+from design.coupling_file import Stored, SwitchingProof
 from design.coverage import search_part, search_words
 from design.environments import Searched, search_ranges
 from design.guarantees import HERE, RANGES, switching_guarantee
 from design.result import listed
-from design.stored import Stored, SwitchingProof
 from sim.couplings import read_coupling
-from sim.scenario import InputError
 
 
 @dataclass(frozen=True)
@@ -57,16 +56,14 @@ def main(argv: list[str]) -> int:
     options.check_json(args)
     begin = time.perf_counter()
     stored = read_coupling(args.coupling)
-    try:
+    with options.refused(f"{args.coupling}: "):
         verdict = verify(stored)
-    except (ValueError, ArithmeticError) as error:
-        raise InputError(f"{args.coupling}: {error}") from None
     searched = _searched(stored) if verdict.proved else None
     if searched and not searched.worst[0].ratio < 1:
         verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
     checked = _checked(stored, verdict, searched, time.perf_counter() - begin)
-    render.publish(args, render.plain(checked), [_table(checked)])
-    return options.DONE if verdict.proved else options.DOES_NOT_HOLD
+    render.publish(args, checked, [_table(checked)])
+    return options.exit_code(verdict.proved)
 
 
 def _parser() -> options.Parser:
@@ -86,31 +83,27 @@ def _searched(stored: Stored) -> Searched | None:
 
 
 def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, seconds: float) -> _Checked:
-    claim = stored.certificate
+    loop, claim, proved = stored.loop, stored.certificate, verdict.proved
+    span, switching = loop.varying_delay, None
+    if span and claim and isinstance(delays := claim.switching, SwitchingProof):
+        guarantee = f"{switching_guarantee(span)}, in {HERE}" if proved else None
+        shown = span.lo, span.hi, guarantee, "rational" if proved else None
+        switching = _Switching(*shown, delays.required, delays.margin)
     return _Checked(
-        verdict.proved,
+        proved,
         verdict.reason,
         claim and claim.condition,
-        claim.guarantee if claim and verdict.proved else None,
-        claim.proof if claim and verdict.proved else None,
-        len(stored.loop.members()) - 1 if stored.loop.ranges else None,
+        claim.guarantee if claim and proved else None,
+        claim.proof if claim and proved else None,
+        len(loop.members()) - 1 if loop.ranges else None,
         searched and search_part(searched),
         claim and claim.required,
-        stored.loop.delta,
+        loop.delta,
         claim and claim.margin,
-        "proved, also while forces are limited" if verdict.proved and lag(stored.loop, claim) is not None else None,
+        "proved, also while forces are limited" if proved and lag(loop, claim) is not None else None,
         seconds,
-        _switching(stored, verdict),
+        switching,
     )
-
-
-def _switching(stored: Stored, verdict: Verdict) -> _Switching | None:
-    span, claim = stored.loop.varying_delay, stored.certificate and stored.certificate.switching
-    if span is None or not isinstance(claim, SwitchingProof):
-        return None
-    guarantee = f"{switching_guarantee(span)}, in {HERE}" if verdict.proved else None
-    proof = "rational" if verdict.proved else None
-    return _Switching(span.lo, span.hi, guarantee, proof, claim.required, claim.margin)
 
 
 def _table(checked: _Checked) -> Table:

@@ -9,29 +9,25 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
 from cli import options, render
-from cli.design import add_optimal_options, optimal_options
-from controller import older
+from cli.design import add_optimal_options, asked_of
 from controller.loop import Loop
 from controller.lti import Array
 from design import compare
-from design.certificate import CONDITIONS
-from design.compare import AXES, FEEL_HZ, LADDERS, Demands, LadderRow, Limit, Perceived, Point, optimum, points_along
+from design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
 from design.program import Options
-from design.result import DesignFailed, certificate_part, finite
-from design.robustness import robustness_part
-from design.transparency import transparency
-from sim import baselines, report
+from design.result import CONDITIONS, DesignFailed
+from sim import baselines
+from sim.compare_report import ComparedCoupling, Comparison
 from sim.couplings import NAMES, Chosen, choose
-from sim.scenario import InputError, Scenario, require_even_ticks
+from sim.scenario import InputError, Scenario
 
 _MOST = 6  # curves that can be told apart in one panel
 
@@ -58,7 +54,7 @@ def _parser() -> options.Parser:
     parser = options.Parser("design.compare", what, example)
     options.add_loop_options(parser)
     given = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION asks for a condition"
-    parser.add_argument("--coupling", metavar="NAME,FILE,..", help=f"{given} (default none,spring-damper)")
+    parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"{given} (default none,spring-damper)")
     options.add_condition_option(parser, "of designs that name none")
     short = "every design side by side, cases I and II (full: minutes)"
     parser.add_argument("--ladder", nargs="?", const="short", choices=tuple(LADDERS), help=short)
@@ -74,7 +70,7 @@ def _parser() -> options.Parser:
     )
     curve.add_argument("--keep", choices=("samples", "seconds"), default="samples", help="delays, as the period varies")
     beside = "spring-dampers drawn: none, any-environment, this-environment or both (default both)"
-    curve.add_argument("--beside", type=_beside, default=CONDITIONS, metavar="NAME", help=beside)
+    curve.add_argument("--beside", type=_beside, default=tuple(CONDITIONS), metavar="NAME", help=beside)
     optimal = parser.add_argument_group("the optimal coupling of --over")
     add_optimal_options(optimal)
     options.add_output_options(parser, picture=True)
@@ -82,7 +78,7 @@ def _parser() -> options.Parser:
 
 
 def _beside(text: str) -> tuple[str, ...]:
-    return {"none": (), "both": CONDITIONS}[text] if text in ("none", "both") else (options.condition(text),)
+    return {"none": (), "both": tuple(CONDITIONS)}[text] if text in ("none", "both") else (options.condition(text),)
 
 
 #: options -> the modes that take them
@@ -116,71 +112,35 @@ def _check_mode(args: argparse.Namespace, parser: options.Parser) -> None:
 # Couplings over frequency.
 
 
-@dataclass(frozen=True, eq=False)
-class _Shown:
-    """One coupling, with all that the pictures show of it."""
-
-    name: str
-    states: int
-    transparency: dict[str, Any]
-    robustness: dict[str, Any] | None
-    sigma_F: Array
-    sigma_M: Array
-    perceived: Perceived
-    coupling: dict[str, Any] = render.unseen("beside")
-    conditions: dict[str, dict[str, Any]] = render.unseen("beside")
-
-
-@dataclass(frozen=True, eq=False)
-class _Couplings:
-    """Couplings over frequency; SI units, null where a figure is infinite or does not exist."""
-
-    case: str
-    scenario: str
-    seed: int
-    T_s: float
-    theta: tuple[int, ...]
-    psi: tuple[int, ...]
-    lam: tuple[int, ...]
-    available_damping: tuple[float, ...]
-    frequency_hz: Array
-    sigma_E: Array
-    ideal: Perceived
-    couplings: list[_Shown]
-    notes: list[str]
-
-
 def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
-    names, out = _names(args), options.out_folder(args, "compare")
+    names = args.coupling or (("none",) if args.case == "none" else ("none", "spring-damper"))
+    out = options.out_folder(args, "compare")
     chosen, failed = _chosen(scenario, args, names)
-    loop = scenario.loop(args.case)
-    judged = {name: compare.judge(loop, c.coupling, c.phi) for name, c in chosen.items()}
-    hz = compare.grid(loop, list(judged.values()))
-    sigma_E, undelayed = compare.ideal(loop, hz)
-    shown = [_shown(loop, name, c, judged[name], hz) for name, c in chosen.items()]
-    notes = [*(f"{name}: {note}" for name, c in chosen.items() for note in c.notes), *failed, *_missing_curves(shown)]
-    about = args.case, scenario.name, args.seed, loop.T, loop.theta, loop.psi, loop.lam, loop.delta
-    report = _Couplings(*about, hz, sigma_E, undelayed, shown, notes)
-    files = _pictures(args, out, render.plain(report))
-    render.publish(args, report, [_guarantees(report), _feel(report)], notes, out, files)
-    return options.DOES_NOT_HOLD if failed else options.DONE
+    report = Comparison.of(scenario, args.case, chosen, failed, args.seed)
+    files = render.pictures(args, report, out, _PICTURES)
+    render.publish(args, report, [_guarantees(report), _feel(report)], report.notes, out, files)
+    return options.exit_code(not failed)
 
 
-def _names(args: argparse.Namespace) -> list[str]:
-    """The couplings that were asked for. Raises InputError."""
-    usual = "none" if args.case == "none" else "none,spring-damper"
-    asked: str = usual if args.coupling is None else args.coupling
-    names = asked.split(",")
+_PICTURES = {
+    "singular-values.png": lambda plots: plots.plot_singular_values,
+    "required-damping.png": lambda plots: plots.plot_required_damping,
+    "perceived.png": lambda plots: plots.plot_perceived,
+}
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(text.split(","))
     if "" in names:
-        raise InputError(f"--coupling is {args.coupling!r}, expected names separated by commas")
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected names separated by commas" if text else "is empty")
     if len(set(names)) < len(names):
-        raise InputError(f"--coupling is {args.coupling!r}: a name stands there twice")
+        raise argparse.ArgumentTypeError(f"is {text!r}: a name stands there twice")
     if len(names) > _MOST:
-        raise InputError(f"--coupling has {len(names)} entries, allowed are 1 to {_MOST}")
+        raise argparse.ArgumentTypeError(f"has {len(names)} entries, allowed are 1 to {_MOST}")
     return names
 
 
-def _chosen(scenario: Scenario, args: argparse.Namespace, names: list[str]) -> tuple[dict[str, Chosen], list[str]]:
+def _chosen(scenario: Scenario, args: argparse.Namespace, names: Sequence[str]) -> tuple[dict[str, Chosen], list[str]]:
     """The couplings by name, and why designs failed. Raises DesignFailed where all of them did."""
     chosen: dict[str, Chosen] = {}
     failures: dict[str, DesignFailed] = {}
@@ -207,67 +167,34 @@ def _named(name: str) -> tuple[str, str | None]:
         return name, None  # a file may have a colon in its name
 
 
-def _shown(loop: Loop, name: str, chosen: Chosen, judged: Demands, hz: Array) -> _Shown:
-    lines, conditions = compare.curves(loop, judged, hz), {}
-    for key, requirement in judged.requirements.items():
-        demand = lines.demands[key]
-        part = certificate_part(requirement) | {"ratio": finite(requirement.ratio), "demand": demand}
-        if demand is None and not requirement.reason:
-            part["reason"] = f"this coupling is no V in feedback around the environment: no curve for {key}"
-        conditions[key] = part
-    return _Shown(
-        Path(name).name,
-        judged.F.order,
-        report.transparency_part(transparency(judged.F, loop.E(), loop.lam)),
-        robustness_part(loop, chosen.coupling),
-        lines.sigma_F,
-        lines.sigma_M,
-        lines.perceived,
-        report.coupling_part(chosen.kind, chosen.coupling, loop.T),
-        older.with_older(conditions, older.CONDITIONS),
-    )
-
-
-def _missing_curves(couplings: list[_Shown]) -> list[str]:
-    parts = [(c.name, condition, c.conditions[condition]) for c in couplings for condition in CONDITIONS]
-    return [f"{name}, {condition}: {part['reason']}" for name, condition, part in parts if "reason" in part]
-
-
-def _pictures(args: argparse.Namespace, out: Path, outcome: dict[str, Any]) -> list[Path]:
-    if args.no_plot:
-        return []
-    from sim.plots import plot_perceived, plot_required_damping, plot_singular_values
-
-    return [
-        plot_singular_values(outcome, out / "singular-values.png"),
-        plot_required_damping(outcome, out / "required-damping.png"),
-        plot_perceived(outcome, out / "perceived.png"),
-    ]
-
-
-def _guarantees(report: _Couplings) -> Table:
+def _guarantees(report: Comparison) -> Table:
     """Required damping [N s/m] where all devices have the same, else as a multiple of what each has."""
     available = report.available_damping
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
     title = f"{damping} of {_list(available)} N s/m · {report.scenario}, case {report.case}"
-    heads = ("coupling", "this-env.", "at Hz", "at 10 %", "any-env.", "at Hz", "sup dB", "rms dB")  # render.ORDER
-    rows = []
-    for coupling in report.couplings:
-        parts = [coupling.conditions[condition] for condition in render.ORDER]
-        needs = [(_needs(p, available[0] if alike else 1.0), p["binding_frequency_hz"]) for p in parts]
-        asked = [cell for need, hz in needs for cell in (need, render.optional(hz, "{:.4g}"))]
-        asked.insert(2, _robust(coupling.robustness, available[0] if alike else 1.0))
-        errors = [coupling.transparency[f"{which}_mismatch_db"] for which in ("relative", "rms")]
-        rows.append([coupling.name, *asked, *(render.optional(e, "{:.2f}", "-inf") for e in errors)])
-    return render.grid(title, heads, rows)
+    scale = available[0] if alike else 1.0
+    cells: dict[str, Callable[[ComparedCoupling], str]] = {
+        "coupling": lambda c: c.name,
+        "this-env.": lambda c: _needs(c.conditions["this-environment"], scale),
+        "at Hz": lambda c: _binds(c.conditions["this-environment"]),
+        "at 10 %": lambda c: _robust(c.robustness, scale),
+        "any-env.": lambda c: _needs(c.conditions["any-environment"], scale),
+        "at Hz ": lambda c: _binds(c.conditions["any-environment"]),
+        "sup dB": lambda c: render.optional(c.transparency["relative_mismatch_db"], "{:.2f}", "-inf"),
+        "rms dB": lambda c: render.optional(c.transparency["rms_mismatch_db"], "{:.2f}", "-inf"),
+    }
+    return render.columns(title, cells, report.couplings)
+
+
+def _binds(part: dict[str, Any]) -> str:
+    return render.optional(part["binding_frequency_hz"], "{:.4g}")
 
 
 def _needs(part: dict[str, Any], scale: float) -> str:
     """The worst device's figure, green where it is certified."""
-    if part["ratio"] is None:
-        return "[red]infinite[/]"
-    return f"[{'green' if part['certified'] else 'red'}]{scale * part['ratio']:.5g}[/]"
+    need = "infinite" if np.isinf(part["ratio"]) else f"{scale * part['ratio']:.5g}"
+    return f"[{'green' if part['certified'] else 'red'}]{need}[/]"
 
 
 def _robust(part: dict[str, Any] | None, scale: float = 1.0) -> str:
@@ -278,10 +205,10 @@ def _robust(part: dict[str, Any] | None, scale: float = 1.0) -> str:
     return "infinite" if need is None else f"{scale * need:.4g}"
 
 
-def _feel(report: _Couplings) -> Table:
+def _feel(report: Comparison) -> Table:
     columns = [(what, unit, hz) for what, unit in (("stiffness", "N/m"), ("damping", "N s/m")) for hz in FEEL_HZ]
     heads = ["coupling", *(f"{what}\n{unit}, {hz:g} Hz" for what, unit, hz in columns)]
-    named = {"ideal (E)": report.ideal, **{c.name: c.perceived for c in report.couplings}}
+    named = {"ideal (E)": report.ideal, **{c.name: c.curves.perceived for c in report.couplings}}
 
     def at(hz: float, curves: Array) -> list[float]:
         """Each channel's curve at `hz`, which is in the grid; nan above Nyquist's frequency."""
@@ -316,25 +243,37 @@ def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
     out, begin = options.out_folder(args, "compare"), time.perf_counter()
     loops = {case: scenario.loop(case) for case in ("I", "II")}
     with render.progress("designing") as move:
-        rows, interrupted = compare.compare_designs(loops, LADDERS[args.ladder], move)
+        rows, interrupted = options.until_interrupted(compare.compare_designs(loops, LADDERS[args.ladder], move))
     report = _Ladder(scenario.name, args.seed, rows, time.perf_counter() - begin, interrupted)
-    heads = ("design", "needs N s/m", "x, 10 %", "sup dB", "rms dB", "proof", "s")
     shown = []
     for case in loops:
-        cells = [_rung(row) for row in rows if row.case == case]
-        shown.append(render.grid(f"the ladder · {scenario.name}, case {case}", heads, cells, left=(0, 5)))
+        some = [row for row in rows if row.case == case]
+        shown.append(render.columns(f"the ladder · {scenario.name}, case {case}", _LADDER, some, left=(0, 5)))
     lines = [f"{row.design}, case {row.case}: {row.reason}" for row in rows if row.reason]
     render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out)
-    return options.INTERRUPTED if interrupted else options.DONE
+    return options.exit_code(True, interrupted)
 
 
-def _rung(row: LadderRow) -> tuple[str, ...]:
-    need = "inf" if row.required_damping is None else f"{max(row.required_damping):.4f}"
-    need += "" if row.certified else " (no)"
-    errors = [render.optional(getattr(row, f"{which}_mismatch_db"), "{:.2f}", "exact") for which in ("relative", "rms")]
-    if row.required_damping is None:
-        need, errors = ("-", ["-", "-"]) if row.reason else ("-", ["-", errors[1]])
-    return row.design, need, _robust(row.robustness), *errors, row.proof or "-", f"{row.wall_s:.2f}"
+def _decibels(value: float | None) -> str:
+    return render.optional(value, "{:.2f}", "exact")
+
+
+#: what stands in a column, given a row; a bound has no damping and only an rms error, a failed design neither
+_LADDER: dict[str, str | Callable[[LadderRow], str]] = {
+    "design": "{r.design}",
+    "needs N s/m": lambda r: (
+        "-" if r.required_damping is None else f"{max(r.required_damping):.4f}" + ("" if r.certified else " (no)")
+    ),
+    "x, 10 %": lambda r: _robust(r.robustness),
+    "sup dB": lambda r: (
+        "-" if r.required_damping is None else render.optional(r.relative_mismatch_db, "{:.2f}", "exact")
+    ),
+    "rms dB": lambda r: (
+        "-" if r.required_damping is None and r.reason else render.optional(r.rms_mismatch_db, "{:.2f}", "exact")
+    ),
+    "proof": lambda r: r.proof or "-",
+    "s": "{r.wall_s:.2f}",
+}
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -357,59 +296,35 @@ class _Baselines:
 
 
 def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
-    require_even_ticks(scenario, "--baselines")
-    if scenario.ranges or scenario.switches:
-        given = "[ranges]" if scenario.ranges else "[varying_delay]"
-        raise InputError(f"--baselines compares in one environment with constant delays: leave out {given}")
-    if any(device.friction for device in scenario.device):
-        raise InputError("--baselines runs in the exact plant, which has no Coulomb friction; the devices have")
-    out, rows, interrupted = options.out_folder(args, "compare"), [], False
-    begin = time.perf_counter()
     with render.progress("comparing") as move:
-        try:
-            rows.extend(baselines.rivals(scenario, args.case, move, args.limiter))
-        except KeyboardInterrupt:
-            interrupted = True
+        all_of_them = baselines.rivals(scenario, args.case, move, args.limiter)
+        out, begin = options.out_folder(args, "compare"), time.perf_counter()
+        rows, interrupted = options.until_interrupted(all_of_them)
     report = _Baselines(scenario.name, args.case, args.seed, rows, time.perf_counter() - begin, interrupted)
-    files = []
-    if rows and not args.no_plot:
-        from sim.plots import plot_baselines
-
-        files.append(plot_baselines(render.plain(report), out / "baselines.png"))
-    heads = ("", "error %", "> 40 Hz N", "peak N", "acted %", "hands", "m/s", "guarantee")
-    cells = [_rival(row) for row in rows]
-    shown = [render.grid(f"on the same runs · {scenario.title(args.case)}", heads, cells, left=(0, 7))]
+    files = render.pictures(args, report, out, {"baselines.png": lambda plots: plots.plot_baselines} if rows else {})
+    shown = [render.columns(f"on the same runs · {scenario.title(args.case)}", _RIVALS, rows, left=(0, 7))]
     lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
     began = f"{baselines.SLOW:g} m/s they began with"
     lines.append(f"hands: of {baselines.PAIRS} lossless pairs, faster after {baselines.SECONDS:g} s than the {began}.")
     lines += sorted({f"error: {row.reason}." for row in rows if row.reason})
     render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out, files)
-    return options.INTERRUPTED if interrupted else options.DONE
+    return options.exit_code(True, interrupted)
 
 
-def _rival(row: baselines.Rival) -> tuple[str, ...]:
-    error = render.optional(row.error_percent, "{:.2f}")
-    figures = f"{row.fast_n:.3f}", f"{row.peak_n:.1f}", f"{row.acted_percent:.0f}", str(row.moving)
-    short = "energy" if row.name == "energy budget" else row.guarantee or "none"
-    return f"{row.name}{' *' if row.baseline else ''}", error, *figures, f"{row.fastest_m_s:.3f}", short
+_RIVALS: dict[str, str | Callable[[baselines.Rival], str]] = {
+    "": lambda r: f"{r.name}{' *' if r.baseline else ''}",
+    "error %": lambda r: render.optional(r.error_percent, "{:.2f}"),
+    "> 40 Hz N": "{r.fast_n:.3f}",
+    "peak N": "{r.peak_n:.1f}",
+    "acted %": "{r.acted_percent:.0f}",
+    "hands": "{r.moving}",
+    "m/s": "{r.fastest_m_s:.3f}",
+    "guarantee": lambda r: "energy" if r.name == "energy budget" else r.guarantee or "none",
+}
 
 
 # ----------------------------------------------------------------------------------------------------
 # The limits of any coupling along an axis.
-
-
-@dataclass(frozen=True)
-class _Sweep:
-    """The designs along one axis of the loop."""
-
-    label: str
-    unit: str
-    values: list[float]
-    curves: dict[str, list[Limit]] = render.unseen("beside")
-
-    @classmethod
-    def of(cls, name: str, along: Sequence[Point], curves: dict[str, list[Limit]]) -> _Sweep:
-        return cls(AXES[name].label, AXES[name].unit, [point.value for point in along], curves)
 
 
 @dataclass(frozen=True)
@@ -423,99 +338,51 @@ class _Limits:
     delays_kept_in: str
     wish: Options
     here: dict[str, Any]
-    sweeps: dict[str, _Sweep]
+    sweeps: dict[str, compare.Sweep]
     gains: list[str]
     wall_s: float
     interrupted: bool
 
 
 def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
-    wish, loop = _wish(args), scenario.loop(args.case)
+    loop = scenario.loop(args.case)
     if min(loop.delta) <= 0:
         raise InputError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
+    with options.refused(args=args):
+        wish = Options(**asked_of(args, "optimal"))
     plan, out = _plan(args, loop, wish), options.out_folder(args, "compare")
-    designers = {"optimal": compare.remembered(optimum, True)}
-    designers |= {name: compare.remembered(compare.spring_damper(name), False) for name in args.beside}
     begin = time.perf_counter()
-    curves, interrupted = _designed(plan, designers)
-    report = _Limits(
-        scenario.name,
-        args.seed,
-        args.case,
-        wish.objective,
-        args.keep,
-        wish,
-        {"delta": loop.delta, "theta": loop.theta, "psi": loop.psi, "T_s": loop.T},
-        {
-            name: _Sweep(AXES[name].label, AXES[name].unit, [at.value for at in plan[name]], rows)
-            for name, rows in curves.items()
-        },
-        compare.gains(plan, curves, loop, wish),
-        time.perf_counter() - begin,
-        interrupted,
-    )
-    points = [(name, row) for name, sweep in report.sweeps.items() for row in sweep.curves["optimal"]]
-    files = []
-    if not args.no_plot and points:
-        from sim.plots import plot_limits
-
-        files.append(plot_limits(render.plain(report), out / "limits.png"))
+    with render.progress("designing") as move:
+        sweeps, interrupted = compare.limits(plan, args.beside, move)
+    here = {"delta": loop.delta, "theta": loop.theta, "psi": loop.psi, "T_s": loop.T}
+    about = scenario.name, args.seed, args.case, wish.objective, args.keep, wish, here
+    wall, gains = time.perf_counter() - begin, compare.gains(plan, sweeps, loop, wish)
+    report = _Limits(*about, sweeps, gains, wall, interrupted)
+    points = [(name, row) for name, sweep in sweeps.items() for row in sweep.curves["optimal"]]
+    files = render.pictures(args, report, out, {"limits.png": lambda plots: plots.plot_limits} if points else {})
     names = " and by ".join(args.beside)
     lines = [f"beside the optimum: the designed spring-damper by {names}"] if names else []
     lines += [f"{name} {row.value:.4g}: {row.reason}" for name, row in points if row.reason]
-    tables = [_limit_table(report, name, args.beside) for name in report.sweeps]
-    lines += [*report.gains, f"{report.wall_s:.1f} s"]
-    render.publish(args, report, tables, lines, out, files)
-    if interrupted:
-        return options.INTERRUPTED
-    found = any(row.rms_mismatch_db is not None for _, row in points)
-    return options.DONE if found else options.DOES_NOT_HOLD
-
-
-def _wish(args: argparse.Namespace) -> Options:
-    try:
-        return Options(**optimal_options(args))
-    except ValueError as error:
-        raise InputError(options.as_option(error, args)) from None
+    tables = [_limit_table(report, name, args.beside) for name in sweeps]
+    render.publish(args, report, tables, [*lines, *gains, f"{wall:.1f} s"], out, files)
+    return options.exit_code(any(row.rms_mismatch_db is not None for _, row in points), interrupted)
 
 
 def _plan(args: argparse.Namespace, loop: Loop, wish: Options) -> dict[str, list[Point]]:
     """The points of every sweep that is asked for. Raises InputError."""
     plan = {}
     for part in args.over.split(","):
-        name, _, text = part.partition("=")
+        name, given, text = part.partition("=")
         if name not in AXES:
             raise InputError(f"--over has {name!r}, allowed are {', '.join(AXES)}")
-        try:
-            plan[name] = points_along(name, loop, wish, args.points, _span(name, text) if text else None, args.keep)
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(f"--over {part}: {error}") from None
+        low, colon, high = text.partition(":")
+        if given and not colon:
+            raise InputError(f"--over {part}: expected LOW:HIGH in {AXES[name].unit}")
+        ends = (options.numbers(f"--over {name}", end, float, 1)[0] for end in (low, high))
+        span = (next(ends), next(ends)) if given else None
+        with options.refused(f"--over {part}: "):
+            plan[name] = points_along(name, loop, wish, args.points, span, args.keep)
     return plan
-
-
-def _span(name: str, text: str) -> tuple[float, float]:
-    low, colon, high = text.partition(":")
-    if not colon:
-        raise InputError(f"--over {name}={text}: expected LOW:HIGH in {AXES[name].unit}")
-    return options.numbers(f"--over {name}", low, float, 1)[0], options.numbers(f"--over {name}", high, float, 1)[0]
-
-
-def _designed(
-    plan: dict[str, list[Point]], designers: dict[str, compare.Designer]
-) -> tuple[dict[str, dict[str, list[Limit]]], bool]:
-    """Every design at every point; what is done when the keyboard interrupts is kept."""
-    curves: dict[str, dict[str, list[Limit]]] = {name: {kind: [] for kind in designers} for name in plan}
-    jobs = [(name, point, kind) for name, along in plan.items() for point in along for kind in designers]
-    with render.progress("designing") as move:
-        try:
-            for done, (name, point, kind) in enumerate(jobs):
-                move(done, len(jobs))
-                curves[name][kind].append(designers[kind](point))
-        except KeyboardInterrupt:
-            return {name: rows for name, rows in curves.items() if any(rows.values())}, True
-    return curves, False
 
 
 def _limit_table(report: _Limits, name: str, beside: Sequence[str]) -> Table:

@@ -25,10 +25,8 @@ def main(argv: list[str]) -> int:
         raise InputError(f"--duration is {args.duration:g}, allowed are numbers above 0 up to 1000000 s")
     if args.parent not in (0, os.getppid()):
         raise InputError(f"--parent is {args.parent}, but this process is a child of {os.getppid()}")
-    try:
+    with options.refused("the scenario cannot stand behind a serial link: "):
         emulator = Emulator(nobody(scenario) if args.nobody else scenario, faults, coulomb=args.coulomb)
-    except ValueError as error:
-        raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
     terminal, stops = Terminal(), []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, frame: stops.append(received))
@@ -60,18 +58,18 @@ def _parser() -> argparse.ArgumentParser:
         "The scenario's devices behind a pseudo-terminal; prints its path, which hw.bridge --port takes.",
         "python -m hw.emulator --fault up:drop=0.05 --fault unplug@3",
     )
+    add, number = parser.add_argument, options.number
     options.add_loop_options(parser)
-    kinds = ", ".join((*LINE, *DEVICE, *AXIS))
     what = "KIND[=VALUE][@START[+DURATION]], times in seconds after arming; in front up: or down: for one direction, "
-    what += "axis2: for an axis"
-    parser.add_argument("--fault", action="append", default=[], metavar="FAULT", help=f"{what}; KIND is {kinds}")
-    seconds = "default: until interrupted"
-    parser.add_argument("--duration", type=options.number(0, 1e6, "s"), default=1e6, metavar="SECONDS", help=seconds)
-    parser.add_argument("--nobody", action="store_true", help="no person at the handles")
+    what += f"axis2: for an axis; KIND is {', '.join((*LINE, *DEVICE, *AXIS))}"
+    add("--fault", action="append", default=[], metavar="FAULT", help=what)
+    end = "length of the emulation (default: until interrupted)"
+    add("--duration", type=number(0, 1e6, "s"), default=1e6, metavar="SECONDS", help=end)
+    add("--nobody", action="store_true", help="no person at the handles")
     rub = "dry friction at every motor (default 0)"
-    parser.add_argument("--coulomb", type=options.number(0, 10, "N"), default=0.0, metavar="NEWTON", help=rub)
-    add_pace_option(parser, "slow motion for busy machines (default 1; host too)")
+    add("--coulomb", type=number(0, 10, "N"), default=0.0, metavar="NEWTON", help=rub)
+    add_pace_option(parser, "slow motion for busy machines, as the host's (default 1)")
     parent = "end with this process, which must be the parent"
-    parser.add_argument("--parent", type=options.whole(), default=0, metavar="PID", help=parent)
-    parser.add_argument("--seed", type=options.whole(0), metavar="N", default=0, help="for the faults (default 0)")
+    add("--parent", type=options.whole(), default=0, metavar="PID", help=parent)
+    add("--seed", type=options.whole(0), metavar="N", default=0, help="for the faults (default 0)")
     return parser

@@ -6,36 +6,30 @@ Like design.check it works from the file alone, loop included: what is exported 
 from __future__ import annotations
 
 import argparse
-import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from cli import options, render
-from controller.coupling import SpringDamperForm
 from controller.lti import Array
 from design.certificate import Verdict, verify
+from design.coupling_file import Stored
 from design.export import (
+    SUFFIXES,
     ExportedBlock,
     NothingToExport,
-    Trial,
-    c_source,
-    control_source,
+    content,
     coupling_block,
-    data,
     process_block,
     trial,
+    with_origin,
 )
 from design.files import out_file, write
-from design.guarantees import HERE, RANGES, switching_guarantee
 from design.result import listed
-from design.stored import Stored
 from sim.couplings import read_coupling
 from sim.scenario import InputError
-
-_SUFFIX = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}
 
 
 @dataclass(frozen=True)
@@ -76,12 +70,18 @@ def main(argv: list[str]) -> int:
         other = "--format control: that is linear" if args.process else "a coupling alone sends no forces"
         raise InputError(f"--force-limit is for --process, {other}")
     stored = read_coupling(args.coupling)
-    verdict = _verdict(stored)
+    try:
+        verdict = verify(stored)
+    except (ValueError, ArithmeticError) as error:
+        verdict = Verdict(False, str(error))
     block = _block(args, stored, verdict)
-    path = _destination(args, block)
+    path = out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{SUFFIXES[args.format]}")
     test = trial(block, args.seed)
-    write(path, _content(args.format, block, test, path.name))
+    write(path, content(args.format, block, test, path.name))
 
+    forces = "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
+    if block.limiter:
+        forces = f"limited to {listed(block.limiter.limit)} N by the limiter"
     exported = _Exported(
         args.format,
         block.name,
@@ -92,12 +92,12 @@ def main(argv: list[str]) -> int:
         _Proof(verdict.proved, verdict.reason),
         block.system.order**2 + 2 * block.system.order * block.system.inputs + block.system.inputs**2,
         block.limiter and block.limiter.limit,
-        _forces(block) if args.process else None,
+        forces if args.process else None,
         {"ticks": len(test.inputs), "seed": args.seed, "largest_output": np.abs(test.outputs).max()},
     )
     title = f"{block.name} as {args.format}"
     render.publish(args, exported, [render.facts(title, render.rows_of(exported), left=True)])
-    return options.DOES_NOT_HOLD if stored.certificate and not verdict.proved else options.DONE
+    return options.exit_code(verdict.proved or not stored.certificate)
 
 
 def _parser() -> options.Parser:
@@ -107,7 +107,7 @@ def _parser() -> options.Parser:
         "python -m design.export coupling.json --process --format c",
     )
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling, which names its loop")
-    parser.add_argument("--format", choices=tuple(_SUFFIX), default="c", help="(default c)")
+    parser.add_argument("--format", choices=tuple(SUFFIXES), default="c", help="(default c)")
     parser.add_argument("--process", action="store_true", help="coupling, environment and delays as one block (6)")
     link = "leave out Theta, where the link to the devices is that delay"
     parser.add_argument("--without-theta", action="store_true", help=link)
@@ -117,75 +117,13 @@ def _parser() -> options.Parser:
     return parser
 
 
-def _verdict(stored: Stored) -> Verdict:
-    try:
-        return verify(stored)
-    except (ValueError, ArithmeticError) as error:
-        return Verdict(False, str(error))
-
-
-def _forces(block: ExportedBlock) -> str:
-    if block.limiter:
-        return f"limited to {listed(block.limiter.limit)} N by the limiter"
-    return "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
-
-
 def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> ExportedBlock:
     """The block that was asked for, with lines on where it comes from. Raises InputError."""
+    limit = options.per_channel("--force-limit", args.force_limit, stored.loop.channels) if args.force_limit else None
     try:
-        m = len(stored.loop.theta)
-        limit = options.per_channel("--force-limit", args.force_limit, m) if args.force_limit else None
         block = process_block(stored, not args.without_theta, limit) if args.process else coupling_block(stored)
     except NothingToExport as error:
         raise InputError(f"{args.coupling}: {error} (--process)") from None
     except ValueError as error:  # coefficients beyond floating point
         raise InputError(f"{args.coupling}: {error}") from None
-    origin = (
-        f"Written by python -m design.export from {Path(args.coupling).name}: {_gains(stored)}",
-        *block.about,
-        _guarantee(stored, verdict, block.limiter is not None),
-    )
-    return replace(block, about=origin)
-
-
-def _gains(stored: Stored) -> str:
-    coupling = stored.coupling
-    if isinstance(coupling, SpringDamperForm):
-        return f"spring-damper, K = {listed(coupling.K)} N/m, B = {listed(coupling.B)} N s/m"
-    return f"coupling of kind {coupling.__struct_config__.tag}"
-
-
-def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
-    claim = stored.certificate
-    if claim is None or not verdict.proved:
-        return f"NOT CERTIFIED: {verdict.reason}"
-    needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
-    delays = f"; {switching_guarantee(stored.loop.varying_delay)}, in {HERE}" if stored.loop.varying_delay else ""
-    how = f"{claim.condition}, proof: {claim.proof}"
-    if claim.guarantee == RANGES:
-        how += "; at the vertices, between them nothing is proved: design.check searches there"
-    return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; " + (
-        "also while forces are limited." if limited else "linear forces only."
-    )
-
-
-def _destination(args: argparse.Namespace, block: ExportedBlock) -> Path:
-    return out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{_SUFFIX[args.format]}")
-
-
-def _content(kind: str, block: ExportedBlock, test: Trial, file: str) -> Any:
-    """What `design.files.write` takes."""
-    if kind == "c":
-        return c_source(block, test, file)
-    if kind == "control":
-        return control_source(block, test)
-    plain = data(block, test)
-    if kind == "json":
-        return json.dumps(plain, indent=1, allow_nan=False) + "\n"
-
-    arrays: dict[str, Any] = {name: np.array(value) for name, value in plain.items()}
-
-    def archive(destination: BinaryIO) -> None:
-        np.savez(destination, **arrays)
-
-    return archive
+    return with_origin(block, Path(args.coupling).name, stored, verdict)

@@ -45,10 +45,10 @@ class _Sitting:
 
     axes: list[Estimate]  # none where there is a reason
     reason: str | None
-    report: SessionReport = render.unseen("table")
-    session: Session = render.unseen("table")
-    trace: Path | None = render.unseen("table")
-    signals: Sequence[int] = render.unseen("table")
+    report: SessionReport = render.unseen("no")
+    session: Session = render.unseen("no")
+    trace: Path | None = render.unseen("no")
+    signals: Sequence[int] = render.unseen("no")
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +91,7 @@ def main(argv: list[str]) -> int:
         tables = [_table(e, scenario, i) for i, e in enumerate(report.axes)]
         files.append(write(out / "devices.toml", "\n".join(tables)))
     render.publish(args, report, [_figures(report)], report.lines(), out, files)
-    if sittings[-1].signals:
-        return options.INTERRUPTED
-    return options.DONE if report.bounded else options.DOES_NOT_HOLD
+    return options.exit_code(report.bounded, bool(sittings[-1].signals))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -104,19 +102,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     options.add_loop_options(parser)
     add_link_options(parser)
-    push, seconds = options.number(0.05, 6.0), options.number(0.5, 30.0)
-    parser.add_argument("--force", type=push, default=1.0, metavar="NEWTON", help="amplitude of the chirp (default 1)")
-    band = "of the chirp [Hz] (default 3,200)"
-    parser.add_argument("--band", type=options.pair, default=(3.0, 200.0), metavar="LOW,HIGH", help=band)
-    parser.add_argument("--seconds", type=seconds, default=2.5, metavar="SECONDS", help="of the chirp (default 2.5)")
-    rub = "dry friction of an emulated device"
-    parser.add_argument("--coulomb", type=options.number(0.0, 10.0), default=0.0, metavar="NEWTON", help=rub)
+    parser.set_defaults(deadman=None, no_preflight=True)
+    add, number = parser.add_argument, options.number
+    add("--force", type=number(0.05, 6.0), default=1.0, metavar="NEWTON", help="amplitude of the chirp (default 1)")
+    band = "frequencies of the chirp [Hz] (default 3,200)"
+    add("--band", type=options.pair, default=(3.0, 200.0), metavar="LOW,HIGH", help=band)
+    add("--seconds", type=number(0.5, 30.0), default=2.5, metavar="SECONDS", help="length of the chirp (default 2.5)")
+    rub = "dry friction of an emulated device (default 0)"
+    add("--coulomb", type=number(0.0, 10.0), default=0.0, metavar="NEWTON", help=rub)
     count = "records of every axis, each with the handles at another place; two have to agree (default 2)"
-    parser.add_argument("--sittings", type=options.whole(1, 20), default=2, metavar="N", help=count)
-    stay = "do not ask that handles are taken elsewhere in between: at the emulator's nobody is there to do so"
-    parser.add_argument("--same-place", action="store_true", help=stay)
-    rests = "with --rehearse, a hand that only damps, at every handle in the first sitting"
-    parser.add_argument("--hand", type=options.number(0.0, 10.0), default=0.0, metavar="N_S/M", help=rests)
+    add("--sittings", type=options.whole(1, 20), default=2, metavar="N", help=count)
+    stay = "leave the handles where they are between sittings (an emulator has nobody to move them)"
+    add("--same-place", action="store_true", help=stay)
+    rests = "with --rehearse, the damping of a hand at every handle in the first sitting (default 0)"
+    add("--hand", type=number(0.0, 10.0), default=0.0, metavar="N_S/M", help=rests)
     options.add_output_options(parser)
     return parser
 

@@ -16,7 +16,9 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -25,18 +27,18 @@ from threadpoolctl import threadpool_limits
 
 from controller import older
 from controller.delay import LOST, VaryingDelay
-from controller.environment import RIGID_WALL
-from controller.loop import Loop
+from controller.loop import DelayRange, Loop
 from controller.lti import SingularLoop
 from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
-from design.result import DesignFailed
+from design.result import CONDITIONS, DesignFailed
 from models.device import MOST_DAMPING
-from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load, load_humans
+from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
 _Number = TypeVar("_Number", int, float)
+_Given = TypeVar("_Given")
 _OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # of the types below
 
 
@@ -69,39 +71,51 @@ class Parser(argparse.ArgumentParser):
 # Types of options.
 
 
-def number(least: float = -math.inf, most: float = math.inf, unit: str = "") -> Callable[[str], float]:
-    """A number within these limits."""
-    return _one(float, least, most, unit)
+def _one(
+    kind: Callable[[str], _Number], least: float = -math.inf, most: float = math.inf, unit: str = ""
+) -> Callable[[str], _Number]:
+    """A number of this kind within these limits."""
+
+    def read(text: str) -> _Number:
+        try:
+            value = kind(text)
+        except ValueError:
+            what = "a whole number" if kind is int else "a number"
+            raise argparse.ArgumentTypeError(f"is {text!r}, expected {what}") from None
+        return _within(value, least, most, unit)
+
+    return read
 
 
-def whole(least: float = -math.inf, most: float = math.inf, unit: str = "") -> Callable[[str], int]:
-    """A whole number within these limits."""
-    return _one(int, least, most, unit)
+number, whole = partial(_one, float), partial(_one, int)  # (least, most, unit)
 
 
 def several(
     kind: Callable[[str], _Number], least: float = -math.inf, most: float = math.inf, unit: str = ""
 ) -> Callable[[str], tuple[_Number, ...]]:
     """Numbers within these limits, separated by commas; `per_channel` makes them one for each channel."""
+    expected = f"{'whole numbers' if kind is int else 'numbers'} separated by commas"
 
     def read(text: str) -> tuple[_Number, ...]:
-        try:
-            values = tuple(kind(part) for part in text.split(","))
-        except ValueError:
-            what = "whole numbers" if kind is int else "numbers"
-            raise argparse.ArgumentTypeError(f"is {text!r}, expected {what} separated by commas") from None
-        return tuple(_within(value, least, most, unit) for value in values)
+        return tuple(_within(value, least, most, unit) for (value,) in _parts(text, kind, expected))
 
     return read
 
 
+def _parts(text: str, kind: Callable[[str], _Number], expected: str, within: str = "") -> list[list[_Number]]:
+    """The numbers between commas, and between what stands `within` a part."""
+    try:
+        return [[kind(word) for word in (part.split(within) if within else [part])] for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}") from None
+
+
 def pair(text: str) -> tuple[float, float]:
     """Two numbers separated by a comma."""
-    try:
-        first, second = (float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"is {text!r}, expected two numbers separated by a comma") from None
-    return first, second
+    found = _parts(text, float, expected := "two numbers separated by a comma")
+    if len(found) != 2:
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
+    return found[0][0], found[1][0]
 
 
 def _band_of(text: str) -> tuple[float, float]:
@@ -123,45 +137,28 @@ def energy_budget(text: str) -> tuple[float, float]:
 
 def delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
     """'1,2' as one range for all channels, '1-2,0-3' as one per channel [samples]."""
-    parts = [part.split("-") for part in text.split(",")]
-    if len(parts) == 2 and all(len(part) == 1 for part in parts):
-        parts = [[parts[0][0], parts[1][0]]]
-    try:
-        return tuple((int(lo), int(hi)) for lo, hi in parts)
-    except ValueError:
-        expected = "LO,HI or LO-HI,LO-HI,.. in whole samples"
-        raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}") from None
+    parts = _parts(text, int, expected := "LO,HI or LO-HI,LO-HI,.. in whole samples", "-")
+    if [len(part) for part in parts] == [1, 1]:
+        return ((parts[0][0], parts[1][0]),)
+    if any(len(part) != 2 for part in parts):
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
+    return tuple((lo, hi) for lo, hi in parts)
 
 
 def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
     """'130e-6' as 0 to 0.13 ms, '100e-6:130e-6' as a range of its own; one for all, or one per channel [s]."""
-    try:
-        parts = [[float(word) for word in part.split(":")] for part in text.split(",")]
-    except ValueError:
-        parts = [[]]
-    if not all(len(part) in (1, 2) for part in parts):
-        raise argparse.ArgumentTypeError(f"is {text!r}, expected S or LO:HI in seconds, one or one per channel")
+    parts = _parts(text, float, expected := "S or LO:HI in seconds, one or one per channel", ":")
+    if any(len(part) > 2 for part in parts):
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
     return tuple((0.0, part[0]) if len(part) == 1 else (part[0], part[1]) for part in parts)
 
 
 def condition(text: str) -> str:
     """A condition by its name, or by the name that it had before."""
     name = older.CONDITIONS.get(text, text)
-    if name not in older.CONDITIONS.values():
-        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(older.CONDITIONS.values())}")
+    if name not in CONDITIONS:
+        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)}")
     return name
-
-
-def _one(kind: Callable[[str], _Number], least: float, most: float, unit: str) -> Callable[[str], _Number]:
-    def read(text: str) -> _Number:
-        try:
-            value = kind(text)
-        except ValueError:
-            what = "a whole number" if kind is int else "a number"
-            raise argparse.ArgumentTypeError(f"is {text!r}, expected {what}") from None
-        return _within(value, least, most, unit)
-
-    return read
 
 
 def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
@@ -173,30 +170,52 @@ def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
     raise argparse.ArgumentTypeError(f"is {shown}, allowed are {span}{unit}")
 
 
-def per_channel(option: str, values: tuple[_Number, ...], channels: int) -> tuple[_Number, ...]:
+def given(value: Any) -> bool:
+    """Whether the value of an option says that the option was given; 0 does."""
+    return value is not None and value is not False
+
+
+@contextmanager
+def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[None]:
+    """What is refused within is bad input: InputError, with this name in front of what was said.
+
+    Of `args` the option's name takes the place of the argument's that a message begins with.
+    """
+    try:
+        yield
+    except (InputError, DesignFailed):
+        raise
+    except (ValueError, ArithmeticError) as error:
+        text = str(error)
+        argument = text.partition(" ")[0]
+        if given(getattr(args, argument, None)):
+            text = f"--{argument.replace('_', '-')}{text[len(argument) :]}"
+        raise InputError(f"{name}{text}") from None
+
+
+def per_channel(option: str, values: tuple[_Given, ...], channels: int, what: str = "entries") -> tuple[_Given, ...]:
     """One value for each channel; a single one serves all. Raises InputError."""
     values = values * channels if len(values) == 1 else values
     if len(values) != channels:
         expected = "one" if channels == 1 else f"{channels} (one per channel) or 1"
-        raise InputError(f"{option} has {len(values)} entries, expected {expected}")
+        raise InputError(f"{option} has {len(values)} {what}, expected {expected}")
     return values
 
 
-def ranges_per_channel(
-    option: str, pairs: tuple[tuple[int, int], ...], channels: int
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """(least, largest) delays of every channel [samples]; a single range serves all. Raises InputError."""
-    if len(pairs) not in (1, channels):
-        raise InputError(f"{option} has {len(pairs)} ranges, expected {channels} (one per channel) or 1")
-    lo, hi = zip(*(pairs * channels if len(pairs) == 1 else pairs), strict=True)
-    return lo, hi
+def delay_range(pairs: tuple[tuple[int, int], ...], channels: int, most: int) -> DelayRange:
+    """What --varying-delay says, as a range of delays on every channel. Raises InputError."""
+    lo, hi = zip(*per_channel("--varying-delay", pairs, channels, "ranges"), strict=True)
+    if any(not 0 <= a <= b <= most for a, b in zip(lo, hi, strict=True)):
+        asked = ",".join(f"{a}-{b}" for a, b in pairs)
+        raise InputError(f"--varying-delay is {asked}, expected 0 <= LO <= HI <= {most} samples")
+    return DelayRange(lo, hi)
 
 
 def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) -> tuple[_Number, ...]:
     """Numbers that stand within a longer text, a single one for all. Raises InputError with `option` in front."""
     try:
         if count == 1 and "," not in text:
-            return (_one(kind, -math.inf, math.inf, "")(text),)
+            return (_one(kind)(text),)
         return per_channel(option, several(kind)(text), count)
     except argparse.ArgumentTypeError as error:
         raise InputError(f"{option} {error}") from None
@@ -229,15 +248,13 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     scenario = load(args.scenario)
     if args.scenario in older.SCENARIOS:
         print(f"scenario {args.scenario} is called {scenario.name} now", file=sys.stderr)
-    given = {name: getattr(args, name) for name in ("theta", "psi", "lam") if getattr(args, name) is not None}
-    changes: dict[str, Any] = {name: per_channel(f"--{name}", n, scenario.channels) for name, n in given.items()}
-    for name in ("T", "T_max"):
-        if getattr(args, name) is not None:
-            changes[name] = getattr(args, name)
-    if args.latency is not None:
-        changes["latency"] = per_channel("--latency", args.latency, scenario.channels)
-    delta = None if args.delta is None else per_channel("--delta", args.delta, scenario.channels)
-    return scenario.replace(delta, **changes) if changes or delta else scenario
+    names = ("theta", "psi", "lam", "latency", "delta", "T", "T_max")
+    said = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    changes: dict[str, Any] = {
+        name: value if name in ("T", "T_max") else per_channel(f"--{name}", value, scenario.channels)
+        for name, value in said.items()
+    }
+    return scenario.replace(**changes) if changes else scenario
 
 
 def add_band_option(parser: argparse._ActionsContainer) -> None:
@@ -254,13 +271,7 @@ def add_human_option(parser: argparse.ArgumentParser, more: str = "") -> None:
 
 def with_humans(args: argparse.Namespace, scenario: Scenario) -> Scenario:
     """The scenario in the hands that --human names. Raises InputError."""
-    if args.human is None:
-        return scenario
-    people = load_humans(args.human, scenario.channels)
-    who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
-    if people.population is not None:
-        who["population"] = people.population
-    return scenario.replace(**who)
+    return scenario if args.human is None else held_by(scenario, args.human)
 
 
 def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: str = "spring-damper") -> None:
@@ -269,10 +280,10 @@ def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: s
     add_condition_option(parser)
 
 
-def add_condition_option(parser: argparse._ActionsContainer, what: str = "that the certificate is about") -> None:
+def add_condition_option(parser: argparse._ActionsContainer, what: str = "the condition of the certificate") -> None:
     """--condition."""
-    names = ",".join(older.CONDITIONS.values())
-    help_ = f"{what}: {' or '.join(older.CONDITIONS.values())} (default: the coupling's own)"
+    names = ",".join(CONDITIONS)
+    help_ = f"{what}: {' or '.join(CONDITIONS)} (default: the coupling's own)"
     parser.add_argument("--condition", type=condition, metavar=f"{{{names}}}", help=help_)
 
 
@@ -328,14 +339,6 @@ def place(args: argparse.Namespace) -> str:
     return Path(args.scenario).stem + ("" if args.case == "I" else f"-{args.case}")
 
 
-def as_option(error: ValueError, args: argparse.Namespace) -> str:
-    """The message of a design about its argument, with the option's name in the argument's place."""
-    text = str(error)
-    name, _, _ = text.partition(" ")
-    given = getattr(args, name, None)
-    return text if given is None or given is False else f"--{name.replace('_', '-')}{text[len(name) :]}"
-
-
 def add_rigid_option(parser: argparse.ArgumentParser) -> None:
     """A rigid wall in place of the environment."""
     wall = "a rigid wall in place of the environment; one channel, the scenario's first"
@@ -346,20 +349,8 @@ def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     """The loop of the one channel that --rigid is about. Raises InputError where options name more of them."""
     for name in ("theta", "psi", "delta"):
         per_channel(f"--rigid is one channel: --{name}", getattr(args, name) or (0,), 1)
-    theta, psi, late = scenario.theta[:1], scenario.psi[:1] if args.psi else (0,), scenario.latency
-    try:
-        return Loop(
-            scenario.T,
-            theta,
-            psi,
-            theta,
-            scenario.delta[:1],
-            RIGID_WALL,
-            T_max=scenario.longest_period,
-            latency=late and late[:1],
-        )
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    with refused():
+        return scenario.before_a_rigid_wall(scenario.psi[:1] if args.psi else (0,))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -397,11 +388,9 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
     if args.pattern is not None:
         changes |= _pattern(args.pattern, scenario.channels)
     if args.varying_delay is not None:
-        changes["lo"], changes["hi"] = ranges_per_channel("--varying-delay", args.varying_delay, scenario.channels)
-    if args.loss is not None:
-        changes["loss"] = args.loss
-    if args.playout:
-        changes["playout"] = True
+        pairs = per_channel("--varying-delay", args.varying_delay, scenario.channels, "ranges")
+        changes["lo"], changes["hi"] = zip(*pairs, strict=True)
+    changes |= {name: value for name in ("loss", "playout") if given(value := getattr(args, name))}
     if not changes:
         return scenario
     if scenario.varying_delay is None and "lo" not in changes:
@@ -409,60 +398,62 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
             option = "--playout" if args.playout else "--pattern"
             raise InputError(f"{option} without a range of delays: give --varying-delay LO,HI")
         changes |= {"lo": scenario.theta, "hi": scenario.theta}
-    try:
+    with refused():
         old = scenario.varying_delay
         varying = msgspec.structs.replace(old, **changes) if old else VaryingDelay(**changes)
-    except ValueError as error:
-        raise InputError(str(error)) from None
     theta = varying.hi if varying.playout and args.theta is None else scenario.theta
     return scenario.replace(theta=theta, varying_delay=varying)
 
 
 def _periods(text: str) -> Periods:
-    """Of two numbers, or of a file of one column [s]; # begins a comment. Raises InputError."""
-    try:
+    """Of two numbers, or of a file of one column [s]. Raises InputError."""
+    with refused("--period: "):
         if "," in text and not Path(text).is_file():
             least, most = numbers("--period", text, float, 2)
             return Periods(least, most)
-        lines = Path(text).read_text(encoding="utf-8").splitlines()
-        words = [(n, line.split("#")[0].strip()) for n, line in enumerate(lines, start=1)]
-        return Periods(
-            recorded=tuple(numbers(f"--period {text}, line {n}:", word, float, 1)[0] for n, word in words if word)
-        )
-    except OSError as error:
-        raise InputError(f"--period {text}: {error.strerror}; give MIN,MAX in seconds or a file") from None
-    except UnicodeDecodeError:
-        raise InputError(f"--period {text}: not a text file in UTF-8") from None
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"--period: {error}") from None
+        rows = _rows("--period", text, float, 1, "; give MIN,MAX in seconds or a file")
+        return Periods(recorded=tuple(row[0] for row in rows))
 
 
 def _pattern(name: str, channels: int) -> dict[str, Any]:
     if name in _DRAWN:
         return {"pattern": name, "recorded": ()}
-    rows = _recorded(name, channels)
+    rows = _rows("--pattern", name, int, channels, f"; give a file or one of: {', '.join(_DRAWN)}")
     arrived = [[n for n in column if n != LOST] or [0] for column in zip(*rows, strict=True)]
     lo, hi = (tuple(side(column) for column in arrived) for side in (min, max))
     return {"pattern": "recorded", "recorded": rows, "lo": lo, "hi": hi}
 
 
-def _recorded(name: str, channels: int) -> tuple[tuple[int, ...], ...]:
-    """Rows of delays, separated by commas or blanks; one column serves all channels; # begins a comment."""
-    text = read_text(name, f"--pattern {name}", f"; give a file or one of: {', '.join(_DRAWN)}")
+def _rows(
+    option: str, path: str, kind: Callable[[str], _Number], columns: int, hint: str
+) -> tuple[tuple[_Number, ...], ...]:
+    """Numbers of a file, between commas or blanks; one column serves all; # begins a comment. Raises InputError."""
     rows = []
-    for line_number, line in enumerate(text.splitlines(), start=1):
-        words = line.split("#")[0].replace(",", " ").split()
-        if words:
-            rows.append(numbers(f"--pattern {name}, line {line_number}:", ",".join(words), int, channels))
+    for n, line in enumerate(read_text(path, f"{option} {path}", hint).splitlines(), start=1):
+        if words := line.split("#")[0].replace(",", " ").split():
+            rows.append(numbers(f"{option} {path}, line {n}:", ",".join(words), kind, columns))
     if not rows:
-        raise InputError(f"--pattern {name}: holds no delays")
+        raise InputError(f"{option} {path}: holds no numbers")
     return tuple(rows)
 
 
 # ----------------------------------------------------------------------------------------------------
 # Running a command.
+
+
+def until_interrupted(rows: Iterable[_Given]) -> tuple[list[_Given], bool]:
+    """What was done until the keyboard ended it, and whether it did."""
+    done: list[_Given] = []
+    try:
+        done.extend(rows)
+    except KeyboardInterrupt:
+        return done, True
+    return done, False
+
+
+def exit_code(holds: bool, interrupted: bool = False) -> int:
+    """Of a command that has reported what it found."""
+    return INTERRUPTED if interrupted else DONE if holds else DOES_NOT_HOLD
 
 
 def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> NoReturn:

@@ -24,7 +24,8 @@ from rich.text import Text
 from controller.loop import Loop
 from controller.older import REPORTS, with_older
 from design.files import nobody_reads, plain, printable, write_json
-from design.result import DesignFailed, listed
+from design.files import unseen as unseen
+from design.result import CONDITIONS, DesignFailed, listed
 
 # ----------------------------------------------------------------------------------------------------
 # The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
@@ -122,6 +123,9 @@ def designing(loop: Loop | None = None, kind: str | None = None, condition: str 
 # A whole report: files, tables, lines below them, JSON.
 
 
+_Drawing = Callable[[Any], Callable[[Any, Path], Path]]  # from sim.plots the function that draws
+
+
 def publish(
     args: argparse.Namespace,
     report: Any,
@@ -148,6 +152,16 @@ def publish(
         screen.print("files: " + ", ".join(outcome["files"]), soft_wrap=True)
     if args.json:
         write_json(args.json, outcome)
+
+
+def pictures(args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, _Drawing]) -> list[Path]:
+    """Pictures of a report, by file what draws it; with --no-plot none, and matplotlib is not loaded."""
+    if args.no_plot:
+        return []
+    from sim import plots
+
+    outcome = plain(report)
+    return [drawing(plots)(outcome, folder / file) for file, drawing in drawn.items()]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -179,6 +193,15 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
     return table
 
 
+def columns(title: str, cells: Mapping[str, _Form], records: Iterable[Any], left: Sequence[int] = (0,)) -> Table:
+    """A table of records: under each head a format of the record `r`, or what a function says of it.
+
+    A head that stands there twice has a blank behind it once.
+    """
+    rows = [[str(form(r)) if callable(form) else form.format(r=r) for form in cells.values()] for r in records]
+    return grid(title, [head.strip() for head in cells], rows, left)
+
+
 def figure(name: str, form: _Form = "{}", default: Any = MISSING, json: str = "key", absent: str | None = None) -> Any:
     """A field that a report's table shows under this name, in this format: of the value, and of the whole report `r`.
 
@@ -191,11 +214,6 @@ def figure(name: str, form: _Form = "{}", default: Any = MISSING, json: str = "k
 def several(rows: Callable[[Any], Rows], json: str = "key") -> Any:
     """A field that a report's table shows as these rows."""
     return field(metadata={"rows": rows, "json": json})
-
-
-def unseen(json: str = "key", default: Any = MISSING) -> Any:
-    """A field that no table shows."""
-    return field(default=default, metadata={"json": json})
 
 
 def rows_of(report: Any) -> Rows:
@@ -219,9 +237,6 @@ def rows_of(report: Any) -> Rows:
 # Phrases that several reports share.
 
 
-ORDER = ("this-environment", "any-environment")  # of conditions in a table
-
-
 def certified(part: Mapping[str, Any]) -> str:
     """Whether it is, and whether that is proved in exact arithmetic."""
     if not part["certified"]:
@@ -238,7 +253,7 @@ def needs(part: Mapping[str, Any], digits: int = 6) -> str:
 def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> Rows:
     """What each condition needs, and whether that is proved exactly, where no other row says it."""
     for name, part in certificates.items():
-        if name in ORDER:
+        if name in CONDITIONS:
             word = certified(part) if proof else certified(part | {"proof": None})
             yield f"damping, {name}", f"needs {needs(part, digits)}: {word}"
 

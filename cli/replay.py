@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cli import render
-from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json
+from cli import options, render
 from hw.recording import load, replay
 
 
@@ -18,38 +17,37 @@ class _Compared:
 
     trace: str = render.figure("trace")
     ticks: int = render.figure("ticks")
-    filled_in: int = render.figure("filled in")
-    asked_differ: int = render.figure("asked differ")
-    sent_differ: int = render.figure("sent differ")
+    filled_in: int = render.figure("without an answer")
+    asked_differ: int = render.figure("other forces asked for")
+    sent_differ: int = render.figure("other forces sent")
     largest_difference_n: float = render.figure("largest difference [N]")
     first_difference_s: float | None = render.figure("first difference [s]")
-    identical: bool = render.figure("identical")
+    identical: bool = render.figure("identical", lambda same: "yes, bit by bit" if same else "no")
 
 
 def main(argv: list[str]) -> int:
     """Replay a trace. 0: every force is the recorded one bit by bit, 1: not."""
-    parser = Parser(
+    parser = options.Parser(
         "hw.replay",
         "Feed a recorded session through the controller again and compare the forces bit by bit.",
         "python -m hw.replay out/bridge-I/trace.npz",
     )
     parser.add_argument("trace", metavar="TRACE.npz", help="written by hw.bridge")
-    parser.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
+    options.add_json_option(parser)
     args = parser.parse_args(argv)
-    check_json(args)
+    options.check_json(args)
     result, link = load(Path(args.trace))
     compared = replay(result, link)
-    ticks, received = result.t.size, int(link["received"].sum())
     different = compared.asked | compared.sent
-    compared_ticks = _Compared(
-        args.trace,
-        ticks,
-        ticks - received,
-        int(compared.asked.sum()),
-        int(compared.sent.sum()),
-        compared.largest,
-        float(result.t[np.argmax(different)]) if different.any() else None,
-        compared.identical,
+    report = _Compared(
+        trace=args.trace,
+        ticks=result.t.size,
+        filled_in=result.t.size - int(link["received"].sum()),
+        asked_differ=int(compared.asked.sum()),
+        sent_differ=int(compared.sent.sum()),
+        largest_difference_n=compared.largest,
+        first_difference_s=float(result.t[np.argmax(different)]) if different.any() else None,
+        identical=compared.identical,
     )
-    render.publish(args, render.plain(compared_ticks), [render.facts(args.trace, render.rows_of(compared_ticks))])
-    return DONE if compared.identical else DOES_NOT_HOLD
+    render.publish(args, report, [render.facts(args.trace, render.rows_of(report))])
+    return options.exit_code(compared.identical)

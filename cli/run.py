@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from cli import options, render
 from cli.judged import Judged, judge
+from cli.judged import rows as judged_rows
 from controller.environment import GROUND
 from controller.loop import Loop
 from design.files import write
 from design.guarantees import ANY
 from design.optimal import robustness_parts
-from design.result import listed
-from design.transparency import BAND_HZ, transparency
-from sim import accuracy, report
+from design.result import CONDITIONS, finite, listed
+from design.transparency import BAND_HZ
+from sim import accuracy
 from sim import passivity_layer as layer
 from sim.alternatives import Alternative, alternatives
 from sim.api import ScenarioRun, run_scenario
 from sim.couplings import NAMES, Chosen, choose
-from sim.engines import INTEGRATORS
-from sim.run import ENGINES, beginnings
+from sim.mujoco_engines import INTEGRATORS
+from sim.run import ENGINES
+from sim.run_report import Ran, RunReport, run_report
 from sim.scenario import InputError, Scenario
-from sim.stability import MARGINAL, stability_part
-from sim.stepping import MOST
+from sim.stability import MARGINAL, ExactVerdict
+from sim.step_choice import MOST
 
 
 def main(argv: list[str]) -> int:
@@ -40,39 +43,40 @@ def main(argv: list[str]) -> int:
     done = _run(args, simulated, chosen, judged.limits.rho)  # sample, compute, limit, hold, advance
     same = args.limiter is None and not scenario.ranges and args.case != "none"
     others = _alternatives(args, scenario, done, (chosen, judged.requirements, judged.limits) if same else None)
-    report = _reported(args, scenario, chosen, judged, done, environment, others)
+    robustness = _robustness(chosen, scenario.loop(args.case), judged)
+    asked = {"seed": args.seed, "band_hz": args.band_hz or BAND_HZ, "check": args.cross_check}
+    report = run_report(scenario, args.case, chosen, judged, done, environment, others, robustness, **asked)
     files = _save(args, out, done, report)
     if args.side_by_side:
         files.append(_side_by_side(others, out / "couplings.png", scenario.environment.contacts))
-    render.publish(args, report, _tables(scenario, report, others), report.remarks, out, files)
-    return options.INTERRUPTED if done.trace.interrupted else options.DONE
+    render.publish(args, report, _tables(scenario, report), report.remarks, out, files)
+    return options.exit_code(True, done.trace.interrupted)
 
 
 def _parser() -> options.Parser:
     parser = options.Parser(
         "sim.run", "Close the loop once and report stability, transparency and error.", "python -m sim.run --case none"
     )
+    add = parser.add_argument
     options.add_loop_options(parser)
     options.add_varying_delay_options(parser)
     options.add_coupling_options(parser, f"{', '.join(NAMES)}, as baselines {', '.join(layer.BASELINES)}")
     options.add_energy_budget_option(parser)
-    parser.add_argument("--engine", choices=ENGINES, default="mujoco", help="MuJoCo, or the exact solution")
-    steppers = "of MuJoCo (default exponential, RK4 where devices rub)"
-    parser.add_argument("--integrator", choices=tuple(INTEGRATORS), help=steppers)
+    add("--engine", choices=ENGINES, default="mujoco", help="MuJoCo (default), or the exact solution")
+    steppers = "integrator of MuJoCo (default exponential, RK4 where devices rub)"
+    add("--integrator", choices=tuple(INTEGRATORS), help=steppers)
     steps = "MuJoCo steps per period (default: what the plant asks)"
-    parser.add_argument("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
-    parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help="default: the scenario's")
-    asked = (
-        "relative rms of the positions: compare engines and steps on this scene, run with the cheapest that keeps it"
-    )
-    parser.add_argument("--error", type=options.number(1e-18, 1.0), metavar="E", help=asked)
+    add("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
+    add("--duration", type=options.number(), metavar="SECONDS", help="simulated time (default: the scenario's)")
+    asked = "compare engines and steps on this scene, run with the cheapest that keeps this relative rms error"
+    add("--error", type=options.number(1e-18, 1.0), metavar="E", help=asked)
     check = "run RK4 beside the exponential engine, with which it shares no matrix"
-    parser.add_argument("--cross-check", action="store_true", help=check)
+    add("--cross-check", action="store_true", help=check)
     options.add_human_option(parser)
     options.add_band_option(parser)
     options.add_limiter_option(parser)
     vertex = "simulate at this vertex of the scenario's ranges (default 0: nominal)"
-    parser.add_argument("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
+    add("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
     options.add_output_options(parser, picture=True)
     beside = parser.add_argument_group("the same devices and hands with other couplings")
     beside.add_argument("--no-alternatives", action="store_true", help="no table of them, which takes a second or two")
@@ -137,132 +141,21 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun
 def _side_by_side(others: list[Alternative], path: Path, names: tuple[str, ...]) -> Path:
     from sim.plots import Panel, plot_side_by_side
 
-    shown = [other for other in others if other.trace is not None and other.kind != "published"]
-    panels = []
-    for other in shown:
-        assert other.trace is not None
-        assert other.ideal is not None
-        panels.append(Panel(_panel_title(other), other.trace, other.ideal, other.until_s))
+    panels = [
+        Panel(_panel_title(other), other.trace, other.ideal, other.until_s)
+        for other in others
+        if other.trace is not None and other.ideal is not None and other.coupling != "published"
+    ]
     return plot_side_by_side(panels, path, names)
 
 
 def _panel_title(other: Alternative) -> str:
-    kind = ", spring-damper" if other.kind == "spring-damper" else ""
-    guarantee = f"guarantee: {other.guarantee}" if other.guarantee else "no guarantee"
-    felt = f"grows: {render.optional(other.growth, '{:+.2f} 1/s')}"
-    if other.error_percent is not None:
-        felt = f"force error {other.error_percent:.2g} %"
-    return f"{'no coupling' if other.kind == 'none' else other.name + kind}\n{felt}; {guarantee}"
-
-
-@dataclass(frozen=True, eq=False)
-class _Report:
-    """The result of a run; parts that it does not have are null."""
-
-    case: str
-    scenario: str
-    certificate: dict[str, Any]
-    judged: Judged = render.unseen("beside")
-    encoder: dict[str, Any] | None = render.unseen()
-    transparency: dict[str, Any] = render.unseen()
-    stability: dict[str, Any] = render.unseen()
-    varying_delay: dict[str, Any] | None = render.unseen()
-    run: dict[str, Any] = render.unseen()
-    error: dict[str, Any] = render.unseen()
-    credible: dict[str, Any] = render.unseen()
-    alike: accuracy.ForceError = render.unseen("table")
-    ideal_force: dict[str, Any] = render.unseen()
-    energy_budget: dict[str, Any] | None = render.unseen()
-    baseline: dict[str, Any] | None = render.unseen()
-    robustness: dict[str, Any] = render.unseen("beside")
-    alternatives: list[dict[str, Any]] = render.unseen()
-    reproducibility: list[dict[str, str]] = render.unseen(default=())
-    remarks: tuple[str, ...] = render.unseen(default=())
-
-    @property
-    def unstable(self) -> bool | None:
-        """Whether switching makes the loop grow; None where the eigenvalues say whether it does."""
-        return _switched(self.varying_delay) and self.stability["verdict"] == "unstable"
-
-    def rows(self) -> render.Rows:
-        """Of its table."""
-        coupling, stability, run, transparent = self.judged.coupling, self.stability, self.run, self.transparency
-        contact, apart = stability.get("contact"), self.error["position_relative_rms"]
-        gains = coupling["K"] and f"{listed(coupling['K'], 5)} N/m / {listed(coupling['B'], 5)} N s/m"
-        how = "growth, switching" if self.unstable is not None else "growth, simulated trace"
-        if run["timing"] and "impulse" in stability.get("reason", ""):
-            how = "growth, uneven ticks"
-        measured = render.optional(stability["growth_rate_per_s"], "{:+.4f} 1/s")
-        position = "-" if apart is None else f"{apart:.1e} relative rms, {self.error['position_max_m']:.1e} m at most"
-        return [
-            ("coupling K / B", gains or None),
-            ("coupling, static", coupling.get("stiffness") and f"{listed(coupling['stiffness'], 5)} N/m"),
-            *self.judged.rows(),
-            ("transparency error", render.transparency_error(transparent)),
-            *render.robustness_rows(self.robustness),
-            ("force error", _force_error(self.ideal_force)),
-            ("rendered stiffness", f"{100 * transparent['dc_ratio']:.1f} %" if transparent["dc_ratio"] else "-"),
-            *_net_rows(self.energy_budget, self.baseline),
-            ("growth, eigenvalues", _growth(stability)),
-            (how, f"{measured}: {render.verdict(stability['verdict'])}"),
-            render.timing_row(run["timing"]),
-            *(render.delay_rows(self.varying_delay) if self.varying_delay else []),
-            *(_contact_rows(contact, run["samples"]) if contact else []),
-            ("simulated in", run["environment"] if self.judged.ranges else None),
-            ("force limits", self.judged.limiter["words"]),
-            ("limited ticks", f"{stability['clipped_ticks']} of {run['samples']}"),
-            ("speed", _speed(run)),
-            ("position error", position),
-            ("cross-check", _crossed(run["cross_check"]) if run["cross_check"] else None),
-        ]
-
-
-def _switched(delays: dict[str, Any] | None) -> bool | None:
-    return True if "verdict" in (delays or {}) else None
-
-
-def _reported(
-    args: argparse.Namespace,
-    scenario: Scenario,
-    chosen: Chosen,
-    judged: Judged,
-    run: ScenarioRun,
-    environment: str,
-    others: list[Alternative],
-) -> _Report:
-    """The report of a run."""
-    simulation, lam = run.simulation, scenario.loop(args.case).lam
-    covered = any(requirement.certified for requirement in judged.requirements.values())
-    delays = report.delays_part(simulation, chosen, run.period, run.trace.t.size, covered)
-    if delays and simulation.scenario.switches:
-        stability = report.switched_stability_part(simulation, run.trace, delays)
-    else:
-        stability = stability_part(simulation, run.trace)
-    alike, net = accuracy.force_error(run.ran, run.trace, lam), run.trace.net.part() if run.trace.net else None
-    budget = net if net and net["guarantee"] is not None else None
-    unstable = _switched(delays) and stability["verdict"] == "unstable"
-    found = _Report(
-        args.case,
-        scenario.name,
-        judged.certificates[chosen.condition],
-        judged,
-        report.encoder_steps(scenario, args.case, chosen.coupling),
-        report.transparency_part(transparency(simulation.felt, simulation.E, lam, args.band_hz or BAND_HZ)),
-        stability,
-        delays,
-        _settings(args, run, lam) | {"environment": environment},
-        accuracy.position_error(run.trace, run.exact, simulation, unstable),
-        accuracy.credible_part(simulation, run.trace),
-        alike,
-        alike.part(),
-        budget and budget | {"idle": layer.idle(simulation, judged.requirements["any-environment"], budget)},
-        None if budget else net,
-        _robustness(chosen, scenario.loop(args.case), judged),
-        [other.part() for other in others],
-    )
-    paper = report.beside_the_paper(simulation.scenario, args.case, stability, judged.coupling)
-    remarks = (*run.remarks, *chosen.notes, *report.remarks(render.plain(found)))
-    return replace(found, reproducibility=paper, remarks=remarks)
+    kind = ", spring-damper" if other.coupling == "spring-damper" else ""
+    guarantee = f"guarantee: {other.promise}" if other.promise else "no guarantee"
+    felt = f"grows: {render.optional(other.growth_rate_per_s, '{:+.2f} 1/s')}"
+    if other.force_error_percent is not None:
+        felt = f"force error {other.force_error_percent:.2g} %"
+    return f"{'no coupling' if other.coupling == 'none' else other.name + kind}\n{felt}; {guarantee}"
 
 
 def _robustness(chosen: Chosen, loop: Loop, judged: Judged) -> dict[str, Any]:
@@ -274,48 +167,21 @@ def _robustness(chosen: Chosen, loop: Loop, judged: Judged) -> dict[str, Any]:
         return robustness_parts(loop, chosen.coupling)
 
 
-def _settings(args: argparse.Namespace, run: ScenarioRun, lam: tuple[int, ...]) -> dict[str, Any]:
-    scenario, process, samples = run.simulation.scenario, run.simulation.process, run.trace.t.size
-    duration = float(beginnings(scenario.T, run.simulation.timing, samples, 1)[0])
-    return {
-        "engine": args.engine,
-        "integrator": run.integrator,
-        "substeps": run.substeps,
-        "duration_s": duration,
-        "samples": samples,
-        "wall_s": run.wall_s,
-        "real_time_factor": duration / run.wall_s,
-        "theta": scenario.theta,
-        "psi": scenario.psi,
-        "lam": lam,
-        "T_s": scenario.T,
-        "timing": report.timing_part(run.simulation.timing, scenario),
-        "seed": args.seed,
-        "engines": [choice.part() for choice in run.choices] or None,
-        "cross_check": accuracy.cross_check(run.ran, run.trace, run.integrator, run.substeps)
-        if args.cross_check
-        else None,
-        "interrupted": run.trace.interrupted,
-        "scenario_digest": scenario.digest,
-        "encoder_step_m": process.encoder_step,
-        "steady_ticks": [[0, run.trace.ticks_before_clipping(process.force_limit)]],
-    }
-
-
-def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: _Report) -> list[Path]:
+def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
     result, stability = replace(run.trace, meta=render.plain(report)), report.stability
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", run.simulation.scene.xml))
     if not args.no_plot and result.t.size:
         from sim.plots import Contacts, Onset, plot_run
 
-        apart, hertz = report.ideal_force["error_percent"], stability["exact_frequency_hz"]
-        ideal = None if apart is None else (report.alike.ideal, apart)
-        grows = stability["exact_verdict"] == "unstable" and run.exact is not None
-        growth = stability["exact_growth_rate_per_s"] if grows and report.unstable is None else None
-        onset = Onset(growth, report.run["steady_ticks"][0][1], report.credible["until_s"])
+        apart = report.ideal_force.error_percent
+        ideal = None if apart is None else (report.ideal_force.ideal, apart)
+        grows = stability.exact_verdict == "unstable" and run.exact is not None and not report.switched
+        growth = stability.exact_growth_rate_per_s if grows else None
+        onset = Onset(growth, report.run.steady_ticks[0][1], report.credible.until_s)
         around = Contacts(run.simulation.scenario.environment.contacts, *_walls(run))
         title = _title(run.simulation.scenario.title(args.case), report)
+        hertz = stability.exact_frequency_hz
         files.append(plot_run(result, out / "figure.png", title, hertz, ideal, onset, around))
     return files
 
@@ -336,17 +202,16 @@ def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
     return found, (contact.depths(run.trace.z)[:, : len(network.walls)] > 0).any(axis=1)
 
 
-def _title(what: str, report: _Report) -> str:
+def _title(what: str, report: RunReport) -> str:
     """Of the picture."""
     stability, kind = report.stability, report.judged.coupling["kind"]
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
     if kind != "none" and report.judged.promise:
         coupling += f" for {report.judged.promise}"
-    rate, hertz = stability["exact_growth_rate_per_s"], stability["exact_frequency_hz"]
-    grows, decays = f"grows by {rate:.3f} 1/s at {hertz:.1f} Hz", f"slowest motion decays by {-rate:.3f} 1/s"
-    growth = grows if rate > 0 else decays
-    if report.varying_delay and report.unstable is not None:
-        growth = f"{report.varying_delay['pattern']} delays, {stability['verdict']}"
+    rate, hertz = stability.exact_growth_rate_per_s, stability.exact_frequency_hz
+    growth = f"grows by {rate:.3f} 1/s at {hertz:.1f} Hz" if rate > 0 else f"slowest motion decays by {-rate:.3f} 1/s"
+    if report.varying_delay and report.switched:
+        growth = f"{report.varying_delay['pattern']} delays, {stability.verdict}"
     return f"{what.removesuffix(', no coupling').removesuffix(', case none')}, {coupling}: {growth}"
 
 
@@ -354,46 +219,92 @@ def _title(what: str, report: _Report) -> str:
 # The report as tables.
 
 
-def _tables(scenario: Scenario, report: _Report, others: list[Alternative]) -> list[Any]:
+def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
     title = f"{scenario.title(report.case)}: coupling {report.judged.coupling['kind']}"
-    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *report.rows()], ("", ""))]
-    if report.run["engines"]:
-        shown.append(_speed_against_error(report.run))
-    if others:
-        shown.append(_beside(others, report))
+    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(report)], ("", ""))]
+    if report.run.engines:
+        shown.append(_speed_against_error(report.run, report.run.engines))
+    if report.alternatives:
+        shown.append(_beside(report))
     if report.reproducibility:
-        columns = ("what", "paper", "here", "why")
-        cells = [[row[column] for column in columns] for row in report.reproducibility]
-        shown.append(render.grid("beside the paper", ("", *columns[1:]), cells, range(4)))
+        cells = {"": "{r.what}", "paper": "{r.paper}", "here": "{r.here}", "why": "{r.why}"}
+        shown.append(render.columns("beside the paper", cells, report.reproducibility, range(4)))
     return shown
 
 
-def _speed_against_error(run: dict[str, Any]) -> Any:
+def _rows(report: RunReport) -> render.Rows:
+    """Of its table."""
+    coupling, stability, run, ratio = (
+        report.judged.coupling,
+        report.stability,
+        report.run,
+        report.transparency["dc_ratio"],
+    )
+    how = "switching" if report.switched else "simulated trace"
+    if run.timing and "impulse" in (stability.reason or ""):
+        how = "uneven ticks"
+    measured = render.optional(stability.growth_rate_per_s, "{:+.4f} 1/s")
+    if coupling["K"]:
+        yield "coupling K / B", f"{listed(coupling['K'], 5)} N/m / {listed(coupling['B'], 5)} N s/m"
+    if coupling.get("stiffness"):
+        yield "coupling, static", f"{listed(coupling['stiffness'], 5)} N/m"
+    yield from judged_rows(report.judged)
+    yield "transparency error", render.transparency_error(report.transparency)
+    yield from render.robustness_rows(report.robustness)
+    apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
+    yield "force error", f"{apart}, before the force limits" if apart else f"- ({report.ideal_force.reason})"
+    yield "rendered stiffness", f"{100 * ratio:.1f} %" if ratio else "-"
+    yield from _net_rows(report.energy_budget, report.baseline)
+    yield "growth, eigenvalues", _growth(stability)
+    yield f"growth, {how}", f"{measured}: {render.verdict(stability.verdict)}"
+    yield render.timing_row(run.timing)
+    yield from render.delay_rows(report.varying_delay) if report.varying_delay else ()
+    if contact := stability.contact:
+        yield "contact", f"made {contact.made} times, lasting {contact.ticks} of {run.samples} ticks"
+        for state in contact.frozen:
+            name = f"wall{'s' * (len(state.touching) > 1)} {', '.join(map(str, state.touching))}"
+            yield f"growth, {name if state.touching else 'no wall'} touching", _growth(state)
+    yield "simulated in", run.environment if report.judged.ranges else None
+    yield "force limits", report.judged.limiter["words"]
+    yield "limited ticks", f"{stability.clipped_ticks} of {run.samples}"
+    yield "speed", _speed(run)
+    size = render.optional(report.error.position_max_m, "{:.1e} m at most")
+    yield "position error", render.optional(report.error.position_relative_rms, "{:.1e} relative rms, " + size)
+    yield "cross-check", run.cross_check and _crossed(run.cross_check)
+
+
+def _speed(run: Ran) -> str:
+    engine = run.engine + (f" {run.integrator} x {run.substeps}" if run.integrator else "")
+    return f"{run.wall_s:.2f} s for {run.duration_s:g} s: {run.real_time_factor:.2g} x real time ({engine})"
+
+
+def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> Any:
     """Every engine and step on this scene; the one that ran is marked."""
-    cells = []
-    for row in run["engines"]:
-        mark = " *" if (row["integrator"], row["substeps"]) == (run["integrator"], run["substeps"]) else ""
-        error = render.optional(row["position_relative_rms"], "{:.1e}")
-        right = "right" if row["verdict_correct"] else "[red]WRONG[/]"
-        speed = f"{run['duration_s'] / row['cpu_s']:.0f}" if row["cpu_s"] else "-"  # too short for the clock
-        cells.append((f"{row['integrator']} x {row['substeps']}{mark}", error, right, f"{row['cpu_s']:.3f}", speed))
-    heads = ("engine x steps", "position error", "verdict", "CPU s", "x real time")
-    return render.grid("speed against error on this scene (*: the cheapest that keeps --error, this run)", heads, cells)
+    cells: dict[str, Any] = {
+        "engine x steps": lambda r: r.name + " *" * ((r.integrator, r.substeps) == (run.integrator, run.substeps)),
+        "position error": lambda r: render.optional(finite(r.position_relative_rms), "{:.1e}"),
+        "verdict": lambda r: "right" if r.verdict_correct else "[red]WRONG[/]",
+        "CPU s": "{r.cpu_s:.3f}",
+        "x real time": lambda r: f"{run.duration_s / r.cpu_s:.0f}" if r.cpu_s else "-",  # too short for the clock
+    }
+    title = "speed against error on this scene (*: the cheapest that keeps --error, this run)"
+    return render.columns(title, cells, engines)
 
 
-def _beside(others: list[Alternative], report: _Report) -> Any:
+def _beside(report: RunReport) -> Any:
     """The price of each guarantee; the run's own coupling is marked where it is one of them."""
     own = report.judged.coupling["kind"], report.certificate["condition"]
     cells = []
-    for other in others:
-        mark = "*" if own == (other.kind, other.condition) or own[0] == other.kind != "spring-damper" else ""
+    for other in report.alternatives:
         if other.reason:
             cells.append((other.name, "", "", f"not possible: {other.reason}", "", ""))
             continue
-        needs = (_share(other.needs(condition), "never") for condition in render.ORDER)
-        grows = other.growth is None or other.growth > MARGINAL
-        error = "grows" if grows else render.optional(other.error_percent, "{:.3g} %")
-        cells.append((other.name + mark, *needs, other.guarantee or "none", _share(other.rendered, "-"), error))
+        same = own == (other.coupling, other.condition) or own[0] == other.coupling != "spring-damper"
+        needs = (_share(other.needs(condition), "never") for condition in CONDITIONS)
+        grows = other.growth_rate_per_s is None or other.growth_rate_per_s > MARGINAL
+        error = "grows" if grows else render.optional(other.force_error_percent, "{:.3g} %")
+        felt = _share(other.dc_ratio, "-")
+        cells.append((other.name + "*" * same, *needs, other.promise or "none", felt, error))
     heads = ("coupling", "this-env.", "any-env.", "guarantee", "stiffness", "error")
     marked = " (*: this run)" if any(cell[0].endswith("*") for cell in cells) else ""
     title = f"the same devices with other couplings{marked}: required damping\nin % of theirs"
@@ -404,16 +315,11 @@ def _share(value: float | None, absent: str) -> str:
     return absent if value is None else f"{100 * value:.3g} %" if value < 10 else f"{100 * value:.0f} %"
 
 
-def _speed(run: dict[str, Any]) -> str:
-    engine = run["engine"] + (f" {run['integrator']} x {run['substeps']}" if run["integrator"] else "")
-    return f"{run['wall_s']:.2f} s for {run['duration_s']:g} s: {run['real_time_factor']:.2g} x real time ({engine})"
-
-
-def _crossed(part: dict[str, Any]) -> str:
-    apart = render.optional(part["position_relative_rms"], "{:.1e} relative rms apart")
-    growth = f"its loop grows {part['growth_rate_difference_per_s']:+.1e} 1/s otherwise"
-    verdict = "[green]same verdict[/]" if part["agrees"] else "[red]ANOTHER VERDICT[/]"
-    return f"{part['integrator']} x {part['substeps']}: {apart}, {growth}: {verdict}"
+def _crossed(other: accuracy.CrossCheck) -> str:
+    apart = render.optional(finite(other.position_relative_rms), "{:.1e} relative rms apart")
+    growth = f"its loop grows {other.growth_rate_difference_per_s:+.1e} 1/s otherwise"
+    verdict = "[green]same verdict[/]" if other.agrees else "[red]ANOTHER VERDICT[/]"
+    return f"{other.integrator} x {other.substeps}: {apart}, {growth}: {verdict}"
 
 
 def _net_rows(budget: dict[str, Any] | None, baseline: dict[str, Any] | None) -> render.Rows:
@@ -426,21 +332,6 @@ def _net_rows(budget: dict[str, Any] | None, baseline: dict[str, Any] | None) ->
         yield "", budget["guarantee"]
 
 
-def _force_error(part: dict[str, Any]) -> str:
-    if part["error_percent"] is None:
-        return f"- ({part['reason']})"
-    return f"{part['error_percent']:.3g} % rms of the ideal force, before the force limits"
-
-
-def _growth(part: dict[str, Any]) -> str:
-    exact = f"{part['exact_growth_rate_per_s']:+.4f} 1/s at {part['exact_frequency_hz']:.2f} Hz"
-    return f"{exact}: {render.verdict(part['exact_verdict'])}"
-
-
-def _contact_rows(contact: dict[str, Any], samples: int) -> list[tuple[str, str]]:
-    rows = [("contact", f"made {contact['made']} times, lasting {contact['ticks']} of {samples} ticks")]
-    for state in contact["frozen"]:
-        walls = [str(wall) for wall in state["touching"]]
-        name = f"wall{'s' if len(walls) > 1 else ''} {', '.join(walls)}" if walls else "no wall"
-        rows.append((f"growth, {name} touching", _growth(state)))
-    return rows
+def _growth(loop: ExactVerdict) -> str:
+    exact = f"{loop.exact_growth_rate_per_s:+.4f} 1/s at {loop.exact_frequency_hz:.2f} Hz"
+    return f"{exact}: {render.verdict(loop.exact_verdict)}"

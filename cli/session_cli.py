@@ -9,7 +9,7 @@ import termios
 import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,10 @@ from cli.render import console, progress
 from hw.control import Armable
 from hw.emulator import Emulator, FaultInjection, spawned
 from hw.force_dimension import FORCE_DIMENSION, ForceDimension
+from hw.haptic_device import HapticDevice, SerialDevice
 from hw.monitor import Ages, LinkSettings
 from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
-from hw.seam import HapticDevice, SerialDevice
 from hw.session import Operator, Session
 from hw.transport import Live, SerialPort, preflight
 from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
@@ -37,25 +37,24 @@ _PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
 def add_link_options(parser: argparse.ArgumentParser) -> None:
     """Which device, over which line, and how its delay is judged."""
     link = parser.add_argument_group("the link")
+    add, number = link.add_argument, options.number
     port = f"serial port of the device, /dev/ttyACM0 or an emulator's; or {FORCE_DIMENSION}[:0x,1x], devices and axes"
-    link.add_argument("--port", metavar="PATH", help=port)
-    link.add_argument("--emulate", action="store_true", help="start hw.emulator and drive that; it arms by itself")
-    rehearse = (
-        "the whole session in virtual time with an emulated device: no port, no waiting, the same on every machine"
-    )
-    link.add_argument("--rehearse", action="store_true", help=rehearse)
-    fault = "for --emulate and --rehearse, see hw.emulator"
-    link.add_argument("--fault", action="append", default=[], metavar="FAULT", help=fault)
+    add("--port", metavar="PATH", help=port)
+    add("--emulate", action="store_true", help="start hw.emulator and drive that; it arms by itself")
+    virtual = "the whole session in virtual time with an emulated device: no port, no waiting, the same everywhere"
+    add("--rehearse", action="store_true", help=virtual)
+    fault = "a fault of the emulated device, as hw.emulator has them (--emulate, --rehearse)"
+    add("--fault", action="append", default=[], metavar="FAULT", help=fault)
     add_pace_option(link, "slow motion of an emulator, for busy machines (default 1)")
-    link.add_argument("--arm", action="store_true", help="arm without being asked; else press a")
-    baud = "of a UART, checked against T; none: USB without one (default 921600; none for a pseudo-terminal)"
-    link.add_argument("--baud", type=_baud_or_none, metavar="N|none", help=baud)
-    share, ages = options.number(0.5, 1.0), "of the ages that theta covers (default 0.99)"
-    link.add_argument("--quantile", type=share, default=0.99, metavar="Q", help=ages)
-    spare = "added to it (default 1e-4)"
-    link.add_argument("--guard", type=options.number(0.0, 0.1), default=1e-4, metavar="SECONDS", help=spare)
+    add("--arm", action="store_true", help="arm without being asked (default: when the key a is pressed)")
+    baud = "speed of a UART, checked against T; none: USB without one (default 921600; none for a pseudo-terminal)"
+    add("--baud", type=_baud_or_none, metavar="N|none", help=baud)
     count = "answers that are timed (default 800)"
-    link.add_argument("--measure", type=options.whole(50, 100_000), default=800, metavar="N", help=count)
+    add("--measure", type=options.whole(50, 100_000), default=800, metavar="N", help=count)
+    share = "share of the measured ages that theta covers (default 0.99)"
+    add("--quantile", type=number(0.5, 1.0), default=0.99, metavar="Q", help=share)
+    guard = "spare time added to that age (default 1e-4)"
+    add("--guard", type=number(0.0, 0.1), default=1e-4, metavar="SECONDS", help=guard)
 
 
 def add_pace_option(parser: argparse._ActionsContainer, what: str) -> None:
@@ -64,21 +63,21 @@ def add_pace_option(parser: argparse._ActionsContainer, what: str) -> None:
 
 
 def add_safety_options(parser: argparse.ArgumentParser) -> None:
-    """The bridge's limits, and the deadman."""
-    safety = parser.add_argument_group("safety")
+    """What the bridge never does, and who has to be there."""
+    add, number = parser.add_argument_group("safety").add_argument, options.number
     cap = "largest force (default 2, for first sessions)"
-    safety.add_argument("--force-cap", type=options.number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
-    speed = "of a handle while forces act (default 1)"
-    safety.add_argument("--max-speed", type=options.number(1e-3, 2.5), default=1.0, metavar="M/S", help=speed)
-    heat = "force that each motor stands for ever, one is for all; above it, I2t (default: not looked at)"
-    safety.add_argument("--continuous-force", type=options.several(float), metavar="N,N,..", help=heat)
-    seconds = "of the motors' heating (default 10)"
-    safety.add_argument("--thermal-time", type=options.number(0.1, 1000), default=10.0, metavar="SECONDS", help=seconds)
+    add("--force-cap", type=number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
+    speed = "fastest motion of a handle while forces act (default 1)"
+    add("--max-speed", type=number(1e-3, 2.5), default=1.0, metavar="M/S", help=speed)
+    heat = "force that each motor stands for ever, one is for all; above it, I2t (default: not watched)"
+    add("--continuous-force", type=options.several(float), metavar="N,N,..", help=heat)
+    warm = "time constant of the motors' heating (default 10)"
+    add("--thermal-time", type=number(0.1, 1000), default=10.0, metavar="SECONDS", help=warm)
     absolute = "count positions from the encoders' zero, not from where the handles are at arming"
-    safety.add_argument("--no-rereference", action="store_true", help=absolute)
-    who = "forces act only while a key is pressed, or FILE is touched, once a second, or the device's own one is held"
-    safety.add_argument("--deadman", metavar="key|device|FILE", help=who)
-    safety.add_argument("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
+    add("--no-rereference", action="store_true", help=absolute)
+    who = "forces act only while somebody presses a key or touches FILE once a second, or holds the device's own switch"
+    add("--deadman", metavar="key|device|FILE", help=who)
+    add("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
 
 
 def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
@@ -109,6 +108,13 @@ def touched(path: str) -> Callable[[], bool]:
         return now is not None and now != before
 
     return look
+
+
+def _deadman(named: str | None) -> Callable[[], bool] | None:
+    """Whether somebody is there, beside the keys of the keyboard; None: nobody has to be, or the device knows."""
+    if named in (None, "device"):
+        return None
+    return touched(named) if named != "key" else lambda: False
 
 
 def _mtime(path: str) -> int | None:
@@ -176,48 +182,39 @@ def hold_session(
         incidents.attach(session)
         if args.rehearse:
             return _rehearsed(args, session, plan, seconds, incidents, alone, coulomb)
-        device: HapticDevice
-        serial: SerialDevice | None = None
-        if host_clocked(args):
-            axes = args.port.partition(":")[2] or None
-            device = adapter = stack.enter_context(ForceDimension(session.scenario, axes))
-            if not adapter.guarded:
-                console(args).print(
-                    "the device has no watchdog of its own: were this program killed, its force would stay"
-                )
-        else:
-            words = [*_emulator_options(args, seconds), *["--nobody"][: alone is not None], f"--coulomb={coulomb}"]
-            with progress("starting the emulator" if args.emulate else "opening the port"):
-                path = args.port or stack.enter_context(spawned(words))
-            port, pace = stack.enter_context(SerialPort(path, session.settings.baud)), args.pace
-            device = serial = SerialDevice(port, lambda: pace * time.monotonic())
-        if args.port and not getattr(args, "no_preflight", True):
+        device = _device(args, session, stack, seconds, alone is not None, coulomb)
+        if args.port and not args.no_preflight:
             with progress("looking at this machine"):
                 found = preflight(args.port)
             console(args).print(found.line(), soft_wrap=True, highlight=False)
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
-        show = _view(stack)
+        dashboard = stack.enter_context(closing(Dashboard())) if sys.stderr.isatty() else None
 
         def glance(session: Session) -> None:
             incidents.glance(session)
-            show(session)
+            if dashboard:
+                dashboard(session)
 
-        named = getattr(args, "deadman", None)
-        deadman = None if named in (None, "device") else touched(named) if named != "key" else lambda: False
-        auto_arm = args.arm or args.emulate
-        live = Live(
-            session,
-            device,
-            plan,
-            auto_arm,
-            seconds,
-            keyboard,
-            glance,
-            args.pace,
-            deadman,
-        )
+        auto_arm, deadman = args.arm or args.emulate, _deadman(args.deadman)
+        live = Live(session, device, plan, auto_arm, seconds, keyboard, glance, args.pace, deadman)
         live.run()
-    return _Held(live.signals, serial.dropped if serial else 0)
+    return _Held(live.signals, device.dropped if isinstance(device, SerialDevice) else 0)
+
+
+def _device(
+    args: argparse.Namespace, session: Session, stack: ExitStack, seconds: float, nobody: bool, coulomb: float
+) -> HapticDevice:
+    """The device behind the port, open as long as the stack; with --emulate an emulator's."""
+    if host_clocked(args):
+        adapter = stack.enter_context(ForceDimension(session.scenario, args.port.partition(":")[2] or None))
+        if not adapter.guarded:
+            console(args).print("the device has no watchdog of its own: were this program killed, its force would stay")
+        return adapter
+    with progress("starting the emulator" if args.emulate else "opening the port"):
+        words = [*_emulator_options(args, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
+        path = args.port or stack.enter_context(spawned(words))
+    port = stack.enter_context(SerialPort(path, session.settings.baud))
+    return SerialDevice(port, lambda: args.pace * time.monotonic())
 
 
 def _rehearsed(
@@ -231,10 +228,8 @@ def _rehearsed(
 ) -> _Held:
     """The session in virtual time; the emulated person arms once and holds the deadman."""
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
-    try:
+    with options.refused("the scenario cannot stand behind a serial link: "):
         emulator = Emulator(alone or options.scenario_from(args), faults, coulomb=coulomb)
-    except ValueError as error:
-        raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
     with progress("rehearsing") as move:
 
         def planned(ages: Ages) -> Sequence[Armable]:
@@ -259,15 +254,6 @@ def _emulator_options(args: argparse.Namespace, seconds: float) -> list[str]:
     words = [f"--{name}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in given.items()]
     words += [f"--fault={fault}" for fault in args.fault]
     return [*words, f"--seed={args.seed}", f"--pace={args.pace}", f"--duration={seconds + _SPARE:g}"]
-
-
-def _view(stack: ExitStack) -> Callable[[Session], None]:
-    """The dashboard, on a terminal."""
-    if not sys.stderr.isatty():
-        return lambda session: None
-    dashboard = Dashboard()
-    stack.callback(dashboard.close)
-    return dashboard
 
 
 @contextmanager

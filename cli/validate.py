@@ -4,31 +4,27 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import msgspec
 import numpy as np
 
 from cli import options, render
 from cli.judged import Judged, judge
-from controller.lti import Array
 from controller.ranges import Member
 from design.certificate import RangesCheck
 from design.conditions import this_environment
 from design.guarantees import ANY
-from design.result import finite
 from models.human import Human, Population
-from sim import report
+from sim import report, verdicts
 from sim.adversary import Worst, search, search_population
 from sim.couplings import NAMES, Chosen, choose
 from sim.crowds import ENGINES, MIXED, Findings, Validation
 from sim.run import assemble
 from sim.scenario import InputError, Scenario, require_linear, save_humans
 from sim.shards import Table, validate, validate_on_cluster
-from sim.stability import eigenvalue_part, unstable, worst_mode
+from sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
 from sim.switching import certified_part
 
 _ENVIRONMENTS = ("nominal", "ranges", "box")  # the last is the older name of the second
@@ -52,11 +48,9 @@ def main(argv: list[str]) -> int:
     title = f"{scenario.title(args.case)}: coupling {chosen.kind}"
     lines = [*([f"Delays that vary: {report.switching.met['covers']}."] if report.switching else []), *report.remarks]
     render.publish(args, report, [render.facts(title, render.rows_of(report), ("", ""))], lines, out, files)
-    if report.interrupted:
-        return options.INTERRUPTED
-    if report.unfinished:
+    if report.unfinished and not report.interrupted:
         return options.UNFINISHED
-    return options.DONE if report.holds else options.DOES_NOT_HOLD
+    return options.exit_code(bool(report.holds), report.interrupted)
 
 
 def _parser() -> options.Parser:
@@ -65,29 +59,25 @@ def _parser() -> options.Parser:
         "Test a loop with random passive humans in both engines, and search for the worst one.",
         "python -m sim.validate --case I --humans 200 --adversary",
     )
+    add, whole = parser.add_argument, options.whole
     options.add_loop_options(parser)
     options.add_varying_delay_options(parser)
     options.add_coupling_options(parser, ", ".join(NAMES))
     options.add_human_option(parser, " and `population`, whose draw(rng, n) gives n hands,")
     options.add_limiter_option(parser)
-    humans, count = "random humans per device (default 1000)", options.whole(1, 1_000_000)
-    parser.add_argument("--humans", type=count, default=1000, metavar="N", help=humans)
-    parser.add_argument("--links", choices=tuple(_LINKS), help="of each human (default: the scenario's population)")
-    parser.add_argument("--engine", choices=ENGINES, default="both", help="default both")
-    seconds = "of the traces (default 2; 0 for none)"
-    parser.add_argument("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
-    shards = "local processes (default 1); the result is the same"
-    parser.add_argument("--shards", type=options.whole(1, 256), default=1, metavar="K", help=shards)
-    parser.add_argument("--dask", metavar="HOST:PORT", help="work on an existing Dask cluster; the result is the same")
-    again = "go on with what a run of the same words left unfinished in the folder"
-    parser.add_argument("--resume", action="store_true", help=again)
-    parser.add_argument("--adversary", action="store_true", help="also search for the worst passive human")
-    generations = "of the adversary's search (default 150)"
-    parser.add_argument("--generations", type=options.whole(1, 10_000), metavar="N", help=generations)
+    count = "random humans per device (default 1000)"
+    add("--humans", type=whole(1, 1_000_000), default=1000, metavar="N", help=count)
+    add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
+    add("--engine", choices=ENGINES, default="both", help="who decides (default both)")
+    seconds = "length of the traces (default 2; 0 for none)"
+    add("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
+    add("--shards", type=whole(1, 256), default=1, metavar="K", help="local processes, for the same result (default 1)")
+    add("--dask", metavar="HOST:PORT", help="work on an existing Dask cluster; the result is the same")
+    add("--resume", action="store_true", help="go on with what a run of the same words left unfinished in the folder")
+    add("--adversary", action="store_true", help="also search for the worst passive human")
+    add("--generations", type=whole(1, 10_000), metavar="N", help="length of that search (default 150)")
     met = "nominal (default), or ranges: in turn all vertices of the scenario's ranges and as many others inside"
-    parser.add_argument(
-        "--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met
-    )
+    add("--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
     options.add_output_options(parser, picture=True)
     return parser
 
@@ -196,82 +186,7 @@ def _save(
 # The report and its parts. Each says itself what stands in its row of the table.
 
 
-_SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be slower in its last quarter than before
-_ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
 _NOTHING = "no batch of humans was done"
-
-
-@dataclass(frozen=True)
-class _Unstable:
-    """Hands that make the loop unstable, by engine; None for one that was not asked."""
-
-    exact: int
-    mujoco: int | None
-
-    def __str__(self) -> str:
-        return f"{self.exact} exact" + ("" if self.mujoco is None else f", {self.mujoco} MuJoCo")
-
-
-@dataclass(frozen=True)
-class _Environments:
-    """Which environments the loops had, and in which of them a loop was unstable."""
-
-    of: str
-    count: int
-    names: list[str] | None = render.unseen("given", None)
-    unstable_in: list[str] | None = render.unseen("given", None)
-
-    @classmethod
-    def met(cls, question: Validation, findings: Findings) -> _Environments:
-        members = question.environments
-        if not members:
-            return cls("the nominal environment", 1)
-        where = sorted({int(i) % len(members) for i in findings.index[unstable(findings.exact)]})
-        return cls("the ranges", len(members), [each.name for each in members], [members[i].name for i in where])
-
-    def __str__(self) -> str:
-        if self.unstable_in is None:
-            return self.of
-        return f"{self.count} of {self.of}, in turn; unstable in: {'; '.join(self.unstable_in) or 'none'}"
-
-
-@dataclass(frozen=True)
-class _Drawn:
-    """A set of humans that the population drew, and the environment that it met."""
-
-    seed: int
-    index: int
-    human: list[dict[str, Any]]
-    person: list[dict[str, Any]]
-    environment: str | None = render.unseen("given", None)
-    network: dict[str, Any] | None = render.unseen("given", None)
-
-    @classmethod
-    def of(cls, question: Validation, index: int) -> _Drawn:
-        crowd, member = question.crowd(index), question.environment(index)
-        humans, persons = _humans(crowd.humans(0)), msgspec.to_builtins(crowd.persons(0))
-        where, network = (member.name, msgspec.to_builtins(member.network)) if member else (None, None)
-        return cls(question.seed, index, humans, persons, where, network)
-
-
-@dataclass(frozen=True)
-class _Slowest:
-    """The humans of the largest spectral radius."""
-
-    spectral_radius: float
-    growth_rate_per_s: float
-    frequency_hz: float
-    who: _Drawn = render.unseen("beside")
-
-    @classmethod
-    def of(cls, question: Validation, findings: Findings) -> _Slowest:
-        k = int(np.argmax(findings.radius))
-        radius, growth, frequency = (float(of[k]) for of in (findings.radius, findings.exact, findings.frequency))
-        return cls(radius, growth, frequency, _Drawn.of(question, int(findings.index[k])))
-
-    def __str__(self) -> str:
-        growth = f"{self.growth_rate_per_s:+.4g} 1/s at {self.frequency_hz:.2f} Hz (index {self.who.index})"
-        return growth + (f", at {self.who.environment}" if self.who.environment else "")
 
 
 @dataclass(frozen=True)
@@ -279,136 +194,12 @@ class _Own:
     """What the exact loop does in the hands of the scenario, or of --human FILE."""
 
     from_: str
-    mode: Mapping[str, Any] = render.unseen("beside")
+    exact: Eigenvalues = render.unseen("beside")
     holds: bool = render.unseen()
 
     def rows(self) -> render.Rows:
-        mode = self.mode
-        growth = f"{mode['exact_growth_rate_per_s']:+.4g} 1/s at {mode['exact_frequency_hz']:.2f} Hz"
-        yield f"hands of {self.from_}", f"{growth}: {mode['exact_verdict']}"
-
-
-@dataclass(frozen=True)
-class _Traces:
-    """What the traces say, and whether they are long enough for hands to be slower at their end."""
-
-    duration_s: float
-    clipped_runs: int
-    contacts: int
-    measured: int
-    largest_difference_per_s: float | None
-    stable_and_settling: int
-    stable: int
-    slowest_settling: float | None
-    slowest_decay_s: float | None
-    settling_decides: bool
-    reason: str | None = render.unseen("given", None)
-
-    @classmethod
-    def of(cls, question: Validation, findings: Findings) -> _Traces:
-        stable, duration = ~unstable(findings.exact), question.ticks * question.scenario.T
-        decay = _largest(-1 / findings.exact[findings.exact < 0])
-        decides = decay is None or duration >= _SETTLING * decay
-        slow = f"the slowest mode decays in {decay:.3g} s: in {duration:g} s its hands need not be slower"
-        return cls(
-            duration_s=duration,
-            clipped_runs=int((findings.clipped > 0).sum()),
-            contacts=int(findings.contacts.sum()),
-            measured=int(np.isfinite(findings.trace).sum()),
-            largest_difference_per_s=_largest(np.abs(findings.trace - findings.exact)),
-            stable_and_settling=int((stable & (findings.settling < 1)).sum()),
-            stable=int(stable.sum()),
-            slowest_settling=_largest(findings.settling[stable]),
-            slowest_decay_s=decay,
-            settling_decides=decides,
-            reason=None if decides else slow,
-        )
-
-    def rows(self) -> render.Rows:
-        yield "traces", f"{self.duration_s:g} s each, {self.clipped_runs} reached a force limit"
-        yield "contacts made", f"{self.contacts} on these traces" if self.contacts else None
-
-    def settled(self) -> str:
-        undecided = "" if self.settling_decides else f"; no verdict: {self.reason}"
-        return f"{self.stable_and_settling} of {self.stable} stable loops slower at the end{undecided}"
-
-
-@dataclass(frozen=True)
-class _Energy:
-    """Traces on which W >= 0 was asked: forces that were clipped are covered by nothing, those of a limiter are."""
-
-    audited: int
-    clipped: int
-    violated: int
-    least_J: float | None
-    holds: bool
-
-    @classmethod
-    def of(cls, question: Validation, findings: Findings) -> _Energy:
-        asked = (findings.clipped == 0) | (question.lag is not None)
-        violated = int((asked & ~(findings.energy >= -_ROUNDING * findings.audited)).sum())
-        least = float(findings.energy[asked].min()) if asked.any() else None
-        return cls(int(asked.sum()), int((~asked).sum()), violated, least, not violated)
-
-    def __str__(self) -> str:
-        left = f", {self.clipped} clipped left out" if self.clipped else ""
-        return f"{self.audited - self.violated} of {self.audited}{left}"
-
-
-@dataclass(frozen=True)
-class _Growing:
-    """How many humans grow while delays or ticks vary; it holds unless certificates cover these and one grows."""
-
-    met: Mapping[str, Any] = render.unseen("beside")
-    unstable: _Unstable = render.unseen()
-    humans: int = render.unseen()
-    mujoco_unclipped: int = render.unseen()
-    largest_growth_per_s: float | None = render.unseen()
-    worst_index: int | None = render.unseen()
-    holds: bool = render.unseen()
-
-    @classmethod
-    def of(cls, findings: Findings, met: Mapping[str, Any]) -> _Growing:
-        exact, mujoco = findings.switching, findings.switching_mujoco
-        seen, mujoco = ~np.isnan(exact), mujoco[~np.isnan(mujoco)]
-        grow = _Unstable(int((exact > 0).sum()), int((mujoco > 0).sum()) if mujoco.size else None)
-        worst = int(np.nanargmax(exact)) if seen.any() else None
-        figures = (None, None) if worst is None else (float(exact[worst]), int(findings.index[worst]))
-        return cls(met, grow, int(seen.sum()), mujoco.size, *figures, not (met["covered"] and grow.exact))
-
-    def row(self, what: str) -> tuple[str, str | None]:
-        mujoco, growth = self.unstable.mujoco, self.largest_growth_per_s
-        also = "" if mujoco is None else f", MuJoCo {mujoco} of {self.mujoco_unclipped} unclipped"
-        worst = "" if growth is None else f"; worst {growth:+.4g} 1/s (index {self.worst_index})"
-        grow = f"{self.unstable.exact} of {self.humans} exact{also}{worst}"
-        return f"grow while {what} vary", grow if self.humans else None
-
-
-@dataclass(frozen=True)
-class _Adversary:
-    """What a search found, and how far the loop is from its required damping."""
-
-    found: bool
-    spectral_radius: float
-    growth_rate_per_s: float
-    frequency_hz: float
-    evaluated: int
-    required_over_available_damping: float | None
-    human: list[dict[str, Any]]
-    person: list[dict[str, Any]]
-    holds: bool
-
-    @classmethod
-    def of(cls, worst: Worst, ratio: float, certified: bool) -> _Adversary:
-        humans, persons = _humans(worst.humans), msgspec.to_builtins(worst.persons)
-        figures = worst.spectral_radius, worst.growth, worst.frequency_hz, worst.evaluated
-        return cls(worst.destabilises, *figures, finite(ratio), humans, persons, not (certified and worst.destabilises))
-
-    def __str__(self) -> str:
-        grows = f"a human that grows at {self.growth_rate_per_s:+.4g} 1/s"
-        ratio, found = self.required_over_available_damping, grows if self.found else "no destabilising human"
-        close = "no damping is enough" if ratio is None else f"the loop needs {ratio:.4g} of the damping it has"
-        return f"{found} among {self.evaluated}; {close}"
+        growth = f"{self.exact.exact_growth_rate_per_s:+.4g} 1/s at {self.exact.exact_frequency_hz:.2f} Hz"
+        yield f"hands of {self.from_}", f"{growth}: {self.exact.exact_verdict}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -422,23 +213,23 @@ class _Report:
     seed: int
     engine: str
     humans: int = render.figure("humans", "{} (links {r.links}, seed {r.seed})")
-    environments: _Environments = render.figure("environments")
-    unstable: _Unstable = render.figure("unstable")
+    environments: verdicts.EnvironmentsMet = render.figure("environments")
+    unstable: verdicts.Unstable = render.figure("unstable")
     disagreements: int = render.figure("disagreements")
-    disagreeing: list[_Drawn]
-    worst: _Slowest | None = render.figure("worst human")
+    disagreeing: list[verdicts.DrawnHumans]
+    worst: verdicts.WorstDrawn | None = render.figure("worst human")
     own_humans: _Own = render.several(_Own.rows)
     largest_difference_per_s: float | None = render.figure(
         "MuJoCo's growth rates", "within {:.1e} 1/s of the exact ones"
     )
-    traces: _Traces | None = render.several(_Traces.rows)
+    traces: verdicts.Traces | None = render.several(verdicts.Traces.rows)
     judged: Judged = render.figure("force limits", "{.limiter[words]}", json="beside")
     settled: str | None = render.figure("handles come to rest", json="table")
-    energy_audit: _Energy | None = render.figure("energy audit W >= 0", json="given")
-    switching: _Growing | None = render.several(lambda g: [*render.delay_rows(g.met), g.row("delays")], "given")
-    timing: _Growing | None = render.several(lambda g: [render.timing_row(g.met), g.row("ticks")], "given")
-    adversary: _Adversary | None = render.figure("adversary", json="given")
-    adversary_population: _Adversary | None = render.figure("adversary, own population", json="given")
+    energy_audit: verdicts.EnergyAudit | None = render.figure("energy audit W >= 0", json="given")
+    switching: verdicts.Growing | None = render.several(lambda g: [*render.delay_rows(g.met), g.row("delays")], "given")
+    timing: verdicts.Growing | None = render.several(lambda g: [render.timing_row(g.met), g.row("ticks")], "given")
+    adversary: verdicts.Attacked | None = render.figure("adversary", json="given")
+    adversary_population: verdicts.Attacked | None = render.figure("adversary, own population", json="given")
     certified: bool = render.figure("certified", lambda yes: "yes" if yes else "no")
     holds: bool | None = render.figure("holds", lambda yes: "[green]yes[/]" if yes else "[red]no[/]", absent=_NOTHING)
     reason: str | None = render.unseen("given")
@@ -449,6 +240,20 @@ class _Report:
     wall_s: float = render.figure("time", "{:.1f} s, {r.simulated_s_per_s:.0f} simulated seconds per second")
     simulated_s_per_s: float
     remarks: Sequence[str]
+
+
+def _varying(
+    question: Validation, chosen: Chosen, findings: Findings, certified: bool
+) -> tuple[verdicts.Growing | None, verdicts.Growing | None]:
+    """How many hands grow while delays vary, and while ticks do; None where they do not vary."""
+    scenario, switching, timing = question.scenario, None, None
+    if scenario.varying_delay:
+        covered = report.delay_range_part(scenario.varying_delay) | certified_part(scenario, chosen, certified)
+        switching = verdicts.Growing.of(findings, covered)
+    if scenario.uneven:
+        met = report.timing_part(scenario.timing(question.seed, max(1, question.ticks)), scenario) or {}
+        timing = verdicts.Growing.of(findings, met | {"covered": certified})
+    return switching, timing
 
 
 def _reported(
@@ -465,18 +270,12 @@ def _reported(
     guarantee = judged.promise
     certified = guarantee is not None and (not question.environments or guarantee == ANY or judged.proved)
     mode = worst_mode(assemble(scenario, chosen.coupling))
-    own = _Own(args.human or scenario.name, eigenvalue_part(mode), not (certified and unstable(mode.growth)))
-    energy = _Energy.of(question, findings) if certified and question.ticks else None
-    switching = timing = None
-    if scenario.varying_delay:
-        covered = report.delay_range_part(scenario.varying_delay) | certified_part(scenario, chosen, certified)
-        switching = _Growing.of(findings, covered)
-    if scenario.uneven:
-        met = report.timing_part(scenario.timing(args.seed, max(1, question.ticks)), scenario) or {}
-        timing = _Growing.of(findings, met | {"covered": certified})
-    worst, drawn = (w and _Adversary.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))
+    own = _Own(args.human or scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
+    energy = verdicts.EnergyAudit.of(question, findings) if certified and question.ticks else None
+    switching, timing = _varying(question, chosen, findings, certified)
+    worst, drawn = (w and verdicts.Attacked.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))
     also = all(part.holds for part in (own, energy, switching, timing, worst, drawn) if part)
-    traces = _Traces.of(question, findings) if question.ticks and any_done else None
+    traces = verdicts.Traces.of(question, findings) if question.ticks and any_done else None
     both, bad, grows = question.engine != "exact", unstable(findings.exact), unstable(findings.mujoco)
     disagreements, wrong = int(findings.disagreements.sum()), bad | (both & grows & (findings.mujoco > 1e-3))
     interrupted = findings.interrupted or searched.interrupted
@@ -489,13 +288,13 @@ def _reported(
         seed=question.seed,
         engine=question.engine,
         humans=findings.index.size,
-        environments=_Environments.met(question, findings),
-        unstable=_Unstable(int(bad.sum()), int(grows.sum()) if both else None),
+        environments=verdicts.EnvironmentsMet.met(question, findings),
+        unstable=verdicts.Unstable(int(bad.sum()), int(grows.sum()) if both else None),
         disagreements=disagreements,
-        disagreeing=[_Drawn.of(question, int(i)) for i in findings.index[findings.disagreements]],
-        worst=_Slowest.of(question, findings) if any_done else None,
+        disagreeing=[verdicts.DrawnHumans.of(question, int(i)) for i in findings.index[findings.disagreements]],
+        worst=verdicts.WorstDrawn.of(question, findings) if any_done else None,
         own_humans=own,
-        largest_difference_per_s=_largest(np.abs(findings.mujoco - findings.exact)),
+        largest_difference_per_s=verdicts.largest(np.abs(findings.mujoco - findings.exact)),
         traces=traces,
         judged=judged,
         settled=traces and traces.settled(),
@@ -515,19 +314,3 @@ def _reported(
         simulated_s_per_s=findings.simulated / wall,
         remarks=chosen.notes,
     )
-
-
-def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
-    """Links of each channel's human; of a user's own class what the handle feels of it."""
-    parts = ("mass", "across", "damping", "stiffness")
-    return [
-        {"links": msgspec.to_builtins(human.links)}
-        if isinstance(human, Human)
-        else {"class": type(human).__name__} | {name: getattr(human.port(), name) for name in parts}
-        for human in humans
-    ]
-
-
-def _largest(values: Array) -> float | None:
-    values = values[np.isfinite(values)]
-    return float(values.max()) if values.size else None

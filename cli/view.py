@@ -12,7 +12,7 @@ from typing import Any
 
 from cli import options, render
 from design.files import write_json
-from design.result import certificate_part
+from design.result import CONDITIONS, certificate_part
 from sim.scenario import InputError, require_even_ticks
 from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, PreparedLoop, Script, first_loop, parse_script
 from sim.view.film import Picture, check_film, painter, save_film
@@ -34,7 +34,8 @@ def main(argv: list[str]) -> int:
     options.check_json(args)
     if args.video:
         check_film(Path(args.video))
-        _check_speed(args)
+        if args.video.endswith(".gif") and 100 % args.fps:  # GIF counts in hundredths of a second
+            raise InputError(f"--fps is {args.fps}, allowed for a .gif are the numbers that divide 100")
     label, script = _beginning(args, scenario.channels)
     # --case none begins without a coupling; those that keys bring are for case I
     given = args.coupling if label == GIVEN else None
@@ -52,7 +53,7 @@ def main(argv: list[str]) -> int:
         render.console(args).print(line, soft_wrap=True)
     if args.json:
         write_json(args.json, report)
-    return options.INTERRUPTED if ended.interrupted else options.DONE
+    return options.exit_code(True, ended.interrupted)
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class _Event:
         return cls(t, what, *loop, certificates, prepared.guarantee, limiter)
 
     def line(self) -> str:
-        held = [name for name in render.ORDER if self.certificates[name]["certified"]]
+        held = [name for name in CONDITIONS if self.certificates[name]["certified"]]
         growth = f"{self.exact_growth_rate_per_s:+.3g} 1/s at {self.exact_frequency_hz:.1f} Hz"
         grows = growth if isfinite(self.exact_growth_rate_per_s) else "no growth"
         proved = f"certified ({', '.join(held)})" if held else "NOT certified"
@@ -133,35 +134,30 @@ class _Report:
         if clock := self.ended.clock:
             yield f"The clock was missed {clock.overruns} times: {clock.lost_s:.2f} s lost."
         if film := self.ended.video:
-            yield f"{film.file}: {film.pictures} pictures, drawn by {film.drawn}"
+            yield f"{film.file}: {film.pictures} pictures, drawn {'' if film.drawn == 'flat' else 'by '}{film.drawn}"
         yield from (f"Note: {remark}." for remark in self.ended.remarks)
 
 
 def _parser() -> options.Parser:
     keys = ", ".join(f"{name} {word}" for name, word in keys_help(given=True))
     parser = options.Parser("sim.view", f"Feel the loop in a window, or film it.\n\nKeys: {keys}.", _EXAMPLE)
+    add = parser.add_argument
     options.add_loop_options(parser)
     what = f"to begin with: {', '.join(_names())} or FILE.json; designed is spring-damper"
-    parser.add_argument("--coupling", metavar="NAME|FILE", help=what)
-    options.add_condition_option(parser, "of a design")
+    add("--coupling", metavar="NAME|FILE", help=what)
+    options.add_condition_option(parser, "the condition of designs")
     options.add_limiter_option(parser)
-    parser.add_argument("--script", metavar="EVENTS", help=f"what happens when [s] (default of a video: '{_SCRIPT}')")
-    seconds, until = options.number(1e-3, _LONGEST, "s"), "a window until it is closed, a video until after its script"
-    parser.add_argument("--duration", type=seconds, metavar="SECONDS", help=f"default: {until}")
+    add("--script", metavar="EVENTS", help=f"what happens when [s] (default of a video: '{_SCRIPT}')")
+    until = "default: a window until it is closed, a video until after its script"
+    add("--duration", type=options.number(1e-3, _LONGEST, "s"), metavar="SECONDS", help=until)
     options.add_json_option(parser)
-    film = parser.add_argument_group("without a display")
-    film.add_argument("--video", metavar="FILE", help="a film: .gif, or .mp4 where ffmpeg is installed")
+    add = parser.add_argument_group("without a display").add_argument
+    add("--video", metavar="FILE", help="a film: .gif, or .mp4 where ffmpeg is installed")
     rate = "pictures per second (default 10); for a .gif what divides 100"
-    film.add_argument("--fps", type=options.whole(1, 100), default=10, metavar="N", help=rate)
+    add("--fps", type=options.whole(1, 100), default=10, metavar="N", help=rate)
     drawn = "by OpenGL, or flat without it (default: by what works)"
-    film.add_argument("--draw", choices=_DRAWN, default="auto", help=drawn)
+    add("--draw", choices=_DRAWN, default="auto", help=drawn)
     return parser
-
-
-def _check_speed(args: argparse.Namespace) -> None:
-    """Raises InputError; GIF counts in hundredths of a second."""
-    if args.video.endswith(".gif") and 100 % args.fps:
-        raise InputError(f"--fps is {args.fps}, allowed for a .gif are the numbers that divide 100")
 
 
 def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:

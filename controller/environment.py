@@ -90,7 +90,7 @@ class Environment:
 
     def E(self, T: Number) -> Lti:
         """E(z), contact displacements [m] to forces [N], every wall touching, in the arithmetic of T."""
-        raise NotImplementedError
+        raise TypeError(f"{type(self).__name__} has no E(T): define it")
 
     def sent(self, coupling: Coupling, psi: Sequence[int], T: Number) -> Lti:
         """G = (I + Psi E V)^-1 Psi E: the forces that leave through the coupling. Raises SingularLoop."""

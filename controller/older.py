@@ -1,4 +1,6 @@
-"""Names that files, options and reports had before, and the names of today: the one place. All are still read.
+"""Names that files, conditions and reports had before, and the names of today. All are still read.
+
+Older spellings of options (`--jitter`) stand with the options.
 
 Digests and seals are made of the first names, so that a file keeps the ones it has.
 """

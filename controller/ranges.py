@@ -6,7 +6,7 @@ that may be absent is there or not. An absent spring stays in its network with n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import prod
@@ -65,21 +65,44 @@ class Region:
 
 
 def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
-    """The environment itself, then the vertices of the ranges that differ from it.
+    """The environment itself, then the vertices of the ranges that differ from it; of more than 128 so many.
 
-    Raises ValueError naming the field where the ranges do not fit the network, or have more than 128 vertices.
+    Raises ValueError naming the field where the ranges do not fit the network, or are of too many parameters.
     """
-    nominal = Member("the nominal environment", network)
     parts = _parts(network, ranges)
-    count = prod(len(part.corners) for part in parts)
-    if count > _MOST_VERTICES:
-        raise ValueError(
-            f"ranges have {count} vertices, allowed are {_MOST_VERTICES}: leave out the ranges that matter least, "
-            "each halves the number"
-        )
-    corners = (c for c in product(*(part.corners for part in parts)) if c != tuple(part.own for part in parts))
+    corners = dict.fromkeys(tuple(p.corners[i] for p, i in zip(parts, at, strict=True)) for at in _vertices(parts))
+    corners.pop(tuple(part.own for part in parts), None)
     vertices = (_member(f"vertex {i}", network, parts, corner) for i, corner in enumerate(corners, start=1))
-    return (nominal, *vertices)
+    return (Member("the nominal environment", network), *vertices)
+
+
+def number_of_vertices(network: Network, ranges: Ranges) -> int:
+    """Every combination of ends, and of contacts that are there or absent."""
+    return prod(len(part.corners) for part in _parts(network, ranges))
+
+
+def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
+    """Which corner every part has: all combinations, or 128 in which any three ends meet in every combination.
+
+    These are the words of a linear code. A bit of a corner's number is the parity of the word's number and a mask of
+    its own; all masks have the highest bit, so that no two of them add up to a third: any three are independent.
+    """
+    sizes = [len(part.corners) for part in parts]
+    if prod(sizes) <= _MOST_VERTICES:
+        return product(*map(range, sizes))
+    bits, half = [(size - 1).bit_length() for size in sizes], _MOST_VERTICES // 2
+    if sum(bits) > half:
+        raise ValueError(f"ranges have {sum(bits)} pairs of ends, allowed are {half}: leave out some")
+    single = [0, *(1 << i for i in range(half.bit_length() - 1)), half - 1]
+    masks = iter([half + low for low in dict.fromkeys([*single, *range(half)])])
+    own = [[next(masks) for _ in range(count)] for count in bits]
+    return [
+        tuple(
+            sum(((word & mask).bit_count() & 1) << i for i, mask in enumerate(some)) % size
+            for some, size in zip(own, sizes, strict=True)
+        )
+        for word in range(_MOST_VERTICES)
+    ]
 
 
 def regions(network: Network, ranges: Ranges) -> tuple[Region, ...]:

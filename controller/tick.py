@@ -4,7 +4,7 @@
           1  x = encoder positions, sampled                (the plant's state just before kT)
           2  u = x - V f_e ;  f_e = Psi E u                (the algebraic loop was solved at construction)
           3  f = Theta f_e
-          4  hold -clip(f, +-force_limit) on the actuators, advance the plant by T
+          4  f = clip(f, +-force_limit); hold -f on the actuators, advance the plant by T
           5  commit the discrete states                    (the plant's state just after kT)
 
 With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
@@ -17,9 +17,9 @@ Where delays vary, Theta is not in the block: its forces pass through a line tha
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -30,6 +30,9 @@ from controller.limiter import Limiter
 from controller.lti import Array, Lti, ReadOnly, frozen
 from controller.walls import Contact, State
 
+Stretch = Callable[[int], None]  # so many ticks from row 0 on
+
+_PART = 512  # ticks of a stretch whose memory and views stay in the cache
 _CALM = 1 - 1e-9  # of the limiter's forces: above that they are being limited
 
 
@@ -107,6 +110,11 @@ class Process(ReadOnly):
         """The linear force maps that the process switches between, by the walls that touch: F alone without walls."""
         return self.contact.frozen() if self.contact else {(): self.F}
 
+    def applied(self, force: Array, out: Array | None = None) -> Array:
+        """What the actuators make of forces (.., m, nsim) [N] that are asked of them."""
+        high = self.force_limit[:, None]
+        return np.maximum(np.minimum(force, high, out=out), -high, out=out)
+
     @property
     def linear(self) -> Array:
         """[f; z+] of a tick by its [z; x], (m + order, order + m), while no wall touches and no force is limited."""
@@ -149,18 +157,28 @@ class StepBuffer:
         shifted = self._memory[width - m :][: ticks * width].reshape(ticks, width, nsim)
         #: (ticks, m + order, nsim): [f; z+] of each tick
         self.after = shifted[:, : m + nz]
-        self._transition = transition or process.transition()
+        self._given = transition
         self._quantised = bool((process.encoder_step > 0).any())
         self._line = None if process.delays is None else HeldLine(process.delays, nsim)
         self.net = process.net(nsim) if process.net else None
         self.first = 0  # the tick of row 0
         self._straight = nsim == 1 and not (self._quantised or process.walls or self._line or self.net)
-        #: whether to try the next ticks by the linear law alone: nothing can bend it but a limiter that now rests
+        #: whether to try the next ticks by the linear law alone: nothing can bend it but limits that are far now
         self.calm = self._straight
-        limiter, self._sent = process.limiter, []
-        if self._straight and limiter:
-            places = zip(limiter.sent_rows.tolist(), limiter.limit.tolist(), strict=True)
-            self._sent = [(self.after[:, row, 0], limit) for row, limit in places]
+        limiter, bounds = process.limiter, []
+        if limiter:
+            bounds += zip(limiter.sent_rows.tolist(), limiter.limit.tolist(), strict=True)
+        within = limiter and self.net is None and (limiter.limit <= process.force_limit).all()
+        #: whether a force may leave the tick that is more than the actuators have
+        self.clips = not within and bool((process.force_limit < np.inf).any())
+        if self.clips:
+            bounds += enumerate(process.force_limit.tolist())
+        self._bounds = bounds if self._straight else []
+        self._asked = [(self.after[:, row, 0], limit) for row, limit in self._bounds]
+
+    @cached_property
+    def _transition(self) -> Callable[[Array, Array], object]:
+        return self._given or self.process.transition()
 
     # views are made once, and only those that are used: making one costs as much as a small product
 
@@ -189,15 +207,20 @@ class StepBuffer:
         """[f; z+] of each tick."""
         return list(self.after)
 
+    @property
+    def limited(self) -> bool:
+        """Whether the limiter or the actuators may limit a force, so that a stretch is taken back."""
+        return bool(self._bounds)
+
     def linear_until(self, ticks: int, most: float = 1.0) -> int:
-        """The first of these ticks in which a force asks for more than `most` of what the limiter gives, else `ticks`.
+        """The first of these ticks in which a force asks for more than `most` of what there is, else `ticks`.
 
         Not a number counts as such.
         """
-        for forces, limit in self._sent:
+        for forces, limit in self._asked:
             sent, limit = forces[:ticks], most * limit
             if not (sent.max() <= limit and sent.min() >= -limit):
-                within = [np.abs(forces[:ticks]) <= most * limit for forces, limit in self._sent]
+                within = [np.abs(forces[:ticks]) <= most * limit for forces, limit in self._asked]
                 return int(np.all(within, axis=0).argmin())
         return ticks
 
@@ -211,6 +234,8 @@ class StepBuffer:
             self._line.carry(self.first + k, self.force[k])
         if self.net is not None:
             self.net.apply(self.first + k, self.force[k])
+        if self.clips:
+            self.process.applied(self.force[k], self.force[k])
 
     def ticking(self) -> Callable[[int], object]:
         """The shortest function that does `tick` for this process."""
@@ -221,21 +246,24 @@ class StepBuffer:
         """`tick` where it is one product, and one look at the forces that a limiter may limit."""
         if self._quantised or self._line is not None or self.net is not None:
             return None
-        transition, seen, after = self._transition, self.law_input, self.law_output
-        limiter = self.process.limiter
-        if limiter is None or limiter.walls or self._memory.shape[1] > 1:
+        transition, seen, after, process = self._transition, self.law_input, self.law_output, self.process
+        if not self._bounds:
+            if self.clips:
+                return None
             return lambda k: transition(seen[k], after[k])
         # a single simulation spends its time in calls: its forces are looked at without numpy, of two channels by name
-        linear, first = self.process.linear.dot, self._width - self.process.channels
-        forces = [self._memory[first + i :: self._width, 0].data for i in limiter.sent_rows]
-        sent = list(zip(forces, (-limiter.limit).tolist(), limiter.limit.tolist(), strict=True))
-        (one, low, high), (other, lowest, highest), *others = sent if len(sent) > 1 else 2 * sent
+        linear, force, clips = process.linear.dot, self.force, self.clips
+        first = self._width - process.channels
+        asked = [(self._memory[first + i :: self._width, 0].data, -limit, limit) for i, limit in self._bounds]
+        (one, low, high), (other, lowest, highest), *others = asked if len(asked) > 1 else 2 * asked
 
         def tick(k: int) -> None:
             linear(seen[k], after[k])
             within = low <= one[k] <= high and lowest <= other[k] <= highest
-            if not within or (others and not all(least <= force[k] <= most for force, least, most in others)):
+            if not within or (others and not all(least <= asked[k] <= most for asked, least, most in others)):
                 transition(seen[k], after[k])
+                if clips:
+                    process.applied(force[k], force[k])
 
         return tick
 
@@ -247,14 +275,45 @@ class StepBuffer:
         m = self.process.channels
         return np.concatenate([row[:-m], self.process.measured(row[-m:].T).T])
 
-    def saturate(self, ticks: int) -> None:
-        """Turn the forces of the first `ticks` rows from asked for into applied, as the actuators did."""
-        limit = self.process.force_limit[:, None]
-        np.clip(self.f[:ticks], -limit, limit, out=self.f[:ticks])
-
     def rewind(self, ticks: int) -> None:
         """Start a new stretch where this one stood after `ticks` ticks."""
         self.calm = self.calm or (self._straight and self.linear_until(ticks, _CALM) == ticks)
         self.z[0] = self.z[ticks]
         self.s[0] = self.s[ticks]
         self.first += ticks
+
+
+class FusedTicks:
+    """The plant's step and the law at its end in one product a tick: [f; z+; s] of the next one.
+
+    A row of the memory is [w, f, z+, s, a] of a tick, where the entries a are the engine's own. The next s is
+    A s + B [w; f] + G a; without B the product reads a row from z+ on.
+    """
+
+    def __init__(self, buffer: StepBuffer, A: Array, B: Array | None = None, G: Array | None = None) -> None:
+        law, outside, states = buffer.process.linear, buffer.w.shape[1], len(A)
+        m, nz = buffer.process.channels, buffer.process.F.order
+        B, G = (np.empty((states, 0)) if part is None else part for part in (B, G))
+        step = np.hstack([B, np.zeros((states, nz)), A, G])
+        seen = np.vstack([np.eye(nz, step.shape[1], B.shape[1]), step[:m]])  # [z+; x] of the next tick
+        self.product = np.vstack([law @ seen, step]).dot
+        to_z, to_s, to_a = np.cumsum([outside + m, nz, states]).tolist()
+        memory = np.zeros((min(_PART, buffer.ticks) + 1, to_a + G.shape[1]))
+        self.held, self.before = list(memory[:, :to_z]), list(memory[:, to_z - B.shape[1] :])
+        self.next, self.states = list(memory[1:, outside:to_a]), memory[1:, to_s:to_a]
+        self.further = list(memory[:, to_a:])
+        self._w, self._after, self._s = memory[:, :outside], memory[:, outside:to_s], memory[:, to_s:to_a]
+        self._buffer, self._law = buffer, partial(law.dot, buffer.rows[0, : nz + m], buffer.after[0])
+
+    def parts(self, ticks: int) -> Iterator[int]:
+        """Ticks to be made from row 0 of the memory on, again and again, until the first rows of the buffer are."""
+        buffer, after, s = self._buffer, self._after, self._s
+        self._law()
+        after[0], s[0] = buffer.after[0, :, 0], buffer.s[0, :, 0]
+        for first in range(0, ticks, _PART):
+            count = min(_PART, ticks - first)
+            self._w[:count] = buffer.w[first : first + count, :, 0]
+            yield count
+            buffer.after[first : first + count, :, 0] = after[:count]
+            buffer.s[first + 1 : first + count + 1, :, 0] = s[1 : count + 1]
+            after[0], s[0] = after[count], s[count]

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Literal, TypedDict, Unpack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, TypedDict, Unpack
 
 from controller.coupling import Coupling
 from controller.loop import Loop
 from controller.lti import Lti
 from design.arguments import known, of_kind, one_of, shown
-from design.certificate import assess, check_ranges, switching_requirement
+from design.certificate import RangesCheck, assess, check_ranges, lag, prove, switching_requirement
+from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save
 from design.designs import KINDS, design_by_kind, usual_condition
-from design.guarantees import guarantee_of
-from design.result import Condition, Design, Requirement
-from design.stored import Stored
+from design.guarantees import HERE, guarantee_of, switching_guarantee
+from design.result import Condition, Design, NotProved, Requirement
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 _Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
@@ -143,6 +144,59 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
     """
     of_kind("loop", loop, Loop, _LOOP)
     return transparency(loop.F(_fitting(loop, coupling)), loop.E(), loop.lam, band_hz)
+
+
+@dataclass(frozen=True)
+class Filed:
+    """What was stored of a design, and what is proved of it; `reason` says why a proof is missing."""
+
+    file: Path
+    proof: str | None
+    reason: str | None
+    switching: dict[str, Any] | None  # the guarantee for delays that vary, by its older name, with its proof
+    limited_forces: bool
+
+
+def store(
+    loop: Loop,
+    design: Design,
+    path: Path,
+    whole: RangesCheck | None = None,
+    limiter: LimiterCertificate | None = None,
+) -> Filed:
+    """Save the coupling with the proof of its condition, and that of limited forces, or without a proof.
+
+    What is not proved for whole ranges, or for switching delays, is kept as what it is: a coupling for the nominal
+    environment, or for constant delays. Raises InputError where the file cannot be written.
+    """
+    if whole and whole.proved and design.condition == "this-environment":
+        certificate, reason = whole.certificate, None
+    else:
+        loop = loop if design.condition == "any-environment" else loop.at(loop.environment)
+        certificate, reason = _proved(loop, design, limiter)
+    switching = None
+    if loop.varying_delay:
+        proof = certificate.proof if certificate else None
+        words = f"{switching_guarantee(loop.varying_delay)}, in {HERE}"
+        switching = {"promise": words, "proof": proof, "reason": reason}
+        if certificate is None:
+            loop = loop.switching(None)
+            certificate, reason = _proved(loop, design, limiter)
+    save(Stored.of(loop, design.coupling, certificate), path)
+    limited = certificate is not None and lag(loop, certificate) is not None
+    return Filed(path, certificate and certificate.proof, reason, switching, limited)
+
+
+def _proved(loop: Loop, design: Design, limiter: LimiterCertificate | None) -> tuple[Certificate | None, str | None]:
+    """The certificate of all that the loop claims, or why there is none."""
+    held = design.certificate
+    if held and held.scenario == digest(loop, design.coupling.form()):
+        return held, None
+    try:
+        phi = None if design.phi is None else design.phi.tolist()
+        return prove(loop, design.coupling, design.condition, phi, limiter), None
+    except NotProved as error:
+        return None, str(error)
 
 
 COUPLING = "a coupling (controller.coupling), or a Design"

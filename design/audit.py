@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
 from typing import Any, TypeVar, cast, get_args
@@ -19,7 +19,7 @@ from controller.coupling import (
 from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
 from controller.lti import TooLong
-from design.certificate import RangesCheck, any_environment_of, switching_requirement
+from design.certificate import RangesCheck, any_environment_of
 from design.conditions import any_environment
 from design.coverage import ranges_part, switching_part
 from design.frequency import sweeping, too_long
@@ -89,22 +89,30 @@ _EDGE = 1e-7  # relative accuracy of an edge
 _NOT_CERTIFIED = "not certified: there is nothing to lose"
 
 
+_GIVEN: dict[str, Any] = {"json": "given"}  # a key only where there is something to say
+
+
 @dataclass(frozen=True)
 class _Stiffest:
     """The largest certified stiffness of each channel beside its B [N/m]; None where the reason says why."""
 
     K: tuple[float | None, ...]
-    reason: str | None = None
+    reason: str | None = field(default=None, metadata=_GIVEN)
 
 
 @dataclass(frozen=True)
-class _Tolerance:
-    """What may be wrong, one thing at a time, before the certificate is lost; None where the reason says why."""
+class _Sensitivity:
+    """What may be wrong, one thing at a time, before the certificate is lost; None where the reason says why.
 
-    least_delta: tuple[float, ...] | None  # [N s/m]: the required damping
-    largest_T: float | None  # [s], gains and delays in samples kept
-    extra_samples: int | None  # of delay, on all channels at once
-    reason: str | None = None
+    Errors are relative: delta may be 1 - delta_error times and T 1 + T_error times what was given.
+    """
+
+    least_delta: tuple[float, ...] | None = None  # [N s/m]: the required damping
+    delta_error: float | None = None
+    largest_T_s: float | None = None  # gains and delays in samples kept
+    T_error: float | None = None
+    extra_samples: int | None = None  # of delay, on all channels at once
+    reason: str | None = field(default=None, metadata=_GIVEN)
 
 
 def stiffest(loop: Loop, coupling: Coupling, condition: Condition) -> _Stiffest:
@@ -154,20 +162,28 @@ def _stiffest_for_any_environment(loop: Loop, coupling: SpringDamper) -> _Stiffe
     return _Stiffest(tuple(stiffest), "; ".join(reasons) or None)
 
 
-def tolerance(loop: Loop, coupling: Coupling, needs: Requirement) -> _Tolerance:
+def sensitivity(loop: Loop, coupling: Coupling, needs: Requirement) -> _Sensitivity:
     """How much error in delta, T and delay the certificate by `needs.condition` tolerates."""
     if not needs.certified:
-        return _Tolerance(None, None, None, _NOT_CERTIFIED)
+        return _Sensitivity(reason=_NOT_CERTIFIED)
     if needs.condition == "any-environment" and any(loop.psi):
-        reason = "with psi >= 1 every T and delay needs a multiplier of its own: not searched"
-        return _Tolerance(needs.required, None, None, reason)
+        return _of_delta(needs, "with psi >= 1 every T and delay needs a multiplier of its own: not searched")
     largest = _largest_period(loop, coupling, needs.condition)
     extra = _extra_samples(loop, coupling, needs.condition)
     reasons = [
         f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s" if largest is None else "",
         f"certified with {MOST_EXTRA_SAMPLES} samples more, the most that were tried" if extra is None else "",
     ]
-    return _Tolerance(needs.required, largest, extra, "; ".join(filter(None, reasons)) or None)
+    error = None if largest is None else largest / loop.T - 1
+    found = _of_delta(needs, "; ".join(filter(None, reasons)) or None)
+    return replace(found, largest_T_s=largest, T_error=error, extra_samples=extra)
+
+
+def _of_delta(needs: Requirement, reason: str | None) -> _Sensitivity:
+    """What the requirement alone says."""
+    if not needs.certified:
+        return _Sensitivity(reason=reason)
+    return _Sensitivity(needs.required, 1 - needs.ratio, reason=reason)
 
 
 def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> float | None:
@@ -274,17 +290,69 @@ def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], s
     return _Remedy(describe(best), needs(best))
 
 
-def report(
-    loop: Loop,
-    coupling: Coupling,
-    switching: DelayRange | None = None,
-    whole: RangesCheck | None = None,
-) -> dict[str, Any]:
-    """Both conditions with what surrounds them; SI units, null with a "reason" where a figure does not exist.
+@dataclass(frozen=True)
+class _Coupling:
+    """The coupling that is audited; gains are those of a spring-damper."""
 
-    They are about the loop's own environment and constant delays. With a range of delays also the damping that any
-    switching within it asks; `whole` is the same coupling over the ranges around the environment, if there is one.
-    Raises ValueError naming the field of the loop that is wrong.
+    kind: str
+    K: Sequence[float] | None
+    B: Sequence[float] | None
+
+
+@dataclass(frozen=True)
+class _Loop:
+    """The loop that it is audited in."""
+
+    T_s: float
+    T_max_s: float | None
+    latency_s: Sequence[tuple[float, float]] | None
+    theta: tuple[int, ...]
+    psi: tuple[int, ...]
+    delta: tuple[float, ...]
+    rigid: bool
+
+
+@dataclass(frozen=True)
+class ConditionAudit:
+    """What one condition says, and how far the coupling is from its edge."""
+
+    certificate: dict[str, Any] = field(metadata={"json": "beside"})
+    stiffest: _Stiffest
+    sensitivity: _Sensitivity
+
+
+@dataclass(frozen=True)
+class Help:
+    """A change that was tried, and what the condition asks after it."""
+
+    change: str
+    condition: str
+    required_damping: tuple[float, ...]
+    certified: bool
+
+
+@dataclass(frozen=True)
+class Audit:
+    """Both conditions with what surrounds them; SI units, null with a "reason" where a figure does not exist."""
+
+    coupling: _Coupling
+    loop: _Loop
+    conditions: dict[str, ConditionAudit] = field(metadata={"json": "beside"})
+    switching: dict[str, Any] | None
+    ranges: dict[str, Any] | None
+    certified: bool
+    promise: str | None  # the guarantee, by its older name
+    helps: list[Help]
+    not_covered: str = CAVEATS
+
+
+def audit(
+    loop: Loop, coupling: Coupling, switching: DelayRange | None = None, whole: RangesCheck | None = None
+) -> Audit:
+    """What both conditions say of the loop's own environment and constant delays.
+
+    With a range of delays also the damping that any switching within it asks; `whole` is the same coupling over the
+    ranges around the environment, if there is one. Raises ValueError naming the field of the loop that is wrong.
     """
     loop = loop.at(loop.environment).switching(None)
     check_loop(loop)
@@ -292,30 +360,17 @@ def report(
     here = requirements["this-environment"].certified
     proved = bool(whole and whole.proved)
     guaranteed = guarantee_of(requirements, loop, proved)
-    figures = coupling.figures(loop.T)
-    return {
-        "coupling": {
-            "kind": coupling.kind,
-            "K": figures.get("K"),
-            "B": figures.get("B"),
-        },
-        "loop": {
-            "T_s": loop.T,
-            "T_max_s": loop.T_max,
-            "latency_s": loop.latency,
-            "theta": list(loop.theta),
-            "psi": list(loop.psi),
-            "delta": list(loop.delta),
-            "rigid": loop.environment is RIGID_WALL,
-        },
-        **{name: _condition_part(loop, coupling, needs) for name, needs in requirements.items()},
-        "switching": _switching_part(loop, coupling, switching) if switching else None,
-        "ranges": whole and ranges_part(whole),
-        "certified": here and (whole is None or proved or guaranteed == ANY),
-        "promise": guaranteed,
-        "helps": _helps(loop, coupling, requirements["any-environment" if here else "this-environment"]),
-        "not_covered": CAVEATS,
-    }
+    figures, rigid = coupling.figures(loop.T), loop.environment is RIGID_WALL
+    return Audit(
+        _Coupling(coupling.kind, figures.get("K"), figures.get("B")),
+        _Loop(loop.T, loop.T_max, loop.latency, loop.theta, loop.psi, loop.delta, rigid),
+        {name: _judged(loop, coupling, needs) for name, needs in requirements.items()},
+        _switching_part(loop, coupling, switching) if switching else None,
+        whole and ranges_part(whole),
+        here and (whole is None or proved or guaranteed == ANY),
+        guaranteed,
+        _helps(loop, coupling, requirements["any-environment" if here else "this-environment"]),
+    )
 
 
 _SWEEPS = 60  # that a search asks for, about
@@ -336,59 +391,28 @@ def _in_time(loop: Loop, coupling: Coupling, search: Callable[[], _Found], witho
         return search()
 
 
-def _condition_part(loop: Loop, coupling: Coupling, needs: Requirement) -> dict[str, Any]:
-    nothing, least = (None,) * loop.channels, needs.required if needs.certified else None
-    stiff = _in_time(
-        loop, coupling, lambda: stiffest(loop, coupling, needs.condition), lambda reason: _Stiffest(nothing, reason)
+def _judged(loop: Loop, coupling: Coupling, needs: Requirement) -> ConditionAudit:
+    unknown = (None,) * loop.channels
+    return ConditionAudit(
+        certificate_part(needs),
+        _in_time(
+            loop, coupling, lambda: stiffest(loop, coupling, needs.condition), lambda why: _Stiffest(unknown, why)
+        ),
+        _in_time(loop, coupling, lambda: sensitivity(loop, coupling, needs), lambda why: _of_delta(needs, why)),
     )
-    tolerated = _in_time(
-        loop, coupling, lambda: tolerance(loop, coupling, needs), lambda reason: _Tolerance(least, None, None, reason)
-    )
-    return certificate_part(needs) | {
-        "stiffest": _stiffest_part(stiff),
-        "sensitivity": _sensitivity_part(loop, needs, tolerated),
-    }
 
 
 def _switching_part(loop: Loop, coupling: Coupling, span: DelayRange) -> dict[str, Any]:
     """Of an environment with walls, while all of them touch."""
     touching = msgspec.structs.replace(loop.at(loop.environment.frozen()[-1]), latency=None).switching(span)
-    found = switching_requirement(touching, coupling)
-    if found.requirement.reason:
-        return certificate_part(found.requirement) | {"lo": list(span.lo), "hi": list(span.hi)}
-    return switching_part(found, touching.sent(coupling), span, loop.T_max)
+    return switching_part(touching, coupling)
 
 
-def _stiffest_part(found: _Stiffest) -> dict[str, Any]:
-    return {"K": list(found.K)} | _because(found.reason)
-
-
-def _sensitivity_part(loop: Loop, needs: Requirement, found: _Tolerance) -> dict[str, Any]:
-    """Errors are relative: delta may be 1 - delta_error times and T 1 + T_error times what was given."""
-    return {
-        "least_delta": None if found.least_delta is None else list(found.least_delta),
-        "delta_error": None if found.least_delta is None else 1 - needs.ratio,
-        "largest_T_s": found.largest_T,
-        "T_error": None if found.largest_T is None else found.largest_T / loop.T - 1,
-        "extra_samples": found.extra_samples,
-    } | _because(found.reason)
-
-
-def _because(reason: str | None) -> dict[str, str]:
-    return {"reason": reason} if reason else {}
-
-
-def _helps(loop: Loop, coupling: Coupling, needs: Requirement) -> list[dict[str, Any]]:
+def _helps(loop: Loop, coupling: Coupling, needs: Requirement) -> list[Help]:
     """Changes that help the condition that fails first: this-environment, else any_environment."""
-    return [
-        {
-            "change": remedy.change,
-            "condition": needs.condition,
-            "required_damping": list(remedy.requirement.required),
-            "certified": remedy.requirement.certified,
-        }
-        for remedy in _in_time(loop, coupling, lambda: remedies(loop, coupling, needs), lambda reason: [])
-    ]
+    found = _in_time(loop, coupling, lambda: remedies(loop, coupling, needs), lambda why: [])
+    asked = ((remedy.change, remedy.requirement) for remedy in found)
+    return [Help(change, needs.condition, after.required, after.certified) for change, after in asked]
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ _RIDGE = 1e-9  # of its column: what a direction that neither objective nor ineq
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """constant + sum_a x_a slope_a > 0 at k frequencies, as real vectors (`_packed`)."""
+    """constant + sum_a x_a slope_a > 0 at k frequencies, as real vectors (`packed`)."""
 
     constant: Array  # (k, r^2)
     slope: Array  # (k, r^2, n)
@@ -34,7 +34,7 @@ class Block:
     @classmethod
     def of(cls, constant: Complex, slope: Complex) -> Block:
         """Of Hermitian matrices: constant (k, r, r), slope (k, n, r, r)."""
-        return cls(_packed(constant), np.ascontiguousarray(np.swapaxes(_packed(slope), 1, 2)))
+        return cls(packed(constant), np.ascontiguousarray(np.swapaxes(packed(slope), 1, 2)))
 
     @property
     def degree(self) -> int:
@@ -162,12 +162,12 @@ def _directions(block: Block, x: Array) -> tuple[Array, Array]:
     W = _inverse_root(block.at(x))[:, None]
     r = W.shape[-1]
     units = _unpacked(np.eye(r * r))
-    turned = np.swapaxes(_packed(W @ units @ np.conj(np.swapaxes(W, 2, 3))), 1, 2)  # (k, r^2, r^2)
+    turned = np.swapaxes(packed(W @ units @ np.conj(np.swapaxes(W, 2, 3))), 1, 2)  # (k, r^2, r^2)
     rows = turned @ block.slope
-    return rows.reshape(-1, rows.shape[2]), np.tile(_packed(np.eye(r, dtype=complex)), len(rows))
+    return rows.reshape(-1, rows.shape[2]), np.tile(packed(np.eye(r, dtype=complex)), len(rows))
 
 
-def _packed(H: Complex) -> Array:
+def packed(H: Complex) -> Array:
     """Hermitian matrices (.., r, r) as real vectors (.., r^2) of the same inner product."""
     upper = np.triu_indices(H.shape[-1], 1)
     off = np.sqrt(2) * H[..., upper[0], upper[1]]
@@ -175,7 +175,7 @@ def _packed(H: Complex) -> Array:
 
 
 def _unpacked(v: Array) -> Complex:
-    """The Hermitian matrices of `_packed`."""
+    """The Hermitian matrices of `packed`."""
     r = math.isqrt(v.shape[-1])
     upper, count = np.triu_indices(r, 1), r * (r - 1) // 2
     H = np.zeros((*v.shape[:-1], r, r), dtype=complex)

@@ -11,44 +11,39 @@ weigh what the delays forbid,
     D = He[ (4/T) ((1/z - 1) H_+ + H_0) + sum_{k>=1} C_k z^-k ] + C_0  >=  0,     H_+ = sum_{k>=0} H_k z^-k,
 and then J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/w>. With H = w |E| h this is
     1 - tr C_0 Delta - mean |h + Lambda E/|E||^2,
-the mean over log frequency in the band. What D lacks to be positive on the points of the transform is charged.
+the mean over log frequency in the band. H is piecewise linear, so that its sums over the circle are closed forms, and
+D is known at every frequency; what it lacks to be positive in a dense sweep is charged.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from itertools import product
+from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
-from numpy.typing import NDArray
 
-from controller.coupling import Coupling
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti
-from design.barrier import Block, Program, centre, towards
-from design.designs import design_by_kind
+from design.barrier import Block, Program, centre, packed, towards
 from design.frequency import frequencies, hermitian, on_circle
-from design.program import LADDER
+from design.result import Design
 from design.transparency import BAND_HZ, decibels
 
-_Indices = NDArray[np.intp]  # of points of the transform
-
-_POINTS = 65536  # of the transform
-_KNOTS = {1: 60, 2: 60}  # of h, by channels; fewer for more
-_FEWEST = 24
-_EVERY = 3  # channels up to which h is any matrix
-MOST = 4  # channels for which there is a bound
-NO_BOUND = f"no bound for more than {MOST} devices: it takes minutes, and what it gives then is decibels too low"
-_NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the upper end of the band
+_GRID = 250  # points, even and even in the logarithm, on which H is given
+_KNOTS = {1: 60, 2: 60, 3: 24, 4: 20}  # of h, by channels
+MOST = max(_KNOTS)  # channels for which there is a bound
+NO_BOUND = f"no bound for more than {MOST} devices: its program would take many minutes"
+_NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the ends of the band
+_NEAR_MODE = 1.0  # of the width of a mode, from it: further knots
+_CLOSEST = 0.1  # of a step: nearer knots are one
+_MOST_ADDED = 96  # frequencies after a sweep
 _DEGREE = 3  # of the splines that h is made of
 _GAP = 0.002  # of the bound, relatively, that the barrier leaves
 _SWEEPS = 6
-_QUADRATURE = 3e-6  # of the mean square: what the sums over transform and band may differ from their integrals
-_RUNGS = LADDER[:2]  # of the design that it begins from
-_LEFT_OUT = 0.0005  # of the mean square mismatch of a coupling: what the shapes of h lack
+_QUADRATURE = 1e-8  # of the mean square: what Gauss's rule may differ from the integral
 _LARGEST_CHARGE = 0.003  # of the bound, for what D lacks between the frequencies where it is imposed
 _STEEPER = 4.0
 
@@ -65,195 +60,155 @@ class _Bound:
         return decibels(self.rms)
 
 
-def bound(
-    loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None, near: Coupling | None = None
-) -> _Bound:
-    """The least rms mismatch over the band that any coupling certified this-environment can have.
-
-    `near` is a good one, or one is designed: with more than EVERY channels h is made of what makes up its mismatch.
-    """
+def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> _Bound:
+    """The least rms mismatch over the band of any coupling certified this-environment; for up to MOST channels."""
     started = time.perf_counter()
-    if loop.channels <= _EVERY:
-        shapes = np.eye(loop.channels**2)
-    else:
-        shapes = _shapes(loop, loop.F(near or design_by_kind(loop, "optimal", ladder=_RUNGS).coupling), band_hz)
-    dual = _Dual.of(loop, band_hz, knots or _KNOTS.get(loop.channels, _FEWEST), shapes)
+    dual = _Dual.of(loop, band_hz, knots or _KNOTS[loop.channels])
     square = dual.best()
     return _Bound(float(np.sqrt(max(square - _QUADRATURE, 0.0))), time.perf_counter() - started)
 
 
 @dataclass(frozen=True, eq=False)
 class _Dual:
-    """Unknowns: h at its knots (real and imaginary parts, entry by entry), C_0, then the C_k; D in units of 1/delta."""
+    """Unknowns: h, entry by entry, its real parts and then its imaginary ones; C_0; the C_k. D in units of 1/delta.
 
-    m: int
-    A: Array  # (rows, n) h over the band, weighted
-    b: Array  # (rows,) -Lambda E/|E|, weighted
-    c: Array  # (n,) tr C_0
-    shapes: Array  # (shapes, m, m) orthonormal: h is a sum of them, each times a scalar function
-    parts: Complex  # (scalars, POINTS/2 + 1): what each real scalar function of h contributes to one entry of D
-    forbidden: tuple[
-        tuple[int, Array], ...
-    ]  # (row, (steps + 1, m)): sums over s_k[row] that are zero for every coupling
-    root: Array  # (m,) sqrt(delta)
+    H is piecewise linear between the points of `grid`: its sums over the circle are closed forms (`_causal`).
+    """
+
+    loop: Loop
+    grid: Array  # (k,) [rad/sample]
+    heights: Array  # (k, inner): the scalar functions of H there
+    R: Array  # (inner, inner): of a scalar function the mean |h|^2 over the band is |R x|^2
+    target: Array  # (2 inner, m^2): -Lambda E/|E| in the same units, real and then imaginary parts
+    knots: Array
+    forbidden: tuple[tuple[int, Array], ...]  # (row, weights (k, m)): sums over s_k[row] that are zero for every F
 
     @classmethod
-    def of(cls, loop: Loop, band_hz: tuple[float, float], count: int, shapes: Array) -> _Dual:
-        E, m = loop.E(), loop.channels
+    def of(cls, loop: Loop, band_hz: tuple[float, float], count: int) -> _Dual:
+        E = loop.E()
         low, high = 2 * np.pi * band_hz[0] * loop.T, min(2 * np.pi * band_hz[1] * loop.T, 0.999 * np.pi)
         span = np.log(high / low)
-        modes = np.abs(np.angle(E.poles()))
-        knots = np.geomspace(low, high, count)
-        width = knots[1] / knots[0]
-        extra = [w * f for w in modes for f in (width**-0.5, 1.0, width**0.5) if low < w * f < high]
-        extra += [high * width**-f for f in _NEAR_END]
-        knots = np.union1d(knots, extra)
-        knots = knots[np.concatenate([[True], np.diff(np.log(knots)) > 0.2 * np.log(width)])]
+        knots = _knots(E, low, high, count)
+        grid = np.union1d(knots, frequencies(E, low=low, high=high, points=_GRID))
         x = np.log(knots)
         spline = np.concatenate([[x[0]] * _DEGREE, x, [x[-1]] * _DEGREE])
-        inner = x.size + _DEGREE - 3  # h is zero at both ends of the band, else H_+ would be unbounded there
+        hats = scipy.interpolate.BSpline.design_matrix(np.clip(np.log(grid), x[0], x[-1]), spline, _DEGREE).toarray()
+        unit = np.pi / (span * grid * np.linalg.norm(E.at(on_circle(grid)), axis=(1, 2)))
+        heights = unit[:, None] * hats[:, 1:-1]  # h is zero at both ends of the band, else H_+ would be unbounded there
 
-        def hats(w: Array) -> Array:
-            """(inner, k): B-splines in log w."""
-            x = np.clip(np.log(w), spline[0], spline[-1])
-            return scipy.interpolate.BSpline.design_matrix(x, spline, _DEGREE).toarray()[:, 1:-1].T
-
-        # objective, by Gauss's rule between the points of a grid that has the knots
-        grid = np.union1d(knots, frequencies(E, low=low, high=high, points=200))
-        node, weight = np.polynomial.legendre.leggauss(3)
-        left, right = np.log(grid[:-1]), np.log(grid[1:])
-        logarithm = ((left + right) / 2 + (right - left) / 2 * node[:, None]).ravel()
-        weight = ((right - left) / 2 * weight[:, None]).ravel() / span
-        w = np.exp(logarithm)
+        # objective, by Gauss's rule between the points of the grid: mean |h + Lambda E/|E||^2
+        part, weight = np.polynomial.legendre.leggauss(3)
+        part = (1 + part[:, None]) / 2
+        width = np.diff(grid)
+        w = (grid[:-1] + part * width).ravel()
+        weight = (weight[:, None] / 2 * width).ravel() / (w * span)
+        H = np.concatenate([(1 - f) * heights[:-1] + f * heights[1:] for f in part.ravel()])
         z = on_circle(w)
         response = E.at(z)
         size = np.linalg.norm(response, axis=(1, 2))
         target = (z[:, None] ** -np.asarray(loop.lam))[:, :, None] * response / size[:, None, None]
-        shape = np.sqrt(weight) * hats(w)  # (inner, k)
-        target = np.sqrt(weight)[:, None, None] * target
-        sizes = (2 * inner * len(shapes), m * (m + 1) // 2)
-        forbidden = _forbidden(loop, E)
-        n = sum(sizes) + len(forbidden)
-        along = target.reshape(w.size, -1) @ shapes.T  # (k, shapes)
-        rows, ends = [np.zeros((1, n))], [[np.sqrt(max((np.abs(target) ** 2).sum() - (np.abs(along) ** 2).sum(), 0))]]
-        for at, part in product(range(len(shapes)), (np.real, np.imag)):
-            row = np.zeros((w.size, n))
-            row[:, inner * (len(rows) - 1) :][:, :inner] = shape.T
-            rows.append(row)
-            ends.append(-part(along[:, at]))
-        A, b = np.vstack(rows), np.concatenate(ends)
-        c = np.zeros(n)
-        c[sizes[0] : sizes[0] + sizes[1]] = [1.0 if i == j else 0.0 for i, j in _triangle(m)]
-
-        # the causal parts, by transforms
-        w = 2 * np.pi * np.arange(_POINTS // 2 + 1) / _POINTS
-        inside = (w > low) & (w < high)
-        real = np.zeros((inner, w.size))
-        e = np.linalg.norm(E.at(on_circle(w[inside])), axis=(1, 2))
-        real[:, inside] = (
-            hats(w[inside]) * np.pi / (span * w[inside] * e)
-        )  # H = weight |E| h, weight = pi/(span w |E|^2)
-        parts = np.concatenate([_causal(real.astype(complex)), _causal((1j * real).astype(np.complex128))]) * (
-            2 / loop.T
-        )
-        root = np.sqrt(np.asarray(loop.delta))
-        return cls(m, A, b, c, shapes.reshape(-1, m, m), parts, forbidden, root)
+        target = np.sqrt(weight)[:, None] * target.reshape(w.size, -1)
+        Q, R = np.linalg.qr((np.sqrt(weight) * span * w * size / np.pi)[:, None] * H)
+        target = -np.vstack([Q.T @ target.real, Q.T @ target.imag])
+        return cls(loop, grid, heights, R, target, knots, _forbidden(loop, E))
 
     @property
-    def inner(self) -> int:
-        return len(self.parts) // 2
-
-    def block(self, points: _Indices) -> Block:
-        """D at some of the transform's points, scaled by root(delta) from both sides."""
-        m, inner = self.m, self.inner
-        z = np.exp(2j * np.pi * points / _POINTS)
-        slope = np.zeros((points.size, self.c.size, m, m), dtype=complex)
-        at, parts = 2 * inner * len(self.shapes), 2 * self.parts[:, points].T
-        scaled = self.shapes * np.outer(self.root, self.root)
-        slope[:, :at] = np.einsum("kh,sij->kshij", parts, scaled).reshape(points.size, at, m, m)
-        for i, j in _triangle(m):
-            slope[:, at, i, j] = 1.0 if i == j else 2.0
-            at += 1
-        for i, weights in self.forbidden:
-            slope[:, at, i] = z[:, None] ** -np.arange(len(weights)) @ weights
-            at += 1
-        return Block.of(np.zeros((points.size, m, m), dtype=np.complex128), hermitian(slope))
-
     def start(self) -> Array:
-        """h = 0 and C_0 = I/delta: D = I."""
-        x = np.zeros(self.c.size)
-        x[2 * self.inner * len(self.shapes) :][: self.m * (self.m + 1) // 2] = [
-            float(i == j) for i, j in _triangle(self.m)
-        ]
-        return x
+        """h = 0 and C_0 = I/delta: D = I. As a row, tr C_0."""
+        m = self.loop.channels
+        unit = [float(i == j) for i, j in _triangle(m)]
+        return np.concatenate([np.zeros(m * m * len(self.target)), unit, np.zeros(len(self.forbidden))])
 
-    def lacking(self, x: Array) -> Array:
-        """The least eigenvalue of D at every point, (POINTS/2 + 1,)."""
-        points = np.arange(_POINTS // 2 + 1)
-        return np.concatenate([np.linalg.eigvalsh(self._at(x, some))[:, 0] for some in np.array_split(points, 16)])
+    def objective(self) -> tuple[Array, Array, Array]:
+        """A, b, c: -2 <H, Lambda E> - <H, H/w> is |b|^2 - |A x - b|^2, and c'x is tr C_0."""
+        A = np.kron(np.eye(self.target.size // len(self.R)), self.R)
+        return np.hstack([A, np.zeros((len(A), self.start.size - len(A)))]), self.target.T.ravel(), self.start
 
-    def _at(self, x: Array, points: _Indices) -> Complex:
-        """D itself, without its slopes."""
-        m, inner = self.m, self.inner
-        z = np.exp(2j * np.pi * points / _POINTS)
-        D: Complex = np.zeros((points.size, m, m), dtype=np.complex128)
-        h = x[: 2 * inner * len(self.shapes)].reshape(-1, 2 * inner)
-        D += 2 * np.tensordot(self.parts[:, points].T @ h.T, self.shapes, axes=1) * np.outer(self.root, self.root)
-        at = h.size
-        for i, j in _triangle(m):
-            D[:, i, j] += x[at] * (1.0 if i == j else 2.0)
-            at += 1
-        for i, weights in self.forbidden:
-            D[:, i] += x[at] * (z[:, None] ** -np.arange(len(weights)) @ weights)
-            at += 1
-        return (D + np.conj(np.swapaxes(D, 1, 2))) / 2
+    def parts(self, w: Array) -> Complex:
+        """What the scalar functions of h, real and then imaginary, contribute to an entry of D, (k, 2 inner)."""
+        return 4 / self.loop.T * _causal(self.grid, self.heights, w)
+
+    def further(self, w: Array) -> Complex:
+        """What each unknown of C_0 and the C_k adds to D, (k, unknowns, m, m), before its Hermitian part is taken."""
+        m, z = self.loop.channels, on_circle(w)
+        triangle = _triangle(m)
+        slope = np.zeros((w.size, len(triangle) + len(self.forbidden), m, m), dtype=np.complex128)
+        for at, (i, j) in enumerate(triangle):
+            slope[:, at, i, j] = 1.0 if i == j else 2.0
+        for at, (i, weights) in enumerate(self.forbidden, start=len(triangle)):
+            slope[:, at, i] = z[:, None] ** -np.arange(len(weights)) @ weights
+        return slope
+
+    def block(self, w: Array) -> Block:
+        """D > 0 at these frequencies, scaled by root(delta) from both sides."""
+        m, parts = self.loop.channels, self.parts(w)[..., None, None]
+        units = self.scale[..., None, None] * np.eye(m * m).reshape(m, m, m, m)
+        slopes = [packed(hermitian(parts * unit)) for row in units for unit in row]
+        slope = np.concatenate([*slopes, packed(hermitian(self.further(w)))], axis=1)
+        return Block(np.zeros((w.size, m * m)), np.ascontiguousarray(np.swapaxes(slope, 1, 2)))
+
+    def lacking(self, x: Array, w: Array, parts: Complex, further: Complex) -> Array:
+        """By how much D is not positive, (k,)."""
+        m = self.loop.channels
+        h, C = np.split(x, [m * m * len(self.target)])
+        D = (parts @ h.reshape(m * m, -1).T).reshape(-1, m, m) * self.scale + np.einsum("knij,n->kij", further, C)
+        return -np.linalg.eigvalsh(hermitian(D))[:, 0]
+
+    @property
+    def scale(self) -> Array:
+        """(m, m): what D's unit is."""
+        root = np.sqrt(np.asarray(self.loop.delta))
+        return np.outer(root, root)
 
     def best(self) -> float:
         """The bound on the mean square."""
-        last = _POINTS // 2
-        # the lowest points first, then even in the logarithm and even
-        points = np.unique(np.concatenate([[0], np.geomspace(1, last, 220).round(), np.linspace(1, last, 160).round()]))
-        points = points.astype(int)
-        Q, R = np.linalg.qr(self.A)
-        A, b = R, Q.T @ self.b
-        rest = float(self.b @ self.b - b @ b)  # what no h reaches
-        start = x = self.start()
+        low, high = self.grid[0], self.grid[-1]
+        between = np.sqrt(self.knots[1:] * self.knots[:-1])
+        beside = np.concatenate([low * np.geomspace(1e-3, 0.95, 12), np.geomspace(1.01 * high, np.pi, 24)])
+        imposed = np.concatenate([[0.0], self.knots, between, beside, np.linspace(high, np.pi, 40)])
+        beside = np.concatenate([low * np.geomspace(1e-3, 1, 60), np.geomspace(high, np.pi, 200)])
+        swept = np.unique(np.concatenate([[0.0], self.grid, beside, np.linspace(high, np.pi, 400)]))
+        swept = np.union1d(swept, (swept[1:] + swept[:-1]) / 2)
+        parts = self.parts(swept), self.further(swept)
+        A, b, c = self.objective()
+        x, nothing = self.start, float(b @ b)
         t, found = None, 0.0
         for sweep in range(_SWEEPS):
-            program = Program(A, b, self.c, (self.block(points),))
-            x = towards(start, x, program)
+            imposed = np.unique(imposed)
+            program = Program(A, b, c, (self.block(imposed),))
+            x = towards(self.start, x, program)
             program, U = program.conditioned(x)
             y = U @ x
             t = program.degree / max(program.value(y), 1e-12) if t is None else t / _STEEPER
             while True:
                 y = centre(program, y, t)
-                left = max(1 - rest - program.value(y), 1e-9)
+                left = max(nothing - program.value(y), 1e-9)
                 if program.degree / t <= (_GAP if sweep else 5 * _GAP) * left:
                     break
                 t *= _STEEPER
             x = scipy.linalg.solve_triangular(U, y)
-            lacking = self.lacking(x)
-            charge = self.m * max(0.0, -float(lacking.min()))
-            value = 1 - rest - program.value(y) - charge
+            lacking = self.lacking(x, swept, *parts)
+            charge = self.loop.channels * max(0.0, float(lacking.max()))
+            value = nothing - program.value(y) - charge
             found = max(found, value)
             if sweep and charge <= _LARGEST_CHARGE * max(value, 1e-9):
                 break
-            points = np.union1d(points, _worst(lacking))
+            imposed = np.concatenate([imposed, _worst(lacking, swept)])
         return found
 
 
-def _shapes(loop: Loop, near: Lti, band_hz: tuple[float, float]) -> Array:
-    """(shapes, m m): the real matrices that make up all but _LEFT_OUT of the mean square mismatch of this force map."""
-    E, per_hz = loop.E(), 2 * np.pi * loop.T
-    w = frequencies(E, low=per_hz * band_hz[0], high=min(per_hz * band_hz[1], 0.999 * np.pi), points=200)
-    z = on_circle(w)
-    ideal = E.at(z)
-    M = near.at(z) - z[:, None, None] ** -np.asarray(loop.lam)[:, None] * ideal
-    M *= (np.sqrt(np.gradient(np.log(w))) / np.linalg.norm(ideal, axis=(1, 2)))[:, None, None]
-    M = M.reshape(w.size, -1)
-    _, size, shapes = np.linalg.svd(np.vstack([M.real, M.imag]), full_matrices=False)
-    left = 1 - np.cumsum(size**2) / (size**2).sum()
-    return shapes[: int(np.argmax(left < _LEFT_OUT)) + 1]
+def _knots(E: Lti, low: float, high: float, count: int) -> Array:
+    """Those of h: even in the logarithm, closer at the ends of the band and around the modes of E, by their width."""
+    even = np.geomspace(low, high, count)
+    step = np.log(even[1] / even[0])
+    ends = np.exp(step * np.array(_NEAR_END))
+    poles = E.poles()
+    poles = poles[(np.abs(poles) > 0.01) & (poles.imag > 0)]
+    width = np.array([-1.0, 0.0, 1.0])[:, None] * np.minimum(-np.log(np.abs(poles)) / np.angle(poles), step)
+    near = (np.angle(poles) * np.exp(_NEAR_MODE * width)).ravel()
+    knots = np.sort(np.concatenate([even, low * ends, high / ends, near]))
+    knots = knots[(knots >= low) & (knots <= high)]
+    return knots[np.concatenate([[True], np.diff(np.log(knots)) > _CLOSEST * step])]
 
 
 def _triangle(m: int) -> list[tuple[int, int]]:
@@ -293,17 +248,47 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[int, Array], ...]:
     return tuple(found)
 
 
-def _causal(half: Complex) -> Complex:
-    """(1/z - 1) H_+ + H_0 on the half circle, of functions H given there, (n, POINTS/2 + 1); H(conj z) = conj H(z)."""
-    coefficients = np.fft.irfft(half, n=_POINTS)  # H_k of z^-k: H(w) = sum_k H_k e^{-jwk}
-    coefficients[:, _POINTS // 2 :] = 0.0  # k < 0
-    shifted = np.roll(coefficients, 1, axis=1) - coefficients
-    shifted[:, 0] = 0.0  # -H_0 + H_0
-    return np.fft.rfft(shifted, n=_POINTS)
+def _causal(grid: Array, heights: Array, w: Array) -> Complex:
+    """(1/z - 1) H_+ + H_0 at z = e^jw of H = a and H = j a, each H(conj z) = conj H(z), (k, 2 functions).
+
+    Each a is piecewise linear with these heights on the grid, the first and last of them zero, and zero elsewhere. With
+    sigma_i the change of its slope at x_i, H_k = -sum sigma_i cos(k x_i)/(pi k^2), so that H_+ consists of dilogarithms
+    Li2(e^jx) = pi^2/6 - |x| (2 pi - |x|)/4 + j Cl2(x).
+    """
+    slopes = np.diff(heights, axis=0) / np.diff(grid)[:, None]
+    bends = np.diff(slopes, axis=0, prepend=0, append=0) / (2 * np.pi)
+    mean = (np.diff(grid) @ (heights[1:] + heights[:-1])) / (2 * np.pi)
+    below, above = _dilogarithm(grid - w[:, None]), _dilogarithm(grid + w[:, None])
+    back = np.exp(-1j * w)[:, None]
+    cosine, sine = -((below + np.conj(above)) @ bends), -1j * ((below - np.conj(above)) @ bends)
+    return np.hstack([(back - 1) * cosine + back * mean, (back - 1) * sine])
 
 
-def _worst(lacking: Array) -> _Indices:
-    """The points of the deepest local minima below zero."""
-    padded = np.concatenate([[np.inf], lacking, [np.inf]])
-    local = np.flatnonzero((lacking <= padded[:-2]) & (lacking <= padded[2:]) & (lacking < 0))
-    return local[np.argsort(lacking[local])[:96]]
+def _dilogarithm(x: Array) -> Complex:
+    """Li2(e^jx) for |x| <= 2 pi."""
+    short = np.where(np.abs(x) > np.pi, x - 2 * np.pi * np.sign(x), x)
+    square, series = short**2, np.zeros_like(short)
+    for n in range(46, 0, -2):
+        series = (series + 2 * scipy.special.zeta(n) / ((2 * np.pi) ** n * n * (n + 1))) * square
+    clausen = short * (1 + series - np.log(np.where(short == 0, 1.0, np.abs(short))))
+    return np.pi**2 / 6 - np.abs(short) * (2 * np.pi - np.abs(short)) / 4 + 1j * clausen
+
+
+def _worst(lacking: Array, w: Array) -> Array:
+    """The frequencies of the highest local maxima above zero."""
+    padded = np.concatenate([[-np.inf], lacking, [-np.inf]])
+    local = np.flatnonzero((lacking >= padded[:-2]) & (lacking >= padded[2:]) & (lacking > 0))
+    return w[local[np.argsort(lacking[local])[-_MOST_ADDED:]]]
+
+
+def bound_part(loop: Loop, best: Design, reached_db: float, band_hz: tuple[float, float]) -> dict[str, Any]:
+    """What no linear coupling can be better than, and by how much the best one is worse; or why there is no bound."""
+    part: dict[str, Any] = {"rms_mismatch_db": None}
+    if loop.channels > MOST:
+        return part | {"reason": NO_BOUND}
+    if best.objective == 0:
+        return part | {"reason": "the mismatch is zero: there is nothing to bound"}
+    least = bound(loop, band_hz)
+    if not least.rms:
+        return part | {"reason": "the bound is zero: nothing is known to be lost"}
+    return {"rms_mismatch_db": least.rms_db, "gap_db": reached_db - least.rms_db}

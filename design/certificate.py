@@ -20,14 +20,14 @@ from controller.coupling import (
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti, SingularLoop, TooLong, rational, within
-from controller.ranges import Member, inside
+from controller.ranges import Member, inside, number_of_vertices
 from design import conditions, multipliers
+from design.coupling_file import Certificate, Guarantee, LimiterCertificate, Stored, SwitchingProof, digest, sealed
 from design.environments import Progress, Searched, in_each, search_ranges, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
 from design.frequency import frequencies, on_circle, rounding
 from design.guarantees import LATE, no_compliance, switching_guarantee
 from design.result import Condition, NotProved, Requirement, refusal
-from design.stored import Certificate, Guarantee, LimiterCertificate, Stored, SwitchingProof, digest, sealed
 
 # ----------------------------------------------------------------------------------------------------
 # An exact proof that no switching of the delays within a loop's range is dangerous: made, stored, proved again.
@@ -534,9 +534,6 @@ def _multiplier(loop: Loop, certificate: Certificate) -> list[Fraction] | None:
         raise NotProved(f"{name} is no row of rational numbers") from None
 
 
-CONDITIONS: tuple[Condition, ...] = ("any-environment", "this-environment")
-
-
 def assess(
     loop: Loop, coupling: Coupling, phi: Array | None = None, known: Certificate | None = None
 ) -> dict[str, Requirement]:
@@ -604,6 +601,7 @@ class RangesCheck:
     at_members: tuple[Requirement, ...]
     samples: tuple[Member, ...]
     at_samples: tuple[Requirement, ...]
+    vertices: int  # of the ranges: of more than 128 so many are members
     searched: Searched
     at_found: Requirement  # at the worst environment that the search has found
     seed: int
@@ -655,7 +653,16 @@ def check_ranges(
     at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)
     (at_found,) = in_each(loop, coupling, [searched.worst[0].member])
     check = RangesCheck(
-        members, tuple(at_members), drawn, tuple(at_samples), searched, at_found, seed, certificate, reason
+        members,
+        tuple(at_members),
+        drawn,
+        tuple(at_samples),
+        number_of_vertices(loop.network, loop.ranges),
+        searched,
+        at_found,
+        seed,
+        certificate,
+        reason,
     )
     if certificate and not check.proved:
         place, requirement = check.worst_found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -20,17 +20,19 @@ from controller.lti import Array, Lti
 from design import conditions
 from design.bound import MOST, NO_BOUND, bound
 from design.certificate import any_environment_of, prove
+from design.coupling_file import digest
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
 from design.program import LADDER, Options
 from design.result import Condition, Design, DesignFailed, NotProved, Requirement, finite
 from design.robustness import robustness_part
-from design.stored import digest
 from design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling over frequency: singular values, the demand for damping, and what a hand perceives.
 
+
+_Progress = Callable[[int, int], None]  # (designs done, designs in all)
 
 _LOWEST_HZ = 0.1
 FEEL_HZ = (1.0, 10.0)  # where perceived stiffness and damping are quoted
@@ -54,13 +56,13 @@ class Demands:
 
 
 @dataclass(frozen=True, eq=False)
-class _Curves:
+class Curves:
     """One coupling at the frequencies `hz` of its picture."""
 
     sigma_F: Array  # (k, m) singular values of F [N/m], largest first
     sigma_M: Array  # (k, m) of the mismatch F - Lambda E [N/m]
     perceived: Perceived
-    demands: dict[str, Array | None]  # (k,) required over available damping
+    demands: dict[str, Array | None] = field(metadata={"json": "table"})  # (k,) required over available damping
 
 
 def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Demands:
@@ -100,7 +102,7 @@ def grid(loop: Loop, couplings: Sequence[Demands], low_hz: float = _LOWEST_HZ) -
     return np.unique([*even, *(hz for hz in wanted if low_hz <= hz <= even[-1])])
 
 
-def curves(loop: Loop, judged: Demands, hz: Array) -> _Curves:
+def curves(loop: Loop, judged: Demands, hz: Array) -> Curves:
     """The curves of one coupling at `hz` (k,)."""
     w = 2 * np.pi * hz * loop.T
     z = on_circle(w)
@@ -108,7 +110,7 @@ def curves(loop: Loop, judged: Demands, hz: Array) -> _Curves:
     target = (delay(loop.lam, loop.T) @ E).at(z)
     F = judged.F.at(z)
     demands = {name: None if demand is None else demand(w) for name, demand in judged.demands.items()}
-    return _Curves(_singular_values(F), _singular_values(F - target), perceived(F, hz), demands)
+    return Curves(_singular_values(F), _singular_values(F - target), perceived(F, hz), demands)
 
 
 def ideal(loop: Loop, hz: Array) -> tuple[Array, Perceived]:
@@ -238,7 +240,7 @@ class Limit:
     proof_reason: str | None = None  # why there is no exact proof
 
 
-Designer = Callable[[Point], Limit]
+_Designer = Callable[[Point], Limit]
 
 
 def optimum(point: Point) -> Limit:
@@ -246,7 +248,7 @@ def optimum(point: Point) -> Limit:
     return measured(point, "optimal", None, vars(point.options))
 
 
-def spring_damper(condition: Condition) -> Designer:
+def spring_damper(condition: Condition) -> _Designer:
     """The designed spring-damper of a point."""
     return lambda point: measured(point, "spring-damper", condition, {})
 
@@ -293,7 +295,7 @@ def _damping(requirement: Requirement) -> tuple[float | None, ...]:
     return tuple(finite(b) for b in requirement.required)
 
 
-def remembered(designer: Designer, whole: bool) -> Designer:
+def remembered(designer: _Designer, whole: bool) -> _Designer:
     """A designer that does not repeat a design; `whole` where the options matter to the design."""
     known: dict[tuple[str, Options | None], Limit] = {}
 
@@ -304,6 +306,38 @@ def remembered(designer: Designer, whole: bool) -> Designer:
         return replace(known[key], value=point.value)
 
     return recalled
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The designs along one axis of the loop."""
+
+    label: str
+    unit: str
+    values: list[float]
+    curves: dict[str, list[Limit]] = field(metadata={"json": "beside"})  # by design
+
+
+def limits(
+    plan: Mapping[str, Sequence[Point]], beside: Sequence[Condition], progress: _Progress
+) -> tuple[dict[str, Sweep], bool]:
+    """The optimum at every point of a plan, beside it the spring-dampers by these conditions; what an interruption
+    leaves, and whether there was one.
+    """
+    designers = {"optimal": remembered(optimum, True)}
+    designers |= {name: remembered(spring_damper(name), False) for name in beside}
+    sweeps = {
+        name: Sweep(AXES[name].label, AXES[name].unit, [at.value for at in along], {kind: [] for kind in designers})
+        for name, along in plan.items()
+    }
+    jobs = [(name, point, kind) for name, along in plan.items() for point in along for kind in designers]
+    try:
+        for done, (name, point, kind) in enumerate(jobs):
+            progress(done, len(jobs))
+            sweeps[name].curves[kind].append(designers[kind](point))
+    except KeyboardInterrupt:
+        return {name: sweep for name, sweep in sweeps.items() if any(sweep.curves.values())}, True
+    return sweeps, False
 
 
 def _spread(base: float, axis: _Axis, points: int, span: tuple[float, float] | None) -> Array:
@@ -347,8 +381,6 @@ def _reference(loop: Loop, theta: tuple[int, ...], psi: tuple[int, ...]) -> tupl
 
 
 _PRINTED = {"I": "(27)", "II": "(28)"}  # the paper's equations for its gains
-
-_Progress = Callable[[int, int], None]  # (designs done, designs in all)
 
 
 @dataclass(frozen=True)
@@ -400,20 +432,12 @@ _FULL = (
 LADDERS = {"short": SHORT, "full": _FULL}
 
 
-def compare_designs(
-    loops: Mapping[str, Loop], entries: Sequence[_Entry], progress: _Progress
-) -> tuple[list[LadderRow], bool]:
-    """The rows of every case, and whether the keyboard ended it; what was done before is kept."""
-    rows: list[LadderRow] = []
-    total = len(loops) * len(entries)
-    try:
-        for case, loop in loops.items():
-            for entry in entries:
-                progress(len(rows), total)
-                rows.append(ladder_row(case, loop, entry))
-    except KeyboardInterrupt:
-        return rows, True
-    return rows, False
+def compare_designs(loops: Mapping[str, Loop], entries: Sequence[_Entry], progress: _Progress) -> Iterator[LadderRow]:
+    """The rows of every case."""
+    jobs = [(case, loop, entry) for case, loop in loops.items() for entry in entries]
+    for done, (case, loop, entry) in enumerate(jobs):
+        progress(done, len(jobs))
+        yield ladder_row(case, loop, entry)
 
 
 def ladder_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:
@@ -470,15 +494,14 @@ def _made(loop: Loop, case: str, entry: _Entry) -> tuple[Coupling, Design | None
     return design.coupling, design
 
 
-_Sweeps = dict[str, dict[str, list[Limit]]]  # sweep -> design -> its points
 _EXACT_DB = -60.0  # below it the difference to the environment is the solver's
 
 
-def gains(plan: dict[str, list[Point]], curves: _Sweeps, loop: Loop, options: Options) -> list[str]:
+def gains(plan: dict[str, list[Point]], sweeps: Mapping[str, Sweep], loop: Loop, options: Options) -> list[str]:
     """What there is to gain, in a line per sweep."""
     lines = []
-    for name, rows in curves.items():
-        found = [(limit, _figure(limit, options.objective)) for limit in rows["optimal"]]
+    for name, sweep in sweeps.items():
+        found = [(limit, _figure(limit, options.objective)) for limit in sweep.curves["optimal"]]
         known = [(limit, figure) for limit, figure in found if figure is not None]
         if len(known) < 2:
             continue
@@ -489,7 +512,7 @@ def gains(plan: dict[str, list[Point]], curves: _Sweeps, loop: Loop, options: Op
             if limit in (known[0][0], known[-1][0]) or limit.value == here
         ]
         lines.append(f"{name} in {AXES[name].unit}: {', '.join(words)}")
-    bare = next((limit for rows in curves.values() for limit in rows["optimal"] if _is(limit, loop)), None)
+    bare = next((limit for sweep in sweeps.values() for limit in sweep.curves["optimal"] if _is(limit, loop)), None)
     needs = [b for b in bare.bare_damping if b is not None] if bare else []
     if len(needs) == len(loop.delta):
         need = ", ".join(f"{b:.4g}" for b in needs)

@@ -9,15 +9,15 @@ from typing import Any
 from controller.coupling import Coupling
 from controller.delay import delay
 from controller.environment import environment
-from controller.loop import DelayRange, Loop, force_map
-from controller.lti import Lti
+from controller.loop import Loop, force_map
 from controller.ranges import Member
-from design.certificate import RangesCheck, check_limiter, prove_limiter
+from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
 from design.conditions import this_environment
+from design.coupling_file import LimiterCertificate
+from design.designs import design_by_kind
 from design.environments import SEARCH, Searched, worst
-from design.multipliers import BETA, SwitchingSweep, limiter_refusal, limiter_requirement
-from design.result import NotProved, Requirement, certificate_part, finite
-from design.stored import LimiterCertificate
+from design.multipliers import BETA, limiter_refusal, limiter_requirement
+from design.result import Design, DesignFailed, NotProved, Requirement, certificate_part, finite
 from design.transparency import decibels, transparency
 
 _OWN_PROOF = "by a proof of its own, for this environment"
@@ -103,15 +103,18 @@ _NOT_COVERED = (
 )
 
 
-def switching_part(found: SwitchingSweep, G: Lti, span: DelayRange, T_max: float | None = None) -> dict[str, Any]:
-    """The requirement with its multiplier, and what a playout buffer to the constant delay hi would need.
+def switching_part(loop: Loop, coupling: Coupling) -> dict[str, Any]:
+    """What any switching within the loop's range asks, and what a playout buffer to the constant delay hi would need.
 
-    G is the force map without Theta.
+    Only the requirement where there is none: its reason says why.
     """
-    buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available, T_max)
-    return certificate_part(found.requirement) | {
-        "lo": list(span.lo),
-        "hi": list(span.hi),
+    found, span = switching_requirement(loop, coupling), loop.delays
+    part = certificate_part(found.requirement) | {"lo": list(span.lo), "hi": list(span.hi)}
+    if found.requirement.reason:
+        return part
+    G = loop.sent(coupling)
+    buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available, loop.T_max)
+    return part | {
         "alpha": [finite(a) for a in found.alpha],
         "playout": {
             "theta": list(span.hi),
@@ -126,20 +129,28 @@ def switching_part(found: SwitchingSweep, G: Lti, span: DelayRange, T_max: float
 # What a guarantee for ranges of parameters costs: the robust coupling beside the one made for the nominal one.
 
 
-@dataclass(frozen=True)
-class _Cost:
-    """One coupling over the members of the ranges, where it runs on the current environment."""
+def price(loop: Loop, design: Design, kind: str, asked: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A design over the ranges; an optimal one beside the one for the nominal environment alone, `asked` the same.
 
-    name: str
-    ratio: tuple[float, float]  # required over available damping: in the nominal environment, and the most
-    violated: int  # members at which the this-environment condition fails
-    rms_db: tuple[float, float]  # mismatch: in the nominal environment, and at its worst vertex
-    sup_db: tuple[float, float]
-    worst: str  # the vertex with the largest rms mismatch
+    SI units; null for a mismatch of zero, or where no damping is enough.
+    """
+    couplings = {kind: design.coupling}
+    if kind == "optimal":
+        couplings = {"whole ranges": design.coupling}
+        try:
+            alone = design_by_kind(loop.at(loop.environment), kind, None, **asked)
+            couplings = {"nominal only": alone.coupling, **couplings}
+        except DesignFailed:  # ranges are given another basis by default
+            pass
+    members = loop.members()
+    return [_cost(name, loop, coupling, members) for name, coupling in couplings.items()]
 
 
-def cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -> _Cost:
-    """Required damping and mismatch at every member; those that no device feels have no mismatch."""
+def _cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -> dict[str, Any]:
+    """Required damping and mismatch in the nominal environment and at the worst member.
+
+    Members that no device feels have no mismatch.
+    """
     ratios, figures = [], {}
     for member in members:
         E = environment(member.network, loop.T)
@@ -147,34 +158,25 @@ def cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -
         ratios.append(this_environment(F, loop.delta, loop.T_max, loop.latency).ratio)
         if E.D.any():
             figures[member.name] = transparency(F, E, loop.lam)
-    nominal = figures[members[0].name]
-    worst = max(figures, key=lambda member: figures[member].rms_mismatch)
-    return _Cost(
-        name,
-        (ratios[0], max(ratios)),
-        sum(ratio >= 1 for ratio in ratios),
-        (decibels(nominal.rms_mismatch), decibels(figures[worst].rms_mismatch)),
-        (decibels(nominal.relative_mismatch), decibels(max(f.relative_mismatch for f in figures.values()))),
-        worst,
-    )
+    nominal, worst = figures[members[0].name], max(figures, key=lambda member: figures[member].rms_mismatch)
+    largest = max(f.relative_mismatch for f in figures.values())
 
+    def pair(first: float, second: float) -> dict[str, float | None]:
+        return {"nominal": finite(first), "worst": finite(second)}
 
-def price(loop: Loop, couplings: Mapping[str, Coupling]) -> tuple[_Cost, ...]:
-    """The cost of each coupling over the ranges of the loop."""
-    members = loop.members()
-    return tuple(cost(name, loop, coupling, members) for name, coupling in couplings.items())
-
-
-def cost_part(row: _Cost) -> dict[str, Any]:
-    """The row as plain data; null for a mismatch of zero, or where no damping is enough."""
-    pairs = {"required_over_available": row.ratio, "rms_mismatch_db": row.rms_db, "relative_mismatch_db": row.sup_db}
-    figures = {name: dict(zip(("nominal", "worst"), map(finite, pair), strict=True)) for name, pair in pairs.items()}
-    return {"coupling": row.name, "violated": row.violated, **figures, "worst": row.worst}
+    return {
+        "coupling": name,
+        "violated": sum(ratio >= 1 for ratio in ratios),
+        "required_over_available": pair(ratios[0], max(ratios)),
+        "rms_mismatch_db": pair(decibels(nominal.rms_mismatch), decibels(figures[worst].rms_mismatch)),
+        "relative_mismatch_db": pair(decibels(nominal.relative_mismatch), decibels(largest)),
+        "worst": worst,
+    }
 
 
 _WHAT_IS_PROVED = (
-    f"proved at the vertices; between them searched, not proved ({SEARCH}); every environment is frozen: nothing is "
-    "proved of one that changes while it is touched"
+    f"proved at the vertices, of more than 128 at so many; between them searched, not proved ({SEARCH}); "
+    "every environment is frozen: nothing is proved of one that changes while it is touched"
 )
 
 
@@ -183,6 +185,7 @@ def ranges_part(check: RangesCheck) -> dict[str, Any]:
     member, requirement = check.worst
     part: dict[str, Any] = {
         "vertices": len(check.members) - 1,
+        "all_vertices": check.vertices,
         "vertices_certified": sum(r.certified for r in check.at_members[1:]),
         "required_damping": [finite(d) for d in requirement.required],
         "available_damping": list(requirement.available),
@@ -205,6 +208,7 @@ def search_part(searched: Searched) -> dict[str, Any]:
         "worst_ratio": finite(worst.ratio),
         "worst": worst.member.name,
         "violated": not worst.ratio < 1,
+        "ended_by_clock": searched.ended,
     }
 
 
@@ -212,7 +216,8 @@ def search_words(part: dict[str, Any]) -> str:
     """The result of the search between the vertices, in one line."""
     found = "[red]violated[/]" if part["violated"] else "no violation found"
     ratio = "no damping is enough" if part["worst_ratio"] is None else f"worst ratio {part['worst_ratio']:.4f}"
-    return f"searched, not proved: {found}, {ratio} in {part['environments']} points, at {part['worst']}"
+    ended = ", until its time was over" if part["ended_by_clock"] else ""
+    return f"searched, not proved: {found}, {ratio} in {part['environments']} points{ended}, at {part['worst']}"
 
 
 def _inside_part(check: RangesCheck) -> dict[str, Any]:
@@ -235,9 +240,10 @@ def ranges_rows(part: dict[str, Any]) -> list[tuple[str, str]]:
     most = f"{max(ratios):.4f} of the damping" if ratios else "no damping is enough"
     exact = part["proof"] == "rational"
     proof = "[green]proved exactly[/] at all" if exact else f"[red]not proved[/]: {part['reason']}"
-    found, count = part["inside"], part["vertices"]
+    found, count, every = part["inside"], part["vertices"], part["all_vertices"]
+    of = f", of all {every}: any three parameters have all their ends among them" if every > count + 1 else ""
     rows = [
-        ("ranges, vertices", f"{part['vertices_certified']} of {count} certified, {proof}"),
+        ("ranges, vertices", f"{part['vertices_certified']} of {count} certified, {proof}{of}"),
         ("ranges, worst vertex", f"{most}, at {part['worst']}"),
         ("ranges, between", search_words(part["search"])),
     ]

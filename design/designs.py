@@ -77,6 +77,8 @@ def design_by_kind(
     chosen = KINDS[kind]
     if condition not in chosen.conditions:
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(chosen.conditions)}")
+    if kind == "optimal" and loop.environment.walls:
+        raise ValueError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
     own = (("condition", condition), ("progress", progress))
     further = {name: value for name, value in own if name in chosen.takes}
     made = partial(getattr(import_module(chosen.module), chosen.function), **further, **options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -14,7 +15,7 @@ from controller.loop import Loop
 from controller.lti import Array, Sampled, SingularLoop
 from controller.ranges import Member, Region, regions
 from design.conditions import least_multiple, this_environment, this_environment_demand
-from design.frequency import frequencies, hermitian, on_circle, supremum
+from design.frequency import MOST_SECONDS, frequencies, hermitian, on_circle, supremum
 from design.result import Requirement, refusal
 
 
@@ -57,6 +58,9 @@ _ON_EDGES, _ALONG = 240, (3, 9)  # points on the edges of a region, and on each 
 _DRAWN, _SEED = 48, 0xFACE  # points on faces and inside of each region
 
 
+_MANY = 7  # parameters from which on vertices and edges are drawn, too
+
+
 _STARTS, _APART, _SAME = 4, 0.2, 0.05  # of the compass search in a region; least distance of starts, and of tops
 
 
@@ -66,7 +70,7 @@ _LOWEST = 1e-6  # [rad/sample]: below it nothing changes
 _FIRST, _LAST = 1 / 16, 1 / 128  # its steps, in widths of the ranges
 
 
-SEARCH = "along all edges, on faces and inside, then uphill from the worst points"
+SEARCH = "along all edges, or many of them, on faces and inside, then uphill from the worst points"
 
 
 @dataclass(frozen=True)
@@ -83,10 +87,20 @@ class Searched:
 
     worst: tuple[_Found, ...]
     tried: int
+    ended: bool = False  # by its clock, before it was done
 
 
-def search(regions: Sequence[Region], ratio: _Ratio, progress: Progress = lambda done, total: None) -> Searched:
-    """Where the coupling behind `ratio` needs the most in the ranges that consist of these regions."""
+def search(
+    regions: Sequence[Region],
+    ratio: _Ratio,
+    progress: Progress = lambda done, total: None,
+    seconds: float = MOST_SECONDS,
+) -> Searched:
+    """Where the coupling behind `ratio` needs the most in the ranges that consist of these regions.
+
+    When its time is over it returns the worst of what it has tried.
+    """
+    until = time.perf_counter() + seconds
     points = [list(_points(region)) for region in regions]
     refinements = [min(_STARTS, len(some)) * 8 * region.low.size for region, some in zip(regions, points, strict=True)]
     tried, total = 0, sum(map(len, points)) + sum(refinements)
@@ -98,6 +112,8 @@ def search(regions: Sequence[Region], ratio: _Ratio, progress: Progress = lambda
         def need(point: Array, region: Region = region, known: dict[bytes, float] = known) -> float:
             nonlocal tried
             if point.tobytes() not in known:
+                if tried and time.perf_counter() > until:
+                    return -np.inf
                 tried += 1
                 progress(min(tried, total), total)
                 known[point.tobytes()] = ratio(_member(region, point))
@@ -106,9 +122,9 @@ def search(regions: Sequence[Region], ratio: _Ratio, progress: Progress = lambda
         starts = _apart(some, [need(point) for point in some], _APART)[:_STARTS]
         climbed = [_climbed(need, *start) for start in starts]
         distinct = _apart([point for point, _ in climbed], [value for _, value in climbed], _SAME)
-        tops += [_Found(_member(region, point), value) for point, value in distinct]
+        tops += [_Found(_member(region, point), value) for point, value in distinct if value > -np.inf]
     progress(total, total)
-    return Searched(tuple(sorted(tops, key=lambda found: -found.ratio)), tried)
+    return Searched(tuple(sorted(tops, key=lambda found: -found.ratio)), tried, time.perf_counter() > until)
 
 
 def _member(region: Region, point: Array) -> Member:
@@ -119,6 +135,14 @@ def _member(region: Region, point: Array) -> Member:
 def _points(region: Region) -> Iterator[Array]:
     """Of the unit cube: its vertices, points along every edge, and points on faces and inside."""
     n = region.low.size
+    rng = np.random.default_rng(_SEED)
+    if n > _MANY:
+        yield from rng.integers(0, 2, (_ON_EDGES, n)).astype(float)
+        for corner in rng.integers(0, 2, (_ON_EDGES, n)).astype(float):
+            corner[rng.integers(n)] = rng.random()
+            yield corner
+        yield from rng.random((_DRAWN, n))
+        return
     yield from (np.array(corner, dtype=float) for corner in product((0.0, 1.0), repeat=n))
     if n == 0:
         return
@@ -130,7 +154,6 @@ def _points(region: Region) -> Iterator[Array]:
                 yield np.insert(np.array(others), i, x)
     if n == 1:
         return
-    rng = np.random.default_rng(_SEED)
     for _ in range(_DRAWN):  # every number in between, or at one of its ends, as often as not
         between, end, coin = rng.random(n), rng.integers(0, 2, n), rng.random(n) < 0.5
         yield np.where(coin, between, end)
@@ -147,7 +170,7 @@ def _apart(points: Sequence[Array], values: Sequence[float], distance: float) ->
 
 def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tuple[Array, float]:
     """Uphill along the axes of the unit cube, with steps that are halved where none leads up; the ends are exact."""
-    step = _FIRST
+    step = 1.0 if point.size > _MANY else _FIRST  # from end to end first, where not all ends were tried
     while point.size and step >= _LAST and np.isfinite(value):
         moves = [np.clip(point + sign * step * axis, 0, 1) for axis in np.eye(point.size) for sign in (1, -1)]
         values = [need(move) if (move != point).any() else -np.inf for move in moves]
@@ -159,11 +182,16 @@ def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tupl
     return point, value
 
 
-def search_ranges(loop: Loop, coupling: Coupling, progress: Progress = lambda done, total: None) -> Searched:
+def search_ranges(
+    loop: Loop,
+    coupling: Coupling,
+    progress: Progress = lambda done, total: None,
+    seconds: float = MOST_SECONDS,
+) -> Searched:
     """The worst environments of the loop's ranges that the search of design.environments finds."""
     assert loop.ranges
     parts = regions(loop.network, loop.ranges)
-    return search(parts, lambda member: ratio_in(loop.at(member.network), coupling), progress)
+    return search(parts, lambda member: ratio_in(loop.at(member.network), coupling), progress, seconds)
 
 
 def ratio_in(loop: Loop, coupling: Coupling) -> float:

@@ -1,22 +1,26 @@
-"""A block as one C99 file: no allocation, no library, and its own test."""
+"""A stored coupling, or its whole discrete process, as C99, plain data or a python-control block, with its own test."""
 
 from __future__ import annotations
 
+import json
 import textwrap
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from string import Template
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from controller.complementarity import GROUNDED, PIVOT_ROUNDING
+from controller.coupling import SpringDamperForm
 from controller.delay import delay
 from controller.limiter import Limiter
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from design.certificate import lag
-from design.stored import Stored
+from design.certificate import Verdict, lag
+from design.coupling_file import Stored
+from design.guarantees import HERE, RANGES, switching_guarantee
+from design.result import listed
 
 # ----------------------------------------------------------------------------------------------------
 # What is exported: one state-space block, the order in which its sums are taken, and a test vector in that order.
@@ -62,7 +66,7 @@ class ExportedBlock:
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class _Trial:
     """A test vector."""
 
     inputs: Array  # (TICKS, m)
@@ -125,14 +129,14 @@ def _with_a_state(system: Lti) -> Lti:
     return Lti(np.zeros((1, 1)), np.zeros((1, m)), np.zeros((system.outputs, 1)), system.D, system.T)
 
 
-def trial(block: ExportedBlock, seed: int = 0) -> Trial:
+def trial(block: ExportedBlock, seed: int = 0) -> _Trial:
     """Normally distributed inputs, with a limiter such that a third of the ticks are limited, and the outputs."""
     rng = np.random.default_rng(seed)
     inputs = block.input.size * rng.standard_normal((_TICKS, block.system.inputs))
     if block.limiter:
         share = np.abs(sequential(block.system, inputs)) / block.limiter.limit
         inputs = inputs / np.quantile(share.max(axis=1), 2 / 3)
-    return Trial(inputs, sequential(block.system, inputs, block.limiter))
+    return _Trial(inputs, sequential(block.system, inputs, block.limiter))
 
 
 def sequential(system: Lti, inputs: Array, limiter: Limiter | None = None) -> Array:
@@ -210,7 +214,7 @@ def _boxed(M: list[list[float]], limit: list[float], q: list[float]) -> tuple[li
     return e, f
 
 
-def data(block: ExportedBlock, test: Trial) -> dict[str, Any]:
+def data(block: ExportedBlock, test: _Trial) -> dict[str, Any]:
     """The block as plain data, for JSON."""
     system = block.system
     return {
@@ -300,13 +304,12 @@ def main():
     print("$name: largest difference %.1e of the largest output, allowed %.0e" % (error, TOLERANCE))
     return int(not error <= TOLERANCE)
 
-
 if __name__ == "__main__":
     sys.exit(main())
 ''')
 
 
-def control_source(block: ExportedBlock, test: Trial) -> str:
+def _control_source(block: ExportedBlock, test: _Trial) -> str:
     """The file's text; numbers are decimals that read back to the same doubles."""
     system = block.system
     return SOURCE.substitute(
@@ -534,7 +537,7 @@ _LIMITED = """    {
 """
 
 
-def c_source(block: ExportedBlock, test: Trial, file: str) -> str:
+def _c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
     """The file's text; numbers are hexadecimal, so that no compiler's decimal conversion matters."""
     system, name = block.system, block.name
     words = {
@@ -588,6 +591,58 @@ def _table(head: str, values: Array) -> str:
 def _row(values: Array) -> str:
     text = ", ".join(float(v).hex() for v in values)
     return "\n".join(textwrap.wrap(f"{{{text}}}", 112, initial_indent="    ", subsequent_indent="     "))
+
+
+# ----------------------------------------------------------------------------------------------------
+# A file: its format, and what stands above the block.
+
+
+SUFFIXES = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}  # by format
+
+
+def with_origin(block: ExportedBlock, file: str, stored: Stored, verdict: Verdict) -> ExportedBlock:
+    """The block with lines on the file that it comes from, and on what is proved there."""
+    written = f"Written by python -m design.export from {file}: {_gains(stored)}"
+    return replace(block, about=(written, *block.about, _guarantee(stored, verdict, block.limiter is not None)))
+
+
+def _gains(stored: Stored) -> str:
+    coupling = stored.coupling
+    if isinstance(coupling, SpringDamperForm):
+        return f"spring-damper, K = {listed(coupling.K)} N/m, B = {listed(coupling.B)} N s/m"
+    return f"coupling of kind {coupling.__struct_config__.tag}"
+
+
+def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
+    claim = stored.certificate
+    if claim is None or not verdict.proved:
+        return f"NOT CERTIFIED: {verdict.reason}"
+    needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
+    delays = f"; {switching_guarantee(stored.loop.varying_delay)}, in {HERE}" if stored.loop.varying_delay else ""
+    how = f"{claim.condition}, proof: {claim.proof}"
+    if claim.guarantee == RANGES:
+        how += "; at the vertices, between them nothing is proved: design.check searches there"
+    return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; " + (
+        "also while forces are limited." if limited else "linear forces only."
+    )
+
+
+def content(kind: str, block: ExportedBlock, test: _Trial, file: str) -> Any:
+    """A file in this format, as `design.files.write` takes it."""
+    if kind == "c":
+        return _c_source(block, test, file)
+    if kind == "control":
+        return _control_source(block, test)
+    plain = data(block, test)
+    if kind == "json":
+        return json.dumps(plain, indent=1, allow_nan=False) + "\n"
+
+    arrays: dict[str, Any] = {name: np.array(value) for name, value in plain.items()}
+
+    def archive(destination: BinaryIO) -> None:
+        np.savez(destination, **arrays)
+
+    return archive
 
 
 if __name__ == "__main__":

@@ -18,8 +18,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field, fields, is_dataclass
-from io import BytesIO
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -31,8 +30,7 @@ from numpy.typing import NDArray
 
 _MOST_TEXT = 2_000_000  # bytes: scenarios, humans, recorded delays
 _MOST_STORED = 50_000_000  # bytes: a proof over 200 states takes a tenth of it
-_MOST_TRACE = 1_000_000_000  # bytes, packed: an hour of two channels takes a fifth of it
-_MOST_UNPACKED = 4_000_000_000  # bytes
+_MOST_UNPACKED = 4_000_000_000  # bytes of a trace: ten hours of two channels take 3e9
 _MOST_WORDS = 1000  # characters of one message
 
 _DEEPEST_KEY = 20  # names joined by dots: tomllib takes time and memory that grow with their square
@@ -125,7 +123,18 @@ def _met(places: set[Any], known: dict[Any, str]) -> str | None:
 
 def read(path: str | Path, named: str | None = None, most: int = _MOST_STORED, hint: str = "") -> bytes:
     """The bytes of a regular file of at most `most` bytes, called `named` in messages. Raises InputError."""
-    named, path = str(path) if named is None else named, Path(path)
+    named = str(path) if named is None else named
+    with _opened(path, named, hint) as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise InputError(f"{named}: is larger than {most / 1e6:g} MB, which is the most")
+    return content
+
+
+@contextmanager
+def _opened(path: str | Path, named: str, hint: str = "") -> Iterator[BinaryIO]:
+    """A regular file, which no option writes. Raises InputError, also for what goes wrong while it is read."""
+    path = Path(path)
     try:
         if path.exists() and not path.is_file():
             kind = "a folder" if path.is_dir() else "not a regular file"
@@ -135,17 +144,18 @@ def read(path: str | Path, named: str | None = None, most: int = _MOST_STORED, h
             if option := _met(places, ledger.named):
                 raise InputError(f"{named}: is also the file of {option}; name another one there")
             ledger.read |= dict.fromkeys(places, named)
-        with path.open("rb") as file:
-            content = file.read(most + 1)
+        file = path.open("rb")
     except OSError as error:
         raise InputError(f"{named}: {error.strerror or error}{hint}") from None
     except InputError:
         raise
     except ValueError as error:  # a name with a zero byte in it
         raise InputError(f"{named}: {error}{hint}") from None
-    if len(content) > most:
-        raise InputError(f"{named}: is larger than {most / 1e6:g} MB, which is the most")
-    return content
+    with file:
+        try:
+            yield file
+        except OSError as error:
+            raise InputError(f"{named}: {error.strerror or error}{hint}") from None
 
 
 def read_text(path: str | Path, named: str | None = None, hint: str = "") -> str:
@@ -171,15 +181,14 @@ def toml(text: str, named: str) -> dict[str, Any]:
 
 def read_arrays(path: str | Path, expected: str) -> dict[str, NDArray[Any]]:
     """The arrays of an npz file, in which no object is unpickled. Raises InputError where it is not one."""
-    content = read(path, most=_MOST_TRACE)
     try:
-        with ZipFile(BytesIO(content)) as archive:
+        with _opened(path, str(path)) as file, ZipFile(file) as archive:
             entries = archive.infolist()
             size = sum(entry.file_size for entry in entries)  # zipfile unpacks no byte more
             if size > _MOST_UNPACKED:
                 raise ValueError(f"unpacks to {size / 1e9:.3g} GB, allowed are {_MOST_UNPACKED / 1e9:g} GB")
             return {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in entries}
-    except MemoryError:
+    except (MemoryError, InputError):
         raise
     except Exception as error:  # a damaged archive makes zipfile, zlib and NumPy raise whatever they come upon
         raise InputError(f"{path}: not {expected} ({error})") from None
@@ -300,6 +309,11 @@ def _fill(file: BinaryIO, content: Callable[[BinaryIO], None] | bytes | str) -> 
         content(file)
     else:
         file.write(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
+
+
+def unseen(json: str = "key", default: Any = MISSING) -> Any:
+    """A field of a report that no table shows; in JSON as `figure` in cli/render.py has it, or `no` key."""
+    return field(default=default, metadata={"json": json})
 
 
 def plain(report: Any) -> Any:

@@ -55,7 +55,7 @@ def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Arr
 
 
 # ----------------------------------------------------------------------------------------------------
-# sweep.supremum for many functions of frequency at once: one row each, refined between grid points together.
+# `supremum` for many functions of frequency at once: one row each, refined between grid points together.
 
 
 _PEAKS = 3  # highest local maxima of a row that are refined

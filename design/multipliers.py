@@ -577,13 +577,19 @@ def limiter_refusal(loop: Loop) -> str | None:
     return None
 
 
+_MOST_SEARCHED = 12  # devices
+
+
 def limiter_requirement(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> LimiterProof:
     """What this-environment asks with the limiter of rho = beta delta/T, at the multiplier `c` or the best one.
 
+    For many devices the best one takes minutes to find: there it is that at c = 0.
     `proof` of the requirement is "sampled"; `prove` gives the exact one.
     """
     rho = limiter_lag(loop.delta, loop.T, beta)
     reason = limiter_refusal(loop)
+    if loop.channels > _MOST_SEARCHED and c is None:
+        c = ((0.0,),) * loop.channels
     try:
         if reason is None:
             with sweeping():

@@ -12,23 +12,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
 from controller.environment import Network
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
-from controller.ranges import Ranges
 from design import program
 from design.certificate import prove, prove_limiter
 from design.conditions import this_environment as requirement_of
+from design.coupling_file import Certificate, LimiterCertificate
 from design.designs import design_by_kind
 from design.environments import Searched, in_each, ratio_in, search_ranges, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.result import Design, DesignFailed, NotProved, finite
-from design.robustness import at, ranges_around, robustness, robustness_part, vertices
-from design.stored import Certificate, LimiterCertificate
+from design.robustness import at, robustness, robustness_part, vertices
 from design.transparency import Transparency, decibels, transparency
 
 _MINIMISED = {"rms": "rms_mismatch", "sup": "relative_mismatch"}
@@ -40,7 +38,8 @@ _HOPELESS = 0.9  # relative mismatch from which on the climb is compared with ot
 _TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
 _MOST_STATES = 200  # of the loop, up to which a rung is tried: half a minute with five devices
 _MOST_PROOFS = 30 * 112**2.7  # and (environments) states^2.7: a minute
-_MOST_WORK = 7e6  # (channels x unknowns)^2 up to which a rung is tried
+_SEARCHED = 0.2  # of the time limit, at least: what the search between the vertices of ranges may take
+_MOST_WORK = 1.2e7  # (channels x unknowns)^2 up to which a rung is tried
 
 
 @dataclass(frozen=True)
@@ -122,14 +121,13 @@ def design(
     rungs: list[_Rung] = []
     hurried = False
     for taps, poles in options.ladder:
-        if rungs and not climb.room(taps, poles):
-            break
+        if rungs and not climb.room(taps, poles, rungs[-1].states):
+            continue
         found, rung = climb.rung(taps, poles, best)
         rungs.append(rung)
         progress(rung)
-        gained = np.inf if rung.reason else 0.0
+        gained = np.inf if rung.reason or best is None else decibels(climb.merit(best)) - decibels(climb.merit(found))
         if rung.reason is None and (best is None or climb.better(found, best)):
-            gained = np.inf if best is None else decibels(climb.merit(best)) - decibels(climb.merit(found))
             best = found
         settled = gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS
         hurried = not settled and climb.elapsed > options.seconds
@@ -137,6 +135,7 @@ def design(
             break
     if best and loop.ranges:
         best = climb.between(best)
+        hurried |= best.searched is not None and best.searched.ended
     if best is None or climb.mismatch(best) > _HOPELESS:
         rivals = [one for one in (best, climb.scaled(), climb.spring_damper()) if one is not None]
         best = min(rivals, key=lambda one: (not one.proved, climb.merit(one)))
@@ -148,7 +147,7 @@ def _compromise(loop: Loop, around: Sequence[Network], options: program.Options)
 
     By sweeps, without proofs: what it costs, not a coupling to run. Raises DesignFailed where there is none.
     """
-    taps, poles = options.ladder[: 2 if loop.channels <= program.RICH else 1][-1]
+    taps, poles = options.ladder[: 2 if loop.channels <= 2 else 1][-1]
     climb = _Climb.of(loop.at(loop.environment), options)
     others = [at(loop, network) for network in around]
     more = tuple(program.Case(there, there.E(), (program.this_environment(there),), 0.0) for there in others)
@@ -247,15 +246,15 @@ class _Climb:
     def span(self, taps: int, poles: int) -> program.Span:
         return program.span_of(self.cases[0].E, taps, poles, self.options.band_hz[1])
 
-    def room(self, taps: int, poles: int) -> bool:
-        """Whether a rung is tried: by its size, which is the same on a busy machine."""
+    def room(self, taps: int, poles: int, before: int) -> bool:
+        """Whether a rung is tried: by its states, as many on a busy machine, which are more than `before`."""
         span, loop = self.span(taps, poles), self.loop
         m = loop.channels
         own = int((span.used.sum(axis=1) > 0)[:, :m].sum())
         states = own + (len(span.used) - own // m if m > program.FULL else 0)
         states += self.cases[0].E.order + sum(loop.theta) + sum(loop.psi)
         proofs = len(self.cases) * states**2.7  # what they take, in seconds
-        return states <= _MOST_STATES and (m * span.unknowns) ** 2 <= _MOST_WORK and proofs <= _MOST_PROOFS
+        return before < states <= _MOST_STATES and (m * span.unknowns) ** 2 <= _MOST_WORK and proofs <= _MOST_PROOFS
 
     def rung(self, taps: int, poles: int, before: Optimal | None) -> tuple[Optimal, _Rung]:
         """The optimum over a basis, scaled until every sweep passes, and proved where there are no ranges."""
@@ -295,7 +294,8 @@ class _Climb:
         """
         whole = found.coupling
         assert isinstance(whole, ForceFilter)
-        searched = search_ranges(self.loop, whole)
+        left = max(self.options.seconds - self.elapsed, _SEARCHED * self.options.seconds)
+        searched = search_ranges(self.loop, whole, seconds=left)
         ratio, last = searched.worst[0].ratio, found
         for limit in (1 - program.MARGIN / 2, 1 - 2.5 * program.MARGIN):
             share = min(1.0, limit / ratio)
@@ -414,35 +414,3 @@ def robustness_parts(loop: Loop, coupling: Coupling, options: program.Options = 
     price = spread(loop, options) if alone else None
     parts = price and {name: finite(value) for name, value in asdict(price).items()}
     return {"robustness": robustness_part(loop, coupling), "designed_for_it": parts}
-
-
-_MOST_RANGES = 7  # whose 128 vertices can all be proved
-
-
-def widest_ranges(loop: Loop, percent: float) -> tuple[Ranges, str | None]:
-    """Every stiffness and every mass this much more or less, and a note.
-
-    Of more than MOST_RANGES those stay for which a small nominal design needs the most damping at their ends: the note
-    names the others, which are taken as known.
-    """
-    whole = ranges_around(loop.network, percent)
-    single = [Ranges(springs=(spring,)) for spring in whole.springs]
-    single += [Ranges(masses={node: span}) for node, span in whole.masses.items()]
-    if len(single) <= _MOST_RANGES:
-        return whole, None
-    small = design(loop.at(loop.network), replace(program.DEFAULT, ladder=program.DEFAULT.ladder[:1])).coupling
-
-    def most(box: Ranges) -> float:
-        there = msgspec.structs.replace(loop, ranges=box)
-        return max(ratio_in(loop.at(member.network), small) for member in there.members())
-
-    ranked = sorted(single, key=most, reverse=True)
-    kept, known = ranked[:_MOST_RANGES], ranked[_MOST_RANGES:]
-    names = [f"stiffness {' and '.join(spring.between)}" for box in known for spring in box.springs]
-    names += [f"mass {node}" for box in known for node in box.masses]
-    note = (
-        f"{len(single)} ranges have {2 ** len(single)} vertices, {2**_MOST_RANGES} can be proved: those that matter "
-        f"most are kept; nothing is proved of the others, which are taken as known: {', '.join(names)}"
-    )
-    springs = tuple(spring for box in kept for spring in box.springs)
-    return Ranges(springs, {node: span for box in kept for node, span in box.masses.items()}), note

@@ -29,14 +29,14 @@ from design.transparency import BAND_HZ
 
 OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # share of the damping that stays unused: what an exact proof always finds room in
-LADDER = ((4, 3), (8, 6), (14, 10), (22, 16))  # taps and real poles of the rungs
+LADDER = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10))  # taps, real poles; the last where the one before is too large
 _FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # distance to 1 of the real poles' ends
 _FASTER = 0.25  # modes of smaller radius are left to the filter of the sum of all forces
 _NEAR = 0.3  # of its distance to 1: a real pole so close to a mode gives way to it
 _SLOWER = 0.999  # modes of larger radius get no section
-RICH, _EDGED = 2, 20  # channels up to which, and taps from which on, there are sections at the band's end
+RICH, _EDGED = 4, 20  # channels up to which, and taps from which on, there are sections at the band's end
 _EDGES = (0.2, 0.07, 0.02)  # their damping ratios: they crowd at the band's end, where the error may jump
-FULL = 4  # channels up to which every force has a filter to every device
+FULL = 5  # channels up to which every force has a filter to every device
 _STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weight of g - 1 beside the relative mismatch; for more than RICH channels
 HIGH_HZ = 100.0  # above it the force is kept low by a soft row, or capped
 SOFT = 0.05, 0.3  # the soft row's weight: the first number times the mismatch so far, which counts up to the second

@@ -14,6 +14,12 @@ from controller.lti import Array
 
 Condition = Literal["this-environment", "any-environment"]
 
+#: the conditions in the order of tables, each with the environments for which it holds
+CONDITIONS: dict[Condition, str] = {
+    "this-environment": "this environment",
+    "any-environment": "any passive environment",
+}
+
 
 C = TypeVar("C", bound=str)  # a Condition, "switching" or "limiter"
 
@@ -127,5 +133,5 @@ class Design:
     sdps: int = 0  # convex problems solved (local searches count their runs)
     wall_s: float = 0.0
     phi: Array | None = None  # (N,) multiplier Phi_E [N s/m] of Theorem 4, None where the environment has none
-    certificate: Any = field(kw_only=True, default=None)  # design.stored.Certificate, where the design has proved it
+    certificate: Any = field(kw_only=True, default=None)  # the file's Certificate, where the design has proved it
     hurried: bool = field(kw_only=True, default=False)  # its clock ended it: more time may find a better

@@ -37,10 +37,10 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from controller.lti import Lti
+from design.coupling_file import Stored, save
+from design.coupling_file import load as read_stored
 from design.designs import design_by_kind
 from design.frequency import frequencies, on_circle
-from design.stored import Stored, save
-from design.stored import load as read_stored
 from sim import load
 from sim.design_cache import proved, shipped
 

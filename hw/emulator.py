@@ -33,12 +33,12 @@ from typing import Self
 import numpy as np
 
 from controller.lti import Array
-from hw.device import RUNNING, Device
+from hw.device_state import RUNNING, Device
 from hw.protocol import PROTOCOL, Force, Info, Phase, distance
 from models.device import require
+from models.hold import hold
 from models.human import Human, Link
-from models.scene import build, plant
-from sim.engines import hold
+from models.scene import build
 from sim.run import outside_forces
 from sim.scenario import InputError, Scenario
 
@@ -196,7 +196,7 @@ class EmulatedPlant:
         self.coulomb, self._substeps = coulomb, _SUBSTEPS if coulomb else 1
         self.scenario, self.encoder_step = scenario, encoder_step
         self.scene = build(scenario.device, scenario.human, scenario.person)
-        self._plant = plant(self.scene.model)
+        self._plant = self.scene.plant
         self._held = lru_cache(256)(self._hold)
         self.s = np.zeros(len(self._plant.A))
         self._w = np.zeros(self.scene.outside)

@@ -13,10 +13,10 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Protocol, Self
 
-from hw.device import Device
+from hw.device_state import Device
 from hw.emulator import info_of
+from hw.haptic_device import PortLost
 from hw.protocol import NO_MARGIN, Ack, Config, Decoder, Force, Info, Phase, Reason, State, Stop, encode
-from hw.seam import PortLost
 from sim.scenario import InputError, Scenario
 
 FORCE_DIMENSION = "force-dimension"  # in place of a port
@@ -55,7 +55,7 @@ def library() -> _Library:
 class ForceDimension:
     """One axis of each of several Force Dimension devices, clocked by this host.
 
-    The state machine is the firmware's (hw/device.py): armed by ARM, capped, slewed, ramped out.
+    The state machine is the firmware's (hw/device_state.py): armed by ARM, capped, slewed, ramped out.
     """
 
     errors = 0  # frames that cannot be read: there are no frames

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from hw.device import limited
+from hw.device_state import limited
 from hw.limits import DRIVING, SafetyLimits, SafetyStop, Stage
 from hw.protocol import NO_MARGIN, Config, Phase, State, distance
 

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from typing import Self
 
 from hw.control import Armable
+from hw.haptic_device import Driver, HapticDevice, PortLost
 from hw.limits import ENDED, SafetyStop, Stage
 from hw.monitor import Ages
-from hw.seam import Driver, HapticDevice, PortLost
 from hw.session import Operator, Session
 from sim.scenario import InputError
 

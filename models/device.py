@@ -135,6 +135,15 @@ class _Known:
     source: str
 
 
+@dataclass(frozen=True)
+class _Span:
+    """What was published of a number that is not the same everywhere in the workspace, with its source."""
+
+    least: float
+    most: float
+    source: str
+
+
 _CHAI3D = "CHAI3D's device table, src/devices/{}.cpp"
 _DELTA, _FALCON, _PHANTOM = (
     _CHAI3D.format(f"C{name}Device{s}") for name, s in (("Delta", "s"), ("Falcon", ""), ("Phantom", "s"))
@@ -144,11 +153,11 @@ _OMNI, _PREMIUM = _SHEET.format("Phantom Omni"), _SHEET.format("Phantom Premium 
 
 
 @dataclass(frozen=True)
-class Listed:
+class _Listed:
     """A real device along one axis; None stands for a number without a published source."""
 
     title: str
-    damping: tuple[_Known, _Known] | None = None  # [N s/m] least and most over the workspace
+    damping: _Span | None = None  # [N s/m]
     mass: _Known | None = None  # [kg] felt at the handle
     force_limit: _Known | None = None  # [N]
     encoder_step: _Known | None = None  # [m] at the handle
@@ -159,36 +168,36 @@ class Listed:
     @property
     def known(self) -> dict[str, _Known]:
         """The published fields of a RigidDevice. Friction is left out: what is published is an upper bound."""
-        least = self.damping[0] if self.damping else None
+        least = _Known(self.damping.least, self.damping.source) if self.damping else None
         fields = {"damping": least, "mass": self.mass, "force_limit": self.force_limit}
         fields["encoder_step"] = self.encoder_step
         return {name: fact for name, fact in fields.items() if fact}
 
 
-_IDENTIFIED = _Known(1.37, "section 6 of the paper: a first-order model identified on an Omega")
+_IDENTIFIED = _Span(1.37, 1.37, "section 6 of the paper: a first-order model identified on an Omega")
 
-CATALOGUE: Mapping[str, Listed] = {
-    "omega.3": Listed(
+CATALOGUE: Mapping[str, _Listed] = {
+    "omega.3": _Listed(
         "Force Dimension omega.3",
-        damping=(_IDENTIFIED, _IDENTIFIED),
+        damping=_IDENTIFIED,
         force_limit=_Known(12.0, _DELTA),
         stiffness=_Known(5000.0, _DELTA),
         framework_damping=_Known(30.0, _DELTA),
     ),
-    "delta.3": Listed(
+    "delta.3": _Listed(
         "Force Dimension delta.3",
         force_limit=_Known(20.0, _DELTA),
         stiffness=_Known(5000.0, _DELTA),
         framework_damping=_Known(30.0, _DELTA),
     ),
-    "falcon": Listed(
+    "falcon": _Listed(
         "Novint Falcon",
         force_limit=_Known(8.0, _FALCON),
         encoder_step=_Known(63.5e-6, "more than 400 dpi, H3D API's page of the Falcon"),
         stiffness=_Known(3000.0, _FALCON),
         framework_damping=_Known(20.0, _FALCON),
     ),
-    "touch": Listed(
+    "touch": _Listed(
         "3D Systems Touch (SensAble Phantom Omni)",
         mass=_Known(0.045, _OMNI),
         force_limit=_Known(3.3, _OMNI),
@@ -197,7 +206,7 @@ CATALOGUE: Mapping[str, Listed] = {
         stiffness=_Known(700.0, _PHANTOM),
         framework_damping=_Known(5.0, _PHANTOM),
     ),
-    "phantom-premium": Listed(
+    "phantom-premium": _Listed(
         "SensAble Phantom Premium 1.5",
         mass=_Known(0.075, _PREMIUM),
         force_limit=_Known(8.5, _PREMIUM),
@@ -206,15 +215,15 @@ CATALOGUE: Mapping[str, Listed] = {
         stiffness=_Known(800.0, _PHANTOM + " (1.5 6DOF)"),
         framework_damping=_Known(5.0, _PHANTOM + " (1.5 6DOF)"),
     ),
-    "haply-2diy": Listed("Haply 2DIY"),
-    "inverse3": Listed("Haply Inverse3"),
-    "hapkit": Listed("Hapkit"),
+    "haply-2diy": _Listed("Haply 2DIY"),
+    "inverse3": _Listed("Haply Inverse3"),
+    "hapkit": _Listed("Hapkit"),
 }
 _OTHER_NAMES = {"omni": "touch", "omega": "omega.3", "delta": "delta.3", "2diy": "haply-2diy"}
 _NEEDED = ("damping", "force_limit")  # of a simulated device; for mass and encoder a RigidDevice has an assumption
 
 
-def listed_device(name: str) -> tuple[str, Listed]:
+def listed_device(name: str) -> tuple[str, _Listed]:
     """The catalogue's device of this name, and its spelling there. Raises ValueError that lists the names."""
     key = _OTHER_NAMES.get(name.lower(), name.lower())
     if key not in CATALOGUE:

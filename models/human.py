@@ -7,6 +7,7 @@ A `Port` cannot be built unless it is passive, so there is nothing else to prove
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -235,17 +236,16 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         require("phase", self.phase, -100.0, 100.0, "rad")
         require("ease", self.ease, 0.0, 1e4, "s")
 
-    def motion(self, t: _Array) -> tuple[_Array, _Array]:
-        """Equilibrium position [m] and velocity [m/s] at times t [s]."""
-        w = 2 * np.pi * self.frequency
-        wave = self.amplitude * np.sin(w * t + self.phase)
-        wave_rate = self.amplitude * w * np.cos(w * t + self.phase)
-        rising = np.flatnonzero(t < self.ease)
-        if rising.size:
-            part, rate = wave[rising], np.pi / self.ease
-            gain, gain_rate = (1 - np.cos(rate * t[rising])) / 2, rate / 2 * np.sin(rate * t[rising])
-            wave[rising], wave_rate[rising] = gain * part, gain_rate * part + gain * wave_rate[rising]
-        return wave, wave_rate
+    def force(self, t: _Array, stiffness: float, damping: float) -> _Array:
+        """What pulls the end of a spring-damper along, k x + b x' [N] at times t [s]."""
+        w, rate = 2 * np.pi * self.frequency, np.pi / self.ease if self.ease else 0.0
+        pull, ahead = self.amplitude * math.hypot(stiffness, damping * w), math.atan2(damping * w, stiffness)
+        force = pull * np.sin(w * t + (self.phase + ahead))
+        if (rising := np.flatnonzero(t < self.ease)).size:
+            early = t[rising]
+            force[rising] *= (1 - np.cos(rate * early)) / 2
+            force[rising] += damping * rate / 2 * np.sin(rate * early) * self.amplitude * np.sin(w * early + self.phase)
+        return force
 
 
 class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -271,8 +271,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """k x_eq + b x_eq' [N] on the last mass, at times t [s]."""
         if self.voluntary is None:
             return np.zeros_like(t)
-        position, velocity = self.voluntary.motion(t)
-        return self.links[-1].stiffness * position + self.links[-1].damping * velocity
+        return self.voluntary.force(t, self.links[-1].stiffness, self.links[-1].damping)
 
 
 class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -73,6 +73,11 @@ class Scene:
     def outside(self) -> int:
         """Number of outside inputs: the actuators before the motors."""
         return int(self.model.nu) - self.channels
+
+    @cached_property
+    def plant(self) -> Plant:
+        """The linear plant that the model simulates."""
+        return plant(self.model)
 
 
 @dataclass(frozen=True, eq=False)

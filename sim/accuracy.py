@@ -8,36 +8,44 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from controller.delay import delay
 from controller.lti import Array, Lti
+from design.files import unseen
 from models.device import credible_force
-from sim.engines import EXPONENTIAL, default_integrator
+from sim.mujoco_engines import EXPONENTIAL, default_integrator
 from sim.run import Simulation, make_engine, run
 from sim.scenario import InputError
 from sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode
-from sim.stepping import NEUTRAL, default_substeps, measured_hold, simulated_growth, step_radius
+from sim.step_choice import NEUTRAL, default_substeps, measured_hold, simulated_growth, step_radius
 from sim.trace import Trace
 
 # ---- beside the exact engine
 
 
+@dataclass(frozen=True)
+class PositionError:
+    """Device positions against the exact engine's closed loop; None with a reason where there is none."""
+
+    position_relative_rms: float | None = None
+    position_max_m: float | None = None
+    reason: str | None = unseen("given", None)
+
+
 def position_error(
     trace: Trace, exact: Trace | None, simulation: Simulation, grows: bool | None = None
-) -> dict[str, Any]:
-    """Device positions against the exact engine's closed loop, where there is one; None with a reason elsewhere.
+) -> PositionError:
+    """Of a trace beside the exact engine's.
 
     `grows` says whether the loop is unstable where its eigenvalues do not: then the trace is compared up to the first
     clipped tick, because growth multiplies any difference.
     """
     if exact is None:
-        reason = "the exact engine is linear and has no Coulomb friction to compare with"
-        return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
+        return PositionError(reason="the exact engine is linear and has no Coulomb friction to compare with")
     limit, m = simulation.process.force_limit, simulation.process.channels
     n = min(trace.t.size, exact.t.size)
     clipped = exact.clipped(limit)[:n] | trace.clipped(limit)[:n]
@@ -49,14 +57,14 @@ def position_error(
     if size > 0:
         relative, largest = _rms(own - true) / size, float(np.abs(own - true).max())
     if linear == n:
-        return {"position_relative_rms": relative, "position_max_m": largest}
+        return PositionError(relative, largest)
     until = f"the unstable run first clips at t = {linear * simulation.scenario.T:.3f} s"
     reason = f"{until}; up to there the relative rms is {relative:.1e}, and its growth multiplies any difference"
-    return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
+    return PositionError(reason=reason)
 
 
 #: (engine, integrator, substeps) that are compared; the first is the reference
-SETTINGS = (
+_SETTINGS = (
     ("exact", None, None),
     ("mujoco", EXPONENTIAL, 1),
     *(("mujoco", "RK4", n) for n in (1, 2, 3, 4, 8)),
@@ -64,10 +72,26 @@ SETTINGS = (
     *(("mujoco", "implicitfast", n) for n in (1, 4, 12)),
     *(("mujoco", "discrete", n) for n in (4, 12)),
 )
-Row = dict[str, Any]
-
 _REPEATS = 3  # the least of their times is the cost
 _TAIL = 4000  # ticks in which a limit cycle is measured
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one setting of an engine costs and how wrong it is; null where a figure does not exist."""
+
+    engine: str
+    integrator: str | None
+    substeps: int | None
+    position_relative_rms: float | None
+    growth_rate_error: float  # [1/s] the larger of the loop with and without the coupling
+    verdict_correct: bool  # of both
+    cycle_amplitude_n: float | None  # of the limit cycle without coupling
+    cycle_frequency_hz: float | None
+    cycle_amplitude_error: float | None  # relative
+    cycle_frequency_error_hz: float | None
+    wall_s_per_simulated_s: float
+    pareto: bool = False  # see `with_front`
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,29 +115,53 @@ def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
     return _Reference(coupled, uncoupled, run(coupled, "exact"), cycle)
 
 
+def measure_all(
+    coupled: Simulation, uncoupled: Simulation, default: int, progress: Callable[[int, int], None]
+) -> tuple[list[Row], list[str], bool]:
+    """Rows of every setting that is stable on this plant, the reasons of those that are not, and whether it was ended.
+
+    `default` is the number of substeps that RK4 takes where nobody says it.
+    """
+    rows: list[Row] = []
+    skipped: list[str] = []
+    settings = list(dict.fromkeys((*_SETTINGS, ("mujoco", "RK4", default))))
+    try:
+        truth = reference(coupled, uncoupled)
+        for done, (engine, integrator, substeps) in enumerate(settings):
+            progress(done, len(settings))
+            try:
+                if integrator and substeps and step_radius(coupled, integrator, substeps) > 1 + NEUTRAL:
+                    raise InputError("outside the stable region")
+                rows.append(measure(truth, engine, integrator, substeps))
+            except ValueError as error:
+                skipped.append(f"{integrator} x {substeps}: {error}")
+    except KeyboardInterrupt:
+        return with_front(rows), skipped, True
+    return with_front(rows), skipped, False
+
+
 def measure(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
     """One row: errors of position [-], growth [1/s] and limit cycle [-], [Hz], and the cost of that very run."""
-    row: Row = {"engine": engine, "integrator": integrator, "substeps": substeps}
     settings = (engine, integrator, substeps)
     trace, wall = _timed(truth.coupled, *settings)
     for _ in range(_REPEATS - 1):
         wall = min(wall, _timed(truth.coupled, *settings)[1])
-    row["position_relative_rms"] = position_error(trace, truth.trace, truth.coupled)["position_relative_rms"]
-    row |= _growth(truth, *settings) | _cycle(truth, *settings)
-    row["wall_s_per_simulated_s"] = wall / (trace.t.size * truth.coupled.scenario.T)
-    return row
+    position = position_error(trace, truth.trace, truth.coupled).position_relative_rms
+    share = wall / (trace.t.size * truth.coupled.scenario.T)
+    return Row(*settings, position, *_growth(truth, *settings), *_cycle(truth, *settings), share)
 
 
-def mark_front(rows: list[Row]) -> None:
+def with_front(rows: Sequence[Row]) -> list[Row]:
     """Set `pareto`: no other row of that kind of engine is at least as good in cost and both errors, and better in one.
 
     The exact engine is on it by itself: only a linear plant has one.
     """
-    points = np.array([_point(row) for row in rows])
+    points, marked = np.array([_point(row) for row in rows]), []
     for i, row in enumerate(rows):
-        rivals = points[[other["engine"] == row["engine"] for other in rows]]
+        rivals = points[[other.engine == row.engine for other in rows]]
         beaten = ((rivals <= points[i]).all(axis=1) & (rivals < points[i]).any(axis=1)).any()
-        row["pareto"] = bool(np.isfinite(points[i]).all() and row["verdict_correct"] and not beaten)
+        marked.append(replace(row, pareto=bool(np.isfinite(points[i]).all() and row.verdict_correct and not beaten)))
+    return marked
 
 
 def limit_cycle(trace: Trace, channel: int) -> tuple[float, float]:
@@ -135,7 +183,7 @@ def _timed(simulation: Simulation, engine: str, integrator: str | None, substeps
     return trace, time.perf_counter() - begin
 
 
-def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
+def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> tuple[float, bool]:
     """The larger growth-rate error of the two loops, and whether both verdicts are right."""
     errors, right = [], True
     for simulation in (truth.coupled, truth.uncoupled):
@@ -143,35 +191,51 @@ def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: in
         own, exact = dominant_mode(close(held, simulation.F)).growth, exact_growth(simulation)
         errors.append(float(own - exact))
         right &= bool(unstable(own) == unstable(exact))
-    return {"growth_rate_error": max(errors, key=abs), "verdict_correct": right}
+    return max(errors, key=abs), right
 
 
-def _cycle(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
-    names = ("cycle_amplitude_n", "cycle_frequency_hz", "cycle_amplitude_error", "cycle_frequency_error_hz")
+def _cycle(
+    truth: _Reference, engine: str, integrator: str | None, substeps: int | None
+) -> tuple[float, float, float, float] | tuple[None, None, None, None]:
+    """Amplitude and frequency of the limit cycle, and their errors."""
     if truth.cycle is None:
-        return dict.fromkeys(names)
+        return None, None, None, None
     channel, amplitude, frequency = truth.cycle
     trace = run(truth.uncoupled, make_engine(truth.uncoupled, engine, integrator, substeps))
     if trace.diverged:
-        return dict.fromkeys(names)
+        return None, None, None, None
     own, turns = limit_cycle(trace, channel)
-    return dict(zip(names, (own, turns, own / amplitude - 1, turns - frequency), strict=True))
+    return own, turns, own / amplitude - 1, turns - frequency
 
 
 def _point(row: Row) -> Array:
-    position = np.inf if row["position_relative_rms"] is None else row["position_relative_rms"]
-    return np.array([row["wall_s_per_simulated_s"], position, abs(row["growth_rate_error"])])
+    position = np.inf if row.position_relative_rms is None else row.position_relative_rms
+    return np.array([row.wall_s_per_simulated_s, position, abs(row.growth_rate_error)])
 
 
 # ---- how long a run can be believed
 
 
-def credible_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Credible:
     """Up to when a run stays within what its devices declare credible, and what it asks of them at most.
 
-    The model has a linear transmission of any strength, and motors of any speed. `until_s` is the first time at which a
-    transmission carries more than `credible_force`, or a motor moves faster than `credible_speed`; None where that
-    never happens. Figures per device; a rigid device has no transmission, and its force is None.
+    Figures per device; a rigid device has no transmission, and its force is None.
+    """
+
+    until_s: float | None
+    transmission_force_n: list[float | None]
+    motor_speed_m_per_s: list[float]
+    credible_force_n: list[float | None]
+    credible_speed_m_per_s: list[float]
+    reason: str | None = unseen("given", None)
+
+
+def credible(simulation: Simulation, trace: Trace) -> Credible:
+    """The model has a linear transmission of any strength, and motors of any speed.
+
+    `until_s` is the first time at which a transmission carries more than `credible_force`, or a motor moves faster than
+    `credible_speed`; None where that never happens.
     """
     n, devices = simulation.scene.model.nq, simulation.scenario.device
     forces: list[float | None] = []
@@ -190,28 +254,23 @@ def credible_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
         force = np.abs(stiffness * stretched + damping * stretching)
         outside |= force > credible_force(device)
         forces.append(float(force.max(initial=0.0)))
-    part: dict[str, Any] = {
-        "until_s": float(trace.t[np.argmax(outside)]) if outside.any() else None,
-        "transmission_force_n": forces,
-        "motor_speed_m_per_s": speeds,
-        "credible_force_n": [None if d.transmission is None else credible_force(d) for d in devices],
-        "credible_speed_m_per_s": [device.credible_speed for device in devices],
-    }
-    if part["until_s"] is not None:
-        part["reason"] = _not_credible(part)
-    return part
+    most_forces = [None if d.transmission is None else credible_force(d) for d in devices]
+    most_speeds = [device.credible_speed for device in devices]
+    until = float(trace.t[np.argmax(outside)]) if outside.any() else None
+    found = Credible(until, forces, speeds, most_forces, most_speeds)
+    return found if until is None else replace(found, reason=_not_credible(found, until))
 
 
-def _not_credible(part: dict[str, Any]) -> str:
+def _not_credible(found: Credible, until: float) -> str:
     """One sentence, for report and caption."""
-    pairs = zip(part["transmission_force_n"], part["credible_force_n"], strict=True)
-    carried = max(((f, c) for f, c in pairs if f is not None), key=lambda pair: pair[0] / pair[1], default=None)
-    pairs = zip(part["motor_speed_m_per_s"], part["credible_speed_m_per_s"], strict=True)
-    speed, most = max(pairs, key=lambda pair: pair[0] / pair[1])
+    pairs = zip(found.transmission_force_n, found.credible_force_n, strict=True)
+    carried = max(((f, c) for f, c in pairs if f is not None and c), key=lambda pair: pair[0] / pair[1], default=None)
+    speeds = zip(found.motor_speed_m_per_s, found.credible_speed_m_per_s, strict=True)
+    speed, most = max(speeds, key=lambda pair: pair[0] / pair[1])
     what = f"a motor moves at up to {speed:.2g} m/s (credible: {most:g})"
     if carried:
         what = f"a transmission carries up to {carried[0]:.3g} N (credible: {carried[1]:g}) and {what}"
-    return f"from t = {part['until_s']:.2f} s on the motion is the linear model's and no device's: {what}"
+    return f"from t = {until:.2f} s on the motion is the linear model's and no device's: {what}"
 
 
 # ---- beside the ideal environment
@@ -221,21 +280,23 @@ def _not_credible(part: dict[str, Any]) -> str:
 class ForceError:
     """Two answers to the same displacements, from rest at t = 0 and over the whole run, before any force limit."""
 
-    asked: Array  # (N, m) what the coupled loop asks of the motors, F x [N]
-    ideal: Array  # (N, m) what the delay-matched environment itself would ask, Lambda E x [N]
-    reason: str | None = None  # why the two cannot be compared
+    asked: Array = unseen("no")  # (N, m) what the coupled loop asks of the motors, F x [N]
+    ideal: Array = unseen("no")  # (N, m) what the delay-matched environment itself would ask, Lambda E x [N]
+    error_percent: float | None = unseen()  # rms(asked - ideal)/rms(ideal), over all ticks and channels
+    asked_rms_n: float | None = unseen()
+    ideal_rms_n: float | None = unseen()
+    reason: str | None = unseen("given")  # why the two cannot be compared
 
-    def part(self) -> dict[str, Any]:
-        """rms(asked - ideal)/rms(ideal) in percent, over all ticks and channels; None with a reason where undefined."""
-        asked, ideal, apart = _rms(self.asked), _rms(self.ideal), _rms(self.asked - self.ideal)
-        part: dict[str, Any] = {"error_percent": None, "asked_rms_n": asked, "ideal_rms_n": ideal}
-        if self.reason:
-            return part | {"ideal_rms_n": None, "reason": self.reason}
-        if not np.isfinite([asked, ideal, apart]).all():
-            return part | {"asked_rms_n": None, "ideal_rms_n": None, "reason": "the run left the range of numbers"}
-        if ideal == 0:
-            return part | {"reason": "the ideal environment would have rendered no force"}
-        return part | {"error_percent": 100 * apart / ideal}
+    @classmethod
+    def of(cls, asked: Array, ideal: Array, reason: str | None = None) -> ForceError:
+        own, true, apart = _rms(asked), _rms(ideal), _rms(asked - ideal)
+        if reason:
+            return cls(asked, ideal, None, own, None, reason)
+        if not np.isfinite([own, true, apart]).all():
+            return cls(asked, ideal, None, None, None, "the run left the range of numbers")
+        if true == 0:
+            return cls(asked, ideal, None, own, true, "the ideal environment would have rendered no force")
+        return cls(asked, ideal, 100 * apart / true, own, true, None)
 
 
 def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> ForceError:
@@ -246,10 +307,10 @@ def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> For
     """
     process = simulation.process
     if process.walls:
-        return ForceError(trace.f, trace.f, "walls have no linear ideal to compare with")
+        return ForceError.of(trace.f, trace.f, "walls have no linear ideal to compare with")
     F = process.F
     asked = trace.f if process.delays is not None or process.limiter else trace.z @ F.C.T + trace.x @ F.D.T
-    return ForceError(asked, response(delay(lam, F.T) @ simulation.E, trace.x))
+    return ForceError.of(asked, response(delay(lam, F.T) @ simulation.E, trace.x))
 
 
 def response(G: Lti, x: Array) -> Array:
@@ -285,23 +346,13 @@ class EngineChoice:
 
     integrator: str
     substeps: int
-    error: float  # relative rms of the encoders' positions over the run, at most
-    right: bool  # whether the loop that it simulates has the exact loop's verdict
+    position_relative_rms: float  # of the encoders' positions over the run, at most
+    verdict_correct: bool  # whether the loop that it simulates has the exact loop's verdict
     cpu_s: float  # of that run
 
     @property
     def name(self) -> str:
         return f"{self.integrator} x {self.substeps}"
-
-    def part(self) -> dict[str, Any]:
-        """As plain data."""
-        return {
-            "integrator": self.integrator,
-            "substeps": self.substeps,
-            "position_relative_rms": self.error if math.isfinite(self.error) else None,
-            "verdict_correct": self.right,
-            "cpu_s": self.cpu_s,
-        }
 
 
 def compare_engines(simulation: Simulation, error: float, ticks: int | None = None) -> tuple[EngineChoice, ...]:
@@ -330,16 +381,26 @@ def compare_engines(simulation: Simulation, error: float, ticks: int | None = No
 
 def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
     """The cheapest that keeps the error and the verdict. Raises InputError where none does."""
-    kept = [choice for choice in choices if choice.right and choice.error <= error]
+    kept = [choice for choice in choices if choice.verdict_correct and choice.position_relative_rms <= error]
     if kept:
         return min(kept, key=lambda choice: choice.cpu_s)
-    best = min(choices, key=lambda choice: choice.error)
-    raise InputError(f"--error {error:g}: the nearest, {best.name}, is within {best.error:.1g}")
+    best = min(choices, key=lambda choice: choice.position_relative_rms)
+    raise InputError(f"--error {error:g}: the nearest, {best.name}, is within {best.position_relative_rms:.1g}")
 
 
-def cross_check(
-    simulation: Simulation, trace: Trace, integrator: str | None, own_substeps: int | None
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class CrossCheck:
+    """The run beside that of another integrator."""
+
+    integrator: str
+    substeps: int
+    position_relative_rms: float  # null in JSON where one left the range of numbers
+    growth_rate_per_s: float
+    growth_rate_difference_per_s: float
+    agrees: bool
+
+
+def cross_check(simulation: Simulation, trace: Trace, integrator: str | None, own_substeps: int | None) -> CrossCheck:
     """The run again by RK4, which shares no matrix with the exponential and the exact engine; by it, if RK4 ran.
 
     `simulation` is what ran, with its net; integrator and substeps are None for the exact engine. Positions are
@@ -353,14 +414,8 @@ def cross_check(
     growth = simulated_growth(linear, other, substeps)
     own = simulated_growth(linear, integrator, own_substeps) if integrator and own_substeps else exact_growth(linear)
     apart = _apart(trace.s[:ticks, :m], beside.s[:ticks, :m])
-    return {
-        "integrator": other,
-        "substeps": substeps,
-        "position_relative_rms": apart if math.isfinite(apart) else None,
-        "growth_rate_per_s": growth,
-        "growth_rate_difference_per_s": growth - own,
-        "agrees": not disagree(own, growth) and trace.diverged == beside.diverged,
-    }
+    agrees = not disagree(own, growth) and trace.diverged == beside.diverged
+    return CrossCheck(other, substeps, apart, growth, growth - own, agrees)
 
 
 def _refined(

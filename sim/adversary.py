@@ -12,22 +12,23 @@ with long delays bind). Closer than that no search has succeeded, and just outsi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from controller.coupling import Coupling
+from controller.coupling import Coupling, NoCoupling
 from controller.environment import environment
 from controller.loop import force_map
 from controller.lti import Array, Lti
 from design.conditions import this_environment
 from models.human import Hand, Person
 from models.scene import Crowd, HumanSets, variants
+from sim.couplings import choose
 from sim.run import Progress
-from sim.scenario import Scenario
+from sim.scenario import Scenario, load
 from sim.stability import ClosedLoop, dominant_mode, exact_loops
 
 if TYPE_CHECKING:
@@ -155,7 +156,7 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
 
 
 @dataclass(frozen=True)
-class Attack:
+class _Attack:
     """A search against a loop placed short of its required damping."""
 
     name: str
@@ -168,9 +169,9 @@ def attempts(
     shortages: Array,
     seed: int = 0,
     generations: int = 150,
-    attempted: Callable[[Attack], None] = lambda attempt: None,
-) -> list[Attack]:
-    """Attack every loop at every shortage: devices get (1 - short) times the damping that `this_environment` requires.
+    attempted: Callable[[_Attack], None] = lambda attempt: None,
+) -> list[_Attack]:
+    """_Attack every loop at every shortage: devices get (1 - short) times the damping that `this_environment` requires.
 
     A negative shortage gives the devices more than required: there the search must fail. `attempted` is called
     with each.
@@ -181,7 +182,7 @@ def attempts(
         required = np.array(this_environment(F, scenario.delta, scenario.longest_period, scenario.latency).required)
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
-            rows.append(Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))
+            rows.append(_Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))
             attempted(rows[-1])
     return rows
 
@@ -224,3 +225,47 @@ def _worst(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets, evaluated: int)
     mode = dominant_mode(_loops(scenario, F, crowd))
     radius, growth, frequency = (float(a[0]) for a in (mode.spectral_radius, mode.growth, mode.frequency_hz))
     return Worst(crowd.humans(0), crowd.persons(0), radius, growth, frequency, evaluated)
+
+
+# ----------------------------------------------------------------------------------------------------
+# How tight the condition is.
+
+
+@dataclass(frozen=True)
+class _Shortage:
+    """Whether a passive human destabilises a loop whose devices lack a share of the damping that is required."""
+
+    loop: str
+    short: float
+    found: bool
+    growth_rate_per_s: float
+    frequency_hz: float
+    held_together: bool  # by one person
+    evaluated: int
+
+    @property
+    def holds(self) -> bool:
+        """With the damping that is required no human may succeed."""
+        return self.short > 0 or not self.found
+
+
+def shortages(
+    couplings: Sequence[str], short: Sequence[float], generations: int, **changes: Any
+) -> Callable[[int], Iterator[_Shortage]]:
+    """From a seed: the search against the default loop with these couplings, by name, at these shortages.
+
+    Where it succeeds close to the required damping, the condition is tight.
+    """
+
+    def rows(seed: int) -> Iterator[_Shortage]:
+        scenario = load().replace(**changes)
+        for name in couplings:
+            coupling = NoCoupling() if name == "none" else choose(scenario, "I", name).coupling
+            loop = {"no coupling" if name == "none" else f"{name}, case I": (scenario, coupling)}
+            for share in short:
+                (attempt,) = attempts(loop, np.array([share]), seed, generations)
+                worst, found = attempt.worst, (attempt.worst.destabilises, attempt.worst.growth)
+                about = worst.frequency_hz, bool(worst.persons), worst.evaluated
+                yield _Shortage(attempt.name, attempt.short, *found, *about)
+
+    return rows

@@ -10,24 +10,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
-from controller.coupling import Coupling
 from controller.lti import Array
 from design.certificate import assess
 from design.coverage import Limits
+from design.files import unseen
 from design.guarantees import guarantee_of
 from design.result import Requirement, finite
 from design.transparency import decibels, transparency
-from sim.accuracy import credible_part, force_error
+from sim.accuracy import credible, force_error
 from sim.couplings import Chosen, choose, limits_of
 from sim.run import assemble, run
 from sim.scenario import Scenario, load
 from sim.stability import exact_growth, unstable
 from sim.trace import Trace
 
-#: (kind, condition) in the order of a table; the optimal one is quick for so many channels
+#: (kind, condition) in the order of a table
 _ROWS = (
     ("none", None),
     ("published", None),
@@ -35,51 +34,33 @@ _ROWS = (
     ("spring-damper", "this-environment"),
     ("optimal", "this-environment"),
 )
-_QUICK = 2
+_QUICK, _SHORT = 2, 200  # channels of an optimal one, samples of delay in all for any environment: more take long
 
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
     """One coupling in the loop, or the reason why there is none."""
 
-    kind: str
+    coupling: str  # its kind
     condition: str | None
-    coupling: Coupling | None = None
-    requirements: dict[str, Requirement] | None = None
-    guarantee: str | None = None
-    rendered: float | None = None  # share of the static stiffness that is felt
+    promise: str | None = None  # the guarantee, by its older name
+    dc_ratio: float | None = None  # share of the static stiffness that is felt
     rms_mismatch_db: float | None = None
-    growth: float | None = None  # [1/s] of the exact loop
-    error_percent: float | None = None  # of the forces, as in a run's report; None where the loop grows or has walls
-    trace: Trace | None = None  # of the exact engine
-    ideal: Array | None = None  # (N, m) forces of the ideal environment at the trace's displacements [N]
-    until_s: float | None = None  # from here on the trace is not credible
-    reason: str | None = None  # why there is no such coupling
+    growth_rate_per_s: float | None = None  # of the exact loop
+    force_error_percent: float | None = None  # as in a run's report; None where the loop grows or has walls
+    required_damping: dict[str, tuple[float, ...]] = field(default_factory=dict)  # [N s/m], by condition
+    reason: str | None = unseen("given", None)  # why there is no such coupling
+    requirements: dict[str, Requirement] | None = unseen("no", None)
+    trace: Trace | None = unseen("no", None)  # of the exact engine
+    ideal: Array | None = unseen("no", None)  # (N, m) forces of the ideal environment at its displacements [N]
+    until_s: float | None = unseen("no", None)  # from here on the trace is not credible
 
     @property
     def name(self) -> str:
         """As tables and pictures call it: a spring-damper by its condition."""
-        if self.kind == "spring-damper":
+        if self.coupling == "spring-damper":
             return self.condition or ""
-        return {"optimal": "best (optimal)"}.get(self.kind, self.kind)
-
-    def part(self) -> dict[str, Any]:
-        """As plain data."""
-        damping = {
-            name: [finite(float(x)) for x in requirement.required]
-            for name, requirement in (self.requirements or {}).items()
-        }
-        part: dict[str, Any] = {
-            "coupling": self.kind,
-            "condition": self.condition,
-            "required_damping": damping,
-            "promise": self.guarantee,
-            "dc_ratio": self.rendered,
-            "rms_mismatch_db": self.rms_mismatch_db,
-            "growth_rate_per_s": self.growth,
-            "force_error_percent": self.error_percent,
-        }
-        return part | ({"reason": self.reason} if self.reason else {})
+        return {"optimal": "best (optimal)"}.get(self.coupling, self.coupling)
 
     def needs(self, condition: str) -> float | None:
         """The largest share of its guaranteed damping that the condition asks of a device; None: none is enough."""
@@ -107,12 +88,12 @@ def alternatives(
     if scenario.switches:
         return []
     case = "I" if case == "none" else case
-    rows = [row for row in _ROWS if _possible(scenario, case, *row)]
+    present = (own[0].kind, own[0].condition) if own else None
+    rows = [row for row in _ROWS if row == present or _possible(scenario, case, *row)]
     made = []
-    for i, (kind, condition) in enumerate(rows):
+    for i, row in enumerate(rows):
         progress(i, len(rows))
-        same = own if own and (own[0].kind, own[0].condition) == (kind, condition) else None
-        made.append(_alternative(scenario, case, kind, condition, same))
+        made.append(_alternative(scenario, case, *row, own if row == present else None))
     return made
 
 
@@ -120,6 +101,8 @@ def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -
     if kind == "published":
         return scenario.loop(case) == load().loop(case)
     if condition == "this-environment" and scenario.ranges:
+        return False
+    if condition == "any-environment" and sum(scenario.theta) + sum(scenario.psi) > _SHORT:
         return False
     return kind != "optimal" or (scenario.channels <= _QUICK and not scenario.environment.walls)
 
@@ -139,20 +122,19 @@ def _alternative(
     made = Alternative(
         kind,
         condition,
-        chosen.coupling,
-        dict(requirements),
-        guarantee_of(requirements, loop, False),
-        finite(felt.dc_ratio),
-        finite(decibels(felt.rms_mismatch)),
-        finite(growth),
+        promise=guarantee_of(requirements, loop, False),
+        dc_ratio=finite(felt.dc_ratio),
+        rms_mismatch_db=decibels(felt.rms_mismatch),
+        growth_rate_per_s=finite(growth),
+        required_damping={name: tuple(needs.required) for name, needs in requirements.items()},
+        requirements=dict(requirements),
     )
     if scenario.environment.walls or simulation.friction:
         return made
     trace = run(simulation, "exact")
-    alike = force_error(simulation, trace, loop.lam)
-    error = None if unstable(growth) else alike.part()["error_percent"]
-    until = credible_part(simulation, trace)["until_s"]
-    return replace(made, error_percent=error, trace=trace, ideal=alike.ideal, until_s=until)
+    alike, until = force_error(simulation, trace, loop.lam), credible(simulation, trace).until_s
+    error = None if unstable(growth) else alike.error_percent
+    return replace(made, force_error_percent=error, trace=trace, ideal=alike.ideal, until_s=until)
 
 
 def _lag(scenario: Scenario, chosen: Chosen, requirements: dict[str, Requirement]) -> tuple[float, ...] | None:

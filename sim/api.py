@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING
 from controller.coupling import Coupling
 from controller.lti import Array
 from design.arguments import number, of_kind, one_of, whole
+from design.files import plain
 from design.result import Design
 from sim.accuracy import EngineChoice, compare_engines, pick
 from sim.couplings import given, limits_of
-from sim.engines import INTEGRATORS
+from sim.mujoco_engines import INTEGRATORS
 from sim.passivity_layer import EnergyNet, Plugged, Wanted, netted
 from sim.run import ENGINES, Progress, Simulation, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
-from sim.stability import stability_part
-from sim.stepping import MOST, settle
+from sim.stability import stability_of
+from sim.step_choice import MOST, settle
 from sim.switching import Period, switching
 from sim.trace import Trace
 
@@ -145,7 +146,7 @@ def simulate(
         "substeps": done.substeps,
         "seed": seed,
         "limiter": limits.part([device.force_limit for device in scenario.device]),
-        "stability": None if scenario.switches or environment else stability_part(done.simulation, trace),
+        "stability": None if scenario.switches or environment else plain(stability_of(done.simulation, trace)),
         "remarks": done.remarks,
         "energy_budget": trace.net.part() if trace.net else None,
     }

@@ -17,13 +17,14 @@ from controller.coupling import NoCoupling
 from controller.lti import Array
 from controller.tick import StepBuffer
 from design.result import DesignFailed
+from models.hold import hold
 from models.scene import Crowd, variants
 from sim.accuracy import force_error
 from sim.couplings import Chosen, choose, limits_of
-from sim.engines import ExactBatchEngine, hold
+from sim.engines import ExactEngine
 from sim.passivity_layer import BASELINES, Classic, EnergyNet, netted
 from sim.run import Simulation, assemble, run, run_blocks
-from sim.scenario import Scenario
+from sim.scenario import InputError, Scenario, require_even_ticks
 
 PAIRS, SECONDS, SLOW = 100, 10.0, 0.1  # of lossless hands, their time [s], their speed at the start [m/s]
 _AUDIBLE = 40.0  # [Hz] above which a force is felt as buzzing
@@ -64,8 +65,20 @@ def rivals(
 
     With `limiter` False forces of the designs are clipped, too, and they are designed for that.
 
-    Raises ValueError for Coulomb friction, which the exact plant has not.
+    Raises InputError for what this comparison cannot show.
     """
+    require_even_ticks(scenario, "--baselines")
+    if scenario.ranges or scenario.switches:
+        given = "[ranges]" if scenario.ranges else "[varying_delay]"
+        raise InputError(f"--baselines compares in one environment with constant delays: leave out {given}")
+    if any(device.friction for device in scenario.device):
+        raise InputError("--baselines runs in the exact plant, which has no Coulomb friction; the devices have")
+    return _rivals(scenario, case, progress, limiter)
+
+
+def _rivals(
+    scenario: Scenario, case: str, progress: Callable[[int, int], None], limiter: bool | None
+) -> Iterator[Rival]:
     nets = [None, *map(Classic, BASELINES), EnergyNet(0.0)]
     total = len(nets) + len(_DESIGNS)
     for done, net in enumerate(nets):
@@ -151,6 +164,6 @@ def _left_alone(simulation: Simulation) -> tuple[int, float]:
         return False
 
     outside = plants.B.shape[-1] - m
-    engine = ExactBatchEngine(plants, process.force_limit)
+    engine = ExactEngine(plants)
     run_blocks(process, engine, lambda first, count: np.zeros((count, outside)), ticks, start, look)
     return int((fastest > SLOW).sum()), float(fastest.max())

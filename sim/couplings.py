@@ -12,11 +12,11 @@ from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design.api import COUPLING, bare
 from design.certificate import assess, verify
+from design.coupling_file import Certificate, LimiterCertificate, Stored, load
 from design.coverage import Limits, covered_limits
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import switching_guarantee
 from design.result import Design, DesignFailed, Requirement
-from design.stored import Certificate, LimiterCertificate, Stored, load
 from sim import design_cache
 from sim.scenario import InputError, Scenario
 

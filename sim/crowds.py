@@ -23,9 +23,11 @@ from controller.coupling import Coupling
 from controller.lti import Array
 from controller.ranges import Member
 from controller.timing import Timing
+from models.hold import hold
 from models.human import Population
 from models.scene import Crowd, HumanSets, Variants, variants
-from sim.engines import EXPONENTIAL, ExactBatchEngine, MujocoBatchEngine, hold
+from sim.engines import ExactEngine
+from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine
 from sim.run import Simulation, assemble
 from sim.scenario import Scenario
 from sim.stability import (
@@ -288,7 +290,7 @@ def _tests(
     settings = held_by.scene, loops, np.array(validation.scenario.delta), validation.ticks
     late = validation.scenario.usual_latency
     latch = Latch.of(held_by, validation.scenario.loop("I"), late) if late else None
-    engine = ExactBatchEngine(hold(held_by.plants(), T, late), process.force_limit)
+    engine = ExactEngine(hold(held_by.plants(), T, late))
     exact = impulse_test(process, engine, *settings, latch=latch)
     if validation.engine == "exact":
         return exact, exact

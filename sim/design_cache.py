@@ -21,9 +21,9 @@ import controller
 import design
 from controller.loop import Loop
 from design.certificate import prove, prove_limiter, verify
+from design.coupling_file import Certificate, Stored, digest, load, save, sealed
 from design.files import one_command
 from design.result import Design, NotProved
-from design.stored import Certificate, Stored, digest, load, save, sealed
 
 _SHIPPED = Path(__file__).with_name("designs")
 _MOST = 200  # entries; the oldest go

@@ -21,13 +21,14 @@ from controller.timing import Timing
 from controller.walls import Contact
 from design.conditions import Latency
 from models.device import Device
+from models.hold import HeldPlant, hold
 from models.human import Population
 from models.scene import Crowd, Scene, variants
 from sim.crowds import crowds
-from sim.engines import HeldPlant, MujocoBatchEngine, hold, profiler_off, quiet_warnings
+from sim.mujoco_engines import MujocoBatchEngine, profiler_off, quiet_warnings
 from sim.run import run_block
 from sim.stability import close
-from sim.stepping import pace
+from sim.step_choice import pace
 from sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen
 
 Cells = NDArray[np.intp]

@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from controller.lti import Array
+from design.result import CONDITIONS
 from sim import plots
 from sim.limit_cycles import UNDECIDED
 from sim.stability import MARGINAL
@@ -70,6 +71,7 @@ def _cell_edges(axis: Array, scale: str) -> Array:
 
 def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
     entries = []
+    environments: dict[str, str] = {**CONDITIONS}
     for name, style in _LINES.items():
         if name not in drawn.ratio:
             continue
@@ -82,7 +84,7 @@ def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
             axes.contour(drawn.grid.B, drawn.grid.K, height, [1], **drawing)
         side = "inside this edge" if about_environment else "below this edge"
         where = side if safe and unsafe else "everywhere here" if safe else "nowhere here"
-        label = f"{plots.CONDITIONS.get(name, name)}: certified {where}"
+        label = f"{environments.get(name, name)}: certified {where}"
         entries.append(Line2D([], [], label=label, **style))
     return entries
 

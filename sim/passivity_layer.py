@@ -116,15 +116,15 @@ def _budget(wanted: EnergyNet, scenario: Scenario, process: Process, spans: Dela
     except ValueError as error:
         raise InputError(f"energy budget: {error}") from None
     late = ages(process.delays) if lost else None
-    return _Budgeted(budget, wanted, process.force_limit, late, np.array(spans.hi) + hold)
+    return _Budgeted(budget, wanted, process, late, np.array(spans.hi) + hold)
 
 
 def _classic(wanted: Classic, scenario: Scenario, process: Process, spans: DelayRange, nsim: int) -> Net:
-    delta, limit = np.array(scenario.delta), process.force_limit
+    delta = np.array(scenario.delta)
     if wanted.name == "eba":
-        return _Bounded(EnergyBounding(delta, scenario.T, nsim=nsim), wanted.name, limit)
+        return _Bounded(EnergyBounding(delta, scenario.T, nsim=nsim), wanted.name, process)
     credit = delta if wanted.name.endswith(":delta") else None
-    return _Damped(PassivityControl(len(delta), scenario.T, delta=credit, nsim=nsim), wanted.name, limit)
+    return _Damped(PassivityControl(len(delta), scenario.T, delta=credit, nsim=nsim), wanted.name, process)
 
 
 def _shelled(wanted: Plugged, V: Lti | None, process: Process, nsim: int) -> Net:
@@ -132,7 +132,7 @@ def _shelled(wanted: Plugged, V: Lti | None, process: Process, nsim: int) -> Net
         raise ValueError("an environment of your own needs a coupling with a compliance V before it")
     if (process.encoder_step > 0).any():
         raise ValueError("an environment of your own needs ideal encoders: no shell is known for coarse ones")
-    return _Shelled(Shell(V, start=wanted.start, nsim=nsim), wanted, process.force_limit)
+    return _Shelled(Shell(V, start=wanted.start, nsim=nsim), wanted, process)
 
 
 def idle(simulation: Simulation, any_environment: Requirement, part: dict[str, Any]) -> str | None:
@@ -154,8 +154,8 @@ def idle(simulation: Simulation, any_environment: Requirement, part: dict[str, A
 class _InLoop:
     """What the nets have in common: forces within the actuators' limits, and how far the devices went meanwhile."""
 
-    def __init__(self, limit: Array) -> None:
-        self._limit = limit[:, None]
+    def __init__(self, process: Process) -> None:
+        self._within = process.applied
         self._before: Array | None = None
 
     def _moved(self, x: Array) -> Array:
@@ -163,15 +163,14 @@ class _InLoop:
         self._before = x.copy()
         return dx
 
-    def _within(self, force: Array) -> Array:
-        return np.clip(force, -self._limit, self._limit)
-
 
 class _Budgeted(_InLoop):
     """The budget; behind it devices that let go of a force that is too old."""
 
-    def __init__(self, budget: EnergyBudget, asked: EnergyNet, limit: Array, late: Ticks | None, oldest: Array) -> None:
-        super().__init__(limit)
+    def __init__(
+        self, budget: EnergyBudget, asked: EnergyNet, process: Process, late: Ticks | None, oldest: Array
+    ) -> None:
+        super().__init__(process)
         self._budget, self._asked, self._late, self._oldest = budget, asked, late, oldest[:, None]
         self._acted: Array | None = None
         self._dropped = 0
@@ -206,8 +205,8 @@ class _Budgeted(_InLoop):
 class _Shelled(_InLoop):
     """An environment of the user's own, its force within the actuators' limits, and the shell."""
 
-    def __init__(self, shell: Shell, asked: Plugged, limit: Array) -> None:
-        super().__init__(limit)
+    def __init__(self, shell: Shell, asked: Plugged, process: Process) -> None:
+        super().__init__(process)
         self._shell, self._asked = shell, asked
 
     def send(self, x: Array, force: Array, /) -> None:
@@ -236,8 +235,8 @@ class _Shelled(_InLoop):
 class _Bounded(_InLoop):
     """Energy bounding, at the computer."""
 
-    def __init__(self, bounding: EnergyBounding, name: str, limit: Array) -> None:
-        super().__init__(limit)
+    def __init__(self, bounding: EnergyBounding, name: str, process: Process) -> None:
+        super().__init__(process)
         self._net, self._name = bounding, name
 
     def send(self, x: Array, force: Array, /) -> None:
@@ -253,8 +252,8 @@ class _Bounded(_InLoop):
 class _Damped(_InLoop):
     """The passivity controller, at the devices."""
 
-    def __init__(self, control: PassivityControl, name: str, limit: Array) -> None:
-        super().__init__(limit)
+    def __init__(self, control: PassivityControl, name: str, process: Process) -> None:
+        super().__init__(process)
         self._net, self._name = control, name
         self._dx: Array = np.zeros(())
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from controller.lti import Array
 from design.files import printable, write
+from design.result import CONDITIONS
 from sim.trace import Trace
 
 # ----------------------------------------------------------------------------------------------------
@@ -38,8 +39,6 @@ STYLES: tuple[dict[str, Any], ...] = (
 )
 #: what is ideal: broad, grey and behind the rest
 _IDEAL: dict[str, Any] = {"color": "0.45", "linestyle": "-", "linewidth": 3.0, "alpha": 0.55}
-#: the two conditions, by the keys that reports have
-CONDITIONS = {"this-environment": "this environment", "any-environment": "any passive environment"}
 
 
 def _panels(title: str, rows: int, columns: int, size: tuple[float, float], **shared: Any) -> tuple[Figure, Any]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,13 @@ from controller.delay import LOST, Ticks, VaryingDelay, ages
 from controller.older import CONDITIONS, with_older
 from controller.timing import Timing
 from design.certificate import assess
-from design.guarantees import ANY, CAVEATS, MAKING, encoder_part
+from design.guarantees import encoder_part
 from design.result import Requirement, certificate_part, finite, listed
 from design.transparency import Transparency, decibels
 from sim.couplings import Chosen
 from sim.run import Simulation
 from sim.scenario import Scenario, load
-from sim.stability import close, dominant_mode, eigenvalue_part, linear_growth
+from sim.stability import Stability, close, dominant_mode, eigenvalues, linear_growth
 from sim.switching import Period, certified_part
 from sim.trace import Trace
 
@@ -68,39 +69,6 @@ def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> dict[str
 
 
 # ----------------------------------------------------------------------------------------------------
-# What a run was worth: one dictionary for machines, and the same as tables for people.
-
-
-def remarks(outcome: dict[str, Any]) -> list[str]:
-    """What a reader must know to read the figures rightly."""
-    lines = []
-    certificates = {name: outcome["certificates"][name] for name in ("any-environment", "this-environment")}
-    name = "any-environment" if outcome["certificate"]["condition"] == "any-environment" else "this-environment"
-    part = certificates[name]
-    if not part["certified"] and "reason" not in part:
-        worst = max(n / a for n, a in zip(part["required_damping"], part["available_damping"], strict=True))
-        condition = f"the {name} condition" + (" (the paper's Theorem 4)" if name == "any-environment" else "")
-        what = "The loop without coupling fails" if outcome["coupling"]["kind"] == "none" else "This coupling fails"
-        lines.append(f"{what} {condition}: it needs {worst:.3g} times the damping that the devices guarantee.")
-    if "contact" in outcome["stability"]:
-        covered = {ANY: "any-environment", MAKING: "this-environment"}.get(outcome["promise"], "no certificate")
-        slopes = listed(outcome["stability"]["contact"]["slopes_n_per_m"])
-        softer = f", and any walls with K + 2 B/T up to {slopes} N/m" if outcome["promise"] == MAKING else ""
-        lines.append(f"Contact that makes and breaks: {covered} covers it in this loop{softer}.")
-    for name in ("stability", "error", "transparency", "credible"):
-        if "reason" in outcome[name]:
-            lines.append(f"{name}: {outcome[name]['reason']}.")
-    for name, part in certificates.items():
-        if "reason" in part:
-            lines.append(f"{name}: {part['reason']}.")
-    if outcome.get("varying_delay"):
-        lines.append(f"Delays that vary: {outcome['varying_delay']['covers']}.")
-    if part := outcome.get("encoder"):
-        lines.append(f"{part['words'][0].upper()}{part['words'][1:]}.")
-    return [*lines, CAVEATS]
-
-
-# ----------------------------------------------------------------------------------------------------
 # What the paper prints beside what comes out here, for its own scenario.
 
 
@@ -108,57 +76,59 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
 PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 
+@dataclass(frozen=True)
+class PaperRow:
+    """A figure of the paper, and what it is here."""
+
+    what: str
+    paper: str
+    here: str
+    why: str
+
+
 def beside_the_paper(
-    scenario: Scenario, case: str, stability: dict[str, Any], coupling: dict[str, Any]
-) -> list[dict[str, str]]:
-    """Rows of {what, paper, here, why}; empty where the loop is not the paper's."""
+    scenario: Scenario, case: str, stability: Stability, coupling: dict[str, Any]
+) -> tuple[PaperRow, ...]:
+    """Every figure that the paper prints of its loop; none where the loop is another."""
     if scenario.varying_delay or scenario.loop(case) != load().loop(case):
-        return []
+        return ()
     figure = _figure(case, stability)
-    return [figure] if case == "none" else [*_printed_gains(scenario, case, coupling), _tau(case), figure]
+    return (figure,) if case == "none" else (*_printed_gains(scenario, case, coupling), _tau(case), figure)
 
 
-def _printed_gains(scenario: Scenario, case: str, got: dict[str, Any]) -> list[dict[str, str]]:
+def _printed_gains(scenario: Scenario, case: str, got: dict[str, Any]) -> tuple[PaperRow, ...]:
     printed = PUBLISHED[case]
     need = assess(scenario.loop(case), printed)
     any_environment, this_environment = (need[name].required for name in ("any-environment", "this-environment"))
-    here = "none" if got["K"] is None else f"K = {listed(got['K'], 5)}, B = {listed(got['B'], 5)}"
-    return [
-        {
-            "what": "gains [N/m], [N s/m]",
-            "paper": f"K = {listed(printed.K, 5)}, B = {listed(printed.B, 5)}",
-            "here": here,
-            "why": "the printed gains are no solution of the paper's own problem (next row)",
-        },
-        {
-            "what": "damping that the printed gains need [N s/m]",
-            "paper": f"at most {listed(scenario.delta, 5)}",
-            "here": f"{listed(any_environment, 5)} by Theorem 4; {listed(this_environment, 5)} in this environment",
-            "why": "Theorem 4 as printed is strictly infeasible (E-hat has a pole at z = 1); mended, it refuses them",
-        },
-    ]
+    gains = PaperRow(
+        "gains [N/m], [N s/m]",
+        f"K = {listed(printed.K, 5)}, B = {listed(printed.B, 5)}",
+        "none" if got["K"] is None else f"K = {listed(got['K'], 5)}, B = {listed(got['B'], 5)}",
+        "the printed gains are no solution of the paper's own problem (next row)",
+    )
+    damping = PaperRow(
+        "damping that the printed gains need [N s/m]",
+        f"at most {listed(scenario.delta, 5)}",
+        f"{listed(any_environment, 5)} by Theorem 4; {listed(this_environment, 5)} in this environment",
+        "Theorem 4 as printed is strictly infeasible (E-hat has a pole at z = 1); mended, it refuses them",
+    )
+    return gains, damping
 
 
-def _tau(case: str) -> dict[str, str]:
-    return {
-        "what": "transparency index tau (25)",
-        "paper": f"{PRINTED_TAU_DB[case]} dB",
-        "here": "infinite",
-        "why": "inf sigma_min(E) = 0: moving both contacts together costs no static force",
-    }
+def _tau(case: str) -> PaperRow:
+    why = "inf sigma_min(E) = 0: moving both contacts together costs no static force"
+    return PaperRow("transparency index tau (25)", f"{PRINTED_TAU_DB[case]} dB", "infinite", why)
 
 
-def _figure(case: str, stability: dict[str, Any]) -> dict[str, str]:
-    growth = f"{stability['exact_growth_rate_per_s']:+.2f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
-    return {
-        "what": "Figure 5: no coupling" if case == "none" else "Figure 6: with a coupling",
-        "paper": "self-sustained oscillation" if case == "none" else "no oscillation",
-        "here": f"{stability['exact_verdict']}: {growth}",
-        "why": "agrees; masses and transmission of the devices are assumed: the paper's own first-order device is "
-        "stable with each of 200 pairs of hands"
-        if case == "none"
-        else "agrees; masses and stiffness of the devices are assumed",
-    }
+def _figure(case: str, stability: Stability) -> PaperRow:
+    growth = f"{stability.exact_growth_rate_per_s:+.2f} 1/s at {stability.exact_frequency_hz:.1f} Hz"
+    here = f"{stability.exact_verdict}: {growth}"
+    if case != "none":
+        why = "agrees; masses and stiffness of the devices are assumed"
+        return PaperRow("Figure 6: with a coupling", "no oscillation", here, why)
+    why = "agrees; masses and transmission of the devices are assumed: the paper's own first-order device is "
+    why += "stable with each of 200 pairs of hands"
+    return PaperRow("Figure 5: no coupling", "self-sustained oscillation", here, why)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -237,20 +207,20 @@ def timing_part(timing: Timing | None, scenario: Scenario) -> dict[str, Any] | N
     }
 
 
-def switched_stability_part(simulation: Simulation, trace: Trace, delays: dict[str, Any]) -> dict[str, Any]:
-    """As report.stability_part, for a loop that switches: it has no eigenvalue of its own but over a period."""
+def switched_stability(simulation: Simulation, trace: Trace, delays: dict[str, Any]) -> Stability:
+    """As stability_of, for a loop that switches: it has no eigenvalue of its own but over a period."""
     worst = delays["period"] or delays
-    constant = eigenvalue_part(dominant_mode(close(simulation.plant, simulation.F)))
-    verdict = "unstable" if trace.diverged or "unstable" in (worst["verdict"], delays["verdict"]) else "stable"
-    return {
-        "verdict": verdict,
-        "clipped_ticks": int(trace.clipped(simulation.process.force_limit).sum()),
-        "growth_rate_per_s": worst["growth_rate_per_s"],
-        "frequency_hz": trace.dominant_frequency_hz(),
-        **constant,
-        "reason": _how(delays)
-        + f"; the eigenvalues are those of the constant delay theta = {listed(simulation.scenario.theta)}",
-    }
+    constant = eigenvalues(dominant_mode(close(simulation.plant, simulation.F)))
+    grows = trace.diverged or "unstable" in (worst["verdict"], delays["verdict"])
+    theta = listed(simulation.scenario.theta)
+    return Stability(
+        **vars(constant),
+        verdict="unstable" if grows else "stable",
+        clipped_ticks=int(trace.clipped(simulation.process.force_limit).sum()),
+        growth_rate_per_s=worst["growth_rate_per_s"],
+        frequency_hz=trace.dominant_frequency_hz(),
+        reason=f"{_how(delays)}; the eigenvalues are those of the constant delay theta = {theta}",
+    )
 
 
 def _how(delays: dict[str, Any]) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,20 +28,10 @@ from controller.lti import Array, Lti
 from controller.tick import Net, Process, StepBuffer
 from controller.timing import Timing
 from controller.walls import contact
-from models.scene import Scene, build, plant
-from sim.engines import (
-    EXPONENTIAL,
-    LEAST,
-    Engine,
-    ExactEngine,
-    ExactTimedEngine,
-    HeldPlant,
-    MujocoEngine,
-    default_integrator,
-    hold,
-    profiler_off,
-    quiet_warnings,
-)
+from models.hold import HeldPlant, hold
+from models.scene import Scene, build
+from sim.engines import Engine, ExactEngine, ExactTimedEngine
+from sim.mujoco_engines import EXPONENTIAL, LEAST, MujocoEngine, default_integrator, profiler_off, quiet_warnings
 from sim.scenario import InputError, Scenario
 from sim.trace import Trace
 
@@ -53,7 +44,7 @@ Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 _COPIES = 4  # of a trace, at most, from the run to its report
 _SMALL = 1e8  # [bytes] of a trace for which the free memory is not looked up
 _COLUMNS = 50  # numbers a tick that the report of a trace on the disk takes in memory
-_BLOCK = 1024  # ticks between two looks at the clock, the keyboard and the numbers
+_BLOCK = 2048  # ticks between two looks at the clock, the keyboard and the numbers
 _AHEAD = 8  # blocks for which outside forces are asked at once
 
 
@@ -88,7 +79,7 @@ class Simulation:
         """The same in periods T, with forces that latch at ticks: what integrators and their steps are judged on."""
         if self.timing is None:
             return self
-        return replace(self, plant=hold(plant(self.scene.model), self.scenario.T), timing=None)
+        return replace(self, plant=hold(self.scene.plant, self.scenario.T), timing=None)
 
     @property
     def felt(self) -> Lti:
@@ -114,7 +105,7 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
         walled = contact(network, coupling, *delays, scenario.T) if network.walls else None
     F = walled.open if walled else force_map(E, coupling, *delays)
     scene = build(scenario.device, scenario.human, scenario.person)
-    usual = hold(plant(scene.model), scenario.T, scenario.usual_latency)
+    usual = hold(scene.plant, scenario.T, scenario.usual_latency)
     timing = scenario.timing(seed, scenario.samples)
     return Simulation(scenario, E, F, Process(F, limits, steps, walled), scene, usual, timing)
 
@@ -160,18 +151,16 @@ def run(
         run_blocks(process, engine, outside, ticks, start, keep, _BLOCK)
     except KeyboardInterrupt:  # what was finished is kept
         interrupted = True
-    n, m, handles = simulation.scene.model.nq, process.channels, list(simulation.scene.handles)
+    n, m, handles = simulation.scene.model.nq, process.channels, simulation.scene.handles
     z, s, w, f = np.split(record[:done], np.cumsum(widths)[:3], axis=1)
-    for force, limit in zip(f.T, process.force_limit, strict=True):
-        np.clip(force, -limit, limit, out=force)  # from asked for into applied
     for part in (record, z, s, w, f):
         part.setflags(write=False)
     return Trace(
         t=beginnings(scenario.T, simulation.timing, 0, done),
         x=process.measured(s[:, :m]),
         f=f,
-        x_handle=s[:, handles],
-        v_handle=s[:, n:][:, handles],
+        x_handle=_columns(s, handles),
+        v_handle=_columns(s[:, n:], handles),
         w=w,
         z=z,
         s=s,
@@ -179,6 +168,12 @@ def run(
         interrupted=interrupted,
         net=net,
     )
+
+
+def _columns(rows: Array, which: tuple[int, ...]) -> Array:
+    """These columns, which are no copy where they lie side by side."""
+    together = slice(which[0], which[-1] + 1)
+    return rows[:, together] if which == tuple(range(which[0], which[-1] + 1)) else rows[:, list(which)]
 
 
 def _room(width: int, ticks: int, T: float) -> Array:
@@ -215,17 +210,17 @@ def run_blocks(
 
     Row 0 of the buffer is the block's first tick. So few ticks in a block that it stays in the processor's cache.
     """
-    buffer = StepBuffer(process, min(block, ticks), start.shape[0], outside(0, 0).shape[1], start.shape[1])
+    ahead = outside(0, min(_AHEAD * block, ticks))
+    buffer = StepBuffer(process, min(block, ticks), start.shape[0], ahead.shape[1], start.shape[1])
     buffer.s[0] = start
     # a diverging run is reported, not warned about
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
         engine.start(buffer)
-        ahead = outside(0, 0)
         for first in range(0, ticks, block):
-            count, ahead = min(block, ticks - first), ahead[block:]
+            count = min(block, ticks - first)
             if not len(ahead):
                 ahead = outside(first, min(_AHEAD * block, ticks - first))
-            buffer.w[:count] = ahead[:count, :, None]
+            buffer.w[:count], ahead = ahead[:count, :, None], ahead[block:]
             run_block(buffer, engine, count)
             if look(buffer, first, count):
                 return
@@ -244,8 +239,8 @@ def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
         buffer.calm = False
     tick, advance = buffer.ticking(), engine.advance
     for k in range(done, ticks):
-        tick(k)  # sample x, compute f and z+
-        advance(k)  # limit f, hold -f on the actuators for T, move the plant
+        tick(k)  # sample x, compute f and z+, limit f
+        advance(k)  # hold -f on the actuators for T, move the plant
 
 
 def beginnings(T: float, timing: Timing | None, first: int, ticks: int) -> Array:
@@ -266,9 +261,9 @@ def outside_forces(
         for human, column in zip(scenario.human, scene.pushed, strict=True):
             w[:, column] += human.voluntary_force(t)
     if tap := scenario.tap:
-        begin, end = (np.round(time / scenario.T, 9) for time in (tap.start, tap.start + tap.duration))
-        k = np.round(t / scenario.T, 9) if timing else np.arange(first, first + ticks)
-        w[(k >= begin) & (k < end), scene.tapped[tap.channel - 1]] += tap.force
+        places = np.round(t / scenario.T, 9) if timing else range(first, first + ticks)
+        ends = [bisect_left(places, round(time / scenario.T, 9)) for time in (tap.start, tap.start + tap.duration)]
+        w[slice(*ends), scene.tapped[tap.channel - 1]] += tap.force
     return w
 
 
@@ -289,10 +284,9 @@ def make_engine(
     if engine == "exact":
         if simulation.friction:
             raise ValueError("the devices have Coulomb friction, which the exact engine, being linear, does not model")
-        limit = simulation.process.force_limit
         if simulation.timing and T is None:
-            return ExactTimedEngine(plant(simulation.scene.model), simulation.timing, limit)
-        return ExactEngine(simulation.plant, limit)
+            return ExactTimedEngine(simulation.scene.plant, simulation.timing)
+        return ExactEngine(simulation.plant)
     integrator = integrator or default_integrator(simulation.scene)
     count = substeps if substeps is not None else 1 if integrator == EXPONENTIAL else LEAST
     if T is not None:

@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 
 from controller.delay import VaryingDelay
-from controller.environment import Network, Spring, Wall, environment
+from controller.environment import RIGID_WALL, Network, Spring, Wall, environment
 from controller.loop import DelayRange, Loop
 from controller.older import SCENARIOS as OLDER_SCENARIOS
 from controller.older import named_first, named_today
@@ -219,6 +219,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         rest = (self.delta, self.environment, self.ranges, varying)
         return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency)
 
+    def before_a_rigid_wall(self, psi: tuple[int, ...] = (0,)) -> Loop:
+        """The loop of the first channel alone, a rigid wall in the place of the environment. Raises ValueError."""
+        theta, late = self.theta[:1], self.latency and self.latency[:1]
+        rest = {"T_max": self.longest_period, "latency": late}
+        return Loop(self.T, theta, psi, theta, self.delta[:1], RIGID_WALL, **rest)
+
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping [N s/m].
 
@@ -305,6 +311,15 @@ class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     human: tuple[Any, ...]  # Human, MeasuredHand, or a user's own
     person: tuple[Person, ...] = ()
     population: Any = None  # of a Python file: who else is drawn, what has draw(rng, n)
+
+
+def held_by(scenario: Scenario, path: str | Path) -> Scenario:
+    """The scenario in the hands, or of the population, that a file names. Raises InputError as `load_humans` does."""
+    people = load_humans(path, scenario.channels)
+    who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
+    if people.population is not None:
+        who["population"] = people.population
+    return scenario.replace(**who)
 
 
 def load_humans(path: str | Path, channels: int) -> _HumanFile:

@@ -19,9 +19,11 @@ from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
 from controller.timing import Timing
 from controller.walls import State
-from design.result import finite
+from design.files import unseen
+from models.hold import HeldPlant, at_the_latch, hold
 from models.scene import Scene, Variants
-from sim.engines import Engine, HeldPlant, MujocoBatchEngine, at_the_latch, hold, profiler_off, quiet_warnings
+from sim.engines import Engine
+from sim.mujoco_engines import MujocoBatchEngine, profiler_off, quiet_warnings
 from sim.run import Simulation, beginnings, make_engine, run_blocks
 from sim.trace import Trace
 
@@ -215,11 +217,66 @@ def measured_growth(
     return float(Mode(eigenvalue, loop.T).growth), None
 
 
-def stability_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
+@dataclass(frozen=True, kw_only=True)
+class ExactVerdict:
+    """The verdict of the exact loop."""
+
+    exact_verdict: str
+    exact_growth_rate_per_s: float
+    exact_frequency_hz: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Eigenvalues(ExactVerdict):
+    """What the eigenvalues of the exact loop say."""
+
+    spectral_radius: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Frozen(ExactVerdict):
+    """The loop that has these walls, and no others."""
+
+    touching: list[int]  # counted from 1
+
+
+@dataclass(frozen=True)
+class _Contact:
+    """How often the walls were touched in a run, and the linear loops that they switch between."""
+
+    made: int
+    ticks: int
+    slopes_n_per_m: list[float]
+    frozen: list[_Frozen]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stability(Eigenvalues):
     """Measured on the trace, and from the eigenvalues of the exact loop; of walls, in the worst contact state."""
-    contact = _contact_part(simulation, trace) if simulation.process.walls else {}
-    if contact.get("ticks"):
-        growth, reason = None, f"contact was made {contact['made']} times, and a growth rate is of one linear loop"
+
+    verdict: str | None
+    clipped_ticks: int
+    growth_rate_per_s: float | None
+    frequency_hz: float | None
+    contact: _Contact | None = unseen("given", None)
+    reason: str | None = unseen("given", None)
+
+
+def eigenvalues(mode: Mode) -> Eigenvalues:
+    """As a report has them."""
+    return Eigenvalues(**_exact(mode), spectral_radius=float(mode.spectral_radius))
+
+
+def _exact(mode: Mode) -> dict[str, Any]:
+    figures = mode.verdict, float(mode.growth), float(mode.frequency_hz)
+    return dict(zip(("exact_verdict", "exact_growth_rate_per_s", "exact_frequency_hz"), figures, strict=True))
+
+
+def stability_of(simulation: Simulation, trace: Trace) -> Stability:
+    """The verdict on a run."""
+    contact = _contact(simulation, trace) if simulation.process.walls else None
+    if contact and contact.ticks:
+        growth, reason = None, f"contact was made {contact.made} times, and a growth rate is of one linear loop"
     elif simulation.friction:
         growth, reason = None, "with Coulomb friction there is no growth rate; the eigenvalues are those without it"
     elif trace.net:
@@ -232,45 +289,32 @@ def stability_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
         growth, reason = measured_growth(loop, trace, simulation.process.force_limit, ahead)
     if trace.diverged:
         reason = "the simulation left the range of finite numbers: reported as unstable"
-    part: dict[str, Any] = {
-        "verdict": "unstable" if trace.diverged else None if growth is None else verdict(growth),
-        "clipped_ticks": int(trace.clipped(simulation.process.force_limit).sum()),
-        "growth_rate_per_s": growth,
-        "frequency_hz": trace.dominant_frequency_hz(),
-        **eigenvalue_part(worst_mode(simulation)),
-    }
-    if reason == NOT_EXCITED:
-        part["verdict"] = part["exact_verdict"]
-    part |= {"contact": contact} if contact else {}
-    return part | ({"reason": reason} if reason else {})
+    exact = eigenvalues(worst_mode(simulation))
+    found = "unstable" if trace.diverged else None if growth is None else verdict(growth)
+    return Stability(
+        **vars(exact),
+        verdict=exact.exact_verdict if reason == NOT_EXCITED else found,
+        clipped_ticks=int(trace.clipped(simulation.process.force_limit).sum()),
+        growth_rate_per_s=growth,
+        frequency_hz=trace.dominant_frequency_hz(),
+        contact=contact,
+        reason=reason or None,
+    )
 
 
-def eigenvalue_part(mode: Mode) -> dict[str, Any]:
-    """What the eigenvalues of the exact loop say."""
-    return {
-        "exact_verdict": mode.verdict,
-        "exact_growth_rate_per_s": finite(float(mode.growth)),
-        "exact_frequency_hz": float(mode.frequency_hz),
-        "spectral_radius": float(mode.spectral_radius),
-    }
-
-
-def _contact_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
-    """How often the walls were touched in a run, and the linear loops that they switch between."""
+def _contact(simulation: Simulation, trace: Trace) -> _Contact:
     walls = simulation.process.contact
     assert walls is not None
     touching = walls.depths(trace.z) > 0
-    states = []
-    for state, mode in _frozen_modes(simulation).items():
-        part = eigenvalue_part(mode)
-        part.pop("spectral_radius")
-        states.append({"touching": [i + 1 for i, on in enumerate(state) if on]} | part)
-    return {
-        "made": int((touching[1:] & ~touching[:-1]).sum() + touching[:1].sum()),
-        "ticks": int(touching.any(axis=1).sum()),
-        "slopes_n_per_m": [wall.slope(simulation.scenario.T) for wall in walls.walls],
-        "frozen": states,
-    }
+    return _Contact(
+        made=int((touching[1:] & ~touching[:-1]).sum() + touching[:1].sum()),
+        ticks=int(touching.any(axis=1).sum()),
+        slopes_n_per_m=[float(wall.slope(simulation.scenario.T)) for wall in walls.walls],
+        frozen=[
+            _Frozen(**_exact(mode), touching=[i for i, on in enumerate(state, start=1) if on])
+            for state, mode in _frozen_modes(simulation).items()
+        ],
+    )
 
 
 # ---- the impulse test: what short traces say of many humans at once

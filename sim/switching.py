@@ -27,13 +27,13 @@ from controller.delay import LOST, Ticks, VaryingDelay, realising
 from controller.loop import DelayRange, force_map
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
-from design.certificate import switching_requirement
 from design.coverage import switching_part
 from design.guarantees import switching_guarantee
-from design.result import Requirement
+from models.hold import HeldPlant, hold
 from models.scene import Scene, Variants
 from sim.couplings import Chosen
-from sim.engines import Engine, ExactBatchEngine, ExactTimedEngine, HeldPlant, MujocoBatchEngine, hold
+from sim.engines import Engine, ExactEngine, ExactTimedEngine
+from sim.mujoco_engines import MujocoBatchEngine
 from sim.run import Simulation
 from sim.scenario import Scenario
 from sim.stability import impulse_forces, impulse_growth, unlimited
@@ -134,7 +134,7 @@ def greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Vary
     lo, hi = (np.array(side)[:, None] for side in (varying.lo, varying.hi))
     depth = int(hi.max()) + 1
     buffer = StepBuffer(replace(process, force_limit=free, delays=None), 1, states, scene.outside, nsim)
-    engine = ExactBatchEngine(plants, free)
+    engine = ExactEngine(plants)
     engine.start(buffer)
     pushed = impulse_forces(scene, process.F.T, 0, ticks)
     sent, age = np.zeros((depth, m, nsim)), np.broadcast_to(hi, (m, nsim))
@@ -232,9 +232,9 @@ def switched_crowd(
             process = replace(free, delays=_crowd_delays(scenario, free, scene, plants, index, seed, ticks))
         endless = unlimited(process)
         if timing:
-            moved: Engine = ExactTimedEngine(held_by.plants(), timing, endless.force_limit)
+            moved: Engine = ExactTimedEngine(held_by.plants(), timing)
         else:
-            moved = ExactBatchEngine(plants, endless.force_limit)
+            moved = ExactEngine(plants)
         exact, _ = impulse_growth(endless, moved, scene, states, ticks, nsim)
         if not mujoco:
             return Switched(exact, np.full(nsim, np.nan))
@@ -281,12 +281,13 @@ def certified_part(scenario: Scenario, chosen: Chosen, certified: bool) -> dict[
         return nothing | _coverage(scenario.varying_delay, certified, None)
     span = scenario.delay_range
     loop = scenario.loop("I").switching(span)  # the case does not matter to stability
-    found = switching_requirement(loop, chosen.coupling)
     on_file = chosen.switching if chosen.switching and chosen.switching.contains(span) else None
-    figures = switching_part(found, loop.sent(chosen.coupling), span, loop.T_max)
-    proof = _how_proved(found.requirement, on_file)
+    figures = switching_part(loop, chosen.coupling)
+    proof = _how_proved(figures, on_file)
     parts = {"switching": figures, "jitter_proof": figures, "on_file": on_file and msgspec.to_builtins(on_file)}
-    return parts | _coverage(scenario.varying_delay, certified, proof, figures["playout"]["certified"])
+    return parts | _coverage(
+        scenario.varying_delay, certified, proof, figures.get("playout", {}).get("certified", False)
+    )
 
 
 def _coverage(varying: VaryingDelay, certified: bool, proof: str | None, buffered: bool = False) -> dict[str, Any]:
@@ -316,10 +317,10 @@ def _coverage(varying: VaryingDelay, certified: bool, proof: str | None, buffere
     }
 
 
-def _how_proved(requirement: Requirement, on_file: DelayRange | None) -> str:
+def _how_proved(part: dict[str, Any], on_file: DelayRange | None) -> str:
     """What shows that any switching within the range is safe, "" where nothing does."""
     if on_file:
         return f"proved in the coupling's file for {switching_guarantee(on_file)}"
-    if not requirement.certified:
+    if not part["certified"]:
         return ""
-    return "proved exactly" if requirement.proof == "rational" else "by a refined sweep, without an exact proof"
+    return "proved exactly" if part["proof"] == "rational" else "by a refined sweep, without an exact proof"

@@ -30,11 +30,11 @@ from controller.tick import Process
 from controller.walls import contact
 from design import conditions
 from design.audit import check_loop, edge
-from design.certificate import CONDITIONS, any_environment_of
+from design.certificate import any_environment_of
 from design.coverage import covered_limits
 from design.guarantees import LATE
 from design.lmi import least_phi
-from design.result import DesignFailed, Requirement, refusal
+from design.result import CONDITIONS, DesignFailed, Requirement, refusal
 from models.device import Device
 from models.human import Population
 from sim import limit_cycles
@@ -107,7 +107,7 @@ class CouplingSweep(_Sweep):
     @property
     def conditions(self) -> tuple[str, ...]:
         """What is asked of every cell."""
-        return CONDITIONS
+        return tuple(CONDITIONS)
 
     @property
     def refusals(self) -> dict[str, str]:
@@ -246,7 +246,7 @@ class EnvironmentSweep(_Sweep):
     @property
     def conditions(self) -> tuple[str, ...]:
         """What is asked of every cell."""
-        return (*CONDITIONS, MODEL_KEPT) if self._kept else CONDITIONS
+        return (*CONDITIONS, MODEL_KEPT) if self._kept else tuple(CONDITIONS)
 
     @property
     def refusals(self) -> dict[str, str]:
@@ -367,7 +367,7 @@ def _press_directions(network: environment.Network | None, channels: int) -> Arr
 
 #: what K and B may be, as in design.audit: within these, all arithmetic is far from overflow
 _STIFFNESSES, _DAMPINGS = (1e-3, 1e9), (0.0, 1e6)
-Range = tuple[float, float]
+_Range = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -394,7 +394,7 @@ class Grid:
         return (rows[:, None] * self.shape[1] + columns).ravel()
 
 
-def make_grid(sweep: Sweep, n: int, K: Range | None, B: Range | None, marks: tuple[Range, ...] = ()) -> Grid:
+def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: tuple[_Range, ...] = ()) -> Grid:
     """n x n cells. Ranges that are not given come from the loop, and make room for the marks.
 
     K is about the loop's stiffness_scale, B about delta, the most that a linear law may damp. A linear map goes up to
@@ -420,13 +420,13 @@ def make_grid(sweep: Sweep, n: int, K: Range | None, B: Range | None, marks: tup
     return Grid(along_K, along_B, scale)
 
 
-def _with_room(usual: Range, marked: Sequence[float]) -> Range:
+def _with_room(usual: _Range, marked: Sequence[float]) -> _Range:
     """The range, widened so that marks lie well inside; a mark at 0 stays on the edge of a logarithmic map."""
     low, high = usual
     return min([low, *(mark / 1.1 for mark in marked if mark > 0)]), max([high, *(1.1 * mark for mark in marked)])
 
 
-def _check(name: str, low: float, high: float, allowed: Range, scale: str) -> None:
+def _check(name: str, low: float, high: float, allowed: _Range, scale: str) -> None:
     option, unit = f"--{name}-range", "N/m" if name == "K" else "N s/m"
     if not (allowed[0] <= low and high <= allowed[1]):
         raise InputError(f"{option} is {low:g},{high:g}, allowed are {allowed[0]:g} to {allowed[1]:g} {unit}")

@@ -18,13 +18,15 @@ class Driven:
     f: np.ndarray
 
 
-def driven(process: Process, engine: Engine, outside: Outside, ticks: int, start: np.ndarray) -> Driven:
-    """Close the loop from the plant states `start`, (2n, nsim)."""
+def driven(
+    process: Process, engine: Engine, outside: Outside, ticks: int, start: np.ndarray, last: int | None = None
+) -> Driven:
+    """Close the loop from the plant states `start`, (2n, nsim); only the blocks of the last ticks are kept."""
     kept = []
 
     def look(buffer: StepBuffer, first: int, count: int) -> None:
-        buffer.saturate(count)
-        kept.append([rows[:count].copy() for rows in (buffer.z, buffer.s, buffer.f)])
+        if last is None or first + count > ticks - last:
+            kept.append([rows[:count].copy() for rows in (buffer.z, buffer.s, buffer.f)])
 
     run_blocks(process, engine, outside, ticks, start, look, 1000)
     return Driven(*(np.concatenate(rows) for rows in zip(*kept, strict=True)))

@@ -6,8 +6,10 @@ python tests/forked.py FOLDER     designs that runs ask for are kept in FOLDER; 
 from __future__ import annotations
 
 import atexit
+import fcntl
 import functools
 import hashlib
+import inspect
 import json
 import os
 import pickle
@@ -24,39 +26,63 @@ ROOT = Path(__file__).parents[1]
 
 
 def share_designs(folder: Path, patch=setattr) -> None:
-    """One design for all tests and processes that ask for the same one: seconds each, and the same at every time.
+    """What commands work out again and again, seconds each, once for all tests and processes that ask for the same.
 
-    What makes them, design.designs and the modules behind it, is as it was.
+    That is: designs, bounds, the price of a wrong model, what limited forces ask, and how the couplings beside a run's
+    own are judged. What makes them, design.designs and the modules behind it, is as it was.
     """
     import cli.design
-    from design import api, bound, compare, designs
-    from sim import couplings
+    from design import api, bound, compare, coverage, designs, optimal
+    from sim import alternatives, couplings
 
-    for module in (cli.design, api, compare, couplings):
-        patch(module, "design_by_kind", _remembering(folder, designs.design_by_kind))
-    for module in (cli.design, compare):
-        patch(module, "bound", _remembering(folder, bound.bound))
+    for made, modules in (
+        (designs.design_by_kind, (cli.design, api, compare, coverage, couplings)),
+        (bound.bound, (bound, compare)),
+        (optimal.spread, (optimal,)),
+        (coverage.limiter_requirement, (coverage,)),
+        (alternatives.assess, (alternatives,)),
+        (api.instead, (api,)),
+    ):
+        for module in modules:
+            patch(module, made.__name__, _remembering(folder, made))
 
 
 def _remembering(folder: Path, make):
     """The same function, with its results kept in the folder; failures and loops without a digest are not."""
-    from design.stored import digest
+    from design.coupling_file import digest
 
-    def remembered(loop, *asked, **named):
-        plain = [x for x in asked if not callable(x)], sorted((k, x) for k, x in named.items() if not callable(x))
+    @functools.wraps(make)
+    def remembered(loop, *asked, **options):
         try:
-            loop_and_asked = digest(loop), make.__name__, plain
+            loop_and_asked = digest(loop), make.__name__, _asked(make, loop, *asked, **options)
         except TypeError:  # an environment of a test's own class
-            return make(loop, *asked, **named)
+            return make(loop, *asked, **options)
         file = folder / hashlib.sha256(repr(loop_and_asked).encode()).hexdigest()
-        if not file.exists():
-            made = make(loop, *asked, **named)
-            part = file.with_suffix(f".{os.getpid()}")
-            part.write_bytes(pickle.dumps(made))
-            part.rename(file)
+        with file.with_suffix(".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # whoever asks meanwhile waits for the one that is at it
+            if not file.exists():
+                made = make(loop, *asked, **options)
+                part = file.with_suffix(".part")
+                part.write_bytes(pickle.dumps(made))
+                part.rename(file)
         return pickle.loads(file.read_bytes())
 
     return remembered
+
+
+def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
+    """What a call asks of the loop, defaults by their values, in words that two equal calls share."""
+    from design.coupling_file import digest
+    from design.designs import usual_condition
+    from design.program import DEFAULT
+
+    call = inspect.signature(make).bind(loop, *asked, **options)
+    call.apply_defaults()
+    words = {name: x for name, x in call.arguments.items() if name != "loop" and not callable(x)}
+    if make.__name__ == "design_by_kind":
+        words["condition"] = words["condition"] or usual_condition(loop, words["kind"])
+        words |= (vars(DEFAULT) if words["kind"] == "optimal" else {}) | words.pop("options")
+    return sorted((name, digest(x.form()) if hasattr(x, "form") else repr(x)) for name, x in words.items())
 
 
 @functools.cache

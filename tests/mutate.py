@@ -53,7 +53,7 @@ TABLE = {
     "controller/walls.py": "controller/test_tick controller/test_walls",
     "controller/limiter.py": "controller/test_tick controller/test_limiter",
     "hw/limits.py": "hw/test_limits",
-    "hw/device.py": "hw/test_device hw/test_latch_on_arrival",
+    "hw/device_state.py": "hw/test_device hw/test_latch_on_arrival",
 }
 _ENOUGH = 6.0  # [s] of CPU that the tests of one mutant may take when nothing is wrong; the quickest are taken
 _TIMEOUT = 3.0  # times as long, and some seconds, end a mutant

@@ -12,13 +12,13 @@ from design.coverage import Limits
 from design.designs import KINDS
 from design.guarantees import guarantee_of
 from design.result import Requirement
-from sim.couplings import Chosen, choose, limits_of
+from sim.couplings import NAMES, Chosen, choose, limits_of
 from sim.run import Simulation, assemble
 from sim.scenario import LONGEST_DELAY, InputError, Scenario
 from sim.stability import Mode, worst_mode
 
 #: what a user calls a coupling -> what sim.couplings calls it
-COUPLINGS = {"none": "none", "published": "published", "designed": "spring-damper", "optimal": "optimal", "ccl": "ccl"}
+COUPLINGS = {"designed" if name == "spring-damper" else name: name for name in NAMES}
 #: the other way round: a user may say it as the other commands do
 LABELS = {kind: label for label, kind in COUPLINGS.items()}
 GIVEN = "given"  # the coupling of --coupling FILE.json

@@ -22,8 +22,9 @@ import numpy as np
 from controller.lti import Array, SingularLoop
 from controller.tick import StepBuffer
 from design.result import DesignFailed
-from models.scene import Plant, Scene, plant
-from sim.engines import ExactEngine, HeldPlant, hold
+from models.hold import HeldPlant, hold
+from models.scene import Plant, Scene
+from sim.engines import ExactEngine
 from sim.run import outside_forces, run_block
 from sim.scenario import InputError
 from sim.view.events import Couple, Delay, Event, PreparedLoop, Push, Restart, Script, changed, words
@@ -82,7 +83,7 @@ class Grip:
 
 def gripped(scene: Scene, channel: int, T: float) -> HeldPlant:
     """The plant with the hand's spring and damper on a handle, its end at rest."""
-    free, joint, n = plant(scene.model), scene.handles[channel], scene.model.nq
+    free, joint, n = scene.plant, scene.handles[channel], scene.model.nq
     A, at_handle = free.A.copy(), free.B[:, scene.tapped[channel]]
     A[:, joint] -= STIFFNESS * at_handle
     A[:, n + joint] -= DAMPING * at_handle
@@ -235,7 +236,6 @@ class LiveLoop:
             self._happen(Restart())
             self._note = "the process itself ran away, beyond all numbers: restarted from rest"
             return
-        buffer.saturate(count)
         f = buffer.f[:count, :, 0]
         self.clipped += int((np.abs(f) >= buffer.process.force_limit).any(axis=1).sum())
         self._history = np.concatenate([self._history[count:], f])[-len(self._history) :]
@@ -273,7 +273,7 @@ class LiveLoop:
         """The engine of the plant, with the mouse's hand where there is one, on the present buffer."""
         simulation, held = self.prepared.simulation, self._grip
         plant = gripped(simulation.scene, held.channel, simulation.scenario.T) if held else simulation.plant
-        self._engine = ExactEngine(plant, simulation.process.force_limit)
+        self._engine = ExactEngine(plant)
         self._engine.start(self._buffer)
 
 

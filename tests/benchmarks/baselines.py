@@ -27,8 +27,8 @@ from controller.delay import delay
 from controller.environment import environment, environment_of
 from controller.lti import Array, Lti
 from design import design_coupling
+from models.hold import HeldPlant, hold
 from models.scene import Crowd, variants
-from sim.engines import HeldPlant, hold
 from sim.run import assemble, outside_forces
 from sim.scenario import Scenario, load
 

@@ -21,10 +21,10 @@ from test_engine_cost import SCENES, cpu_seconds, looped, raw
 
 from sim.accuracy import position_error
 from sim.couplings import choose, limits_of
-from sim.engines import EXPONENTIAL
+from sim.mujoco_engines import EXPONENTIAL
 from sim.run import assemble
 from sim.stability import exact_growth
-from sim.stepping import simulated_growth
+from sim.step_choice import simulated_growth
 
 ROUNDS = 9
 COMMANDS = {
@@ -55,7 +55,7 @@ def engines() -> None:
     for name, (_, integrator, count) in settings.items():
         times, ratios = np.array(used[name]).T
         trace = looped(simulation, *settings[name])
-        position = position_error(trace, exact, simulation)["position_relative_rms"]
+        position = position_error(trace, exact, simulation).position_relative_rms
         growth = simulated_growth(simulation, integrator, count) - exact_growth(simulation) if integrator else 0.0
         print(
             f"| {name} | {1e3 * np.median(times):.0f} ms | {np.median(slow / times):.1f} x as fast as RK4 x 4 | "

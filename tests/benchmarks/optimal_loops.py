@@ -61,7 +61,7 @@ def _row(path: Path, most: int, limited: int) -> None:
     loop = load(path).loop("I")
     before, beat = BEFORE.get(path.stem[:2], ("", ""))
     found, seconds = _timed(lambda: design(loop, PATIENT))
-    limit, took = _timed(lambda: f"{bound(loop, near=found.coupling).rms_db:7.2f}" if loop.channels <= most else "")
+    limit, took = _timed(lambda: f"{bound(loop).rms_db:7.2f}" if loop.channels <= most else "")
     held = design(loop, replace(PATIENT, limiter=True)) if loop.channels <= limited else None
     shown = f"{held.figures.rms_mismatch_db:8.2f}" if held and held.proved else ""
     figures = found.figures

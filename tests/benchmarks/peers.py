@@ -22,7 +22,7 @@ import numpy as np
 from controller.coupling import CASE_I
 from controller.lti import Array
 from models.scene import actuation, tendon_jacobian
-from sim.engines import EXPONENTIAL
+from sim.mujoco_engines import EXPONENTIAL
 from sim.run import Simulation, assemble, make_engine, outside_forces, run
 from sim.scenario import load
 from sim.stability import MARGINAL, close, dominant_mode, measured_growth

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from hw.device import Device
+from hw.device_state import Device
 from hw.protocol import Config, Decoder, Force, Info, State, encode
 
 pytestmark = pytest.mark.benchmark(group="frame", timer=time.process_time)  # CPU time: others may use the machine

@@ -11,10 +11,12 @@ import pytest
 from controller.coupling import CASE_I, NoCoupling
 from controller.tick import StepBuffer
 from design.conditions import this_environment
+from models.hold import hold
 from models.scene import variants
 from sim.adversary import attempts
 from sim.crowds import crowds
-from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold, profiler_off
+from sim.engines import ExactEngine
+from sim.mujoco_engines import MujocoBatchEngine, profiler_off
 from sim.run import assemble, run_block
 from sim.scenario import load
 from sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
@@ -55,7 +57,7 @@ def test_batched_exact_engine(benchmark, held_by):
     """CPU seconds for the whole loop: process, limits and plant of every simulation."""
     simulation, ticks, short = assemble(load(), CASE_I), 960, 32
     plants = hold(held_by.plants(), simulation.scenario.T)
-    engine = ExactBatchEngine(plants, simulation.process.force_limit)
+    engine = ExactEngine(plants)
     buffer = StepBuffer(simulation.process, short, plants.A.shape[1], held_by.scene.outside, HUMANS)
     rng = np.random.default_rng(0)
     buffer.s[0] = 1e-4 * rng.normal(size=buffer.s[0].shape)

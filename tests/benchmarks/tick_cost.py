@@ -20,11 +20,11 @@ from collections import defaultdict
 from hw.control import certified_couplings
 from hw.emulator import Emulator, Terminal
 from hw.faults import lively
+from hw.haptic_device import SerialDevice
 from hw.limits import ENDED, Stage
 from hw.monitor import LinkSettings
 from hw.protocol import Command, Decoder, Force, State, encode
 from hw.recording import Recorder
-from hw.seam import SerialDevice
 from hw.session import session_for
 from hw.transport import Live, SerialPort
 from sim.scenario import load

@@ -10,7 +10,7 @@ from worlds import PAIR, SOFT
 from cli.check import main
 from cli.options import execute
 from design.certificate import prove
-from design.stored import Stored, save
+from design.coupling_file import Stored, save
 
 
 def leave(monkeypatch, *argv: str) -> int:

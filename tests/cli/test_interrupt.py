@@ -10,8 +10,8 @@ import pytest
 
 from cli.options import execute
 from controller.coupling import SpringDamper
+from design.coupling_file import Stored, save
 from design.files import check_file, out_file
-from design.stored import Stored, save
 from sim.scenario import InputError, load
 
 ROOT = Path(__file__).parents[2]

@@ -9,6 +9,7 @@ import pytest
 from cli import options, render
 from cli.audit import main as audit
 from cli.run import main as run
+from controller.loop import DelayRange
 from design.files import one_line
 from sim.scenario import InputError
 
@@ -54,8 +55,8 @@ def test_good_words():
     assert (args.count, args.length, args.K, args.theta) == (3, 1e-3, (1.0, 2.0), (0,))
     assert args.mark == [(5000.0, 0.0), (1.0, 2.0)]
     assert options.per_channel("--theta", args.theta, 3) == (0, 0, 0)
-    assert options.ranges_per_channel("--varying-delay", args.varying_delay, 2) == ((1, 0), (2, 3))
-    assert options.ranges_per_channel("--varying-delay", options.delay_ranges("1,2"), 2) == ((1, 1), (2, 2))
+    assert options.delay_range(args.varying_delay, 2, 9) == DelayRange((1, 0), (2, 3))
+    assert options.delay_range(options.delay_ranges("1,2"), 2, 9) == DelayRange((1, 1), (2, 2))
     with pytest.raises(InputError, match="--K has 2 entries, expected 3"):
         options.per_channel("--K", args.K, 3)
 

@@ -10,10 +10,10 @@ from importlib import import_module
 
 import pytest
 
-from cli import suite
-from cli import suite as suite_report
+from cli import suite, suite_report
 from cli.options import Parser
 from cli.suite import CHECKS, Check, main
+from hw import endurance
 from sim.scenario import InputError
 
 HARD = next(check for check in CHECKS if check.name == "hard")
@@ -72,7 +72,7 @@ def test_the_report_begins_with_verdicts_and_every_number_has_its_command(tmp_pa
 
 
 def test_a_check_that_fails_fails_the_suite_and_the_rest_is_done(tmp_path, quick, monkeypatch):
-    monkeypatch.setattr("sim.hard.CLOSE", 0.0)  # as if the rule were wrong
+    monkeypatch.setattr("sim.checks.hard.CLOSE", 0.0)  # as if the rule were wrong
     assert main(["--humans", "5", "--out", str(tmp_path)]) == 1
     text = (tmp_path / "report.md").read_text()
     assert "**1 of 2 checks hold; not: hard.**" in text
@@ -92,12 +92,12 @@ def test_a_check_that_cannot_run_is_no_success(tmp_path, monkeypatch, capsys):
 
 
 def test_a_session_of_seconds_and_some_hands_end_as_they_must_with_flat_memory():
-    session = suite.endure(lambda mark: suite.long_session(mark, 10.0), 4.0)
-    assert session["holds"], session
-    assert re.fullmatch(r"finished \(asked to\) after \d{4,5} ticks", session["result"])
-    hands = suite.endure(lambda mark: suite.many_hands(mark, 1250), 8.0)
-    assert hands["holds"], hands
-    assert hands["result"] == "0 of 1250 unstable"
+    session = endurance.endure(lambda mark: endurance.long_session(mark, 10.0), 4.0)
+    assert session.holds, session
+    assert re.fullmatch(r"finished \(asked to\) after \d{4,5} ticks", session.result)
+    hands = endurance.endure(lambda mark: endurance.many_hands(mark, 1250), 8.0)
+    assert hands.holds, hands
+    assert hands.result == "0 of 1250 unstable"
 
 
 def test_memory_that_grows_and_work_that_goes_wrong_do_not_hold():
@@ -105,25 +105,27 @@ def test_memory_that_grows_and_work_that_goes_wrong_do_not_hold():
 
     def hoards(mark):
         mark(0.1)
-        top = suite._peak()
-        while suite._peak() < top + 16:  # what was freed before is used first
+        top = endurance._peak()
+        while endurance._peak() < top + 16:  # what was freed before is used first
             kept.append(bytearray(2**20))
         return True, "done"
 
-    row = suite.endure(hoards, 8.0)
-    assert row["end_mib"] - row["tenth_mib"] >= 8
-    assert not row["holds"]
-    assert not suite.endure(lambda mark: (mark(0.5), (False, "lost"))[1], 8.0)["holds"]
+    row = endurance.endure(hoards, 8.0)
+    assert row.end_mib - row.tenth_mib >= 8
+    assert not row.holds
+    assert not endurance.endure(lambda mark: (mark(0.5), (False, "lost"))[1], 8.0).holds
 
 
 def test_long_work_is_done_by_a_process_of_its_own(monkeypatch):
     """One that dies is a row that does not hold."""
-    monkeypatch.setattr(suite, "_LONG", (("dies", os.abort, 8.0), ("runs", partial(suite.many_hands, count=125), 8.0)))
-    died, ran = suite.endurance(1)
-    assert (died["result"], died["holds"]) == ("broke off", False)
-    assert ran["result"] == "0 of 125 unstable"
-    assert ran["holds"]
-    parts = suite_report.memory_table({"rows": [died, ran]})
+    monkeypatch.setattr(
+        endurance, "_LONG", (("dies", os.abort, 8.0), ("runs", partial(endurance.many_hands, count=125), 8.0))
+    )
+    died, ran = endurance.endurance(1)
+    assert (died.result, died.holds) == ("broke off", False)
+    assert ran.result == "0 of 125 unstable"
+    assert ran.holds
+    parts = suite_report.memory_table({"rows": [vars(died), vars(ran)]})
     assert parts[0].rows[0][2:] == ("-", "-")
     assert parts[0].answer == "1 of 2 end as they must, with flat memory"
 

@@ -10,8 +10,8 @@ from controller.coupling import SpringDamper
 from controller.environment import FIGURE_4, Network, Spring, environment, environment_of
 from controller.lti import Lti
 from design import design_coupling
+from models.hold import hold as hold_input
 from models.scene import Crowd, variants
-from sim.engines import hold as hold_input
 from sim.scenario import load
 
 T = 1.2e-3
@@ -144,7 +144,7 @@ def test_a_coupling_on_springs_that_it_was_not_made_for():
         s, z, line = np.zeros((nsim, plants.A.shape[-1])), np.zeros((F.order, nsim)), np.zeros((3, 2, nsim))
         s[:, s.shape[1] // 2 :] = 0.1
         x = acted = supplied = np.zeros((2, nsim))
-        for k in range(6000):
+        for k in range(4000):
             dx, x = s[:, :2].T - x, s[:, :2].T.copy()
             wanted = np.clip(F.C @ z + F.D @ x, -12, 12)
             z = F.A @ z + F.B @ x

@@ -20,7 +20,6 @@ def drive(process: Process, x: np.ndarray) -> np.ndarray:
     for k, row in enumerate(x):
         buffer.x[k] = row[:, None]
         buffer.tick(k)
-    buffer.saturate(len(x))
     return buffer.f[: len(x), :, 0]
 
 

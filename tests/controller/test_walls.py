@@ -17,15 +17,17 @@ from controller.loop import force_map
 from controller.lti import SingularLoop
 from controller.tick import Process, StepBuffer
 from controller.walls import contact
-from design.audit import report, requirement
+from design.audit import audit, requirement
 from design.certificate import assess, prove
 from design.conditions import this_environment
 from design.guarantees import MAKING
 from models.device import CompliantDevice
+from models.hold import hold
 from models.human import Population
 from models.scene import variants
 from sim.crowds import crowds
-from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold
+from sim.engines import ExactEngine
+from sim.mujoco_engines import MujocoBatchEngine
 from sim.run import assemble, run, run_blocks
 from sim.scenario import SCENARIOS, InputError, load, parse
 
@@ -184,7 +186,7 @@ def test_random_hands_on_walls_come_to_rest_under_any_environment(name, humans, 
     ((_, crowd),) = crowds(Population(damping=(0.3, 30.0)), 2, 0, range(humans), 1)
     sets = variants(scenario.device, crowd)
     if name == "exact":
-        engine = ExactBatchEngine(hold(sets.plants(), scenario.T), loop.process.force_limit)
+        engine = ExactEngine(hold(sets.plants(), scenario.T))
     else:
         engine = MujocoBatchEngine(sets.scene, scenario.T, nsim=humans, fields=sets.fields)
     n = sets.scene.model.nv
@@ -262,7 +264,7 @@ def test_a_stiffer_coupling_is_promised_for_walls_that_make_and_break():
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
     assert requirement(loop, coupling, "this-environment").certified
     assert not requirement(loop, coupling, "any-environment").certified
-    assert report(loop, coupling)["promise"] == MAKING
+    assert audit(loop, coupling).promise == MAKING
     stiff = SpringDamper([1772.0], [0.453])
     assert not requirement(loop, stiff, "this-environment").certified
     assert all(this_environment(state.F(stiff), loop.delta).certified for state in loop.frozen())

@@ -16,9 +16,10 @@ from controller.environment import FIGURE_4, GROUND, RIGID_WALL, Network, Spring
 from controller.loop import Loop
 from controller.lti import Lti
 from controller.ranges import Ranges
-from design import certificate, frequency, stored
+from design import certificate, coupling_file, frequency
 from design.api import certify
-from design.audit import MOST_EXTRA_SAMPLES, edge, remedies, report, requirement, stiffest, tolerance
+from design.audit import MOST_EXTRA_SAMPLES, audit, edge, remedies, requirement, sensitivity, stiffest
+from design.files import plain
 from design.guarantees import ANY, CAVEATS, guarantee_of
 
 CONDITIONS = ("this-environment", "any-environment")
@@ -30,6 +31,11 @@ def pair(coupling, **changes) -> tuple[Loop, Coupling]:
     """A coupling in the default scenario's loop."""
     loop = {"T": T, "theta": (1, 2), "psi": (0, 0), "delta": (1.37, 1.37), "environment": FIGURE_4} | changes
     return Loop(lam=loop["theta"], **loop), coupling
+
+
+def report(*subject):
+    """As its JSON."""
+    return plain(audit(*subject))
 
 
 def wall(K: float, B: float, theta: int = 0, delta: float = 1.37, T: float = 1e-3) -> tuple[Loop, Coupling]:
@@ -80,8 +86,8 @@ def test_a_coupling_before_a_rigid_wall_is_proved_and_stored_like_any_other(thet
     assert guarantee_of(needs, loop) == ((ANY if theta == 0 else "a rigid wall only") if proved else None)
     if proved:
         made = certificate.prove(loop, coupling, "this-environment")
-        stored.save(stored.Stored.of(loop, coupling, made), tmp_path / "wall.json")
-        again = stored.load(tmp_path / "wall.json")
+        coupling_file.save(coupling_file.Stored.of(loop, coupling, made), tmp_path / "wall.json")
+        again = coupling_file.load(tmp_path / "wall.json")
         assert again.loop == loop
         assert certificate.verify(again).proved
 
@@ -112,8 +118,8 @@ def test_the_stiffest_spring_before_a_wall_is_colgates(condition, theta, K):
 def test_the_largest_period_before_a_wall_is_colgates():
     subject = wall(1000, 0.37)
     for condition in CONDITIONS:
-        found = tolerance(*subject, requirement(*subject, condition))
-        assert found.largest_T == pytest.approx(2 * (1.37 - 0.37) / 1000, rel=1e-6)
+        found = sensitivity(*subject, requirement(*subject, condition))
+        assert found.largest_T_s == pytest.approx(2 * (1.37 - 0.37) / 1000, rel=1e-6)
 
 
 def test_the_papers_gains_and_their_figures():
@@ -142,9 +148,9 @@ def test_just_inside_is_certified_and_just_outside_is_not(subject, condition):
     loop, coupling = subject
     needs = requirement(loop, coupling, condition)
     assert needs.certified
-    found = tolerance(loop, coupling, needs)
+    found = sensitivity(loop, coupling, needs)
     K = np.array(stiffest(loop, coupling, condition).K)
-    least, T = np.array(found.least_delta), found.largest_T
+    least, T = np.array(found.least_delta), found.largest_T_s
     change, later = msgspec.structs.replace, [n + found.extra_samples for n in loop.theta]
     inside = [
         (loop, SpringDamper(K, coupling.B)),
@@ -164,13 +170,13 @@ def test_just_inside_is_certified_and_just_outside_is_not(subject, condition):
 
 def test_figures_that_do_not_exist_say_why():
     spring = wall(0.01, 0.0, delta=1.0)
-    found = tolerance(*spring, requirement(*spring, "this-environment"))
-    assert (found.largest_T, found.extra_samples) == (None, None)
+    found = sensitivity(*spring, requirement(*spring, "this-environment"))
+    assert (found.largest_T_s, found.extra_samples) == (None, None)
     assert f"{MOST_EXTRA_SAMPLES} samples more" in found.reason
     assert "largest T tried" in found.reason
     assert "no scale of K" in stiffest(*wall(5000, 30), "this-environment").reason
     assert "stiffest K tried" in stiffest(*pair(SAFE, delta=(3.0, 3.0)), "this-environment").reason
-    assert "nothing to lose" in tolerance(*pair(CASE_I), requirement(*pair(CASE_I), "this-environment")).reason
+    assert "nothing to lose" in sensitivity(*pair(CASE_I), requirement(*pair(CASE_I), "this-environment")).reason
 
 
 def test_remedies_are_tried_and_mild():
@@ -270,10 +276,10 @@ def test_gains_of_a_device_name_their_source(run):
 def files(tmp_path):
     """A spring-damper for the default scenario, the same as a state space, and a file that is none."""
     loop = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
-    stored.save(stored.Stored.of(loop, SAFE), tmp_path / "gains.json")
-    stored.save(stored.Stored(loop, Compliance(SAFE.compliance(T)).form()), tmp_path / "space.json")
+    coupling_file.save(coupling_file.Stored.of(loop, SAFE), tmp_path / "gains.json")
+    coupling_file.save(coupling_file.Stored(loop, Compliance(SAFE.compliance(T)).form()), tmp_path / "space.json")
     unstable = Compliance(Lti(1.1 * np.eye(2), np.eye(2), np.eye(2), np.eye(2), T))
-    stored.save(stored.Stored.of(loop, unstable), tmp_path / "unstable.json")
+    coupling_file.save(coupling_file.Stored.of(loop, unstable), tmp_path / "unstable.json")
     (tmp_path / "broken.json").write_text("{")
 
 

@@ -17,11 +17,11 @@ from design import certificate as design_certificate
 from design import spring_damper
 from design.certificate import Verdict, prove, required_damping, verify
 from design.conditions import this_environment
+from design.coupling_file import Stored, digest, load, save, sealed
 from design.files import InputError
 from design.frequency import frequencies, on_circle, rounding
 from design.result import NotProved, from_ratio
-from design.stored import Stored, digest, load, save, sealed
-from sim.random_loops import proofs
+from sim.checks.random_loops import proofs
 from sim.scenario import load as scenario
 
 DEFAULT = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)

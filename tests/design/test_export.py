@@ -19,9 +19,9 @@ from controller.loop import Loop, force_map
 from controller.lti import Lti
 from controller.tick import Process, StepBuffer
 from design.certificate import prove, prove_limiter
+from design.coupling_file import Stored, save
 from design.export import process_block, sequential, trial
 from design.files import InputError, one_command
-from design.stored import Stored, save
 
 SPRINGS = SpringDamper((300.0, 200.0), (0.0, 0.0))  # no state at all
 FULL = Compliance(

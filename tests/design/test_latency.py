@@ -13,10 +13,10 @@ from controller.lti import Lti, Sampled
 from design.api import design_coupling, transparency_of
 from design.certificate import assess, prove, required_damping, verify
 from design.conditions import latency_demand, least_scale, this_environment, this_environment_demand
+from design.coupling_file import Stored
 from design.frequency import frequencies, hermitian, on_circle
 from design.guarantees import LATE
 from design.result import NotProved
-from design.stored import Stored
 
 T, TAU, K = 1.2e-3, 0.13e-3, 1000.0
 SOFT = SpringDamper([879.0, 552.0], [0.39, 0.52])

@@ -5,7 +5,7 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
-from worlds import DELTA, PAIR, T
+from worlds import DELTA, PAIR, STIFF, T
 
 from cli.design import main as design_main
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
@@ -13,13 +13,14 @@ from controller.environment import Network, Wall
 from controller.loop import DelayRange
 from controller.lti import Lti, Sampled, taps
 from controller.ranges import Ranges
+from design import multipliers
 from design.certificate import lag, prove, prove_limiter, verify
 from design.conditions import least_multiple, this_environment
+from design.coupling_file import Certificate, LimiterCertificate, Stored, load, save, sealed
 from design.frequency import hermitian, on_circle
 from design.multipliers import limiter, limiter_demand, limiter_lag, limiter_requirement
 from design.result import NotProved
 from design.spring_damper import design
-from design.stored import Certificate, LimiterCertificate, Stored, load, save, sealed
 from design.transparency import transparency
 from sim.scenario import InputError
 
@@ -113,7 +114,7 @@ def test_the_coupling_designed_with_the_block():
         (NoCoupling(), 1.74600),
         (CASE_I, 1.41600),
         (SpringDamper((879.0, 552.0), (0.39, 0.52)), 0.72345),
-        (SpringDamper((7806.0, 3137.0), (0.105, 1.68)), 1.38533),
+        (STIFF, 1.38533),
         (BUILT, 1.32327),
     ],
     ids=["none", "published", "any-environment", "this-environment", "built"],
@@ -132,6 +133,18 @@ def test_no_multiplier_on_a_grid_is_better():
     grid = product(np.linspace(0.1, 0.6, 6), np.linspace(0.4, 0.9, 6))
     others = [limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG, ((a,), (b,))).requirement.ratio for a, b in grid]
     assert min(others) >= best * (1 - 1e-6)
+
+
+def test_for_many_devices_no_multiplier_is_sought(monkeypatch):
+    """The search grows with the fourth power of their number; at c = 0 one sweep is left, which asks for more."""
+    best = limiter_requirement(PAIR, BUILT)
+    monkeypatch.setattr(multipliers, "_MOST_SEARCHED", 1)
+    monkeypatch.setattr(multipliers._LimiterSearch, "least", None)
+    simple = limiter_requirement(PAIR, BUILT)
+    assert simple.c == ((0.0,), (0.0,))
+    assert simple.requirement.required[0] == pytest.approx(required(BUILT, simple.c))
+    assert simple.requirement.required[0] >= best.requirement.required[0]
+    assert limiter_requirement(PAIR, BUILT, c=best.c).requirement.required == pytest.approx(best.requirement.required)
 
 
 def test_unequal_weights_need_enough_lag():
@@ -193,7 +206,7 @@ def test_the_exact_proof_survives_the_file(stored, tmp_path):
 
 def test_files_without_it_stay_as_they_were(tmp_path):
     """A coupling needs 1.385 with the limiter: its linear proof is untouched, the other is refused with the figure."""
-    stiff = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
+    stiff = STIFF
     plain = prove(PAIR, stiff, "this-environment")
     assert "limiter" not in msgspec.to_builtins(plain)
     assert lag(PAIR, plain) is None

@@ -23,6 +23,12 @@ SMALL = Options(ladder=LADDER[:1])
 IMPOSSIBLE = Point(0.0, load().replace(theta=(60, 60), delta=(1e-3, 1e-3)).loop("I"), SMALL)
 
 
+@pytest.fixture(scope="module")
+def impossible():
+    """What is measured where no spring-damper is found, once: the search takes seconds."""
+    return measured(IMPOSSIBLE, "spring-damper", "this-environment", {})
+
+
 def run(tmp_path, *options):
     file = tmp_path / "r.json"
     code = main([*options, "--out", str(tmp_path / "out"), "--json", str(file)])
@@ -89,11 +95,10 @@ def test_more_rungs_are_never_worse():
     assert rms == sorted(rms, reverse=True)
 
 
-def test_a_point_without_a_solution_keeps_its_reason():
-    limit = measured(IMPOSSIBLE, "spring-damper", "this-environment", {})
-    assert limit.rms_mismatch_db is None
-    assert limit.reason
-    assert limit.wall_s > 0
+def test_a_point_without_a_solution_keeps_its_reason(impossible):
+    assert impossible.rms_mismatch_db is None
+    assert impossible.reason
+    assert impossible.wall_s > 0
 
 
 def test_nothing_is_designed_twice():
@@ -133,8 +138,8 @@ def test_the_command_draws_and_reports(tmp_path):
     assert not report["interrupted"]
 
 
-def test_nothing_found_is_exit_code_1(tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "optimum", lambda point: measured(IMPOSSIBLE, "spring-damper", "this-environment", {}))
+def test_nothing_found_is_exit_code_1(tmp_path, monkeypatch, impossible):
+    monkeypatch.setattr(limit_curve, "optimum", lambda point: impossible)
     code, report = run(tmp_path, "--over", "order=1:2", "--points", "2", "--beside", "none")
     assert code == 1
     assert all(row["reason"] for row in report["sweeps"]["order"]["optimal"])
@@ -150,7 +155,7 @@ def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return measured(point, "spring-damper", "any-environment", {})  # what is designed does not matter here
 
-    monkeypatch.setattr(command, "optimum", interrupted)
+    monkeypatch.setattr(limit_curve, "optimum", interrupted)
     code, report = run(tmp_path, "--over", "damping=1.3:1.5", "--points", "4", "--beside", "none")
     assert code == 130
     assert report["interrupted"]
@@ -175,7 +180,7 @@ def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
         (["--ladder", "--seconds", "3"], "--seconds is for --over, not for --ladder"),
         (["--ladder", "--case", "II"], "--ladder shows both cases"),
         (["--ladder", "long"], "argument --ladder: invalid choice: 'long'"),
-        (["--over", "order=1:500"], "--over order=1:500: the range 1:500 is none between 1 and 4 rungs"),
+        (["--over", "order=1:500"], "--over order=1:500: the range 1:500 is none between 1 and 5 rungs"),
         (["--over", "period=1e-9:1"], "--over period=1e-9:1: the range"),
         (["--over", "--delta", "0"], "expected positive dampings"),
     ],
@@ -248,11 +253,11 @@ def test_the_ladder_is_a_command(tmp_path, monkeypatch):
 # what is proved ---------------------------------------------------------------------------------------------------
 
 
-def test_a_point_says_what_is_proved_of_it(monkeypatch):
+def test_a_point_says_what_is_proved_of_it(monkeypatch, impossible):
     """Each design's own condition; a proof that fails leaves the point sampled, with the reason."""
     point = points_along("order", LOOP, SMALL, 1)[0]
     assert (optimum(point).proof, optimum(point).proof_reason) == ("rational", None)
-    assert measured(IMPOSSIBLE, "spring-damper", "this-environment", {}).proof is None
+    assert impossible.proof is None
 
     def hopeless(*arguments):
         raise limit_curve.NotProved("too many states")

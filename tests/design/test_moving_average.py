@@ -8,7 +8,7 @@ from controller.lti import Lti, taps
 from design import certify, design_coupling, transparency_of
 from design.certificate import prove, verify
 from design.conditions import any_environment
-from design.stored import Stored, load, save
+from design.coupling_file import Stored, load, save
 from design.transparency import decibels
 from sim import load as scenario_of
 from sim import simulate

@@ -14,9 +14,9 @@ from controller.environment import FIGURE_4, Network, Spring
 from controller.loop import DelayRange, Loop
 from design.certificate import assess, prove, prove_limiter, required_damping, verify
 from design.conditions import any_environment, any_environment_demand, even_damping, this_environment_demand
+from design.coupling_file import Stored, digest
 from design.multipliers import limiter_requirement, swept
 from design.spring_damper import design
-from design.stored import Stored, digest
 
 T, LONG = 1e-3, 1.6e-3
 LOOP = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)

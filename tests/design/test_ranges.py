@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import replace
-from itertools import pairwise, product
+from itertools import combinations, pairwise, product
 
 import msgspec
 import numpy as np
@@ -19,13 +19,13 @@ from controller.coupling import SpringDamper as StoredSpringDamper
 from controller.delay import VaryingDelay
 from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.loop import Loop, force_map
-from controller.ranges import Ranges, UncertainSpring, inside, members
+from controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices
 from design import optimal
 from design.certificate import check_ranges, prove, verify
+from design.coupling_file import Stored, digest, load, save, sealed
 from design.coverage import ranges_part
 from design.program import Options
 from design.result import NotProved
-from design.stored import Stored, digest, load, save, sealed
 from sim import scenario
 from sim.scenario import SCENARIOS, InputError, parse
 
@@ -117,17 +117,30 @@ def test_samples_lie_inside_and_do_not_depend_on_their_number():
     assert all(m.network.springs[1] == FIGURE_4.springs[1] for m in drawn)
 
 
-def test_the_number_of_vertices_is_limited():
-    nodes = [f"n{i}" for i in range(7)]
+def chain(links: int) -> tuple[Network, Ranges]:
+    """Springs in a row, each of 50 to 200 N/m."""
+    nodes = [f"n{i}" for i in range(links + 1)]
     springs = [Spring((a, b), 100.0, 1.0) for a, b in pairwise(nodes)]
-    network = Network(("n0",), tuple(springs), dict.fromkeys(nodes[1:], 1.0))
-    ranges = Ranges(
-        tuple(UncertainSpring(s.between, (50.0, 200.0)) for s in springs), {"n1": (0.5, 2.0), "n2": (0.5, 2.0)}
-    )
-    with pytest.raises(
-        ValueError, match="ranges have 256 vertices, allowed are 128: leave out the ranges that matter least"
-    ):
-        members(network, ranges)
+    ranges = Ranges(tuple(UncertainSpring(s.between, (50.0, 200.0)) for s in springs))
+    return Network(("n0",), tuple(springs), dict.fromkeys(nodes[1:], 1.0)), ranges
+
+
+@pytest.mark.parametrize("links", [8, 11, 30])
+def test_of_many_vertices_any_three_parameters_have_every_combination_of_ends(links):
+    chosen = members(*chain(links))[1:]
+    ends = np.array([[spring.stiffness for spring in member.network.springs] for member in chosen])
+    assert len(ends) == 128
+    assert set(np.unique(ends)) == {50.0, 200.0}
+    for three in combinations(range(links), 3):
+        found, times = np.unique(ends[:, three], axis=0, return_counts=True)
+        assert len(found) == 8
+        assert set(times) == {16}
+    assert number_of_vertices(*chain(links)) == 2**links
+
+
+def test_the_number_of_parameters_is_limited():
+    with pytest.raises(ValueError, match="ranges have 65 pairs of ends, allowed are 64: leave out some"):
+        members(*chain(65))
 
 
 @pytest.mark.parametrize(
@@ -339,7 +352,18 @@ def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, 
     assert (code, checked["promise"], checked["vertices"]) == (0, "these ranges", 3)
 
     out = ["--out", str(tmp_path / "out"), *common]
-    at_vertex = ["--coupling", str(file), "--vertex", "3", "--engine", "exact", "--duration", "1", "--no-plot"]
+    at_vertex = [
+        "--coupling",
+        str(file),
+        "--vertex",
+        "3",
+        "--engine",
+        "exact",
+        "--duration",
+        "1",
+        "--no-plot",
+        "--no-alternatives",
+    ]
     code, run = told(run_main, *at_vertex, *out)
     assert (code, run["promise"]) == (0, "these ranges")
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")

@@ -24,12 +24,12 @@ from design import certify
 from design import exact as positive_real
 from design.certificate import condition_block, prove, refuted, verify
 from design.conditions import this_environment
+from design.coupling_file import Certificate, Stored, digest, load, save, sealed
 from design.exact import Matrix
 from design.files import InputError
 from design.frequency import hermitian
 from design.multipliers import switching_block, switching_sweep
 from design.result import NotProved
-from design.stored import Certificate, Stored, digest, load, save, sealed
 from hw.control import certified_couplings
 from sim.scenario import load as scenario_of
 
@@ -315,7 +315,7 @@ def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, m
 def test_a_design_for_a_range_without_its_theta_is_refused(tmp_path):
     options = ["--condition", "this-environment", "--varying-delay", "2,3", "--out", str(tmp_path / "c.json")]
     with pytest.raises(
-        ValueError, match=r"--varying-delay is 2-3: theta is \[1, 2\], outside of its varying_delay, \[2, 3\] samples"
+        ValueError, match=r"--varying-delay: theta is \[1, 2\], outside of its varying_delay, \[2, 3\] samples"
     ):
         design_main(options)
 

@@ -9,18 +9,17 @@ import pytest
 from worlds import VERTICES_ONLY, environment_by_hand, filter_by_hand
 
 from cli.check import main as check_main
-from cli.design import _store
 from controller.coupling import ForceFilter, InternalModel
 from controller.environment import FIGURE_4, Network, Spring
 from controller.ranges import Member, Ranges, Region, UncertainSpring, members, regions
 from design import optimal
-from design.api import certify
+from design.api import certify, store
 from design.certificate import check_ranges, prove, verify
+from design.coupling_file import Stored, load, save
 from design.coverage import ranges_part, ranges_rows
 from design.environments import search
 from design.program import Options
 from design.result import Design
-from design.stored import Stored, load, save
 from sim import scenario
 from sim.scenario import SCENARIOS
 
@@ -117,6 +116,23 @@ def test_a_peak_is_found_wherever_it_lies(top):
     assert found.worst[0].ratio > 0.99
 
 
+def test_of_many_parameters_the_worst_vertex_is_found_and_the_clock_ends_the_search():
+    """A need that is most where odd parameters are at their upper ends, the others at their lower."""
+    region = cube(10)
+    signs = np.array([1, -1] * 5)
+
+    def need(member: Member) -> float:
+        return float(signs @ (point_of(member) - region.low))
+
+    found = search([region], need)
+    np.testing.assert_array_equal((point_of(found.worst[0].member) - region.low) / 10, signs > 0)
+    assert not found.ended
+    short = search([region], need, seconds=0.0)
+    assert short.ended
+    assert short.tried == 1
+    assert len(short.worst) == 1
+
+
 def test_two_regions_are_both_searched_and_their_worst_comes_first():
     one, other = cube(1), cube(2)
     found = search([one, other], lambda m: float(point_of(m).sum()))
@@ -173,7 +189,7 @@ def test_fewer_samples_do_not_make_it_a_guarantee():
 def test_its_file_is_stored_for_the_environment_alone(known, tmp_path):
     assert known.at_members[0].certified
     design = Design(VERTICES_ONLY, "this-environment", "rms", 0.07, known.at_members[0], 1, 0.0)
-    assert _store(RANGED, design, known, tmp_path / "c.json")["proof"] == "rational"
+    assert store(RANGED, design, tmp_path / "c.json", known).proof == "rational"
     stored = load(tmp_path / "c.json")
     assert (stored.loop.ranges, stored.certificate.guarantee) == (None, "this environment")
 

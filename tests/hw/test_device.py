@@ -2,7 +2,7 @@
 
 import pytest
 
-from hw.device import Device
+from hw.device_state import Device
 from hw.protocol import (
     NO_MARGIN,
     Ack,

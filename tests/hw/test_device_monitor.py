@@ -9,9 +9,10 @@ from worlds import FakePort
 
 from design.files import plain
 from hw.control import certified_couplings
-from hw.device import Device
+from hw.device_state import Device
 from hw.emulator import Emulator, FaultInjection, info_of, nobody
 from hw.faults import lively
+from hw.haptic_device import Driver, SerialDevice
 from hw.identify import chirp
 from hw.limits import SafetyLimits, SafetyStop, Stage
 from hw.monitor import (
@@ -28,7 +29,6 @@ from hw.monitor import (
 from hw.protocol import NO_MARGIN, Command, Config, Force, Phase, Reason, Refused, State, Stop, encode
 from hw.recording import Recorder, outcome, result_of
 from hw.rehearsal import Rehearsal
-from hw.seam import Driver, SerialDevice
 from hw.session import Session
 from sim.scenario import load as scenario_of
 from sim.trace import growths

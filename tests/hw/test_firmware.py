@@ -1,4 +1,4 @@
-"""hw/firmware against hw/device.py, byte for byte, and the example sketch on a board that is only memory."""
+"""hw/firmware against hw/device_state.py, byte for byte, and the example sketch on a board that is only memory."""
 
 import ctypes
 import os
@@ -12,7 +12,7 @@ from zlib import crc32
 
 import pytest
 
-from hw.device import Device
+from hw.device_state import Device
 from hw.protocol import (
     LAYOUTS,
     READ,
@@ -74,7 +74,7 @@ def info(axes: int, period_ns: int = 1_200_000) -> Info:
 
 
 class Firmware:
-    """The C side with the interface of hw.device.Device."""
+    """The C side with the interface of hw.device_state.Device."""
 
     def __init__(self, library, about: Info) -> None:
         self.lib, self.axes = library, about.axes

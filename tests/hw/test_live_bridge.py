@@ -27,10 +27,10 @@ from cli.options import Parser
 from cli.session_cli import add_link_options, check_link
 from controller.delay import VaryingDelay
 from hw.control import certified_coupling, certified_couplings
+from hw.haptic_device import SerialDevice
 from hw.limits import ENDED, SafetyLimits, Stage
 from hw.monitor import LinkSettings
 from hw.recording import IncidentLog
-from hw.seam import SerialDevice
 from hw.session import Session
 from hw.transport import Live, SerialPort
 from sim.scenario import InputError

@@ -19,11 +19,11 @@ from cli.session_cli import limits_from, touched
 from hw.control import certified_couplings
 from hw.emulator import Emulator, FaultInjection
 from hw.faults import lively
+from hw.haptic_device import Driver, SerialDevice
 from hw.limits import SafetyLimits, Stage
 from hw.monitor import LinkSettings
 from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
-from hw.seam import Driver, SerialDevice
 from hw.session import Operator, Session, session_for
 from hw.transport import Preflight, preflight
 from sim.scenario import InputError

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hw.device import Device
+from hw.device_state import Device
 from hw.protocol import (
     Ack,
     Cause,

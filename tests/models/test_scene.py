@@ -196,7 +196,8 @@ def test_population_is_log_uniform_and_reproducible():
 
 def test_voluntary_motion_is_smooth_and_its_velocity_its_derivative():
     t = np.linspace(0, 3, 30001)
-    x, v = Voluntary(0.015, 0.6, 0.6, 1.0).motion(t)
+    hand = Voluntary(0.015, 0.6, 0.6, 1.0)
+    x, v = hand.force(t, 1.0, 0.0), hand.force(t, 0.0, 1.0)
     np.testing.assert_allclose(np.gradient(x, t)[1:-1], v[1:-1], atol=2e-6)
     assert (x[0], v[0]) == (0.0, 0.0)
     np.testing.assert_allclose(np.abs(x).max(), 0.015, rtol=1e-6)

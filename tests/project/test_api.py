@@ -20,7 +20,7 @@ from cli.design import main as design_command
 from cli.run import main as run_command
 from cli.validate import main as validate_command
 from controller.coupling import NoCoupling, SpringDamper
-from design import DesignOptions, certify, design_coupling, guarantee, stored, transparency_of
+from design import DesignOptions, certify, coupling_file, design_coupling, guarantee, transparency_of
 from design.designs import KINDS, Kind
 from hw import rehearse
 from models.device import RigidDevice
@@ -271,4 +271,4 @@ def test_a_design_of_ones_own_is_one_function_and_one_row(monkeypatch, tmp_path)
     name, kind = row.split(": ", 1)
     monkeypatch.setitem(KINDS, name.strip('"'), eval(kind, {"Kind": Kind}))
     assert design_command(["--coupling", "half-stiff", "--out", str(tmp_path / "own.json")]) == 0
-    assert stored.load(tmp_path / "own.json").certificate.matrices
+    assert coupling_file.load(tmp_path / "own.json").certificate.matrices

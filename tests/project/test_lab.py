@@ -13,7 +13,7 @@ DESIGNS = [
     ("spring-damper", []),
     ("anywhere", ["--condition", "any-environment"]),
     ("average", ["--coupling", "moving-average"]),
-    ("best", ["--best", "--seconds", "1"]),
+    ("best", ["--best"]),
 ]
 
 

@@ -10,7 +10,7 @@ from cli.accuracy import main
 from controller.coupling import NoCoupling
 from models.device import RigidDevice
 from sim import accuracy as yardstick
-from sim.accuracy import credible_part, mark_front
+from sim.accuracy import Row, credible, with_front
 from sim.run import assemble, run
 from sim.scenario import InputError, load
 
@@ -45,11 +45,10 @@ def test_figures(report):
 
 
 def test_the_front_is_what_nothing_beats():
-    names = ("engine", "wall_s_per_simulated_s", "position_relative_rms", "growth_rate_error", "verdict_correct")
     values = [("a", 1, 1, 1, True), ("a", 2, 0.5, -0.5, True), ("a", 3, 0.5, -0.6, True), ("b", 9, 9, 9, True)]
-    rows = [dict(zip(names, value, strict=True)) for value in (*values, ("a", 0.5, 2, 2, False))]
-    mark_front(rows)
-    np.testing.assert_array_equal([row["pareto"] for row in rows], [True, True, False, True, False])
+    cycle, values = (None,) * 4, (*values, ("a", 0.5, 2, 2, False))
+    rows = [Row(kind, None, None, p, g, right, *cycle, wall) for kind, wall, p, g, right in values]
+    assert [row.pareto for row in with_front(rows)] == [True, True, False, True, False]
 
 
 def test_bad_duration():
@@ -62,15 +61,15 @@ def test_a_run_says_up_to_when_its_devices_could_have_done_it():
     scenario = load()
     simulation = assemble(scenario, NoCoupling())
     trace = run(simulation, "exact")
-    part = credible_part(simulation, trace)
+    part = credible(simulation, trace)
     force = 14500 * np.abs(trace.x - trace.x_handle)
     speed = np.abs(np.gradient(trace.x, scenario.T, axis=0))
-    assert part["transmission_force_n"] == pytest.approx(force.max(axis=0))
-    assert part["motor_speed_m_per_s"] == pytest.approx(speed.max(axis=0), rel=0.1)  # 14 samples a period
-    assert part["until_s"] == trace.t[np.argmax((force > 36).any(axis=1))] == pytest.approx(7.35)
-    assert "transmission carries up to 253 N (credible: 36)" in part["reason"]
+    assert part.transmission_force_n == pytest.approx(force.max(axis=0))
+    assert part.motor_speed_m_per_s == pytest.approx(speed.max(axis=0), rel=0.1)  # 14 samples a period
+    assert part.until_s == trace.t[np.argmax((force > 36).any(axis=1))] == pytest.approx(7.35)
+    assert "transmission carries up to 253 N (credible: 36)" in part.reason
     stiff = tuple(msgspec.structs.replace(d, credible_force=300.0, credible_speed=10.0) for d in scenario.device)
-    assert credible_part(assemble(scenario.replace(device=stiff), NoCoupling()), trace)["until_s"] is None
+    assert credible(assemble(scenario.replace(device=stiff), NoCoupling()), trace).until_s is None
     rigid = assemble(scenario.replace(device=(RigidDevice(), RigidDevice())), NoCoupling())
-    part = credible_part(rigid, run(rigid, "exact", ticks=100))
-    assert (part["transmission_force_n"], part["until_s"]) == ([None] * 2, None)
+    part = credible(rigid, run(rigid, "exact", ticks=100))
+    assert (part.transmission_force_n, part.until_s) == ([None] * 2, None)

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 
 from cli import run as run_command
-from cli.suite import Check, rates, shortages, tightness
+from cli.suite import Check
 from cli.suite import main as suite
+from cli.suite_report import tightness
 from cli.validate import main
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from design.conditions import this_environment as real
 from models.device import RigidDevice
+from models.hold import hold
 from models.scene import build, plant
 from sim import adversary
-from sim.adversary import DESTABILISED, attempts, search
-from sim.engines import hold
+from sim.adversary import DESTABILISED, attempts, search, shortages
 from sim.run import assemble
 from sim.scenario import load
 from sim.stability import close, dominant_mode
@@ -132,9 +133,10 @@ def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypa
 
 def test_the_rate_by_shortage():
     rows = list(shortages(("none", "spring-damper"), (0, 0.2), 10)(1))
-    assert rates(rows) == [{"short": 0, "attempts": 2, "rate": 0.0}, {"short": 0.2, "attempts": 2, "rate": 1.0}]
-    assert {row["loop"] for row in rows} == {"no coupling", "spring-damper, case I"}
-    assert all(row["holds"] for row in rows)
+    whole, _ = tightness({"rows": [vars(row) | {"holds": row.holds} for row in rows]})
+    assert whole.rows == (("0.0%", "2", "0%"), ("20.0%", "2", "100%"))
+    assert {row.loop for row in rows} == {"no coupling", "spring-damper, case I"}
+    assert all(row.holds for row in rows)
 
 
 def test_a_human_who_destabilises_a_loop_with_enough_damping_fails_the_check(tmp_path, monkeypatch):
@@ -144,7 +146,9 @@ def test_a_human_who_destabilises_a_loop_with_enough_damping_fails_the_check(tmp
         return replace(real(F, delta), required=(0.5, 0.5))
 
     monkeypatch.setattr("sim.adversary.this_environment", third)
-    check = Check("tightness", "How tight?", shortages(("none",), (0,), 5), tightness, "plot_tightness")
+    check = Check(
+        "tightness", "How tight?", shortages(("none",), (0,), 5), tightness, lambda plots: plots.plot_tightness
+    )
     monkeypatch.setattr("cli.suite.CHECKS", (check,))
     assert suite(["--out", str(tmp_path)]) == 1
     assert (tmp_path / "tightness" / "tightness.png").stat().st_size > 10_000

@@ -13,9 +13,9 @@ from driven import driven
 
 from controller.coupling import CASE_I, NoCoupling
 from models.scene import plant
-from sim import engines as mujoco_engine
+from sim import mujoco_engines as mujoco_engine
 from sim import run as loop
-from sim.engines import MujocoBatchEngine, MujocoEngine, profiler_off
+from sim.mujoco_engines import MujocoBatchEngine, MujocoEngine, profiler_off
 from sim.run import assemble, make_engine, outside_forces, run
 from sim.scenario import InputError, load
 from sim.stability import close, dominant_mode

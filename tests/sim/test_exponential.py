@@ -4,6 +4,9 @@
 the position that the fastest spring turns it into.
 """
 
+from copy import copy
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -13,25 +16,17 @@ from scipy.linalg import expm
 from controller.coupling import CASE_I, NoCoupling
 from controller.tick import Process, StepBuffer
 from models.device import CompliantDevice
+from models.hold import expm_each, hold
 from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
-from sim import engines
+from sim import mujoco_engines
 from sim.accuracy import compare_engines, cross_check, pick
-from sim.engines import (
-    EXPONENTIAL,
-    INTEGRATORS,
-    Engine,
-    ExactBatchEngine,
-    MujocoBatchEngine,
-    MujocoEngine,
-    default_integrator,
-    expm_each,
-    hold,
-)
+from sim.engines import Engine, ExactEngine
+from sim.mujoco_engines import EXPONENTIAL, INTEGRATORS, MujocoBatchEngine, MujocoEngine, default_integrator
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, load
 from sim.stability import exact_growth
-from sim.stepping import check_substeps, default_substeps, measured_hold, pace, simulated_growth
+from sim.step_choice import check_substeps, default_substeps, measured_hold, pace, simulated_growth
 
 SCENARIO = load()
 RUBBING = SCENARIO.replace(device=(CompliantDevice(friction=0.5),) * 2)
@@ -125,7 +120,8 @@ def test_the_forces_are_mujocos(simulation):
     wrong = 1.5
     errors = []
     for substeps in (8, 16):
-        engine = MujocoEngine(simulation.scene, SCENARIO.T, EXPONENTIAL, substeps)
+        scene = replace(simulation.scene, model=copy(simulation.scene.model))
+        engine, _ = MujocoEngine(scene, SCENARIO.T, EXPONENTIAL, substeps), scene.plant
         engine.model.tendon_stiffness[...] *= wrong
         errors.append(_one_period(simulation.process, engine, simulation.scene.outside))
     truth = hold(plant(engine.model), SCENARIO.T).A
@@ -210,7 +206,7 @@ def test_many_hands_are_each_their_own_scene(substeps):
         own = assemble(SCENARIO.replace(human=crowd.humans(i)), CASE_I)
         alone = knocked(own, make_engine(own, "mujoco", EXPONENTIAL, substeps), 300, start[:, [i]]).s
         np.testing.assert_allclose(together[:, :, [i]], alone, rtol=1e-9, atol=1e-13)
-    exact = ExactBatchEngine(hold(held_by.plants(), SCENARIO.T), loop.process.force_limit)
+    exact = ExactEngine(hold(held_by.plants(), SCENARIO.T))
     np.testing.assert_allclose(together, knocked(loop, exact, 300, start).s, rtol=1e-9, atol=1e-13)
 
 
@@ -281,7 +277,7 @@ def cheapest(loop, error, ticks):
 def test_the_cheapest_on_a_smooth_scene_is_one_exponential_step(simulation):
     found = cheapest(simulation, 1e-9, 500)
     assert (found.integrator, found.substeps) == (EXPONENTIAL, 1)
-    assert found.error < 1e-11
+    assert found.position_relative_rms < 1e-11
     assert found.cpu_s > 0
 
 
@@ -299,7 +295,7 @@ def test_where_devices_rub_the_asked_error_is_kept_with_the_fewest_steps():
     for asked, expected in ((1e-2, (EXPONENTIAL, "Euler")), (1e-4, ("RK4",)), (1e-6, ("RK4",))):
         found = cheapest(loop, asked, ticks)
         assert found.integrator in expected  # of the first two the cheaper one changes with the load
-        assert missed(found.integrator, found.substeps) <= found.error <= asked
+        assert missed(found.integrator, found.substeps) <= found.position_relative_rms <= asked
         if found.substeps > 1:
             assert missed("RK4", found.substeps // 2) > asked / 4
 
@@ -320,22 +316,22 @@ def test_errors_that_nothing_keeps(scenario, error, message):
 def test_a_wrong_verdict_is_shown_and_never_chosen():
     """Explicit Euler calls the loop without a coupling stable, so its errors do not matter."""
     choices = {c.name: c for c in compare_engines(assemble(SCENARIO, NoCoupling()), 1.0, 200)}
-    assert not choices["Euler x 1"].right
-    assert choices["RK4 x 1"].right
-    assert pick(list(choices.values()), 1.0).right
+    assert not choices["Euler x 1"].verdict_correct
+    assert choices["RK4 x 1"].verdict_correct
+    assert pick(list(choices.values()), 1.0).verdict_correct
 
 
 def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
     """The exponential engine with a J that is off by one part in a thousand; RK4 knows no J."""
     loop = assemble(SCENARIO.replace(duration=0.5), CASE_I)
     sound = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), EXPONENTIAL, 1)
-    assert (sound["integrator"], sound["substeps"], sound["agrees"]) == ("RK4", 4, True)
-    assert sound["position_relative_rms"] < 1e-6  # of RK4 x 4 here
-    assert abs(sound["growth_rate_difference_per_s"]) < 1e-3
-    monkeypatch.setattr(engines, "_rates", lambda scene, fields: 1.001 * plant(scene.model).A[None])
+    assert (sound.integrator, sound.substeps, sound.agrees) == ("RK4", 4, True)
+    assert sound.position_relative_rms < 1e-6  # of RK4 x 4 here
+    assert abs(sound.growth_rate_difference_per_s) < 1e-3
+    monkeypatch.setattr(mujoco_engines, "_rates", lambda scene, fields: 1.001 * scene.plant.A[None])
     wrong = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), EXPONENTIAL, 1)
-    assert wrong["position_relative_rms"] > 30 * sound["position_relative_rms"]
-    assert abs(wrong["growth_rate_difference_per_s"]) > 1e-3
+    assert wrong.position_relative_rms > 30 * sound.position_relative_rms
+    assert abs(wrong.growth_rate_difference_per_s) > 1e-3
 
 
 # ---- the exponential of many small matrices

@@ -8,11 +8,11 @@ import pytest
 from cli import run as command
 from cli import trace
 from controller.coupling import NoCoupling
-from sim.random_loops import traces
+from sim.checks.random_loops import traces
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, load
-from sim.stability import close, dominant_mode, stability_part
-from sim.stepping import settle
+from sim.stability import close, dominant_mode, stability_of
+from sim.step_choice import settle
 from sim.trace import Trace, growth, growths
 
 T, STEP = 1.2e-3, np.full(2, 1e-6)
@@ -169,13 +169,13 @@ def alike(duration=2.0):
 def test_a_mode_that_nothing_excites_is_called_so_and_the_verdict_is_the_exact_one(engine):
     """By symmetry the hands, which move alike, do no work on the mode in which the devices move against each other."""
     scenario = alike()
-    quiet = stability_part(*ran(scenario, engine))
-    assert quiet["exact_verdict"] == quiet["verdict"] == "unstable"
-    assert quiet["growth_rate_per_s"] is None
-    assert "not excited" in quiet["reason"]
-    loud = stability_part(*ran(scenario.replace(tap=load("omega-pair").tap), engine))
-    assert loud["verdict"] == "unstable"
-    assert loud["growth_rate_per_s"] == pytest.approx(quiet["exact_growth_rate_per_s"], rel=1e-2)
+    quiet = stability_of(*ran(scenario, engine))
+    assert quiet.exact_verdict == quiet.verdict == "unstable"
+    assert quiet.growth_rate_per_s is None
+    assert "not excited" in quiet.reason
+    loud = stability_of(*ran(scenario.replace(tap=load("omega-pair").tap), engine))
+    assert loud.verdict == "unstable"
+    assert loud.growth_rate_per_s == pytest.approx(quiet.exact_growth_rate_per_s, rel=1e-2)
 
 
 def ran(scenario, engine):

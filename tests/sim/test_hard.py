@@ -6,25 +6,24 @@ from functools import partial
 import numpy as np
 import pytest
 from driven import driven
+from worlds import STIFF
 
-from controller.coupling import CASE_I, NoCoupling, SpringDamper
+from controller.coupling import CASE_I, NoCoupling
 from design.certificate import assess
 from models.device import CompliantDevice
 from models.human import Human, Link
 from sim.accuracy import limit_cycle
-from sim.engines import EXPONENTIAL
-from sim.hard import cases, devices, measure, nominal
+from sim.checks.hard import cases, devices, measure, nominal
+from sim.mujoco_engines import EXPONENTIAL
 from sim.run import assemble, make_engine, outside_forces, run, run_blocks
 from sim.scenario import InputError, load
 from sim.stability import exact_growth
-from sim.stepping import default_substeps, simulated_growth
-
-CLOSED_LOOP = SpringDamper(np.array([7806.0, 3137.0]), np.array([0.105, 1.68]))
+from sim.step_choice import default_substeps, simulated_growth
 
 
 @pytest.mark.parametrize("hard", cases(), ids=lambda hard: hard.name)
 def test_a_setting_fails_and_the_rule_holds(hard):
-    """By GROWTH and POSITION of sim.hard; the rule's own choice has the exact verdict, and growth within 1e-2 1/s."""
+    """By its GROWTH and POSITION; the rule's own choice has the exact verdict, and growth within 1e-2 1/s."""
     row = measure(hard)
     assert row.holds, row
 
@@ -79,14 +78,14 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
     humans = (Human((Link(1.2326, damping, 34.923),)), Human((Link(0.01999, damping, 266.28),)))
     limits = (CompliantDevice(), CompliantDevice(force_limit=5.657))
     scenario = load().replace(human=humans, device=limits, tap=None)
-    loop = assemble(scenario, CLOSED_LOOP)
+    loop = assemble(scenario, STIFF)
     assert exact_growth(loop) < 0
     n = loop.plant.A.shape[0]
     rng = np.random.default_rng(0)
     start = np.concatenate([rng.uniform(-0.5, 0.5, (n // 2, 200)), rng.uniform(-10, 10, (n // 2, 200))])
     start = np.hstack([start, start[:, :near] / 5])
     start[2:4], start[6:8] = start[:2], start[4:6]  # the transmissions start unstretched
-    late = driven(loop.process, make_engine(loop, "exact"), quiet(loop), 40_000, start)
+    late = driven(loop.process, make_engine(loop, "exact"), quiet(loop), 40_000, start, last=1000)
     clipped = (np.abs(late.f[-1000:]) >= loop.process.force_limit[:, None]).any(axis=(0, 1))
     last = late.s[-1000:, 1]
     strongest = last[:, last.std(axis=0).argmax()]
@@ -100,7 +99,7 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
 
 def test_saturation_breaks_a_certificate_and_damped_hands_mend_it():
     """Section 7's counterexample: certified for the linear loop, yet with lossless hands clipping goes on for ever."""
-    assert assess(load().loop("I"), CLOSED_LOOP)["this-environment"].certified
+    assert assess(load().loop("I"), STIFF)["this-environment"].certified
     far, near, frequency = sustained(0.0, near=100)
     print(f"lossless hands: {far:.1%} of 200 far and {near} of 100 near starts clip after 48 s, at {frequency:.2f} Hz")
     assert far > 0.2

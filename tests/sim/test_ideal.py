@@ -7,6 +7,7 @@ import pytest
 
 from cli.run import main
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
+from design.files import plain
 from sim.accuracy import ForceError, force_error, response
 from sim.run import Simulation, assemble, run
 from sim.scenario import load
@@ -46,10 +47,10 @@ def test_the_ideal_force_is_the_networks_for_the_measured_motion(case, late):
     expected = by_hand(SCENARIO.T, record.x, late)
     # 1700 ticks of a lightly damped mass in another order of operations
     np.testing.assert_allclose(alike.ideal, expected, atol=1e-9 * np.abs(expected).max())
-    part, asked = alike.part(), record.f
+    asked = record.f
     np.testing.assert_allclose(alike.asked, asked, atol=1e-12)  # nothing is clipped here
     error = np.sqrt(((asked - expected) ** 2).sum() / (expected**2).sum())
-    assert part["error_percent"] == pytest.approx(100 * error, rel=1e-6)
+    assert alike.error_percent == pytest.approx(100 * error, rel=1e-6)
 
 
 def test_the_response_is_the_convolution_with_the_impulse_response():
@@ -65,19 +66,19 @@ def test_a_loop_without_coupling_is_ideal_even_where_its_motors_clip():
     simulation = assemble(SCENARIO.replace(theta=(2, 3)), NoCoupling())
     record = record_of(simulation, 6.0)
     assert np.abs(record.f).max() == 12.0
-    part = force_error(simulation, record, (2, 3)).part()
-    assert part["asked_rms_n"] > np.sqrt(np.mean(record.f**2))
-    assert part["error_percent"] < 1e-8
+    part = force_error(simulation, record, (2, 3))
+    assert part.asked_rms_n > np.sqrt(np.mean(record.f**2))
+    assert part.error_percent < 1e-8
 
 
 def test_undefined_errors_have_a_reason():
     still = np.zeros((5, 2))
-    assert ForceError(still, still).part()["reason"] == "the ideal environment would have rendered no force"
-    assert ForceError(still[:0], still[:0]).part()["error_percent"] is None
-    lost = ForceError(still + 1, np.full((5, 2), 1e200)).part()
-    assert lost["error_percent"] is None
-    assert lost["asked_rms_n"] is None
-    json.dumps(lost, allow_nan=False)
+    assert ForceError.of(still, still).reason == "the ideal environment would have rendered no force"
+    assert ForceError.of(still[:0], still[:0]).error_percent is None
+    lost = ForceError.of(still + 1, np.full((5, 2), 1e200))
+    assert lost.error_percent is None
+    assert lost.asked_rms_n is None
+    json.dumps(plain(lost), allow_nan=False)
 
 
 def test_the_command_ranks_the_designs(tmp_path):

@@ -17,10 +17,10 @@ from controller.coupling import ForceFilter, InternalModel
 from controller.delay import delay
 from controller.lti import Sampled
 from design.certificate import prove, verify
+from design.coupling_file import Stored, save
+from design.coupling_file import load as load_file
 from design.optimal import design
 from design.program import Options
-from design.stored import Stored, save
-from design.stored import load as load_file
 from hw.control import certified_couplings
 from hw.emulator import Emulator
 from hw.limits import SafetyLimits, Stage

@@ -10,12 +10,12 @@ from cli.run import main
 from cli.validate import main as validate_command
 from controller.coupling import CASE_I, NoCoupling
 from design import design_coupling
+from models.hold import hold
 from models.human import Human, Link, Person, Port, state_space
 from models.scene import variants
 from sim import load, simulate, validate
 from sim.adversary import search_population
 from sim.crowds import Validation
-from sim.engines import hold
 from sim.run import assemble
 from sim.scenario import InputError, load_humans
 from sim.stability import close, dominant_mode

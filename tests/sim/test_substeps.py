@@ -10,11 +10,11 @@ from controller.coupling import CASE_I, NoCoupling
 from models.device import CompliantDevice
 from models.human import Human, Link, Person
 from models.scene import plant
-from sim.engines import INTEGRATORS
+from sim.mujoco_engines import INTEGRATORS
 from sim.run import assemble, make_engine, run
 from sim.scenario import SCENARIOS, InputError, load
 from sim.stability import exact_growth
-from sim.stepping import (
+from sim.step_choice import (
     PlantSpeed,
     check_substeps,
     default_substeps,

@@ -15,6 +15,8 @@ from controller.environment import GROUND, Network, Spring
 from controller.limiter import limited
 from controller.tick import Process, StepBuffer
 from design.frequency import on_circle
+from design.optimal import design
+from design.program import Options
 from models.scene import variants
 from sim.couplings import choose
 from sim.crowds import crowds
@@ -33,7 +35,9 @@ def around(scenario, coupling):
 
 @pytest.fixture(scope="module")
 def optimal():
-    return {scenario.name: choose(scenario, "I", "optimal").coupling for scenario in (PAIR, STAR)}
+    """Of three channels one over a small basis."""
+    small = design(STAR.loop("I"), Options(ladder=((8, 6),)))
+    return {PAIR.name: choose(PAIR, "I", "optimal").coupling, STAR.name: small.coupling}
 
 
 def densely(sweep, coupling_force, K, B):
@@ -59,10 +63,12 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
     """1e-5: between points of the sweep 5e-5 apart a peak of width 0.01 rises by (2.5e-5/0.01)^2."""
     coupling = optimal[scenario.name]
     sweep = around(scenario, coupling)
-    R = coupling.filter(scenario.T)
+    responses = {}
 
-    def filtered(z, E):
-        return R.at(z) @ E
+    def filtered(z, E):  # at the same frequencies in every environment
+        if not responses:
+            responses["R"] = coupling.filter(scenario.T).at(z)
+        return responses["R"] @ E
 
     for K, B in ((90.0, 0.3), (350.0, 2.0), (1213.2, 2.54)):
         found = sweep.ratios("this-environment", np.array([K]), np.array([B]))[0]
@@ -137,7 +143,7 @@ def test_the_population_meets_the_filter_in_the_environment_of_the_cell(optimal)
         assert (growth < 0).all() == stable
 
 
-OPTIONS = ["--coupling", "optimal", "--grid", "8", "--humans", "20", "--points", "3", "--duration", "1.5"]
+OPTIONS = ["--coupling", "optimal", "--grid", "6", "--humans", "10", "--points", "3", "--duration", "1.5"]
 
 
 def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
@@ -149,7 +155,7 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
     assert report["designed_for"]["certificates"]["this-environment"]["proof"] == "rational"
     assert report["conditions"] == ["any-environment", "this-environment"]
     assert report["this-environment"]["contradicted_cells"] == 0
-    assert 0 < report["this-environment"]["certified_cells"] < 64
+    assert 0 < report["this-environment"]["certified_cells"] < 36
     assert report["simulation"]["differ_from_linear"] == 0
     for name in report["conditions"]:
         missing = any(value is None for row in report[name]["required_over_available"] for value in row)

@@ -12,10 +12,11 @@ from cli.run import main
 from cli.validate import main as validate
 from controller.delay import VaryingDelay, ages, realising
 from controller.tick import StepBuffer
-from design import stored
+from design import coupling_file
+from models.hold import HeldPlant
 from models.scene import Crowd, plant, variants
 from sim.crowds import draw
-from sim.engines import ExactBatchEngine, ExactEngine, HeldPlant
+from sim.engines import ExactEngine
 from sim.run import assemble
 from sim.run import run as close_loop
 from sim.scenario import SCENARIOS, InputError, load, parse
@@ -56,7 +57,7 @@ def test_the_product_of_mode_matrices_is_the_simulated_map():
     states = moved.plant.A.shape[0]
     buffer = StepBuffer(unlimited(moved.process), ticks, states, moved.scene.outside)
     buffer.s[0, :, 0] = rng.normal(size=states)
-    engine = ExactEngine(moved.plant, np.full(2, np.inf))
+    engine = ExactEngine(moved.plant)
     engine.start(buffer)
     for k in range(ticks):
         buffer.tick(k)
@@ -112,7 +113,7 @@ def test_greedy_ages_repeat_the_trajectory_that_chose_them():
     rates = []
     for each in (delays, drawn):
         free = replace(unlimited(process), delays=each)
-        engine = ExactBatchEngine(held, free.force_limit)
+        engine = ExactEngine(held)
         rates.append(impulse_growth(free, engine, ASSEMBLY.scene, held.A.shape[1], ticks)[0][0])
     assert rates[0] > 0 > rates[1]
 
@@ -153,7 +154,7 @@ def test_both_engines_meet_the_same_delays(tmp_path):
 
 
 def test_the_adversarial_pattern_shows_growth(tmp_path):
-    stored.save(stored.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
+    coupling_file.save(coupling_file.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     options = ["--coupling", str(tmp_path / "stiff.json"), "--varying-delay", "1,2", "--pattern", "adversarial"]
     report = run(tmp_path, *options, "--duration", "1", "--engine", "exact")
     assert report["stability"]["verdict"] == "unstable"
@@ -221,7 +222,7 @@ def validated(tmp_path, *options):
 
 def test_random_humans_under_the_worst_switching(tmp_path):
     """The constants' design fails for most humans, the switching-proof one for none; 0 and 1 are what is claimed."""
-    stored.save(stored.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
+    coupling_file.save(coupling_file.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     code, stiff = validated(tmp_path, "--pattern", "adversarial", "--coupling", str(tmp_path / "stiff.json"))
     assert stiff["unstable"]["exact"] >= 10
     assert not stiff["covered"]

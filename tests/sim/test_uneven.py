@@ -14,10 +14,12 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.delay import VaryingDelay
 from controller.timing import Periods, Timing
 from design.files import InputError
+from models.hold import at_the_latch, hold
 from models.scene import Plant, plant
-from sim import load, uneven
+from sim import load
+from sim.checks import uneven
 from sim.crowds import Validation, examine
-from sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine, at_the_latch, hold
+from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
 from sim.run import assemble, make_engine, run
 from sim.stability import close, dominant_mode
 
@@ -66,7 +68,7 @@ def test_time_adds_up_and_the_blocks_of_a_run_do_not_matter():
     assert trace.t[:5] == pytest.approx([0, 1e-3, 3e-3, 3.5e-3, 4.5e-3])
     assert len(trace.t) == pytest.approx(3.0 / (3.5e-3 / 3), abs=1)
     assert trace.t[-1] == pytest.approx(3.0, abs=3e-3)
-    again = run(simulation, "exact", ticks=1500)  # a run is cut into blocks of 1024 ticks
+    again = run(simulation, "exact", ticks=1500)  # a run is cut into blocks
     np.testing.assert_array_equal(again.s, trace.s[:1500])
 
 
@@ -144,7 +146,7 @@ def test_a_run_says_what_its_ticks_were(tmp_path, capsys):
 def test_hands_that_meet_uneven_ticks(tmp_path):
     """With a coupling nobody grows; without one most do, and both engines agree about whom."""
     file = tmp_path / "r.json"
-    ticks = ["--period", "0.8e-3,1.6e-3", "--latency", "1e-4:2e-4", "--humans", "8", "--duration", "1"]
+    ticks = ["--period", "0.8e-3,1.6e-3", "--latency", "1e-4:2e-4", "--humans", "5", "--duration", "0.5"]
     options = [*ticks, "--no-plot", "--out", str(tmp_path), "--json", str(file)]
     assert validate(["--case", "I", "--condition", "this-environment", *options]) == 0
     part = json.loads(file.read_text())["timing"]

@@ -13,20 +13,22 @@ import pytest
 from driven import driven
 
 from cli import run as run_command
-from cli.validate import _Traces, main
+from cli.validate import main
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from models.device import RigidDevice
+from models.hold import hold
 from models.human import Person
 from models.scene import Crowd, build, plant, variants
 from sim import crowds as examine_module
 from sim import shards
 from sim.couplings import choose
 from sim.crowds import BATCH, MIXED, Findings, Validation, crowds, draw
-from sim.engines import ExactBatchEngine, ExactEngine, hold
+from sim.engines import ExactEngine
 from sim.run import assemble, run
 from sim.scenario import InputError, load
 from sim.shards import validate
 from sim.stability import close, disagree, dominant_mode, exact_loops, impulse_forces, mujoco_loops, unstable
+from sim.verdicts import Traces
 
 SCENARIO = load()
 TWO = "[[human]]\nlinks = [{mass = 1.0, damping = 0, stiffness = 0}]\n" * 2
@@ -147,11 +149,11 @@ def test_batch_engine_is_the_exact_engine(devices):
     def outside(first, ticks):
         return impulse_forces(held_by.scene, SCENARIO.T, first, ticks)
 
-    together = driven(process, ExactBatchEngine(plants, process.force_limit), outside, 400, rest)
+    together = driven(process, ExactEngine(plants), outside, 400, rest)
     assert (np.abs(together.f) == 0.2).any()
     for i in range(len(people)):
         one = hold(plant(build(devices, people.humans(i)).model), SCENARIO.T)
-        alone = driven(process, ExactEngine(one, process.force_limit), outside, 400, rest[:, :1])
+        alone = driven(process, ExactEngine(one), outside, 400, rest[:, :1])
         # sums in another order, and a clipped unstable loop multiplies rounding
         np.testing.assert_allclose(together.s[:, :, i], alone.s[:, :, 0], rtol=1e-6, atol=1e-11)
 
@@ -288,7 +290,7 @@ def test_hands_that_had_no_time_to_rest_are_no_verdict(duration):
     """Against the slowest eigenvalue of the same humans, by the exact engine."""
     question = Validation(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
     found = validate(question)
-    traces = _Traces.of(question, found)
+    traces = Traces.of(question, found)
     assert traces.slowest_decay_s == pytest.approx(-1 / found.exact.max())
     assert traces.settling_decides == (traces.reason is None) == (duration > 30)
 

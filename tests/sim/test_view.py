@@ -16,10 +16,10 @@ from PIL import Image
 
 from cli import view as command
 from controller.coupling import SpringDamper
+from models.hold import hold
 from models.human import Human, Link, Person
 from models.scene import build, plant
 from sim.couplings import Chosen
-from sim.engines import hold
 from sim.run import run as close_loop
 from sim.scenario import InputError, load
 from sim.stability import close, dominant_mode
@@ -563,7 +563,7 @@ BAD = [
     (("--video", "a.gif", "--duration", "-1"), "--duration is -1, allowed are 0.001 to 3600 s"),
     (
         ("--coupling", "soft"),
-        "'soft', allowed are none, published, spring-damper, optimal, ccl, designed or a FILE.json",
+        "'soft', allowed are none, published, spring-damper, moving-average, ccl, optimal, designed or a FILE.json",
     ),
     (("--coupling", "absent.json"), "absent.json: No such file"),
     (("--case", "none", "--coupling", "designed"), "that case is the loop without coupling"),
@@ -572,7 +572,7 @@ BAD = [
     (("--script", ""), "--script is empty"),
     (
         ("--script", "0:soft"),
-        "'0:soft' is no event, allowed are none, published, designed, optimal, ccl, given, theta+1",
+        "'0:soft' is no event, allowed are none, published, designed, moving-average, ccl, optimal, given, theta+1",
     ),
     (("--script", "0:push3=1"), "'0:push3=1', allowed are push1 to push2 with up to 100 N"),
     (("--script", "0:push1=1..2"), "allowed are push1 to push2"),

@@ -22,8 +22,8 @@ from models.scene import build, variants
 from sim import limit_cycles
 from sim import zwidth as zwidth_map
 from sim.crowds import crowds
-from sim.engines import discretised
 from sim.limit_cycles import Effects, HeldDevices, Plan
+from sim.mujoco_engines import discretised
 from sim.scenario import InputError, load
 from sim.stability import dominant_mode, exact_loops
 from sim.trace import oscillation, slowest_seen

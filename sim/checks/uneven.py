@@ -21,8 +21,8 @@ from controller.environment import GROUND, Network, Spring
 from controller.loop import Loop
 from controller.lti import Array, SingularLoop
 from design.multipliers import this_environment_of
+from models.hold import at_the_latch, hold
 from models.scene import Plant
-from sim.engines import at_the_latch, hold
 from sim.stability import close
 
 T, _LONG = 1e-3, 1.6e-3  # [s]

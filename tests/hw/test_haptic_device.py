@@ -1,4 +1,4 @@
-"""The seam for devices: the Force Dimension SDK by a stand-in that plays a device, and the serial link."""
+"""The four calls of a device: the Force Dimension SDK by a stand-in that plays a device, and the serial link."""
 
 import sys
 from types import ModuleType
@@ -12,14 +12,14 @@ from cli import bridge, replay
 from cli.session_cli import check_link
 from controller.coupling import SpringDamper
 from hw.control import certified_coupling, certified_couplings, timed
-from hw.device import Device
+from hw.device_state import Device
 from hw.emulator import info_of
 from hw.force_dimension import ForceDimension, library
+from hw.haptic_device import PortLost, SerialDevice
 from hw.limits import SafetyLimits, Stage
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import Command, Config, Decoder, Force, Hello, Phase, Reason, Refused, State, encode
 from hw.recording import Recorder, save
-from hw.seam import PortLost, SerialDevice
 from hw.session import Session
 from hw.transport import Live
 from models.scene import build, plant

@@ -26,9 +26,10 @@ from controller.tick import Process, StepBuffer
 from design.conditions import any_environment, encoder_friction, this_environment
 from design.multipliers import BETA, limiter, limiter_lag, walls_of
 from models.device import RigidDevice
+from models.hold import HeldPlant, hold
 from models.human import Human, Link
 from models.scene import Crowd, variants
-from sim.engines import ExactBatchEngine, HeldPlant, hold
+from sim.engines import ExactEngine
 from sim.passivity_layer import EnergyNet, netted
 from sim.run import assemble, run_blocks
 from sim.scenario import Scenario
@@ -191,7 +192,7 @@ def _let_go(case: _Case, mass: Array, stiff: Array, speed: Array, seconds: float
         first[...] += square[quarter == 0].sum(axis=0)
         last[...] += square[quarter == 3].sum(axis=0)
 
-    engine = _Rubbing(plants, friction) if rubs else ExactBatchEngine(plants, process.force_limit)
+    engine = _Rubbing(plants, friction) if rubs else ExactEngine(plants)
     outside = plants.B.shape[-1] - m
     run_blocks(process, engine, lambda begin, count: np.zeros((count, outside)), ticks, start, look)
     with np.errstate(invalid="ignore", over="ignore"):

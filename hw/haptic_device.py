@@ -1,4 +1,4 @@
-"""The seam for devices: four calls that a session needs of them, and the loop that makes these calls.
+"""What a device must be able to do: four calls that a session needs of them, and the loop that makes these calls.
 
 A device at a serial port (docs/protocol.md) is one implementation, one that the host clocks another
 (hw/force_dimension.py). None of the calls waits for longer than a tick: keys, signals and time-outs

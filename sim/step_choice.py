@@ -16,8 +16,8 @@ import numpy as np
 
 from controller.lti import Array
 from controller.tick import StepBuffer
-from models.scene import plant
-from sim.engines import EXPONENTIAL, LEAST, HeldPlant, default_integrator, quiet_warnings
+from models.hold import HeldPlant
+from sim.mujoco_engines import EXPONENTIAL, LEAST, default_integrator, quiet_warnings
 from sim.run import Simulation, make_engine
 from sim.scenario import InputError
 from sim.stability import close, disagree, dominant_mode, exact_growth
@@ -91,7 +91,7 @@ def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
     if integrator == "discrete":  # it remembers more than position and velocity, so no map of those can vouch for it
         raise InputError(f"--integrator discrete gives no verdict to rely on: {_MODE_LOST}; use RK4 or give --substeps")
     simulation = simulation.smooth.even
-    speed, T = pace(plant(simulation.scene.model).A), simulation.scenario.T
+    speed, T = pace(simulation.scene.plant.A), simulation.scenario.T
     count = needed = speed.substeps(T)
     while count <= MOST and not _agrees(simulation, integrator, count):
         count *= 2
@@ -108,7 +108,7 @@ def check_substeps(simulation: Simulation, integrator: str, substeps: int) -> li
         first_order = f"{EXPONENTIAL} x {substeps}: of first order where devices rub, RK4 is nearer at equal cost."
         return [] if default_integrator(simulation.scene) == EXPONENTIAL else [first_order]
     simulation = simulation.smooth.even
-    speed, h = pace(plant(simulation.scene.model).A), simulation.scenario.T / substeps
+    speed, h = pace(simulation.scene.plant.A), simulation.scenario.T / substeps
     radius = step_radius(simulation, integrator, substeps)
     what = f"{integrator} x {substeps}: {speed.hardest(h)}"
     if not radius <= 1 + NEUTRAL:

@@ -22,8 +22,8 @@ from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Population, Voluntary
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, Scenario
-from sim.stability import NOT_EXCITED, disagree, stability_part
-from sim.stepping import settle
+from sim.stability import NOT_EXCITED, disagree, stability_of
+from sim.step_choice import settle
 
 _TOO_CLOSE = 1e-4  # of the damping: a proof needs some room
 _HANDS = Population()
@@ -146,9 +146,9 @@ def traces(seed: int, count: int = 460) -> Iterator[_TraceVerdict]:
             trace = run(simulation, make_engine(simulation, engine, *settle(simulation, engine)[:2]))
         except InputError:  # no number of steps does, which is said
             continue
-        part = stability_part(simulation, trace)
-        growth, exact = part["growth_rate_per_s"], part["exact_growth_rate_per_s"]
-        silent, other = part.get("reason") == NOT_EXCITED, growth is not None and bool(disagree(exact, growth))
-        opposite = other or (growth is None and part["verdict"] not in (None, part["exact_verdict"]))
-        yield _TraceVerdict(number, engine, exact, growth, part["verdict"], part.get("reason"), silent, not opposite)
+        part = stability_of(simulation, trace)
+        growth, exact = part.growth_rate_per_s, part.exact_growth_rate_per_s
+        silent, other = part.reason == NOT_EXCITED, growth is not None and bool(disagree(exact, growth))
+        opposite = other or (growth is None and part.verdict not in (None, part.exact_verdict))
+        yield _TraceVerdict(number, engine, exact, growth, part.verdict, part.reason, silent, not opposite)
         number += 1

@@ -111,7 +111,7 @@ def sealed(certificate: Certificate) -> Certificate:
     older: dict[str, Any] = {name: before for before, name in _OLDER.items()}
     plain = _read_back(msgspec.structs.replace(certificate, seal=""))
     guarantee = older.get(plain.guarantee, plain.guarantee)
-    first = msgspec.structs.replace(plain, condition=older[plain.condition], guarantee=guarantee)
+    first = msgspec.structs.replace(plain, condition=older.get(plain.condition, plain.condition), guarantee=guarantee)
     return msgspec.structs.replace(certificate, seal=hashlib.sha256(_canonical([first])).hexdigest())
 
 

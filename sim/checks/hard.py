@@ -14,7 +14,7 @@ from sim.accuracy import position_error
 from sim.run import Simulation, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, load
 from sim.stability import exact_growth
-from sim.stepping import check_substeps, default_substeps, simulated_growth
+from sim.step_choice import check_substeps, default_substeps, simulated_growth
 
 CLOSE = 1e-2  # [1/s] what the growth rate of the rule's own choice may be off
 #: a setting holds if it is stable, has the exact verdict, and errs by less than both of these
@@ -102,8 +102,8 @@ def faults(loop: Simulation, integrator: str, substeps: int) -> dict[str, float]
     found = {"verdict": own - exact} if (own > 0) != (exact > 0) else {}
     if abs(own - exact) > GROWTH:
         found["growth"] = own - exact
-    if (error["position_relative_rms"] or 0.0) > POSITION:
-        found["position"] = error["position_relative_rms"]
+    if (apart := error.position_relative_rms) is not None and apart > POSITION:
+        found["position"] = apart
     return found
 
 

@@ -1,0 +1,118 @@
+"""Whether memory stays flat over an hour of a session, in virtual time, and over 100,000 hands."""
+
+from __future__ import annotations
+
+import multiprocessing
+import resource
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+
+from hw.control import certified_couplings
+from hw.emulator import Emulator
+from hw.faults import person
+from hw.limits import Stage
+from hw.monitor import LinkSettings
+from hw.rehearsal import Rehearsal
+from hw.session import session_for
+from sim.couplings import choose
+from sim.crowds import Validation
+from sim.scenario import load
+from sim.shards import as_worker, validate
+from sim.stability import unstable
+
+
+@dataclass(frozen=True)
+class _Endured:
+    """How long work ended, and the most memory that its process had [MiB]."""
+
+    what: str
+    result: str
+    tenth_mib: float | None  # after a tenth of the work
+    end_mib: float | None
+    allowed_mib: float  # by how much it may rise after that
+    holds: bool
+
+
+_Mark = Callable[[float], None]  # is told what share of the work is done
+
+
+def long_session(mark: _Mark, seconds: float = 3600.0) -> tuple[bool, str]:
+    """A session of the default loop in virtual time, armed for `seconds`; whether it ended as planned, and how."""
+    scenario = load()
+    made = certified_couplings(scenario, "I", None, None, 1, spare=0)
+    session, emulator = session_for(scenario, LinkSettings()), Emulator(scenario)
+    actions = [(seconds, person("stop"))]
+    rehearsal = Rehearsal(session, emulator, lambda ages: made, actions=actions, keep=False)
+    rehearsal.run(0.1 * seconds)
+    mark(0.1)
+    rehearsal.run_to_the_end(seconds + 5.0)
+    ends = session.stage == Stage.FINISHED and not np.any(emulator.applied)
+    return ends, f"{session.stage} ({session.cause}) after {session.counters.states} ticks"
+
+
+def many_hands(mark: _Mark, count: int = 100_000) -> tuple[bool, str]:
+    """Random hands on the default loop with its usual coupling, by eigenvalues; whether all are stable."""
+    scenario = load()
+    question = Validation(scenario, choose(scenario, "I", "spring-damper").coupling, 0, count, 1, "exact", 0.0)
+    found = validate(question, progress=lambda done, total: mark(done / total))
+    bad = int(unstable(found.exact).sum())
+    return bad == 0 and found.index.size == count, f"{bad} of {found.index.size} unstable"
+
+
+_Work = Callable[[_Mark], tuple[bool, str]]
+
+#: what is done, and by how much its peak of memory may rise after a tenth of it [MiB]: a session keeps nothing of a
+#: tick, a crowd 128 bytes of a hand, twice while its batches are joined
+_LONG: tuple[tuple[str, _Work, float], ...] = (
+    ("an hour of a session", long_session, 8.0),
+    ("100,000 hands", many_hands, 32.0),
+)
+
+
+def endurance(seed: int) -> Iterator[_Endured]:
+    """Whether memory stays flat over an hour of a session and 100,000 hands, each in a process of its own."""
+    context = multiprocessing.get_context("spawn")  # a fork would begin with the memory of all checks before
+    for what, work, allowed in _LONG:
+        here, there = context.Pipe(duplex=False)
+        worker = context.Process(target=_alone, args=(work, allowed, there), daemon=True)
+        worker.start()
+        there.close()
+        try:
+            yield replace(here.recv(), what=what)
+        except EOFError:
+            yield _Endured(what, "broke off", None, None, allowed, False)
+        finally:
+            worker.terminate()
+            worker.join()
+
+
+def _alone(work: _Work, allowed: float, there: Connection) -> None:
+    """Of the process that does it, which ends with the one that waits."""
+    as_worker()
+    there.send(endure(work, allowed))
+
+
+def endure(work: _Work, allowed: float) -> _Endured:
+    """Do it, and look at this process's peak of memory after a tenth and at the end [MiB]."""
+    peaks: list[float] = []
+
+    def mark(share: float) -> None:
+        if share >= 0.1 and not peaks:
+            peaks.append(_peak())
+
+    good, result = work(mark)
+    tenth, end = peaks[0], _peak()
+    flat = end - tenth <= allowed
+    return _Endured("", result, tenth, end, allowed, good and flat)
+
+
+def _peak() -> float:
+    """Most memory that this process had [MiB]. Linux's getrusage counts that of the parent before exec, too."""
+    if (status := Path("/proc/self/status")).exists():
+        return float(status.read_text().partition("VmHWM:")[2].split()[0]) / 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)

@@ -1,0 +1,187 @@
+"""The plant under a zero-order hold: exponentials of one plant, or of many at once.
+
+The state [s; forces that the actuators hold] is that of a plant whose forces latch late.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import scipy  # its parts load when they are used
+from numpy.typing import NDArray
+
+from models.scene import Plant
+
+_Array = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class HeldPlant:
+    """s[k+1] = A s[k] + B [w; f][k], x[k] = C s[k]: the plant under a zero-order hold of T seconds.
+
+    Many plants at once have a leading axis in A and B.
+    """
+
+    A: _Array  # (..., 2n, 2n)
+    B: _Array  # (..., 2n, outside + m)
+    C: _Array  # (m, 2n)
+    T: float  # [s]
+
+
+def hold(plant: Plant, T: float, late: Sequence[float] | None = None) -> HeldPlant:
+    """Sample a continuous plant, or many of them, with the input held for T.
+
+    Where forces latch `late` (m,) [s] after the tick, the state is [s; forces that the actuators hold]: until then
+    the last ones act, s+ = A(T) s + B(T) [w; held] + B(T - late) (f - held).
+    """
+    if late is not None:
+        return latched(partial(hold, plant), T, late)
+    *many, n, inputs = plant.B.shape
+    generator = np.zeros((*many, n + inputs, n + inputs))
+    generator[..., :n, :n], generator[..., :n, n:] = plant.A, plant.B
+    if many:
+        step = _expm_in_units(generator * T, np.concatenate([_units(plant.A, T), np.ones((*many, inputs))], axis=1))
+    else:
+        step = scipy.linalg.expm(generator * T)
+    return HeldPlant(step[..., :n, :n], step[..., :n, n:], plant.C, T)
+
+
+def latched(held: Callable[[float], HeldPlant], T: float, late: Sequence[float]) -> HeldPlant:
+    """As hold with `late`, from the plant held for the times that are asked for."""
+    whole, m = held(T), len(late)
+    *many, n, inputs = whole.B.shape
+    w = inputs - m
+    A, B = np.zeros((*many, n + m, n + m)), np.zeros((*many, n + m, inputs))
+    A[..., :n, :n], B[..., :n, :w], B[..., n:, w:] = whole.A, whole.B[..., :w], np.eye(m)
+    for i, tau in enumerate(late):
+        if tau < T:
+            B[..., :n, w + i] = held(T - tau).B[..., w + i]
+    A[..., :n, n:] = whole.B[..., w:] - B[..., :n, w:]
+    return HeldPlant(A, B, np.pad(whole.C, ((0, 0), (0, m))), T)
+
+
+def at_the_latch(plant: Plant, late: Sequence[float]) -> _Array:
+    """[s; forces held; w; f] of a tick to where each device is when its own force latches, (..., m, entries)."""
+    *many, n, inputs = plant.B.shape
+    m = len(late)
+    rows = np.zeros((*many, m, n + m + inputs))
+    for i, tau in enumerate(late):
+        if tau == 0:
+            rows[..., i, :n] = plant.C[i]
+            continue
+        held = hold(plant, tau, [min(other, tau) for other in late])  # the forces that latch before act by then
+        rows[..., i, :] = held.C[i] @ np.concatenate([held.A, held.B], axis=-1)
+    return rows
+
+
+def exponential_step(J: _Array, h: float) -> _Array:
+    """What makes s + h phi1(h J) [v; a] of [q; v; a], (nsim, 2n, 3n), for J (nsim, 2n, 2n) and a step of h seconds.
+
+    phi1(X) = X^-1 (e^X - I) is the upper right block of exp [[X, I], [0, 0]].
+    """
+    nsim, states, _ = J.shape
+    n, unit = states // 2, np.tile(_units(J, h), 2)
+    generator = np.zeros((nsim, 2 * states, 2 * states))
+    generator[:, :states, :states], generator[:, :states, states:] = h * J, np.eye(states)
+    phi = h * _expm_in_units(generator, unit)[:, :states, states:]
+    return np.concatenate([np.broadcast_to(np.eye(states, n), (nsim, states, n)), phi + np.eye(states, k=-n)], axis=2)
+
+
+def expm_each(matrices: _Array) -> _Array:
+    """exp of each of (nsim, n, n) matrices, by scaling and squaring; a result depends on its own matrix only.
+
+    scipy.linalg.expm hands every matrix to a BLAS that wakes all its threads for it: on busy cores that made verdicts
+    about many humans several times slower than their arithmetic.
+    """
+    norm = np.abs(matrices).sum(axis=1).max(axis=1)
+    halvings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, _LARGEST) / _LARGEST))).astype(int)
+    a, b = matrices * (0.5**halvings)[:, None, None], _PADE
+    one = np.eye(matrices.shape[1])
+    a2 = a @ a
+    a4 = a2 @ a2
+    a6 = a4 @ a2
+    odd = a @ (a6 @ (b[13] * a6 + b[11] * a4 + b[9] * a2) + b[7] * a6 + b[5] * a4 + b[3] * a2 + b[1] * one)
+    even = a6 @ (b[12] * a6 + b[10] * a4 + b[8] * a2) + b[6] * a6 + b[4] * a4 + b[2] * a2 + b[0] * one
+    result = np.linalg.solve(even - odd, even + odd)
+    for done in range(halvings.max(initial=0)):
+        unfinished = halvings > done
+        result[unfinished] = result[unfinished] @ result[unfinished]
+    return result
+
+
+def _units(A: _Array, h: float) -> _Array:
+    """What to measure the states of s' = A s in, (nsim, 2n), where exp(h A) is asked for.
+
+    Velocities in units of a rate near the fastest mode's: then a stiff plant has no larger norm than that mode times h,
+    and its exponential is rounded by 1e-16 instead of 1e-11. Powers of two, which round nothing themselves.
+    """
+    n = A.shape[2] // 2
+    fastest = np.sqrt(np.abs(A[:, n:, :n]).max(axis=(1, 2)))
+    unit = np.ones(A.shape[:2])
+    unit[:, n:] = 2.0 ** np.ceil(np.log2(np.maximum(fastest, 1 / h)))[:, None]
+    return unit
+
+
+def _expm_in_units(matrices: _Array, unit: _Array) -> _Array:
+    """exp of (nsim, n, n) matrices, computed with entry i of what they act on measured in unit[:, i]."""
+    return expm_each(matrices * unit[:, None, :] / unit[:, :, None]) * unit[:, :, None] / unit[:, None, :]
+
+
+_ORDER = 13  # of the diagonal Padé approximant, Higham (2005), table 2.3
+_LARGEST = 5.37  # 1-norm up to which that order has the accuracy of double precision
+_PADE = [math.comb(_ORDER, k) * math.factorial(2 * _ORDER - k) / math.factorial(2 * _ORDER) for k in range(_ORDER + 1)]
+
+Product = Callable[[_Array, _Array], object]  # (columns, nsim), (rows, nsim): writes the second
+_Which = NDArray[np.intp]
+
+
+def product_of(matrices: _Array) -> Product:
+    """The product of a matrix, or of (nsim, rows, columns) of them, with a slab, the simulation last and contiguous.
+
+    What devices and humans do not share splits a plant into separate blocks (one device with its human each), found
+    from the zeros of the matrices; only they are multiplied.
+    """
+    if matrices.ndim == 2:
+        return np.ascontiguousarray(matrices).dot
+    rows, columns = _blocks(np.any(matrices != 0, axis=0))
+    valid = (rows >= 0)[:, :, None] & (columns >= 0)[:, None, :]
+    parts = matrices[:, rows[:, :, None], columns[:, None, :]] * valid
+    blocks = np.ascontiguousarray(np.moveaxis(parts, 0, -1))  # (blocks, rows, columns, nsim)
+    moved = np.empty((*rows.shape, matrices.shape[0]))
+    kept, index = rows >= 0, ...
+    if not kept.all():
+        index, rows = kept, rows[kept]
+
+    def multiply(slab: _Array, out: _Array) -> None:
+        np.einsum("crkn,ckn->crn", blocks, slab.take(columns, axis=0), out=moved)
+        out[rows] = moved[index]
+
+    return multiply
+
+
+def _blocks(pattern: NDArray[np.bool_]) -> tuple[_Which, _Which]:
+    """Rows and columns of the independent blocks of a (2n, 2n + inputs) pattern of nonzeros.
+
+    Shapes (blocks, rows) and (blocks, columns); smaller blocks are filled up with -1.
+    """
+    n, width = pattern.shape
+    graph = np.zeros((width, width), dtype=bool)
+    graph[:n] = pattern
+    count, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    rows = [np.flatnonzero(label[:n] == c) for c in range(count)]
+    columns = [np.flatnonzero(label == c) for c in range(count)]
+    # an input that moves nothing is a block without rows
+    pairs = [(r, c) for r, c in zip(rows, columns, strict=True) if r.size]
+    return _filled([r for r, _ in pairs]), _filled([c for _, c in pairs])
+
+
+def _filled(lists: list[_Which]) -> _Which:
+    table = np.full((len(lists), max(part.size for part in lists)), -1)
+    for row, part in zip(table, lists, strict=True):
+        row[: part.size] = part
+    return table

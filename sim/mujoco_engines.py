@@ -1,0 +1,389 @@
+"""MuJoCo's engines, for one simulation or for many at once.
+
+    exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: accelerations by one mj_forward a step,
+                  J from the compiled model's matrices; exact on a linear scene, whatever its stiffness and the step
+    RK4, ..       steps of MuJoCo's own integrators, whose number per period sim.step_choice decides
+
+The exponential engine shares J with the exact one, so it checks forces and assembly, not the stepping in time: for that
+there is RK4.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import glob
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from copy import copy
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+
+from controller.lti import Array
+from controller.tick import FusedTicks, StepBuffer, Stretch
+from controller.timing import Timing
+from design.files import InputError
+from models.hold import Product, exponential_step, product_of
+from models.scene import Scene, Variants, impeded
+
+if TYPE_CHECKING:
+    import mujoco
+
+#: the integrator of ours, which reads MuJoCo's accelerations
+EXPONENTIAL = "exponential"
+
+#: name -> what MuJoCo's model is set to, for the exponential one, where it decides nothing, to RK4
+INTEGRATORS = {
+    EXPONENTIAL: "mjINT_RK4",
+    "RK4": "mjINT_RK4",
+    "Euler": "mjINT_EULER",
+    "implicit": "mjINT_IMPLICIT",
+    "implicitfast": "mjINT_IMPLICITFAST",
+    "discrete": "mjINT_DISCRETE",
+}
+
+LEAST = 4  # steps per period of MuJoCo's own integrators
+
+_WHOLE = 1e-9  # of a step: rounding, where a number of steps is counted
+#: fields of a model that its mass, damping and stiffness matrices are made of
+_MECHANICAL = ("body_mass", "jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping")
+
+
+def default_integrator(scene: Scene) -> str:
+    """exponential where the scene is smooth; RK4 where something rubs, which is nearer there at equal cost."""
+    rubs = scene.model.dof_frictionloss.any() or scene.model.tendon_frictionloss.any()
+    return "RK4" if rubs else EXPONENTIAL
+
+
+def _segments(late: tuple[float, ...] | None, T: float) -> list[tuple[float, NDArray[np.bool_]]]:
+    """(seconds, channels whose last force still acts) between the latch times of a tick, (m,) or (0,) each."""
+    taus = np.array(late or ())
+    ends = np.unique(np.concatenate([[0.0], taus, [T]]))
+    return [(float(b - a), taus > a) for a, b in pairwise(ends)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Access:
+    """What is written to MuJoCo and read from it: of one simulation arrays (n,), of many (n, nsim).
+
+    Its ticks are closures: looking things up would take longer than moving them, and a bound method would be a cycle
+    that keeps a batch's memory.
+    """
+
+    T: float  # [s]
+    substeps: int
+    ctrl: Array
+    state: Array  # [q; v], (2, n) of one simulation
+    qacc: Array
+    forward: Callable[[], object]
+    step: Callable[[int], object]  # so many steps
+    pace: Callable[[float], object]  # sets their length [s]
+    move: Callable[[float], Product] | None  # seconds -> [q; v; qacc] to [q; v] then, where steps are exponential
+
+    def put(self, buffer: StepBuffer, k: int) -> None:
+        """Put the plant into the state of row k."""
+        self.state[...] = buffer.s[k, : 2 * len(self.qacc)].reshape(self.state.shape)
+
+    def ticks(self, buffer: StepBuffer, timing: Timing | None) -> Callable[[int], None]:
+        """What moves tick k of the buffer, from where the plant is."""
+        one = (..., 0) if self.ctrl.ndim == 1 else ...
+        states = buffer.s[:, : 2 * len(self.qacc)][one]
+        rows, inputs = list(states), list(buffer.rows[:, -len(self.ctrl) :][one])
+        if timing:
+            return self._timed(buffer, timing, rows, inputs)
+        shaped = list(states.reshape(-1, *self.state.shape))
+        return self._by_exponentials(rows, inputs, shaped) if self.move else self._by_steps(inputs, shaped)
+
+    def _by_steps(self, inputs: list[Array], written: list[Array]) -> Callable[[int], None]:
+        ctrl, state, step, count = self.ctrl, self.state, self.step, self.substeps
+
+        def advance(k: int) -> None:
+            ctrl[...] = inputs[k]
+            step(count)
+            written[k + 1][...] = state
+
+        return advance
+
+    def _by_exponentials(self, rows: list[Array], inputs: list[Array], shaped: list[Array]) -> Callable[[int], None]:
+        assert self.move
+        ctrl, state, qacc, forward, move = self.ctrl, self.state, self.qacc, self.forward, self.move
+        sight = np.concatenate([rows[0], np.zeros_like(qacc)])  # [q; v; qacc]
+        seen, qacc_seen = np.split(sight, [len(rows[0])])
+        product, each = move(self.T / self.substeps), range(self.substeps)
+
+        def advance(k: int) -> None:
+            ctrl[...] = inputs[k]
+            before, after = rows[k], rows[k + 1]
+            for _ in each:
+                forward()
+                seen[...] = before
+                qacc_seen[...] = qacc
+                product(sight, after)
+                state[...] = shaped[k + 1]
+                before = after
+
+        return advance
+
+    def _timed(
+        self, buffer: StepBuffer, timing: Timing, rows: list[Array], inputs: list[Array]
+    ) -> Callable[[int], None]:
+        """From latch to latch; of the next row also the forces that are held, behind the state."""
+        kinds, which = [_segments(late, T) for T, late in timing.kinds], timing.which
+        m, states = 0 if timing.late is None else timing.late.shape[1], len(rows[0])
+        forces = self.ctrl[len(self.ctrl) - m :]
+
+        def advance(k: int) -> None:
+            self.ctrl[...] = inputs[k]
+            asked, held = inputs[k][len(self.ctrl) - m :], buffer.plant_state[k][states:].reshape(forces.shape)
+            for seconds, waiting in kinds[which[(buffer.first + k) % len(which)]]:
+                forces[...] = asked
+                forces[waiting] = held[waiting]
+                self._move_by(seconds)
+            rows[k + 1][...] = self.state.reshape(rows[k + 1].shape)
+            if m:
+                buffer.plant_state[k + 1][states:] = asked.reshape(m, -1)
+
+        return advance
+
+    def _move_by(self, seconds: float) -> None:
+        if self.move is None:
+            count = math.ceil(self.substeps * seconds / self.T - _WHOLE)
+            self.pace(seconds / count)
+            self.step(count)
+            return
+        seen = np.empty((2 * len(self.qacc), *self.qacc.shape[1:]))
+        for _ in range(self.substeps):
+            self.forward()
+            sight = np.concatenate([self.state.reshape(seen.shape), self.qacc])
+            self.move(seconds / self.substeps)(sight, seen)
+            self.state[...] = seen.reshape(self.state.shape)
+
+
+class MujocoEngine:
+    """One simulation in one MjData, which a viewer can show; inputs are held by MuJoCo's ctrl."""
+
+    def __init__(
+        self, scene: Scene, T: float, integrator: str = "RK4", substeps: int = 4, timing: Timing | None = None
+    ) -> None:
+        import mujoco
+
+        self.model = discretised(scene, T, integrator, substeps)
+        self.data = mujoco.MjData(self.model)
+        self._warnings = self.data.warning.number
+        self.stretch: Stretch | None = None
+        moves = cache(lambda h: exponential_step(_rates(scene, None), h)[0])
+        self._whole = moves if integrator == EXPONENTIAL and substeps == 1 else None
+        self._timing, both, q, v = timing, (self.model, self.data), self.data.qpos, self.data.qvel
+        self._access = _Access(
+            T,
+            substeps,
+            self.data.ctrl,
+            # one view of both, wherever MuJoCo has put them: one copy reads them
+            as_strided(q, (2, q.size), (v.ctypes.data - q.ctypes.data, q.itemsize)),
+            self.data.qacc,
+            partial(mujoco.mj_forward, *both),
+            partial(mujoco.mj_step, *both),
+            partial(setattr, self.model.opt, "timestep"),
+            (lambda h: moves(h).dot) if integrator == EXPONENTIAL else None,
+        )
+        # what rubs is solved from the solution before, which nothing takes back
+        self._rubs = default_integrator(scene) != EXPONENTIAL
+
+    def start(self, buffer: StepBuffer) -> None:
+        self._buffer, self.stretch, access = buffer, None, self._access
+        access.put(buffer, 0)
+        self._advance: Callable[[int], None] | None = None
+        if buffer.calm and not self._timing and not (self._rubs and buffer.limited):
+            if self._whole:
+                self.stretch = self._fused(buffer, self._whole(access.T))
+            elif not access.move:
+                self.stretch = self._stepped(buffer)
+
+    @property
+    def advance(self) -> Callable[[int], None]:
+        """From `start` on; prepared when a tick is asked for alone."""
+        self._advance = self._advance or self._access.ticks(self._buffer, self._timing)
+        return self._advance
+
+    def _fused(self, buffer: StepBuffer, move: Array) -> Stretch:
+        access, states = self._access, len(move)
+        fused = FusedTicks(buffer, move[:, :states], G=move[:, states:])
+        ctrl, state, qacc, forward = access.ctrl, access.state, access.qacc, access.forward
+        product, held, before, after, rates = fused.product, fused.held, fused.before, fused.next, fused.further
+        shaped = list(fused.states.reshape(-1, *state.shape))
+
+        def stretch(ticks: int) -> None:
+            for count in fused.parts(ticks):
+                for inputs, rate, now, then, moved in zip(held[:count], rates, before, after, shaped, strict=False):
+                    ctrl[...] = inputs
+                    forward()
+                    rate[...] = qacc
+                    product(now, then)
+                    state[...] = moved
+
+        return stretch
+
+    def _stepped(self, buffer: StepBuffer) -> Stretch:
+        access = self._access
+        ctrl, state, step, count = access.ctrl, access.state, access.step, access.substeps
+        rows, law, m = buffer.rows[:, :, 0], buffer.process.linear.dot, buffer.process.channels
+        states = list(buffer.s[1:, :, 0].reshape(-1, *state.shape))
+        before, after = list(rows[:, : buffer.z.shape[1] + m]), list(buffer.after[:, :, 0])
+        inputs = list(rows[:, -len(ctrl) :])
+
+        def stretch(ticks: int) -> None:
+            for now, then, held, moved in zip(before, after[:ticks], inputs, states, strict=False):
+                law(now, then)
+                ctrl[...] = held
+                step(count)
+                moved[...] = state
+
+        return stretch
+
+    def back(self, k: int) -> None:
+        """Put the plant into the state of row k; what was warned of since does not count."""
+        self._access.put(self._buffer, k)
+        self._warnings[:] = 0
+
+    def troubled(self) -> bool:
+        return bool(self._warnings.any())
+
+
+class MujocoBatchEngine:
+    """All simulations of a buffer in one mujoco.batch.Batch.
+
+    Steps are those of MujocoEngine for each one, bit for bit; the exponential integrator's products are summed in
+    another order, so they differ by rounding.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        T: float,
+        integrator: str = "RK4",
+        substeps: int = 4,
+        nsim: int = 1,
+        nthread: int = 0,
+        fields: Mapping[str, Array] | None = None,
+        timing: Timing | None = None,
+    ) -> None:
+        """`fields` gives fields of the model a row per simulation, such as masses: (nsim, ...)."""
+        import mujoco
+        from mujoco.batch import Batch
+
+        model = discretised(scene, T, integrator, substeps)
+        self.batch = batch = Batch(model, nsim, nthread)
+        for name, rows in (fields or {}).items():
+            batch.expand(name)[...] = rows
+        if fields:
+            batch.set_const()
+        parts, before = mujoco.mjtState, int(mujoco.mjtState.mjSTATE_TIME)
+        moved = before | int(parts.mjSTATE_QPOS) | int(parts.mjSTATE_QVEL)
+        time, motion = (mujoco.mj_stateSize(model, part) for part in (before, moved))
+
+        def move(h: float) -> Product:
+            moves = exponential_step(_rates(scene, fields), h)
+            return product_of(moves if fields else moves[0])
+
+        self.advance: Callable[[int], None]  # from `start` on
+        self._timing = timing
+        self._access = _Access(
+            T,
+            substeps,
+            batch.bind("ctrl").T,
+            batch.state[:, time:motion].T,  # position and velocity lie side by side in a state row
+            batch.bind("qacc").T,
+            batch.forward,
+            lambda count: batch.step(nstep=count),
+            batch.expand("opt.timestep").fill if timing else float,
+            cache(move) if integrator == EXPONENTIAL else None,
+        )
+
+    def start(self, buffer: StepBuffer) -> None:
+        self._access.put(buffer, 0)
+        self.advance = self._access.ticks(buffer, self._timing)
+
+    def troubled(self) -> bool:
+        return bool(np.any(self.batch.warning))
+
+
+def _rates(scene: Scene, fields: Mapping[str, Array] | None) -> Array:
+    """J of s' = J s + .., (nsim or 1, 2n, 2n), from the matrices of the compiled model, or of every variant of it."""
+    if not fields:
+        return scene.plant.A[None]
+    nsim = len(next(iter(fields.values())))
+    same = {name: np.tile(getattr(scene.model, name).astype(float), (nsim, 1)) for name in _MECHANICAL}
+    return Variants(scene, {**same, **fields}).plants().A
+
+
+def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
+    """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T.
+
+    Of the exponential one it is the scene's own where nothing rubs: accelerations alone know no step.
+    """
+    import mujoco
+
+    if integrator not in INTEGRATORS:
+        raise ValueError(f"integrator is {integrator!r}, allowed are {', '.join(INTEGRATORS)}")
+    if substeps < 1:
+        raise ValueError(f"substeps is {substeps}, allowed are whole numbers from 1")
+    if impeded(scene.model):
+        raise InputError("a human has an impedance (A, B, C, D), which MuJoCo does not simulate: use the exact engine")
+    if integrator == default_integrator(scene) == EXPONENTIAL:
+        return scene.model
+    model = copy(scene.model)
+    model.opt.timestep = T / substeps
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, INTEGRATORS[integrator])
+    return model
+
+
+@contextmanager
+def profiler_off() -> Iterator[bool]:
+    """Run without the clock that MuJoCo's Python binding reads several times per step.
+
+    The clock is the function pointer `mjcb_time` of the library; clearing it changes no result. Yields whether
+    the pointer was found; where it is not, everything just runs with the clock. It is put back at the end.
+    """
+    pointer = _profiler_clock()
+    if pointer is None:
+        yield False
+        return
+    saved = pointer.value
+    pointer.value = None
+    try:
+        yield True
+    finally:
+        pointer.value = saved
+
+
+@contextmanager
+def quiet_warnings() -> Iterator[None]:
+    """Keep MuJoCo from printing and logging its warnings: the engine counts and reports them."""
+    import mujoco
+
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(previous)
+
+
+@cache
+def _profiler_clock() -> ctypes.c_void_p | None:
+    import mujoco
+
+    folder = os.path.dirname(mujoco.__file__)
+    for library in glob.glob(os.path.join(folder, "libmujoco*")):
+        try:
+            return ctypes.c_void_p.in_dll(ctypes.CDLL(library), "mjcb_time")
+        except (OSError, ValueError):
+            continue
+    return None

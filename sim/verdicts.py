@@ -1,0 +1,234 @@
+"""What a validation found, part by part: the figures of its report, and the words of their rows in its table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from controller.lti import Array
+from design.files import unseen
+from design.result import finite
+from models.human import Human
+from sim.adversary import Worst
+from sim.crowds import Findings, Validation
+from sim.stability import unstable
+
+_SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be slower in its last quarter than before
+_ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
+
+
+@dataclass(frozen=True)
+class Unstable:
+    """Hands that make the loop unstable, by engine; None for one that was not asked."""
+
+    exact: int
+    mujoco: int | None
+
+    def __str__(self) -> str:
+        return f"{self.exact} exact" + ("" if self.mujoco is None else f", {self.mujoco} MuJoCo")
+
+
+@dataclass(frozen=True)
+class EnvironmentsMet:
+    """Which environments the loops had, and in which of them a loop was unstable."""
+
+    of: str
+    count: int
+    names: list[str] | None = unseen("given", None)
+    unstable_in: list[str] | None = unseen("given", None)
+
+    @classmethod
+    def met(cls, question: Validation, findings: Findings) -> EnvironmentsMet:
+        members = question.environments
+        if not members:
+            return cls("the nominal environment", 1)
+        where = sorted({int(i) % len(members) for i in findings.index[unstable(findings.exact)]})
+        return cls("the ranges", len(members), [each.name for each in members], [members[i].name for i in where])
+
+    def __str__(self) -> str:
+        if self.unstable_in is None:
+            return self.of
+        return f"{self.count} of {self.of}, in turn; unstable in: {'; '.join(self.unstable_in) or 'none'}"
+
+
+@dataclass(frozen=True)
+class DrawnHumans:
+    """A set of humans that the population drew, and the environment that it met."""
+
+    seed: int
+    index: int
+    human: list[dict[str, Any]]
+    person: list[dict[str, Any]]
+    environment: str | None = unseen("given", None)
+    network: dict[str, Any] | None = unseen("given", None)
+
+    @classmethod
+    def of(cls, question: Validation, index: int) -> DrawnHumans:
+        crowd, member = question.crowd(index), question.environment(index)
+        humans, persons = _humans(crowd.humans(0)), msgspec.to_builtins(crowd.persons(0))
+        where, network = (member.name, msgspec.to_builtins(member.network)) if member else (None, None)
+        return cls(question.seed, index, humans, persons, where, network)
+
+
+@dataclass(frozen=True)
+class WorstDrawn:
+    """The humans of the largest spectral radius."""
+
+    spectral_radius: float
+    growth_rate_per_s: float
+    frequency_hz: float
+    who: DrawnHumans = unseen("beside")
+
+    @classmethod
+    def of(cls, question: Validation, findings: Findings) -> WorstDrawn:
+        k = int(np.argmax(findings.radius))
+        radius, growth, frequency = (float(of[k]) for of in (findings.radius, findings.exact, findings.frequency))
+        return cls(radius, growth, frequency, DrawnHumans.of(question, int(findings.index[k])))
+
+    def __str__(self) -> str:
+        growth = f"{self.growth_rate_per_s:+.4g} 1/s at {self.frequency_hz:.2f} Hz (index {self.who.index})"
+        return growth + (f", at {self.who.environment}" if self.who.environment else "")
+
+
+@dataclass(frozen=True)
+class Traces:
+    """What the traces say, and whether they are long enough for hands to be slower at their end."""
+
+    duration_s: float
+    clipped_runs: int
+    contacts: int
+    measured: int
+    largest_difference_per_s: float | None
+    stable_and_settling: int
+    stable: int
+    slowest_settling: float | None
+    slowest_decay_s: float | None
+    settling_decides: bool
+    reason: str | None = unseen("given", None)
+
+    @classmethod
+    def of(cls, question: Validation, findings: Findings) -> Traces:
+        stable, duration = ~unstable(findings.exact), question.ticks * question.scenario.T
+        decay = largest(-1 / findings.exact[findings.exact < 0])
+        decides = decay is None or duration >= _SETTLING * decay
+        slow = f"the slowest mode decays in {decay or 0:.3g} s: in {duration:g} s its hands need not be slower"
+        return cls(
+            duration_s=duration,
+            clipped_runs=int((findings.clipped > 0).sum()),
+            contacts=int(findings.contacts.sum()),
+            measured=int(np.isfinite(findings.trace).sum()),
+            largest_difference_per_s=largest(np.abs(findings.trace - findings.exact)),
+            stable_and_settling=int((stable & (findings.settling < 1)).sum()),
+            stable=int(stable.sum()),
+            slowest_settling=largest(findings.settling[stable]),
+            slowest_decay_s=decay,
+            settling_decides=decides,
+            reason=None if decides else slow,
+        )
+
+    def rows(self) -> Iterator[tuple[str, str | None]]:
+        yield "traces", f"{self.duration_s:g} s each, {self.clipped_runs} reached a force limit"
+        yield "contacts made", f"{self.contacts} on these traces" if self.contacts else None
+
+    def settled(self) -> str:
+        undecided = "" if self.settling_decides else f"; no verdict: {self.reason}"
+        return f"{self.stable_and_settling} of {self.stable} stable loops slower at the end{undecided}"
+
+
+@dataclass(frozen=True)
+class EnergyAudit:
+    """Traces on which W >= 0 was asked: forces that were clipped are covered by nothing, those of a limiter are."""
+
+    audited: int
+    clipped: int
+    violated: int
+    least_J: float | None
+    holds: bool
+
+    @classmethod
+    def of(cls, question: Validation, findings: Findings) -> EnergyAudit:
+        asked = (findings.clipped == 0) | (question.lag is not None)
+        violated = int((asked & ~(findings.energy >= -_ROUNDING * findings.audited)).sum())
+        least = float(findings.energy[asked].min()) if asked.any() else None
+        return cls(int(asked.sum()), int((~asked).sum()), violated, least, not violated)
+
+    def __str__(self) -> str:
+        left = f", {self.clipped} clipped left out" if self.clipped else ""
+        return f"{self.audited - self.violated} of {self.audited}{left}"
+
+
+@dataclass(frozen=True)
+class Growing:
+    """How many humans grow while delays or ticks vary; it holds unless certificates cover these and one grows."""
+
+    met: Mapping[str, Any] = unseen("beside")
+    unstable: Unstable = unseen()
+    humans: int = unseen()
+    mujoco_unclipped: int = unseen()
+    largest_growth_per_s: float | None = unseen()
+    worst_index: int | None = unseen()
+    holds: bool = unseen()
+
+    @classmethod
+    def of(cls, findings: Findings, met: Mapping[str, Any]) -> Growing:
+        exact, mujoco = findings.switching, findings.switching_mujoco
+        seen, mujoco = ~np.isnan(exact), mujoco[~np.isnan(mujoco)]
+        grow = Unstable(int((exact > 0).sum()), int((mujoco > 0).sum()) if mujoco.size else None)
+        worst = int(np.nanargmax(exact)) if seen.any() else None
+        figures = (None, None) if worst is None else (float(exact[worst]), int(findings.index[worst]))
+        return cls(met, grow, int(seen.sum()), mujoco.size, *figures, not (met["covered"] and grow.exact))
+
+    def row(self, what: str) -> tuple[str, str | None]:
+        mujoco, growth = self.unstable.mujoco, self.largest_growth_per_s
+        also = "" if mujoco is None else f", MuJoCo {mujoco} of {self.mujoco_unclipped} unclipped"
+        worst = "" if growth is None else f"; worst {growth:+.4g} 1/s (index {self.worst_index})"
+        grow = f"{self.unstable.exact} of {self.humans} exact{also}{worst}"
+        return f"grow while {what} vary", grow if self.humans else None
+
+
+@dataclass(frozen=True)
+class Attacked:
+    """What a search found, and how far the loop is from its required damping."""
+
+    found: bool
+    spectral_radius: float
+    growth_rate_per_s: float
+    frequency_hz: float
+    evaluated: int
+    required_over_available_damping: float | None
+    human: list[dict[str, Any]]
+    person: list[dict[str, Any]]
+    holds: bool
+
+    @classmethod
+    def of(cls, worst: Worst, ratio: float, certified: bool) -> Attacked:
+        humans, persons = _humans(worst.humans), msgspec.to_builtins(worst.persons)
+        figures = worst.spectral_radius, worst.growth, worst.frequency_hz, worst.evaluated
+        return cls(worst.destabilises, *figures, finite(ratio), humans, persons, not (certified and worst.destabilises))
+
+    def __str__(self) -> str:
+        grows = f"a human that grows at {self.growth_rate_per_s:+.4g} 1/s"
+        ratio, found = self.required_over_available_damping, grows if self.found else "no destabilising human"
+        close = "no damping is enough" if ratio is None else f"the loop needs {ratio:.4g} of the damping it has"
+        return f"{found} among {self.evaluated}; {close}"
+
+
+def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
+    """Links of each channel's human; of a user's own class what the handle feels of it."""
+    parts = ("mass", "across", "damping", "stiffness")
+    return [
+        {"links": msgspec.to_builtins(human.links)}
+        if isinstance(human, Human)
+        else {"class": type(human).__name__} | {name: getattr(human.port(), name) for name in parts}
+        for human in humans
+    ]
+
+
+def largest(values: Array) -> float | None:
+    """Of the finite ones; None where there is none."""
+    values = values[np.isfinite(values)]
+    return float(values.max()) if values.size else None

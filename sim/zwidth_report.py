@@ -1,0 +1,236 @@
+"""What a Z-width map says: the figures of its report, and a line for every cell."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from controller.environment import RIGID_WALL
+from controller.lti import Array
+from design.files import write
+from design.guarantees import CAVEATS
+from design.result import CONDITIONS, certificate_part
+from sim.limit_cycles import UNDECIDED, Plan
+from sim.scenario import Scenario
+from sim.stability import MARGINAL
+from sim.trace import slowest_seen
+from sim.zwidth import Map, Mark, Sweep, map_error
+
+_GIVEN: dict[str, Any] = {"json": "given"}  # a key only where there is something to say
+_NOT_REACHED = "not reached before the interruption"
+
+
+@dataclass(frozen=True, eq=False)
+class _Ratio:
+    """What one condition says of the cells."""
+
+    required_over_available: Array  # (rows, columns)
+    certified_cells: int
+    contradicted_cells: int | None = field(metadata=_GIVEN)  # by the population, where it meets this condition's loop
+    reason: str | None = field(metadata=_GIVEN)
+
+
+@dataclass(frozen=True, eq=False)
+class _Population:
+    """What the random humans say of the cells."""
+
+    humans: int
+    seed: int
+    growth_rate_per_s: Array  # (rows, columns)
+    unstable_humans_at_least: Array  # (rows, columns)
+    stable_cells: int
+    decided_cells: int
+    reason: str | None = field(metadata=_GIVEN)
+
+
+@dataclass(frozen=True, eq=False)
+class _Simulated:
+    """What MuJoCo shows at some of the cells."""
+
+    effects: dict[str, Any]
+    nonlinear: bool
+    trials: int
+    duration_s: float
+    start_m: float
+    press_n: float
+    threshold_m: float
+    from_hz: float
+    points: list[dict[str, Any]]
+    oscillate: int
+    undecided: int
+    differ_from_linear: int
+
+    @classmethod
+    def of(cls, sweep: Sweep, drawn: Map, plan: Plan) -> _Simulated:
+        """The points that were reached, and what they have beside the linear loop."""
+        points, (K, B) = drawn.points, (axis[drawn.points.cell] for axis in drawn.grid.flat)
+        figures = (K, B, points.verdicts, points.amplitude, points.frequency_hz, points.growth, points.differ)
+        names = ("K", "B", "verdict", "amplitude_m", "frequency_hz", "linear_growth_rate_per_s", "differs_from_linear")
+        devices = plan.effects.on(sweep.devices)
+        effects = {
+            "encoder_step_m": [device.encoder_step for device in devices],
+            "friction_n": [device.friction for device in devices],
+            "force_limit_n": [d.force_limit for d in devices] if plan.effects.saturation else None,
+            "one_sided": sweep.walled is not None,
+        }
+        return cls(
+            effects,
+            plan.effects.nonlinear(sweep.devices) or sweep.walled is not None,
+            plan.trials,
+            plan.duration,
+            plan.start,
+            plan.press,
+            plan.threshold,
+            slowest_seen(plan.duration),
+            [dict(zip(names, row, strict=True)) for row in zip(*figures, strict=True)],
+            points.verdicts.count("oscillates"),
+            points.verdicts.count(UNDECIDED),
+            int(points.differ.sum()),
+        )
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether MuJoCo and the eigenvalues tell different things of the same linear loop."""
+        return bool(self.differ_from_linear) and not self.nonlinear
+
+
+@dataclass(frozen=True, eq=False)
+class MapReport:
+    """The whole map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
+
+    rigid: bool
+    scenario: str | None
+    scenario_digest: str
+    T: float
+    theta: tuple[int, ...]
+    psi: tuple[int, ...]
+    delta: tuple[float, ...]
+    velocity_filter_hz: float | None
+    one_sided: bool
+    conditions: list[str]
+    grid: dict[str, Any]
+    population: _Population
+    simulation: _Simulated
+    holds: bool
+    interrupted: bool
+    wall_s: dict[str, float]
+    ratios: dict[str, _Ratio] = field(metadata={"json": "beside"})
+    fixed: Mapping[str, Any] = field(metadata={"json": "beside"})  # of a map over environments: the coupling
+    error: dict[str, Any] | None = field(metadata=_GIVEN)
+    marks: list[dict[str, Any]] | None = field(metadata=_GIVEN)
+    not_covered: str = CAVEATS
+
+    @classmethod
+    def of(
+        cls,
+        scenario: Scenario,
+        sweep: Sweep,
+        drawn: Map,
+        plan: Plan,
+        fixed: Mapping[str, Any],
+        marks: Sequence[Mark],
+        humans: int,
+        seed: int,
+    ) -> MapReport:
+        """Of a map that met `humans` random humans for each device."""
+        loop, whole, rigid = sweep.loop, not drawn.interrupted, sweep.loop.environment is RIGID_WALL
+        ratios = {name: _ratio(sweep, drawn, name) for name in drawn.ratio}
+        simulation = _Simulated.of(sweep, drawn, plan)
+        certified = all(mark.requirement["this-environment"].certified for mark in marks)
+        contradicted = simulation.contradicts or any(ratios[name].contradicted_cells for name in CONDITIONS)
+        return cls(
+            rigid,
+            None if rigid else scenario.name,
+            scenario.digest,
+            loop.T,
+            loop.theta,
+            loop.psi,
+            loop.delta,
+            sweep.cutoff,
+            sweep.walled is not None,
+            list(drawn.ratio),
+            {"K": drawn.grid.K, "B": drawn.grid.B, "scale": drawn.grid.scale},
+            _population(drawn, humans, seed),
+            simulation,
+            certified and not contradicted,
+            drawn.interrupted,
+            drawn.seconds,
+            ratios,
+            fixed,
+            {name: map_error(sweep, drawn, name) for name in drawn.ratio} if whole else None,
+            [_mark(mark) for mark in marks] if whole else None,
+        )
+
+    @property
+    def cells(self) -> int:
+        return len(self.grid["K"]) * len(self.grid["B"])
+
+
+def _ratio(sweep: Sweep, drawn: Map, name: str) -> _Ratio:
+    ratio = drawn.ratio[name]
+    contradicted = int(((ratio < 1) & (drawn.growth > MARGINAL)).sum()) if name in CONDITIONS else None
+    return _Ratio(ratio.reshape(drawn.grid.shape), int((ratio < 1).sum()), contradicted, _nulls(sweep, drawn, name))
+
+
+def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
+    """Why a condition has cells without a figure, in words of one such cell; None where it has none."""
+    if name in sweep.refusals:
+        return sweep.refusals[name]
+    ratio, (K, B) = drawn.ratio[name], drawn.grid.flat
+    unreached, infinite = np.isnan(ratio), np.flatnonzero(np.isposinf(ratio))
+    parts = [f"null at {unreached.sum()} cells: {_NOT_REACHED}"] if unreached.any() else []
+    if infinite.size:
+        first = infinite[0]
+        why = sweep.requirement(name, float(K[first]), float(B[first])).reason or "the figure grows without end"
+        at = f"at K {K[first]:.4g}, B {B[first]:.4g}, {why}"
+        parts.append(f"null at {infinite.size} cells: no damping is enough; {at}")
+    return "; ".join(parts) or None
+
+
+def _population(drawn: Map, humans: int, seed: int) -> _Population:
+    known, shape = np.isfinite(drawn.growth), drawn.grid.shape
+    return _Population(
+        humans,
+        seed,
+        drawn.growth.reshape(shape),
+        drawn.unstable.reshape(shape),
+        int((known & (drawn.growth <= MARGINAL)).sum()),
+        int(known.sum()),
+        f"null: {_NOT_REACHED}" if np.isnan(drawn.growth).any() else None,
+    )
+
+
+def _mark(mark: Mark) -> dict[str, Any]:
+    """What is asked about a single coupling."""
+    return {
+        "K": mark.K,
+        "B": mark.B,
+        **{name: certificate_part(requirement) for name, requirement in mark.requirement.items()},
+        "growth_rate_per_s": mark.growth,
+        "unstable_humans": mark.unstable,
+        "stiffest_K_at_this_B": {
+            name: "beyond the map" if K is not None and np.isinf(K) else K for name, K in mark.stiffest.items()
+        },
+    }
+
+
+def save_csv(drawn: Map, path: Path) -> Path:
+    """One line per cell, SI units in the header; empty where nothing is known."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    figures = [f"{name} required/available" for name in drawn.ratio]
+    table.writerow(["K [N/m]", "B [N s/m]", *figures, "growth [1/s]", "unstable humans", "simulated", "amplitude [m]"])
+    point = {int(cell): i for i, cell in enumerate(drawn.points.cell)}
+    for cell, (K, B) in enumerate(zip(*drawn.grid.flat, strict=True)):
+        values = [K, B, *(ratio[cell] for ratio in drawn.ratio.values()), drawn.growth[cell], drawn.unstable[cell]]
+        row = ["" if np.isnan(value) else f"{value:.9g}" for value in values]
+        i = point.get(cell)
+        row += ["", ""] if i is None else [drawn.points.verdicts[i], f"{drawn.points.amplitude[i]:.4g}"]
+        table.writerow(row)
+    return write(path, text.getvalue())

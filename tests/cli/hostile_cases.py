@@ -1,0 +1,107 @@
+"""What a hostile case is, the good files that it finds, and how they are spoilt."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from controller.coupling import SpringDamper
+from design.certificate import prove
+from design.coupling_file import Stored, save
+from sim.scenario import SCENARIOS, load
+
+BUT = 2  # exit code of bad input
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command line, what is done before it, and how it should end."""
+
+    name: str
+    words: tuple[str, ...]
+    codes: tuple[int, ...] = (BUT,)
+    says: str = ""  # a regular expression that standard error holds
+    before: Callable[[], object] | None = None  # in the child, within the case's folder
+
+
+QUICK = {  # what a command needs beside the option in question
+    "run": ("--no-plot", "--no-alternatives", "--duration", "0.1"),
+    "validate": ("--humans", "2", "--duration", "0", "--no-plot"),
+    "zwidth": ("--grid", "4", "--points", "0", "--humans", "2", "--no-plot"),
+    "view": ("--video", "v.gif"),
+    "trace": ("t.npz",),
+    "accuracy": (),
+    "suite": ("--only", "I"),
+    "design": (),
+    "audit": ("--K", "400,300", "--B", ".1,.1"),
+    "check": ("c.json",),
+    "compare": (),
+    "export": ("c.json",),
+    "bridge": ("--rehearse", "--duration", "0.2"),
+    "emulator": ("--duration", "0.01"),
+    "identify": ("--rehearse",),
+    "replay": ("t.npz",),
+}
+
+TEXT = (SCENARIOS / "omega-pair.toml").read_text()
+
+
+def furnish(folder: Path) -> None:
+    """A good file of each kind, and things that are no files."""
+    scenario = load()
+    loop, data = scenario.loop("I"), SpringDamper((400.0, 300.0), (0.1, 0.1))
+    (folder / "s.toml").write_text(TEXT)
+    save(Stored.of(loop, data, prove(loop, data, "any-environment")), folder / "c.json")
+    link = "[[human]]\nlinks = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]\n"
+    (folder / "h.toml").write_text(2 * link)
+    (folder / "p.txt").write_text("1,2\n1,2\n")
+    npz(folder / "t.npz")
+    os.mkfifo(folder / "fifo")
+    (folder / "dir").mkdir()
+    (folder / "dir" / "report.json").write_text("{}")
+    (folder / "loop").symlink_to("loop")
+    (folder / "to-s").symlink_to("s.toml")
+
+
+def npz(path, **changed):
+    """A trace of two channels, some of its arrays replaced or (None) left out."""
+    n, t = 400, 1.2e-3 * np.arange(400)
+    x = 1e-3 * np.sin(2 * np.pi * 60 * t)[:, None] * [1.0, 0.5]
+    arrays = {"t": t, "x": x, "f": 100 * x, "x_handle": x, "v_handle": x, "w": np.zeros((n, 0))} | changed
+    arrays.setdefault("meta", np.array("{}"))
+    with Path(path).open("wb") as file:
+        np.savez_compressed(file, **{name: value for name, value in arrays.items() if value is not None})
+
+
+def toml(old: str, new: str) -> Callable[[], None]:
+    """s.toml with some text replaced."""
+    assert old in TEXT, old
+    return lambda: put("s.toml", TEXT.replace(old, new, 1)) and None
+
+
+def stored(path: str, value: object) -> Callable[[], None]:
+    """c.json with one entry replaced; the path of names and numbers is joined by dots."""
+
+    def change() -> None:
+        whole = json.loads(Path("c.json").read_text())
+        *way, last = [int(word) if word.isdecimal() else word for word in path.split(".")]
+        part = whole
+        for step in way:
+            part = part[step]
+        part[last] = value
+        Path("c.json").write_text(json.dumps(whole))
+
+    return change
+
+
+def put(name: str, content: str | bytes) -> int:
+    return Path(name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def written(name: str, content: str | bytes) -> Callable[[], int]:
+    return lambda: put(name, content)

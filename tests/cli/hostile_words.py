@@ -1,0 +1,358 @@
+"""Command lines that nobody should write: odd words and paths, outputs over inputs, options that do not go together."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from collections.abc import Iterator
+from itertools import product
+
+from hostile_cases import BUT, QUICK, TEXT, Case, put, written
+
+NO_NUMBERS = ("x", "", "nan", "1,,2", "\x1b[31m1", "9" * 5000, "-1e999")
+
+NUMERIC = {
+    "run": "theta psi lam delta T T-max latency loss varying-delay energy-budget substeps duration vertex seed",
+    "validate": "humans shards generations duration seed theta",
+    "zwidth": "grid K-range B-range mark humans points trials duration start press threshold quantisation friction",
+    "view": "fps duration",
+    "accuracy": "duration",
+    "suite": "humans",
+    "design": "ranges samples band high-gain seconds order varying-delay delta",
+    "audit": "K B varying-delay",
+    "compare": "points band seconds",
+    "export": "seed",
+    "bridge": "pace quantile guard measure force-cap max-speed continuous-force thermal-time duration seed baud",
+    "emulator": "duration coulomb pace parent seed",
+    "identify": "force band seconds coulomb sittings hand",
+}
+
+
+def numeric_options() -> Iterator[Case]:
+    """Words that are no numbers, or no numbers within any limits."""
+    for command, names in NUMERIC.items():
+        for i, name in enumerate(names.split()):
+            chosen = NO_NUMBERS if command in ("run", "bridge") else [NO_NUMBERS[(i + k) % 7] for k in (0, 2, 4)]
+            for word in chosen:
+                words = (command, *QUICK[command], f"--{name}={word}")
+                yield Case(f"{command} --{name}={word[:8]!r}", words, says=name.split("-")[0])
+
+
+INPUTS = (
+    ("run", "--scenario"),
+    ("run", "--human"),
+    ("run", "--pattern"),
+    ("audit", "--scenario"),
+    ("check", ""),
+    ("export", ""),
+    ("trace", ""),
+    ("replay", ""),
+    ("view", "--coupling"),
+)
+NO_FILES = {
+    "missing": "nix",
+    "folder": "dir",
+    "pipe": "fifo",
+    "endless": "/dev/zero",
+    "terminal": "/dev/tty",
+    "circle": "loop",
+    "long": "n" * 300,
+    "very long": "n/" * 3000,
+    "control": "n\x1b]0;x\x07\r\n",
+    "right to left": "n\u202eabc",
+    "no UTF-8": "n\udcff",
+    "below a file": "s.toml/x",
+    "empty": "",
+}
+
+
+def odd_paths() -> Iterator[Case]:
+    """What cannot be read, and what cannot be written."""
+    for (command, option), (kind, path) in product(INPUTS, NO_FILES.items()):
+        rest = tuple(word for word in QUICK[command] if option or not word.startswith(("c.json", "t.npz")))
+        if option == "--coupling" and not path.startswith(("/", "dir", "fifo", "loop", "s.toml")):
+            path += ".json"
+        words = (command, *rest, *((f"{option}={path}",) if option else ("--", path)))
+        if option:
+            yield Case(f"{command} {option} {kind}", words, says=option.lstrip("-") if option != "--coupling" else "")
+        else:
+            yield Case(f"{command} {kind}", (command, *(w for w in words[1:] if w != "--"), "--json=r.json")
+                       if path and not path.startswith("-") else words)  # fmt: skip
+    outputs = [("run", "--out"), ("run", "--json"), ("design", "--out"), ("export", "--out"), ("trace", "--plot"),
+               ("audit", "--json"), ("view", "--video"), ("bridge", "--out"), ("suite", "--out")]  # fmt: skip
+    for command, option in outputs:
+        for kind in ("below a file", "very long", "long", "circle", "folder", "no folder", "kernel", "zero"):
+            path = {"no folder": "nix/r", "kernel": "/proc/self/r", "zero": "r\0"} | NO_FILES
+            if kind == "no folder" and (command, option) in {("run", "--out"), ("bridge", "--out"), ("suite", "--out")}:
+                continue  # a folder is made
+            if kind == "folder" and option == "--out" and command in ("run", "bridge", "suite"):
+                continue
+            suffix = ".gif" if option == "--video" and kind not in ("folder", "circle") else ""
+            words = (
+                command,
+                *(w for w in QUICK[command] if w not in ("--video", "v.gif")),
+                option,
+                path[kind] + suffix,
+            )
+            yield Case(f"{command} {option} {kind}", words, says=option)
+
+
+BOTH = [
+    ("design", "--scenario", "s.toml", "--out", "s.toml"),
+    ("design", "--scenario", "to-s", "--out", "s.toml"),
+    ("design", "--scenario", "s.toml", "--out", "to-s"),
+    ("design", "--scenario", "s.toml", "--out", "./dir/../s.toml"),
+    ("design", "--scenario", "s.toml", "--json", "s.toml"),
+    ("design", "--out", "a.json", "--json", "a.json"),
+    ("design", "--out", "a.json", "--json", "./a.json"),
+    ("replay", "t.npz", "--json", "t.npz"),
+    ("trace", "t.npz", "--json", "t.npz"),
+    ("trace", "t.npz", "--plot", "t.npz"),
+    ("trace", "t.npz", "--plot", "a.png", "--json", "a.png"),
+    ("check", "c.json", "--json", "c.json"),
+    ("export", "c.json", "--json", "c.json"),
+    ("export", "c.json", "--out", "c.json"),
+    ("export", "c.json", "--out", "a.c", "--json", "a.c"),
+    ("audit", "--coupling", "c.json", "--json", "c.json"),
+    ("audit", "--K", "400", "--B", "1", "--scenario", "s.toml", "--json", "s.toml"),
+    ("run", *QUICK["run"], "--scenario", "s.toml", "--json", "s.toml"),
+    ("run", *QUICK["run"], "--human", "h.toml", "--json", "h.toml"),
+    ("run", *QUICK["run"], "--pattern", "p.txt", "--json", "p.txt"),
+    ("run", *QUICK["run"], "--coupling", "c.json", "--json", "c.json"),
+    ("validate", *QUICK["validate"], "--scenario", "s.toml", "--json", "s.toml"),
+    ("validate", *QUICK["validate"], "--coupling", "c.json", "--json", "c.json"),
+    ("zwidth", *QUICK["zwidth"], "--scenario", "s.toml", "--json", "s.toml"),
+    ("zwidth", *QUICK["zwidth"], "--coupling", "c.json", "--json", "c.json"),
+    ("compare", "--coupling", "none,c.json", "--json", "c.json"),
+    ("compare", "--scenario", "s.toml", "--json", "s.toml"),
+    ("view", "--video", "a.gif", "--json", "a.gif", "--duration", "0.2"),
+    ("bridge", "--rehearse", "--scenario", "s.toml", "--json", "s.toml"),
+    ("identify", "--rehearse", "--scenario", "s.toml", "--json", "s.toml"),
+]
+
+
+def overwritten() -> Iterator[Case]:
+    """Outputs that are inputs, or each other, by whatever name."""
+    for words in BOTH:
+        yield Case(" ".join(words), words, says="also|read")
+
+    def report_is_a_scenario() -> None:
+        put("dir/report.json", TEXT)
+
+    words = ("run", *QUICK["run"], "--scenario", "dir/report.json", "--out", "dir")
+    yield Case("a report over its scenario", words, says="read", before=report_is_a_scenario)
+    words = ("run", *QUICK["run"], "--out", "new", "--json", "new/trace.npz")
+    yield Case("json over the trace", words, says="twice", before=lambda: os.mkdir("new"))
+    hard = ("design", "--scenario", "s.toml", "--json", "hard")
+    yield Case("a second name of the scenario", hard, says="also", before=lambda: os.link("s.toml", "hard"))
+
+
+NONE = ("--case", "none")
+#: options that would have to be ignored, and lists with nothing between their commas; what the line names
+SILENT = [
+    (("run", *QUICK["run"], *NONE, "--coupling", "zzz"), "--coupling"),
+    (("validate", *QUICK["validate"], *NONE, "--coupling", "zzz"), "--coupling"),
+    (("audit", *NONE, "--coupling", "zzz"), "--coupling"),
+    (("audit", *NONE, *QUICK["audit"]), "--K"),
+    (("zwidth", *QUICK["zwidth"], *NONE, "--coupling", "zzz"), "--c"),
+    (("view", "--video", "v.gif", *NONE, "--coupling", "zzz"), "--coupling"),
+    (("bridge", "--rehearse", *NONE, "--coupling", "zzz"), "--c"),
+    (("design", *NONE, "--coupling", "optimal"), "--case none"),
+    (("compare", *NONE, "--coupling", "zzz"), "--coupling"),
+    (("run", *QUICK["run"], "--coupling", ""), "--coupling"),
+    (("run", *QUICK["run"], "--coupling", "x.json"), "x.json"),
+    (("run", *QUICK["run"], "--scenario", ""), "scenario"),
+    (("run", *QUICK["run"], "--human", ""), "--human"),
+    (("run", *QUICK["run"], "--json", ""), "--json"),
+    (("run", *QUICK["run"], "--out", ""), "--out"),
+    (("design", "--out", ""), "--out"),
+    (("design", "--json", ""), "--json"),
+    (("export", "c.json", "--out", ""), "--out"),
+    (("trace", "t.npz", "--plot", ""), "--plot"),
+    (("compare", "--coupling", ""), "--coupling"),
+    (("compare", "--coupling", "none,,published"), "--coupling"),
+    (("compare", "--coupling", ",none"), "--coupling"),
+    (("compare", "--coupling", "none,"), "--coupling"),
+    (("compare", "--over", ""), "--over"),
+    (("compare", "--over", "delay,"), "--over"),
+    (("compare", "--over", "moon"), "--over"),
+    (("compare", "--over", "damping=2"), "--over"),
+    (("compare", "--over", "damping=2:1"), "--over"),
+    (("compare", "--over", "damping=nan:1"), "--over"),
+    (("suite", "--only", ""), "--only"),
+    (("suite", "--only", "I,,hard"), "--only"),
+    (("suite", "--only", "I,"), "--only"),
+    (("run", *QUICK["run"], "--theta", "1,"), "--theta"),
+    (("run", *QUICK["run"], "--delta", ",1"), "--delta"),
+    (("run", *QUICK["run"], "--varying-delay", "1,"), "--varying-delay"),
+    (("run", *QUICK["run"], "--loss", "0.1", "--pattern", "random"), "--varying-delay|--pattern"),
+    (("run", *QUICK["run"], "--playout"), "--playout"),
+    (("run", *QUICK["run"], "--energy-budget", "1,0.5"), "--energy-budget"),
+    (("run", *QUICK["run"], "--engine", "exact", "--integrator", "RK4"), "--integrator"),
+    (("run", *QUICK["run"], "--engine", "exact", "--substeps", "4"), "--substeps"),
+    (("run", *QUICK["run"], "--vertex", "1"), "--vertex"),
+    (("run", *QUICK["run"], "--no-plot", "--no-plot", "--side-by-side"), "--side-by-side"),
+    (("design", "--best", "--coupling", "ccl"), "--coupling"),
+    (("run", *QUICK["run"], "--error", "nan"), "--error is nan, allowed are 1e-18 to 1"),
+    (("design", "--order", "2"), "--order"),
+    (("design", "--method", "inner"), "--method"),
+    (("design", "--compare"), "--compare"),
+    (("design", "--objective", "rms"), "--objective"),
+    (("design", "--band", "80,1"), "--band"),
+    (("design", "--seconds", "9"), "--seconds"),
+    (("design", "--high-gain", "2"), "--high-gain"),
+    (("design", "--coupling", "ccl", "--limiter"), "limiter"),
+    (("design", "--varying-delay", "1-2,0-3", "--condition", "any-environment"), "varying-delay"),
+    (("design", "--coupling", "ccl", "--order", "99"), "--order"),
+    (("design", "--samples", "5"), "--samples"),
+    (("export", "c.json", "--without-theta"), "--without-theta"),
+    (("audit", "--K", "1,2"), "--K"),
+    (("audit",), "nothing to audit"),
+    (("audit", "--rigid", "--K", "1,2", "--B", "1"), "--K"),
+    (("zwidth", *QUICK["zwidth"], "--coupling", "c.json", "--rigid"), "--rigid"),
+    (("zwidth", *QUICK["zwidth"], "--condition", "any-environment"), "--condition"),
+    (("zwidth", "--grid", "4", "--points", "0", "--K-range", "5,1"), "--K-range"),
+    (("zwidth", "--grid", "4", "--points", "0", "--B-range", "0,inf"), "--B-range"),
+    (("bridge", "--rehearse", "--port", "x"), "--port"),
+    (("bridge", "--port", "nix", "--arm"), "nix"),
+    (("bridge", "--port", "dir", "--arm"), "dir"),
+    (("bridge", "--port", "fifo", "--arm"), "fifo"),
+    (("bridge", "--port", "s.toml", "--arm"), "s.toml"),
+    (("bridge", "--port", "x", "--arm", "--fault", "unplug"), "--fault"),
+    (("bridge", "--rehearse", "--fault", "magic"), "magic"),
+    (("bridge", "--rehearse", "--fault", "up:drop=nan"), "drop"),
+    (("bridge", "--rehearse", "--deadman", "key"), "--deadman"),
+    (("bridge", "--rehearse", "--baud", "fast"), "--baud"),
+    (("bridge", "--rehearse", "--condition", "magic"), "--condition"),
+    (("emulator", "--fault", ""), "fault"),
+    (("emulator", "--fault", "drop=2@x", "--duration", "0.01"), "drop"),
+    (("emulator", "--parent", "1"), "--parent"),
+    (("identify", "--rehearse", "--band", "80,3"), "--band"),
+    (("validate", *QUICK["validate"], "--shards", "2", "--dask", "x:1"), "--dask"),
+    (("validate", *QUICK["validate"], "--dask", ""), "--dask"),
+    (("validate", *QUICK["validate"], "--dask", "nix"), "--dask"),
+    (("validate", *QUICK["validate"], "--environments", "ranges"), "--environments"),
+    (("validate", *QUICK["validate"], "--generations", "5"), "--generations"),
+    (("view", "--video", "v.xyz"), "--video"),
+    (("view", "--video", ""), "--video"),
+    (("view", "--video", "v.gif", "--script", "x"), "--script"),
+    (("view", "--video", "v.gif", "--script", "-1:quit"), "--script"),
+]
+
+
+def silence() -> Iterator[Case]:
+    """Options that would have to be ignored, and lists with nothing between their commas."""
+    for words, says in SILENT:
+        yield Case(" ".join(words), words, says=says)
+    yield Case("accuracy of a feather", ("accuracy", "--scenario", "s.toml"), (BUT,), before=feather)
+    yield Case("run of a feather", ("run", *QUICK["run"], "--scenario", "s.toml"), (BUT, 0), before=feather)
+
+
+def feather() -> None:
+    put(
+        "s.toml",
+        TEXT.replace("handle_mass = 0.19", "handle_mass = 1e-6").replace(
+            "links = [{ mass = 0.3", "links = [{ mass = 1e-6"
+        ),
+    )
+
+
+#: every one is refused, whatever its command would do else
+REFUSED = {
+    "run": """--error 0 | --error -1 | --error 1e-400 | --error inf | --error 1e-6 --engine exact
+        --error 1e-6 --integrator RK4 | --error 1e-6 --substeps 4 | --energy-budget -1 | --energy-budget 1,0.5
+        --energy-budget 1, | --energy-budget ,1 | --energy-budget 1,2,3 | --energy-budget 0.1,nan | --T-max 0
+        --T-max 1e-3 | --T-max inf | --period 1e-3 | --period 2e-3,1e-3 | --period 0,1 | --period nix
+        --period 1e-3,5e-3 --T-max 2e-3 | --period -1e-3,2e-3 | --period 1e-3,inf | --latency -1e-4
+        --latency 1.2e-3 | --latency 1 | --latency 1e-4,2e-4,3e-4 | --latency 1e-4:2e-4:3e-4
+        --latency 1e-4 --period 1e-5,2e-3 | --loss 1.5 | --varying-delay 2,1 | --varying-delay 0,1e9
+        --varying-delay 1.5,2 | --playout | --pattern random | --vertex 1 | --vertex -1 | --band 5,1 | --band 0,0
+        --band nan,5 | --theta 1,2,3 | --theta 1.5 | --psi -1,0 | --delta -1 | --T 1e-7 | --T 1 | --theta 1001,0
+        --theta 1000,1000 | --case none --lam 0,0,0 | --condition any-environment --case III
+        --no-limiter --energy-budget x | --human h.py --vertex 3""",
+    "validate": """--resume | --environments ranges | --dask x
+        --dask h:1 --shards 2 | --generations 5 | --links 3 | --humans 0 | --humans 1e3 | --shards 0
+        --duration 1e-9 | --duration -1 | --latency 2e-3 | --T-max 1e-4 | --period 1e-3""",
+    "design": """--ranges 0 | --ranges -5 | --ranges 101% | --ranges 1e9 | --ranges 10%% | --samples 5
+        --ranges 10 --varying-delay 0,2 | --limiter --no-limiter | --best --coupling ccl | --best --order 2
+        --method inner | --compare | --objective sup | --order 0 --coupling ccl
+        --order 1e9 --coupling ccl | --high-gain 0 | --high-gain 2 | --seconds -1 --best | --band 1,0 --best
+        --latency 1e-3 --varying-delay 0,2""",
+    "audit": """--device nix | --devices --K 5 | --rigid | --rigid --K 5 --B 0 --theta 1,2 | --rigid --K 5 --B 0 --psi 1
+        --rigid --K 0 --B 0 | --rigid --K 1e300 --B 0 | --K 1,2,3 --B 0 | --K 1,2 --B 0,0,0 | --K -1,2 --B 0
+        --rigid --K 5 --B 0 --T-max 1e-9 | --K 1,2 --B 0 --coupling c.json""",
+    "bridge": """--fault nonsense | --fault drop=2 | --fault drop=nan | --fault drop@-1 | --fault drop=0.1@1+-1
+        --fault axis9:jump | --fault axis3:jump | --fault up:jump | --fault jump=1e9 | --fault stall=99
+        --fault leap=0 | --fault period=0 | --fault = | --fault '' | --quantile 0 | --quantile 1.01 | --guard -1
+        --guard 1e9 | --measure 0 | --measure 1e9 | --force-cap 0 | --force-cap 13 | --max-speed 0
+        --energy-budget -1 | --pace 0 | --pace 1e-9 | --baud -1 | --continuous-force 0
+        --continuous-force 13 | --continuous-force 1,2,3 | --thermal-time 0 | --T 0.05 | --T 1e-6
+        --varying-delay 0,2 | --port nix | --emulate | --duration -1""",
+    "identify": """--force 0 | --force 100 | --force -1 | --band 200,3 | --band 0,0 | --band 1,1e9 | --band 3
+        --seconds 0 | --seconds 1e9 | --coulomb -1 | --coulomb 100 | --fault axis9:jump | --pace 0 | --T 0.05
+        --port nix | --measure 0 | --quantile 2""",
+    "zwidth": """--coupling nix | --K-range 5,1 | --B-range -1,5 | --grid 1 | --rigid --theta 1,2
+        --mark 1 | --mark 1,2,3 | --points -1 | --velocity-filter 0""",
+    "emulator": "--fault axis9:jump | --fault drop=-1 | --coulomb -1 | --pace 0 | --parent 1 | --duration -1",
+}
+HUMANS = """from models.human import Human, Link
+humans = [Human((Link(0.3, 3.0, 200.0),))] * 2
+"""
+_PORT = """from models.human import *
+class Hand:
+    def port(self): {}
+    def voluntary_force(self, t): {}
+humans = [Hand()] * 2
+"""
+_GOOD = "return Human((Link(.3, 3., 200.),)).port()"
+_DRAWS = HUMANS + "class P:\n    def draw(self, rng, n): {}\npopulation = P()\n"
+#: how the file says it, and whether it may be taken for one of people
+PEOPLE = {
+    "ends": "raise SystemExit(0)",
+    "interrupts": "raise KeyboardInterrupt",
+    "no syntax": "humans = [",
+    "a number": "humans = 5",
+    "strings": "humans = ['a', 'b']",
+    "one": HUMANS.replace("* 2", ""),
+    "a port that is none": _PORT.format("return None", "return 0 * t"),
+    "a port that raises": _PORT.format("raise RuntimeError('\\x1b[2J' * 500)", "return 0 * t"),
+    "a force that raises": _PORT.format(_GOOD, "raise OSError(28, 'no')"),
+    "a force of another shape": _PORT.format(_GOOD, "return [[1.0]]"),
+    "a force that is no number": _PORT.format(_GOOD, "return t / 0"),
+    "a force of words": _PORT.format(_GOOD, "return ['x'] * len(t)"),
+    "nobody drawn": _DRAWS.format("return []"),
+    "drawing that raises": _DRAWS.format("1 / 0"),
+    "numbers drawn": _DRAWS.format("return [1] * n"),
+    "a population that is none": HUMANS + "population = 7\n",
+    "persons that are none": HUMANS + "persons = [1]\n",
+    "endless recursion": "def f(): f()\nf()\n",
+    "memory": "raise MemoryError",
+    "control characters": "print('\\x1b[31mred')\n" + HUMANS,
+    "output that is closed": "import sys\nsys.stdout.close()\n" + HUMANS,
+}
+
+
+def combined() -> Iterator[Case]:
+    """Options that cannot be, options that do not go together, and people of Python who do harm."""
+    asked = [
+        (command, words.strip(), (BUT,), HUMANS)
+        for command, lines in REFUSED.items()
+        for words in re.split(r"[|\n]", lines)
+    ]
+    for name, text in PEOPLE.items():
+        asked += [
+            (command, f"--human h.py --seed {len(name)}", (0, 1, 2, 130), text) for command in ("run", "validate")
+        ]
+    for command, words, codes, people in asked:
+        quick = QUICK[command] if command != "audit" else ()
+        yield Case(f"{command} {words}", (command, *quick, *shlex.split(words)), codes, before=written("h.py", people))
+
+
+def cases() -> Iterator[Case]:
+    """All of them."""
+    yield from numeric_options()
+    yield from odd_paths()
+    yield from overwritten()
+    yield from silence()
+    yield from combined()

@@ -1,0 +1,299 @@
+"""What a session leaves: its trace, the replay that repeats it bit by bit, and traces that are none."""
+
+import json
+import re
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from rich.console import Console
+from sessions import FAST, rehearsal_of
+
+from cli import bridge
+from cli import replay as replay_command
+from cli import trace as trace_command
+from design.certificate import assess
+from design.files import plain
+from hw.control import CertifiedCoupling, certified_coupling, fill
+from hw.emulator import Emulator
+from hw.faults import lively
+from hw.limits import SafetyLimits, Stage, Units
+from hw.recording import Recorder, digest, load, outcome, recipes_of, replay, result_of, save, save_npz, steady_ticks
+from hw.rehearsal import Rehearsal
+from hw.session import Session
+from sim.couplings import choose, limits_of
+from sim.run import assemble, run
+from sim.scenario import InputError
+from sim.stability import close, dominant_mode
+from sim.trace import Trace
+
+
+def test_missing_samples_are_filled_by_a_straight_line():
+    assert fill((0.0, 3.0), (3.0, 0.0), 3) == [(1.0, 2.0), (2.0, 1.0), (3.0, 0.0)]
+    assert fill((0.0,), (1.0,), 1) == [(1.0,)]
+
+
+@pytest.fixture(scope="module")
+def trace(scenario, rungs, tmp_path_factory):
+    """A session over a line that loses STATEs, as files."""
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(lively(scenario), rungs, "up:drop=0.05@0.3", recorder=recorder)
+    session = rehearsal.run_until_armed(1.0)
+    session.stop("enough", session.now)
+    rehearsal.run(2.5)
+    report = outcome("I", session, recorder, 0)
+    out = tmp_path_factory.mktemp("trace")
+    return save(out, session, recorder, report, plot=True), recorder
+
+
+def test_a_trace_is_one_of_sim_run(trace):
+    files, recorder = trace
+    result = Trace.load_npz(files[0])
+    assert result.t.size == len(recorder)
+    np.testing.assert_array_equal(np.diff(recorder.link()["tick"]) & 0xFFFF, 1)  # a row for every tick
+    assert np.isfinite(result.f).all()
+    assert {path.name for path in files} == {"trace.npz", "trace.csv", "figure.png", "report.json"}
+
+
+def test_a_replay_is_identical_bit_by_bit(trace):
+    result, link = load(trace[0][0])
+    assert 10 < (~link["received"]).sum() < 200
+    compared = replay(result, link)
+    assert compared.identical
+    assert np.abs(link["sent"]).max() > 1000
+
+
+def test_a_session_armed_twice_is_replayed_with_both_couplings(scenario, rungs, tmp_path):
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(lively(scenario), rungs, "down:jitter=0.0007@0.45", recorder=recorder)
+    session = rehearsal.run_until_armed(1.2)
+    assert session.stage == Stage.DISARMED
+    session.arm(session.now)
+    rehearsal.run(1e-6 * session.now + 0.8)
+    session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.2)
+    files = save(tmp_path, session, recorder, outcome("I", session, recorder, 0), False)
+    result, link = load(files[0])
+    assert [recipe.link_delay for recipe in recipes_of(result)] == [1, 2]
+    assert np.bincount(link["arming"]).min() > 300
+    assert replay(result, link).identical
+    assert np.abs(link["sent"][link["arming"] == 1]).max() > 100
+
+
+def test_a_replay_finds_one_changed_bit(trace):
+    result, link = load(trace[0][0])
+    changed = link["asked"].copy()
+    changed.view(np.int64)[100, 1] ^= 1
+    compared = replay(result, link | {"asked": changed})
+    assert np.flatnonzero(compared.asked).tolist() == [100]
+    assert not compared.sent.any()
+    x = result.x.copy()
+    x[200, 0] += 1e-6
+    moved = Trace(result.t, x, result.f, result.x_handle, result.v_handle, result.w, result.meta)
+    assert np.flatnonzero(replay(moved, link).asked)[0] == 200
+
+
+def test_the_replay_command(trace, capsys):
+    path = trace[0][0]
+    assert replay_command.main([str(path), "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["identical"] is True
+    with pytest.raises(InputError, match="No such file"):
+        replay_command.main(["nowhere.npz"])
+
+
+def test_a_trace_of_sim_run_is_no_session(scenario, rungs, tmp_path):
+    simulation = assemble(scenario, rungs[0].chosen.coupling)
+    path = run(simulation, "exact", ticks=10).save_npz(tmp_path / "trace.npz")
+    with pytest.raises(InputError, match="not of a bridge's session"):
+        load(path)
+
+
+def test_a_trace_whose_recipe_is_broken_is_bad_input(trace, tmp_path):
+    result, _ = load(trace[0][0])
+    broken = Trace(
+        result.t, result.x, result.f, result.x_handle, result.v_handle, result.w, result.meta | {"replay": {}}
+    )
+    path = save_npz(tmp_path / "trace.npz", broken, trace[1])
+    with pytest.raises(InputError, match="cannot be replayed"):
+        replay(*load(path))
+
+
+def _spoil(path, to, **changes):
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    changed = arrays | {name: change(arrays) for name, change in changes.items()}
+    changed.pop("digest")
+    np.savez_compressed(to, digest=np.array(digest(changed)), **changed)
+    return to
+
+
+def _nan(name):
+    def change(arrays):
+        values = arrays[name].copy()
+        values[7] = np.nan
+        return values
+
+    return change
+
+
+def _meta(**changes):
+    def change(arrays):
+        meta = json.loads(str(arrays["meta"]))
+        (recipe,) = meta["replay"]
+        limits = recipe["limits"] | changes.get("limits_more", {})
+        rest = {name: value for name, value in changes.items() if name != "limits_more"}
+        return np.array(json.dumps(meta | {"replay": [recipe | {"limits": limits} | rest]}))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"x": _nan("x")}, "x is not finite at tick 7"),
+        ({"link_gain": _nan("link_gain")}, "link_gain is not finite at tick 7"),
+        ({"link_asked": _nan("link_asked")}, "link_asked is not finite at tick 7"),
+        ({"link_gain": lambda a: a["link_gain"] * 5}, "link_gain is outside of 0 to 1"),
+        ({"link_gain": lambda a: a["link_gain"].astype(str)}, "link_gain is of type <U32"),
+        ({"link_asked": lambda a: a["link_asked"].astype(np.float32)}, "link_asked is of type float32"),
+        ({"link_received": lambda a: a["link_received"] * np.nan}, "link_received is of type float64"),
+        ({"link_sent": lambda a: a["link_sent"] * 1.0}, "link_sent is of type float64"),
+        ({"meta": lambda a: np.array("[1]")}, "metadata is a list"),
+        ({"link_arming": lambda a: a["link_arming"] + 1}, "link_arming does not count"),
+        ({"link_arming": lambda a: (a["link_tick"] == a["link_tick"][-1]).astype(int)}, "1 recipes for 2 armings"),
+        ({"meta": _meta(force_step=[0.0, 0.0])}, r"force_step #1 is 0"),
+        ({"meta": _meta(force_step=[4e-4])}, "force_step has 1 entries"),
+        ({"meta": _meta(cap=[30000])}, "cap has 1 entries"),
+        ({"meta": _meta(limits={})}, "missing or unknown: cap"),
+        ({"meta": _meta(limits_more={"sleew": 1.0})}, "missing or unknown: sleew"),
+        ({"meta": _meta(limits="none")}, "Expected `object`, got `str`"),
+        ({"meta": _meta(limits_more={"cap": [100.0, 100.0]})}, r"cap #1 is 100"),
+        ({"meta": _meta(limits_more={"slew": "fast"})}, "Expected `float`, got `str`"),
+        ({"meta": _meta(link_delay=9)}, "link_delay is 9, allowed are 1 to 1"),
+        ({"meta": _meta(link_delay=-(10**7))}, "link_delay is -10000000"),
+    ],
+)
+def test_a_spoiled_trace_is_one_line(trace, tmp_path, changes, words):
+    path = _spoil(trace[0][0], tmp_path / "trace.npz", **changes)
+    with pytest.raises(InputError, match=words) as error:
+        replay_command.main([str(path)])
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["t", "f", "link_tick", "link_margin_us", "link_status", "link_sent", "meta", "digest"]
+)
+def test_a_trace_changed_by_hand_is_refused(trace, tmp_path, name):
+    """Also where no force of the replay would show it; so is one that is cut off."""
+    with np.load(trace[0][0]) as archive:
+        arrays = {key: archive[key] for key in archive.files}
+    other = {"meta": np.array(str(arrays["meta"]).replace("true", "false", 1)), "digest": np.array("")}
+    changed = arrays | {name: other[name] if name in other else arrays[name][::-1]}
+    cut = {key: values[:-5] if values.ndim else values for key, values in arrays.items()}
+    for spoiled in (changed, cut):
+        np.savez_compressed(tmp_path / "trace.npz", **spoiled)
+        with pytest.raises(InputError, match="was changed after"):
+            replay_command.main([str(tmp_path / "trace.npz")])
+
+
+def test_an_empty_or_a_damaged_trace_is_one_line(trace, tmp_path):
+    with np.load(trace[0][0]) as archive:
+        empty = {name: archive[name][:0] if archive[name].ndim else archive[name] for name in archive.files}
+    np.savez_compressed(tmp_path / "empty.npz", **empty)
+    with pytest.raises(InputError, match="has no ticks"):
+        replay_command.main([str(tmp_path / "empty.npz")])
+    whole = bytearray(trace[0][0].read_bytes())
+    for place in range(200, len(whole), len(whole) // 40):
+        damaged = whole.copy()
+        damaged[place] ^= 0x55
+        (tmp_path / "damaged.npz").write_bytes(damaged)
+        with suppress(InputError):  # a byte of the archive's own padding or of a name may not matter
+            replay_command.main([str(tmp_path / "damaged.npz")])
+
+
+@pytest.mark.parametrize(("cap", "slew"), [(0.3, 2000.0), (12.0, 10.0)])
+def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
+    """Growth is told before the first force that the cap or the slew rate changed, as the counters saw it.
+
+    To two ticks: a force that is cut by less than a step is the same force.
+    """
+    recorder = Recorder(2)
+    session = Session(scenario, SafetyLimits((cap, cap), slew), FAST)
+    cuts = []
+
+    def record(row):
+        recorder(row)
+        cuts.append(session.counters.clipped + session.counters.slowed)
+
+    session.record = record
+    Rehearsal(session, Emulator(lively(scenario)), lambda ages: rungs).run_until_armed(1.2)
+    ((first, stop),) = steady_ticks(recorder, session.units.force_step, session.limits.cap)
+    assert (recorder.link()["gain"][first:] == 1.0).all()
+    full = np.diff(cuts, prepend=0)[first:]
+    assert 0 <= stop - first - int(np.argmax(full > 0)) <= 2
+    assert stop - first > 20
+
+
+class Dared(CertifiedCoupling):
+    """A coupling that passes for certified: what a certificate keeps out has to be seen once."""
+
+    certified = True
+
+
+@pytest.mark.parametrize(("name", "settles"), [("none", False), (None, True)])
+def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, settles):
+    """From the file alone: the exact engine's eigenvalue without coupling, to 2e-3 1/s (a rounded force is no linear
+    one), and with the certified one nothing that oscillates. On the ticks of full gain, before the cap is met.
+    """
+    made = certified_coupling(scenario, "I", None, None, 1) if settles else None
+    if made is None:
+        chosen = choose(scenario, "I", name, None)
+        requirements = assess(scenario.loop("I"), chosen.coupling)
+        made = Dared(1, scenario, "I", chosen, requirements, limits_of(scenario, chosen, requirements))
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(scenario, [made], recorder=recorder)
+    session = rehearsal.run_until_armed(2.0 if settles else 7.0)
+    session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.2)
+    report = outcome("I", session, recorder, 0)
+    ((first, stop),) = report.run.steady_ticks
+    gain = recorder.link()["gain"]
+    assert (gain[first:stop] == 1.0).all()
+    assert gain[first - 1] < 1.0
+    path = save(tmp_path, session, recorder, report, False)[0]
+    assert trace_command.main([str(path), "--json", "-"]) == 0
+    (part,) = json.loads(capsys.readouterr().out)["growth"]
+    assert [part] == plain(report)["growth"]
+    if settles:
+        assert part["reason"].startswith("nothing oscillates")
+        return
+    simulation = assemble(scenario, made.chosen.coupling)
+    exact = dominant_mode(close(simulation.plant, simulation.F))
+    assert part["growth_rate_per_s"] == pytest.approx(exact.growth, abs=2e-3)
+    assert part["frequency_hz"] == pytest.approx(exact.frequency_hz, abs=1.0)
+    assert part["trend"] == "grows"
+    bridge.print_session(report, Console(width=200))
+    assert re.search(r"growth at full gain, arming 1, ticks \d+ to \d+ .*: \+1.48", capsys.readouterr().out)
+
+
+def test_the_report_is_json_and_names_its_end(trace):
+    report = json.loads(trace[0][-1].read_text())
+    assert report["session"]["stage"] == "finished"
+    assert [e["stage"] for e in report["session"]["log"]][-2:] == ["disarming", "finished"]
+    assert report["link"]["counters"]["gaps"] > 10
+    assert report["link"]["age_us"]["p50"] == pytest.approx(130, abs=1)  # what the rehearsal's line takes
+    assert report["certificate"]["certified"]
+
+
+def test_results_of_nothing():
+    recorder = Recorder(2)
+    assert recorder.link()["x"].shape == (0, 2)
+
+
+def test_result_of_holds_the_last_known_force(trace):
+    """Where no STATE came, the trace shows the force that was known last."""
+    _, recorder = trace
+    link = recorder.link()
+    result = result_of(recorder, Units((1e-6,) * 2, (4e-4,) * 2, (10**5,) * 2), 1.2e-3, {})
+    k = int(np.flatnonzero(~link["received"])[0])
+    np.testing.assert_array_equal(result.f[k], result.f[k - 1])

@@ -1,0 +1,22 @@
+"""Sessions in virtual time: what the tests of hw/ rehearse with."""
+
+from hw.emulator import Emulator, FaultInjection
+from hw.limits import SafetyLimits
+from hw.monitor import LinkSettings
+from hw.rehearsal import Rehearsal
+from hw.session import Session
+
+FAST = LinkSettings(measure=100)
+AT_REST = LinkSettings(measure=100, test_encoders=False)  # nothing moves the handles before the person does
+
+
+def session_with(scenario, settings=FAST):
+    return Session(scenario, SafetyLimits(tuple(d.force_limit for d in scenario.device)), settings)
+
+
+def rehearsal_of(scenario, rungs, *faults, recorder=None, settings=FAST, **options):
+    faults = tuple(map(FaultInjection.parse, faults))
+    session = session_with(scenario, settings)
+    if recorder is not None:
+        session.record = recorder
+    return Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, **options)
