@@ -504,12 +504,12 @@ class _LimiterSearch:
     def least(self) -> tuple[tuple[tuple[float, ...], ...], float, float, float]:
         """(c, s(c), where it binds, a lower bound on s over all c that have something to spare)."""
         unknowns = range(int(np.prod(self._shape)) + 1)  # c and s
-        limits = cone.Block.least(unknowns, 0.0), cone.Block.most(unknowns[:-1], _LARGEST_WEIGHT)
+        limits = cone.Inequality.least(unknowns, 0.0), cone.Inequality.most(unknowns[:-1], _LARGEST_WEIGHT)
         first = self._grid[np.linspace(0, self._grid.size - 1, _FIRST_FREQUENCIES).astype(int)]
         c, bound, blocks = np.zeros(len(unknowns) - 1), np.inf, [*limits, self._block(first, unknowns)]
         for _ in range(_MOST_ROUNDS):
             try:
-                x = cone.Problem(np.eye(len(unknowns))[-1], blocks).solve("the multiplier of the limiter")
+                x = cone.ConeProgram(np.eye(len(unknowns))[-1], blocks).solve("the multiplier of the limiter")
             except DesignFailed:  # no c within the bounds makes the block positive, however large the damping
                 return self._rows(c), np.inf, self.swept(self._rows(c), SPARE)[1], np.inf
             c, bound = np.maximum(x[:-1], 0.0), float(x[-1])
@@ -525,14 +525,14 @@ class _LimiterSearch:
         """c (m lags,) as a row per channel."""
         return tuple(tuple(row) for row in c.reshape(self._shape).tolist())
 
-    def _block(self, w: Array, unknowns: Sequence[int]) -> cone.Block:
+    def _block(self, w: Array, unknowns: Sequence[int]) -> cone.Inequality:
         """free(c) + s gain at w (k,) with something to spare, in units of Delta_D/T."""
         z, root = on_circle(w), np.tile(np.sqrt(self._loop[0].T / np.array(self._delta)), 2)
         none = self.demand(self._rows(np.zeros(len(unknowns) - 1)))
         free, gain = hermitian(none.free.at(z)), hermitian(none.gain.at(z))
         slopes = [hermitian(self.demand(self._rows(unit)).free.at(z)) - free for unit in np.eye(len(unknowns) - 1)]
         constant, by = (root[:, None] * part * root for part in (free - SPARE * self._lag, np.array([*slopes, gain])))
-        return cone.Block(constant, by, unknowns)
+        return cone.Inequality(constant, by, unknowns)
 
 
 def half_widths(lo: Sequence[int], hi: Sequence[int]) -> Array:
