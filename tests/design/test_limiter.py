@@ -5,7 +5,7 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
-from worlds import DELTA, PAIR, T
+from worlds import DELTA, PAIR, STIFF, T
 
 from cli.design import main as design_main
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
@@ -114,7 +114,7 @@ def test_the_coupling_designed_with_the_block():
         (NoCoupling(), 1.74600),
         (CASE_I, 1.41600),
         (SpringDamper((879.0, 552.0), (0.39, 0.52)), 0.72345),
-        (SpringDamper((7806.0, 3137.0), (0.105, 1.68)), 1.38533),
+        (STIFF, 1.38533),
         (BUILT, 1.32327),
     ],
     ids=["none", "published", "any-environment", "this-environment", "built"],
@@ -206,7 +206,7 @@ def test_the_exact_proof_survives_the_file(stored, tmp_path):
 
 def test_files_without_it_stay_as_they_were(tmp_path):
     """A coupling needs 1.385 with the limiter: its linear proof is untouched, the other is refused with the figure."""
-    stiff = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
+    stiff = STIFF
     plain = prove(PAIR, stiff, "this-environment")
     assert "limiter" not in msgspec.to_builtins(plain)
     assert lag(PAIR, plain) is None
@@ -298,3 +298,13 @@ def test_the_command_stores_a_coupling_that_is_proved_with_limited_forces(tmp_pa
     assert lag(stored.loop, stored.certificate) == LAG
     with pytest.raises(InputError, match=r"--limiter is for --coupling .*, not ccl"):
         design_main(["--coupling", "ccl", "--limiter", "--out", str(out)])
+
+
+def test_the_best_multiplier_attains_its_bound_and_no_other_does_better():
+    """Delays of 0 and 3 samples, where lines through the worst directions never settled: 1.263, not 31."""
+    loop = msgspec.structs.replace(PAIR, theta=(0, 3), lam=(0, 0))
+    G, rho = loop.sent(BUILT), limiter_lag(loop.delta, loop.T, 0.01)
+    found = limiter(G, loop.theta, loop.delta, rho)
+    assert found.requirement.ratio <= found.bound * (1 + 1e-5)
+    for c in np.random.default_rng(0).uniform(0, 1.5, (5, 2, 1)).tolist():
+        assert limiter(G, loop.theta, loop.delta, rho, c).requirement.ratio > found.requirement.ratio * (1 - 1e-3)
