@@ -17,7 +17,7 @@ Where delays vary, Theta is not in the block: its forces pass through a line tha
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, Protocol
@@ -32,6 +32,7 @@ from controller.walls import Contact, State
 
 Stretch = Callable[[int], None]  # so many ticks from row 0 on
 
+_PART = 512  # ticks of a stretch whose memory and views stay in the cache
 _CALM = 1 - 1e-9  # of the limiter's forces: above that they are being limited
 
 
@@ -297,21 +298,22 @@ class FusedTicks:
         seen = np.vstack([np.eye(nz, step.shape[1], B.shape[1]), step[:m]])  # [z+; x] of the next tick
         self.product = np.vstack([law @ seen, step]).dot
         to_z, to_s, to_a = np.cumsum([outside + m, nz, states]).tolist()
-        memory = np.zeros((buffer.ticks + 1, to_a + G.shape[1]))
+        memory = np.zeros((min(_PART, buffer.ticks) + 1, to_a + G.shape[1]))
         self.held, self.before = list(memory[:, :to_z]), list(memory[:, to_z - B.shape[1] :])
         self.next, self.states = list(memory[1:, outside:to_a]), memory[1:, to_s:to_a]
         self.further = list(memory[:, to_a:])
         self._w, self._after, self._s = memory[:, :outside], memory[:, outside:to_s], memory[:, to_s:to_a]
         self._buffer, self._law = buffer, partial(law.dot, buffer.rows[0, : nz + m], buffer.after[0])
 
-    def begin(self, ticks: int) -> None:
-        """Take the first row of the buffer, with the law there, and the outside forces."""
-        buffer = self._buffer
+    def parts(self, ticks: int) -> Iterator[int]:
+        """Ticks to be made from row 0 of the memory on, again and again, until the first rows of the buffer are."""
+        buffer, after, s = self._buffer, self._after, self._s
         self._law()
-        self._w[:ticks] = buffer.w[:ticks, :, 0]
-        self._after[0], self._s[0] = buffer.after[0, :, 0], buffer.s[0, :, 0]
-
-    def end(self, ticks: int) -> None:
-        """Write what the ticks came to, and the plant's state after them."""
-        self._buffer.after[1:ticks, :, 0] = self._after[1:ticks]
-        self._buffer.s[1 : ticks + 1, :, 0] = self._s[1 : ticks + 1]
+        after[0], s[0] = buffer.after[0, :, 0], buffer.s[0, :, 0]
+        for first in range(0, ticks, _PART):
+            count = min(_PART, ticks - first)
+            self._w[:count] = buffer.w[first : first + count, :, 0]
+            yield count
+            buffer.after[first : first + count, :, 0] = after[:count]
+            buffer.s[first + 1 : first + count + 1, :, 0] = s[1 : count + 1]
+            after[0], s[0] = after[count], s[count]

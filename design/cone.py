@@ -56,7 +56,7 @@ class Attempt:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class Inequality:
     """constant + sum_a x[unknowns[a]] slopes[a] >= 0, k Hermitian matrices."""
 
     constant: Array | Complex  # (k, n, n)
@@ -64,7 +64,7 @@ class Block:
     unknowns: Sequence[int]  # (q,) those of the problem that take part
 
     @classmethod
-    def of(cls, function: Callable[[Array], Array], unknowns: Sequence[int]) -> Block:
+    def of(cls, function: Callable[[Array], Array], unknowns: Sequence[int]) -> Inequality:
         """function(x[unknowns]) >= 0, affine to a symmetric matrix, from its values at 0 and the unit vectors."""
         constant = function(np.zeros(len(unknowns)))
         return cls(constant[None], np.stack([function(e) - constant for e in np.eye(len(unknowns))])[:, None], unknowns)
@@ -95,11 +95,11 @@ def _real(H: Array | Complex) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class ConeProgram:
     """minimise cost'x under the blocks."""
 
     cost: Array  # (p,)
-    blocks: Sequence[Block]
+    blocks: Sequence[Inequality]
 
     def solve(
         self, what: str, accept: Callable[[Array], bool] | None = None, ladder: Sequence[_Settings] | None = None
@@ -153,7 +153,7 @@ class Problem:
         return None if accept is None or accept(x) else "the result does not pass the caller's verification"
 
 
-def _clarabel(problem: Problem, options: Mapping[str, Any]) -> tuple[Array, str]:
+def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, str]:
     """(x, the status that Clarabel reports): minimise cost'x with constant - s = -slopes x and every s in its cone."""
     import clarabel
 
@@ -196,7 +196,7 @@ _KEPT = 0.98  # of the way to the boundary
 _Parts = list[Any]  # a stack of Hermitian matrices for each block
 
 
-def _interior(problem: Problem) -> tuple[Array, str]:
+def _interior(problem: ConeProgram) -> tuple[Array, str]:
     """(x, status in Clarabel's words)."""
     blocks, cost, x = problem.blocks, problem.cost, np.zeros(len(problem.cost))
     size = max(np.abs(part).max(initial=1.0) for block in blocks for part in (block.constant, block.slopes, cost))
@@ -232,7 +232,7 @@ class _Newton:
     Raises LinAlgError where S, Z or the equations are singular to rounding.
     """
 
-    def __init__(self, problem: Problem, S: _Parts, Z: _Parts, missing: _Parts, wrong: Array) -> None:
+    def __init__(self, problem: ConeProgram, S: _Parts, Z: _Parts, missing: _Parts, wrong: Array) -> None:
         self._problem, self._Z, self._missing, self._wrong = problem, Z, missing, wrong
         self._roots = [[np.linalg.inv(np.linalg.cholesky(part)) for part in parts] for parts in (S, Z)]
         self._inverse = [_adjoint(root) @ root for root in self._roots[0]]
@@ -260,7 +260,7 @@ class _Newton:
         return [_hermitian(mu * inverse - z - (z @ ds + more) @ inverse) for z, ds, more, inverse in parts]
 
 
-def _inner(problem: Problem, Z: _Parts) -> Array:
+def _inner(problem: ConeProgram, Z: _Parts) -> Array:
     """<slope_a, Z> of every unknown."""
     total = np.zeros(len(problem.cost))
     for block, z in zip(problem.blocks, Z, strict=True):

@@ -23,7 +23,7 @@ from controller.loop import Loop
 from controller.lti import Array, Lti
 from design import lmi, spring_damper
 from design.arguments import of_kind, one_of, whole
-from design.cone import Block, Problem
+from design.cone import ConeProgram, Inequality
 from design.frequency import on_circle
 from design.result import Design, DesignFailed, Requirement
 
@@ -179,7 +179,9 @@ def _roomiest(inequality: Callable[[Array], Array], n: int, what: str) -> Array:
         return storage(x) - x[-1] * np.eye(n)
 
     cost = np.append(np.zeros(lmi.packed(n)), -1.0)
-    return storage(Problem(cost, [Block.of(function, every) for function in (roomy, positive, most)]).solve(what))
+    return storage(
+        ConeProgram(cost, [Inequality.of(function, every) for function in (roomy, positive, most)]).solve(what)
+    )
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -238,8 +240,8 @@ def _step(family: FixedOrder, at: Array, Q0: Array, U0: Array, norm: float) -> t
         lambda v: _MOST * np.eye(nq) - split(v)[1],
         lambda v: _MOST * np.eye(nu) - split(v)[2],
     ]
-    blocks = [Block.of(function, every) for function in (passivity, gain, *storages)]
-    problem = Problem(np.append(np.zeros(ends[-1]), 1.0), blocks)
+    blocks = [Inequality.of(function, every) for function in (passivity, gain, *storages)]
+    problem = ConeProgram(np.append(np.zeros(ends[-1]), 1.0), blocks)
     p, Q, U, _ = split(problem.solve("a step of the inner convex approximation"))
     return p, LQ @ Q @ LQ.T, LU @ U @ LU.T
 
@@ -300,7 +302,7 @@ class _Relaxed:
         matrices = [np.eye(n) for n in self.sizes]
         for spent in range(1, patience + 1):
             try:
-                x = Problem(self._inner(matrices), blocks).solve("a step of cone complementarity")
+                x = ConeProgram(self._inner(matrices), blocks).solve("a step of cone complementarity")
             except DesignFailed:
                 return None, spent
             p, matrices = self.split(x)
@@ -314,7 +316,7 @@ class _Relaxed:
         both = [2 * M - np.diag(np.diag(M)) for M in (Y0, Q0, X0, U0)]
         return np.concatenate([np.zeros(self.family.unknowns), *(M[np.triu_indices(len(M))] for M in both)])
 
-    def _blocks(self, mu: float) -> list[Block]:
+    def _blocks(self, mu: float) -> list[Inequality]:
         def passivity(v: Array) -> Array:
             p, (Q, Y, _, _) = self.split(v)
             G = _in_coordinates(self.family.ports(p), self.LQ)
@@ -332,7 +334,7 @@ class _Relaxed:
             return lambda v: lmi.symmetric([[self.split(v)[1][first + 1], one], [one, self.split(v)[1][first]]])
 
         every = range(self.family.unknowns + sum(map(lmi.packed, self.sizes)))
-        return [Block.of(f, every) for f in (passivity, gain, pair(0), pair(2))]
+        return [Inequality.of(f, every) for f in (passivity, gain, pair(0), pair(2))]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -394,10 +396,10 @@ class FixedPoles:
             return lmi.symmetric_from(x[gains:], states)
 
         every = range(gains + entries)
-        passive = Block.of(lambda x: self._passivity(poles, x[:gains], storage(x)), every)
+        passive = Inequality.of(lambda x: self._passivity(poles, x[:gains], storage(x)), every)
         cost = np.append(np.zeros(len(every)), 1.0)  # t is the last
         cuts = self._cuts(poles, [*range(gains), len(every)])
-        x = Problem(cost, [passive, Block.of(storage, every), cuts]).solve("the coupling with fixed poles")
+        x = ConeProgram(cost, [passive, Inequality.of(storage, every), cuts]).solve("the coupling with fixed poles")
         self.sdps += 1
         return self._coupling(poles, x[:gains]), float(np.sqrt(x[-1]))
 
@@ -427,7 +429,7 @@ class FixedPoles:
         excess = np.hstack([C1, D1])[paid] / np.sqrt(self.sigma[paid])[:, None]
         return lmi.symmetric([[plain, excess.T], [excess, np.eye(excess.shape[0])]])
 
-    def _cuts(self, poles: Sequence[Sequence[float]], unknowns: Sequence[int]) -> Block:
+    def _cuts(self, poles: Sequence[Sequence[float]], unknowns: Sequence[int]) -> Inequality:
         """[[I, L*], [L, t I]] >= 0 for W1 L W2 at the binding frequencies."""
         w = np.array(self.frequencies)
         left, right, late = self.shaping.parts(w)

@@ -24,7 +24,7 @@ from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.conditions import even_damping, regular_part, uncovered
-from design.cone import Block, Problem
+from design.cone import ConeProgram, Inequality
 from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import DesignFailed, Infeasible
 
@@ -201,7 +201,7 @@ def _scaled(G: Lti, left: Array, right: Array) -> Lti:
 
 def gain_block(
     unknowns: Sequence[int], rows: Complex, row_slopes: Complex, base: Complex, base_slopes: Complex | Array
-) -> Block:
+) -> Inequality:
     """[[base, rows*], [rows, t I]], where t is the last of the unknowns.
 
     rows (k, p, m) with slopes (q, k, p, m); base (k, m, m) with slopes (q, k, m, m). Where base >= 0 it says
@@ -215,7 +215,7 @@ def gain_block(
         target[..., m:, :m] = low
         target[..., :m, m:] = np.conj(np.swapaxes(low, -1, -2))
     slopes[q, :, m:, m:] = np.eye(p)
-    return Block(constant, slopes, unknowns)
+    return Inequality(constant, slopes, unknowns)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -266,8 +266,10 @@ def _of_least_trace(regular: Lti, most: float) -> Array:
         return lemma1(ports, symmetric_from(x[m:], n), zero, -np.diag(x[:m]))
 
     size = range(m + packed(n))
-    storage, room = Block.of(lambda x: symmetric_from(x[m:], n), size), lambda x: np.diag(most - x[:m])
-    problem = Problem(np.repeat([1.0, 0.0], [m, packed(n)]), [Block.of(passive, size), storage, Block.of(room, size)])
+    storage, room = Inequality.of(lambda x: symmetric_from(x[m:], n), size), lambda x: np.diag(most - x[:m])
+    problem = ConeProgram(
+        np.repeat([1.0, 0.0], [m, packed(n)]), [Inequality.of(passive, size), storage, Inequality.of(room, size)]
+    )
     return problem.solve("the multiplier Phi of the environment")[:m]
 
 

@@ -18,7 +18,7 @@ from controller.coupling import MovingAverage, SpringDamper
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.conditions import any_environment, any_environment_delayed, even_damping, this_environment
-from design.cone import Block, Problem
+from design.cone import ConeProgram, Inequality
 from design.frequency import peaks, too_long
 from design.gain_search import LimiterLoop, SampledLoop, SwitchingLoop, least_rms, polynomials
 from design.lmi import RESERVE, Shaping, gain_block, least_phi, usable
@@ -56,27 +56,27 @@ def solve_within(
     theta: Sequence[int],
     sigma: Array,
     what: str,
-    more: Sequence[Block] = (),
+    more: Sequence[Inequality] = (),
     largest_gram: int = _LARGEST_GRAM,
 ) -> Array:
     """The unknowns of least cost: gains (k_1, ..., k_N, b_1, ..., b_N), each channel's in its set, then others.
 
-    `more` blocks bound these, too. Raises as Problem.solve, and DesignFailed where an inequality still fails after all
-    rounds.
+    `more` inequalities bound these, too. Raises as ConeProgram.solve, and DesignFailed where one still fails after
+    all rounds.
     """
     N, own = len(theta), len(cost)
     both = [(i, N + i) for i in range(N)]
-    blocks = [*more, Block.of(np.diag, range(2 * N))]
+    blocks = [*more, Inequality.of(np.diag, range(2 * N))]
     spare = [(n + 1) * (n + 2) // 2 for n in theta]
     if sum(spare) <= largest_gram:
         ends = own + np.cumsum([0, *spare])
         for i in range(N):
             blocks.append(_gram(theta[i], float(sigma[i]), [*both[i], *range(ends[i], ends[i + 1])]))
-        return Problem(np.append(cost, np.zeros(sum(spare))), blocks).solve(what)[:own]
+        return ConeProgram(np.append(cost, np.zeros(sum(spare))), blocks).solve(what)[:own]
     sampled = [_first_frequencies(n) for n in theta]
     for _ in range(_MOST_ROUNDS):
         sets = [_sampled(theta[i], float(sigma[i]), both[i], sampled[i]) for i in range(N)]
-        x = Problem(cost, [*blocks, *sets]).solve(what)
+        x = ConeProgram(cost, [*blocks, *sets]).solve(what)
         missed = [_missed_frequencies(x[i], x[N + i], theta[i], float(sigma[i])) for i in range(N)]
         if not any(w.size for w in missed):
             return x
@@ -85,7 +85,7 @@ def solve_within(
     raise DesignFailed(None, (), line)
 
 
-def _gram(theta: int, sigma: float, unknowns: Sequence[int]) -> Block:
+def _gram(theta: int, sigma: float, unknowns: Sequence[int]) -> Inequality:
     """The exact set of (k, b): r - |c(z)|^2 is non-negative iff c c' <= Q for some Q whose diagonals sum to r and 0.
 
     c holds the coefficients of 1, 1/z, ..., z^-n; Q is unknown but for the last entry of each diagonal.
@@ -104,10 +104,10 @@ def _gram(theta: int, sigma: float, unknowns: Sequence[int]) -> Block:
         Q += np.triu(Q, 1).T
         return np.block([[Q, c], [c.T, np.eye(c.shape[1])]])
 
-    return Block.of(matrix, unknowns)
+    return Inequality.of(matrix, unknowns)
 
 
-def _sampled(theta: int, sigma: float, unknowns: Sequence[int], w: Array) -> Block:
+def _sampled(theta: int, sigma: float, unknowns: Sequence[int], w: Array) -> Inequality:
     """The inequality at the frequencies w [rad/sample]: |c|^2 <= r as [[r, c'], [c, I]] >= 0."""
 
     def arrow(r: float, one: float, y: Any) -> Array:
@@ -120,7 +120,7 @@ def _sampled(theta: int, sigma: float, unknowns: Sequence[int], w: Array) -> Blo
     of_k, of_b = polynomials(theta, w)
     constant = arrow(0.0, 1.0, np.zeros(w.size, dtype=complex))
     constant += np.diag([0.0, *np.ones(constant.shape[-1] - 1)])
-    return Block(constant, np.stack([arrow(0.5, 0.0, of_k), arrow(1.0, 0.0, of_b)]), unknowns)
+    return Inequality(constant, np.stack([arrow(0.5, 0.0, of_k), arrow(1.0, 0.0, of_b)]), unknowns)
 
 
 def _missed_frequencies(k: float, b: float, theta: int, sigma: float) -> Array:
@@ -155,7 +155,7 @@ def step(shaping: Shaping, sigma: Array, at: Array, norm: float, w: Array) -> tu
     return x[:-1], norm * float(np.sqrt(x[-1]))
 
 
-def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Block:
+def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     """[[g0* g + g* g0 - g0* g0, (W1 L g W2)*], [W1 L g W2, t norm^2]], scaled to order one; t is the last variable."""
     N = shaping.loop.channels
     left, right, late = shaping.parts(w)
@@ -402,7 +402,7 @@ def _start(loop: Loop, sigma: Array, start: SpringDamper | None) -> tuple[Array,
             away = (x[:-1] - wanted)[:, None]
             return np.block([[x[-1] * np.eye(2 * N), away], [away.T, x[-1:, None]]])
 
-        more = [Block.of(near, range(2 * N + 1))]
+        more = [Inequality.of(near, range(2 * N + 1))]
     try:
         x = solve_within(cost, loop.theta, sigma, "the set of gains", more)
     except Infeasible as error:

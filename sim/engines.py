@@ -31,8 +31,9 @@ class Engine(Protocol):
         """Take the plant state of row 0 as the state at the first tick."""
         ...
 
-    def advance(self, k: int, /) -> None:
-        """Hold the plant input of row k, forces within their limits, for T; write the plant state of row k + 1."""
+    @property
+    def advance(self) -> Callable[[int], None]:
+        """k: hold the plant input of row k, forces within their limits, for T; write the plant state of row k + 1."""
         ...
 
     def troubled(self) -> bool:
@@ -77,10 +78,9 @@ class ExactEngine(_Exact):
         product, before, after = fused.product, fused.before, fused.next
 
         def stretch(ticks: int) -> None:
-            fused.begin(ticks)
-            for k in range(ticks):
-                product(before[k], after[k])
-            fused.end(ticks)
+            for count in fused.parts(ticks):
+                for k in range(count):
+                    product(before[k], after[k])
 
         return stretch
 

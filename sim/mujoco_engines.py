@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -199,17 +199,18 @@ class MujocoEngine:
     def start(self, buffer: StepBuffer) -> None:
         self._buffer, self.stretch, access = buffer, None, self._access
         access.put(buffer, 0)
-        self.__dict__.pop("advance", None)
+        self._advance: Callable[[int], None] | None = None
         if buffer.calm and not self._timing and not (self._rubs and buffer.limited):
             if self._whole:
                 self.stretch = self._fused(buffer, self._whole(access.T))
             elif not access.move:
                 self.stretch = self._stepped(buffer)
 
-    @cached_property
+    @property
     def advance(self) -> Callable[[int], None]:
-        """From `start` on; made when a tick is asked for alone."""
-        return self._access.ticks(self._buffer, self._timing)
+        """From `start` on; prepared when a tick is asked for alone."""
+        self._advance = self._advance or self._access.ticks(self._buffer, self._timing)
+        return self._advance
 
     def _fused(self, buffer: StepBuffer, move: Array) -> Stretch:
         access, states = self._access, len(move)
@@ -219,14 +220,13 @@ class MujocoEngine:
         shaped = list(fused.states.reshape(-1, *state.shape))
 
         def stretch(ticks: int) -> None:
-            fused.begin(ticks)
-            for inputs, rate, now, then, moved in zip(held[:ticks], rates, before, after, shaped, strict=False):
-                ctrl[...] = inputs
-                forward()
-                rate[...] = qacc
-                product(now, then)
-                state[...] = moved
-            fused.end(ticks)
+            for count in fused.parts(ticks):
+                for inputs, rate, now, then, moved in zip(held[:count], rates, before, after, shaped, strict=False):
+                    ctrl[...] = inputs
+                    forward()
+                    rate[...] = qacc
+                    product(now, then)
+                    state[...] = moved
 
         return stretch
 

@@ -44,8 +44,8 @@ Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 _COPIES = 4  # of a trace, at most, from the run to its report
 _SMALL = 1e8  # [bytes] of a trace for which the free memory is not looked up
 _COLUMNS = 50  # numbers a tick that the report of a trace on the disk takes in memory
-_BLOCK = 512  # ticks between two looks at the keyboard and the numbers: what a block needs stays in the cache
-_AHEAD = 16  # blocks for which outside forces are asked at once
+_BLOCK = 2048  # ticks between two looks at the clock, the keyboard and the numbers
+_AHEAD = 8  # blocks for which outside forces are asked at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,17 +210,17 @@ def run_blocks(
 
     Row 0 of the buffer is the block's first tick. So few ticks in a block that it stays in the processor's cache.
     """
-    buffer = StepBuffer(process, min(block, ticks), start.shape[0], outside(0, 0).shape[1], start.shape[1])
+    ahead = outside(0, min(_AHEAD * block, ticks))
+    buffer = StepBuffer(process, min(block, ticks), start.shape[0], ahead.shape[1], start.shape[1])
     buffer.s[0] = start
     # a diverging run is reported, not warned about
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
         engine.start(buffer)
-        ahead = outside(0, 0)
         for first in range(0, ticks, block):
-            count, ahead = min(block, ticks - first), ahead[block:]
+            count = min(block, ticks - first)
             if not len(ahead):
                 ahead = outside(first, min(_AHEAD * block, ticks - first))
-            buffer.w[:count] = ahead[:count, :, None]
+            buffer.w[:count], ahead = ahead[:count, :, None], ahead[block:]
             run_block(buffer, engine, count)
             if look(buffer, first, count):
                 return

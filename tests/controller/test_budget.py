@@ -144,7 +144,7 @@ def test_a_coupling_on_springs_that_it_was_not_made_for():
         s, z, line = np.zeros((nsim, plants.A.shape[-1])), np.zeros((F.order, nsim)), np.zeros((3, 2, nsim))
         s[:, s.shape[1] // 2 :] = 0.1
         x = acted = supplied = np.zeros((2, nsim))
-        for k in range(6000):
+        for k in range(4000):
             dx, x = s[:, :2].T - x, s[:, :2].T.copy()
             wanted = np.clip(F.C @ z + F.D @ x, -12, 12)
             z = F.A @ z + F.B @ x

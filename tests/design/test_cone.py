@@ -9,13 +9,13 @@ import pytest
 from analysis import solve
 
 from design import cone
-from design.cone import INTERIOR, LADDER, Block, Problem
+from design.cone import INTERIOR, LADDER, ConeProgram, Inequality
 from design.lmi import symmetric_from
 from design.result import DesignFailed, Infeasible
 
 #: the least trace of X >= M is that of M
 M = np.array([[2.0, 1.0], [1.0, 2.0]])
-LEAST_TRACE = Problem(np.array([1.0, 0.0, 1.0]), [Block.of(lambda v: symmetric_from(v, 2) - M, range(3))])
+LEAST_TRACE = ConeProgram(np.array([1.0, 0.0, 1.0]), [Inequality.of(lambda v: symmetric_from(v, 2) - M, range(3))])
 
 
 def hermitian(rng, *shape):
@@ -39,9 +39,9 @@ def with_known_optimum(rng, p, shapes):
         sizes = rng.uniform(0.5, 2, (count, n))
         S, Z = ((basis * (sizes * part)[:, None]) @ np.conj(np.swapaxes(basis, 1, 2)) for part in (of_S, ~of_S))
         cost[taking] += np.einsum("akij,kji->a", slopes, Z).real
-        blocks.append(Block(S - np.tensordot(x[taking], slopes, axes=1), slopes, taking.tolist()))
-    blocks.append(Block.of(lambda v: np.diag([*(9 - v), *(9 + v)]), range(p)))
-    return Problem(cost, blocks), x
+        blocks.append(Inequality(S - np.tensordot(x[taking], slopes, axes=1), slopes, taking.tolist()))
+    blocks.append(Inequality.of(lambda v: np.diag([*(9 - v), *(9 + v)]), range(p)))
+    return ConeProgram(cost, blocks), x
 
 
 @pytest.mark.parametrize("ladder", [LADDER, (INTERIOR,)], ids=["Clarabel", "interior"])
@@ -132,7 +132,7 @@ def test_a_failure_carries_the_problem_and_what_was_tried(monkeypatch):
 
 def bounds(*of):
     """One unknown, between bounds."""
-    return Problem(np.array([1.0]), [Block.of(lambda v, f=f: np.array([[f(v[0])]]), [0]) for f in of])
+    return ConeProgram(np.array([1.0]), [Inequality.of(lambda v, f=f: np.array([[f(v[0])]]), [0]) for f in of])
 
 
 def test_infeasible_is_told_apart():

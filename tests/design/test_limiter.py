@@ -5,7 +5,7 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
-from worlds import DELTA, PAIR, T
+from worlds import DELTA, PAIR, STIFF, T
 
 from cli.design import main as design_main
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
@@ -114,7 +114,7 @@ def test_the_coupling_designed_with_the_block():
         (NoCoupling(), 1.74600),
         (CASE_I, 1.41600),
         (SpringDamper((879.0, 552.0), (0.39, 0.52)), 0.72345),
-        (SpringDamper((7806.0, 3137.0), (0.105, 1.68)), 1.38533),
+        (STIFF, 1.38533),
         (BUILT, 1.32327),
     ],
     ids=["none", "published", "any-environment", "this-environment", "built"],
@@ -206,7 +206,7 @@ def test_the_exact_proof_survives_the_file(stored, tmp_path):
 
 def test_files_without_it_stay_as_they_were(tmp_path):
     """A coupling needs 1.385 with the limiter: its linear proof is untouched, the other is refused with the figure."""
-    stiff = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
+    stiff = STIFF
     plain = prove(PAIR, stiff, "this-environment")
     assert "limiter" not in msgspec.to_builtins(plain)
     assert lag(PAIR, plain) is None

@@ -3,6 +3,7 @@
 import ast
 import re
 import tokenize
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -40,10 +41,16 @@ def is_door(node: ast.stmt) -> bool:
     return isinstance(node, ast.If) and "__main__" in ast.unparse(node.test)
 
 
+@cache
+def _tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
 def imported(path: Path) -> set[str]:
     """Every module that a file imports, at its head or later; names of modules in full."""
     names = set()
-    for top in ast.parse(path.read_text()).body:
+    for top in _tree(path).body:
         for node in () if is_door(top) else ast.walk(top):
             if isinstance(node, ast.Import):
                 names |= {alias.name for alias in node.names}
@@ -135,6 +142,20 @@ def test_the_check_sees_forbidden_arrows_and_circles(tmp_path):
     assert imported(wrong) == {"numpy", "sim.run"}
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}}) == ["a", "b", "c", "a"]
     assert circle({"a": {"b"}, "b": {"c"}}) is None
+
+
+def test_replaced_fields_exist():
+    """replace() of dataclasses and structs takes any name, so that pyright cannot see a wrong one."""
+    nodes = [(path, node) for path in FILES for node in ast.walk(_tree(path))]
+    fields = {n.target.id for _, n in nodes if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name)}
+    wrong = [
+        f"{path.name}:{node.lineno}: {keyword.arg}"
+        for path, node in nodes
+        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("replace", "change")
+        for keyword in node.keywords
+        if keyword.arg and keyword.arg not in fields
+    ]
+    assert not wrong
 
 
 def prose(path: Path) -> str:

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from driven import tick_by_tick
-from worlds import SOFT
+from worlds import SOFT, STIFF
 
 from cli.run import main
 from controller.coupling import SpringDamper
@@ -37,7 +37,7 @@ def test_which_limiter_a_coupling_may_have():
     assert own.rho == pytest.approx((11.4167, 11.4167))
     assert own.requirement is not None
     assert own.requirement.proof == "rational"
-    stiff = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
+    stiff = STIFF
     refused = covered_limits(loop, stiff, assess(loop, stiff))
     assert refused.rho is None
     assert "needs 1.385" in refused.reason
