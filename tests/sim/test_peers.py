@@ -46,7 +46,7 @@ def test_every_peer_is_looked_at():
 def test_it_is_the_same_loop(loop, name):
     allowed, needed = ALLOWED[name]
     if needed:
-        pytest.importorskip(needed)
+        pytest.importorskip(needed, reason=f"{needed} is no dependency: this runs where somebody has installed it")
     simulation, w, (z, s, f) = loop
     others_z, others_s, others_f = peers.PEERS[name](simulation, w)
     assert (others_z.shape, others_s.shape, others_f.shape) == (z.shape, s.shape, f.shape)
