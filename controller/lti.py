@@ -504,8 +504,12 @@ def taps(weights: Sequence[Any], T: Number) -> Lti:
 
 def _block_diagonal(parts: Sequence[Array]) -> Array:
     """The parts along the diagonal, of any arithmetic and any stack."""
-    zeros = [[np.zeros((p.shape[-2], q.shape[-1]), dtype=int) for q in parts] for p in parts]
-    return _block([[p if i == j else zeros[i][j] for j in range(len(parts))] for i, p in enumerate(parts)])
+    lead = np.broadcast_shapes(*(p.shape[:-2] for p in parts))
+    ends = np.cumsum([(0, 0), *(p.shape[-2:] for p in parts)], axis=0)
+    whole = np.zeros((*lead, *ends[-1]), dtype=np.result_type(*parts))
+    for part, (top, left), (low, right) in zip(parts, ends[:-1], ends[1:], strict=True):
+        whole[..., top:low, left:right] = part
+    return whole
 
 
 def _block(rows: Sequence[Sequence[Array]]) -> Array:

@@ -190,6 +190,8 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
     if (own > 0).all() and not (gain * (1 - np.eye(gain.shape[-1]))).any():
         weight = 1 / np.sqrt(own)
         return largest_eigenvalue(-weight[..., :, None] * free * weight[..., None, :])
+    if gain.ndim > 2 and (gain == gain[..., :1, :, :]).all():
+        gain = gain[..., :1, :, :]  # the same at every frequency: one decomposition
     eigenvalues, basis = np.linalg.eigh(gain)
     floor = np.maximum(1e-13 * np.abs(eigenvalues).max(axis=-1, keepdims=True), np.finfo(float).tiny)
     scale = np.where(eigenvalues > floor, 1 / np.sqrt(np.maximum(eigenvalues, floor)), 1.0)

@@ -69,6 +69,16 @@ class Inequality:
         constant = function(np.zeros(len(unknowns)))
         return cls(constant[None], np.stack([function(e) - constant for e in np.eye(len(unknowns))])[:, None], unknowns)
 
+    @classmethod
+    def least(cls, unknowns: Sequence[int], value: float) -> Inequality:
+        """x >= value, for each of the unknowns."""
+        return cls(np.full((len(unknowns), 1, 1), -value), np.eye(len(unknowns))[:, :, None, None], unknowns)
+
+    @classmethod
+    def most(cls, unknowns: Sequence[int], value: float) -> Inequality:
+        """x <= value, for each of the unknowns."""
+        return cls(np.full((len(unknowns), 1, 1), value), -np.eye(len(unknowns))[:, :, None, None], unknowns)
+
     def at(self, x: Array) -> Array | Complex:
         return self.constant + np.tensordot(x[list(self.unknowns)], self.slopes, axes=1)
 
@@ -187,10 +197,11 @@ def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, 
 # cost_a leaves as many equations as there are unknowns. A first direction with mu = 0 says how small mu may become, and
 # what the product dZ dS leaves (Mehrotra). Neither S nor Z need satisfy its equation at the start.
 
-_GAP = 1e-9  # relative gap and violations at which the iteration ends
+_GAP = 1e-8  # relative gap and violations at which the iteration ends
 _ENOUGH = 1e-6  # .. and at which its best point counts where rounding ends it before
 _MOST_STEPS = 60
 _KEPT = 0.98  # of the way to the boundary
+_SHORT, _CENTRING = 0.2, 0.8  # a step after which the next aims at this share of mu
 
 
 _Parts = list[Any]  # a stack of Hermitian matrices for each block
@@ -220,6 +231,8 @@ def _interior(problem: ConeProgram) -> tuple[Array, str]:
         gains = (_product(s + of_S * ds, z + of_Z * dz) for s, ds, z, dz in zip(S, dS, Z, dZ, strict=True))
         left = np.clip(sum(gains) / sum(map(_product, S, Z)), 0.0, 1.0)
         dx, dS, dZ, of_S, of_Z = newton.direction(left**3 * mu, [dz @ ds for dz, ds in zip(dZ, dS, strict=True)])
+        if min(of_S, of_Z) < _SHORT:  # too near the boundary: back to the centre
+            dx, dS, dZ, of_S, of_Z = newton.direction(_CENTRING * mu, [0.0] * len(S))
         x = x + of_S * dx
         S = [_hermitian(s + of_S * ds) for s, ds in zip(S, dS, strict=True)]
         Z = [_hermitian(z + of_Z * dz) for z, dz in zip(Z, dZ, strict=True)]

@@ -21,8 +21,6 @@ from design.frequency import frequencies, hermitian, on_circle
 from design.lmi import RESERVE, Complex
 from design.multipliers import (
     BETA,
-    Lags,
-    LimiterProof,
     half_widths,
     limiter_demand,
     limiter_lag,
@@ -40,9 +38,12 @@ if TYPE_CHECKING:  # slow to load
 _SAMPLED_RESERVE = 1.5 * RESERVE
 _SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
 _CLOSEST_POLE = 1e-5  # from the unit circle
-_MOST_WEIGHT = 5.0  # of the limiter's multiplier
+_FIRST_WEIGHT, _MOST_WEIGHT = 0.5, 5.0  # of the limiter's multiplier
 _STUCK = 1e-3  # a search that leaves the sampled condition violated by this has no feasible point nearby
 _MOST_ROUNDS = 8
+#: Devices up to which steps are cheap; steps from every start beyond, from the likeliest one, and from each of these.
+FEW, _MOST_STEPS = 12, (15, 60, 100)
+_ROUGH = 0.01  # a violation that further steps will mend
 
 
 _Responses = tuple[Complex, Complex, Complex]  # (z-1)/(Tz), Psi E and Theta at some frequencies
@@ -165,11 +166,12 @@ class SampledLoop:
         """Least eigenvalue (k,) of `_block` in units of Delta_D/T, and v whose v* block v it is; of the last x."""
         at = self.loop_at_conditions
         if self._last is None or self._last[0] is not at or not np.array_equal(self._last[1], x):
-            block = self._block(x)
-            root = np.tile(self.root, block.shape[1] // self.loop.channels)
-            values, vectors = np.linalg.eigh(root[:, None] * block * root)
-            self._last = (at, x.copy(), values[:, 0].astype(float), vectors[:, :, 0] * root)
+            self._last = (at, x.copy(), *self._least_of(self._block(x)))
         return self._last[2], self._last[3]
+
+    def _least_of(self, block: Complex) -> tuple[Array, Complex]:
+        values, vectors = np.linalg.eigh(self.root[:, None] * block * self.root)
+        return values[:, 0].astype(float), vectors[:, :, 0] * self.root
 
     def _block(self, x: Array) -> Complex:
         """What must be positive definite with the damping, at each sampled frequency, Hermitian."""
@@ -180,11 +182,12 @@ class SampledLoop:
         F = force_map(self.E, self.coupling(x), self.loop.theta, self.loop.psi)
         return float(1 - _CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
 
-    def search(self, x: Array) -> OptimizeResult:
-        return self.minimised(x, [], self.room_slope)
+    def search(self, x: Array, most: int) -> OptimizeResult:
+        """The local optimum from x, by so many steps."""
+        return self.minimised(x, most, [], self.room_slope)
 
     def minimised(
-        self, x: Array, more: list[tuple[float, float]], slope: Callable[[Array], Array] | None = None
+        self, x: Array, most: int, more: list[tuple[float, float]], slope: Callable[[Array], Array] | None = None
     ) -> OptimizeResult:
         """The local optimum from x; `more` bounds what is behind the gains; without `slope` room is differenced."""
         N = self.loop.channels
@@ -192,7 +195,7 @@ class SampledLoop:
 
         bounds = [(np.log(_SOFTEST), np.log(STIFFEST))] * N + [(0.0, 20.0)] * N + more
         condition = {"type": "ineq", "fun": self.room, "jac": slope}
-        options = {"maxiter": 100, "ftol": 1e-7}
+        options = {"maxiter": most, "ftol": 1e-7}
         problem = {"bounds": bounds, "constraints": condition, "options": options}
         return minimize(self.square_mismatch, x, jac=self.square_mismatch_slope, method="SLSQP", **problem)
 
@@ -247,8 +250,8 @@ class SwitchingLoop(SampledLoop):
         room = (np.linalg.eigvalsh(self.root[:, None] * schur * self.root)[:, 0] - _SAMPLED_RESERVE).astype(float)
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
-    def search(self, x: Array) -> OptimizeResult:
-        return self.minimised(x, [(np.log(_MULTIPLIERS[0]), np.log(_MULTIPLIERS[1]))] * self.active.size)
+    def search(self, x: Array, most: int) -> OptimizeResult:
+        return self.minimised(x, most, [(np.log(_MULTIPLIERS[0]), np.log(_MULTIPLIERS[1]))] * self.active.size)
 
     def _gains(self, x: Array) -> Array:
         return x[: 2 * self.loop.channels]
@@ -271,17 +274,12 @@ class LimiterLoop(SampledLoop):
         return super().coupling(self._gains(x))
 
     def point(self, coupling: SpringDamper) -> Array:
-        """The gains with their best multiplier."""
-        found = self.proof(coupling)
-        return np.concatenate([super().point(coupling), np.array(found.c)[:, 0]])
-
-    def proof(self, coupling: SpringDamper, c: Lags | None = None) -> LimiterProof:
-        """What the limiter asks at the multiplier `c` or the best one, by the refined sweep."""
-        loop = self.loop
-        return limiter_proof(loop.sent(coupling), loop.theta, loop.delta, self.rho, c, T_max=loop.T_max)
+        """The gains with a usual multiplier."""
+        return np.append(super().point(coupling), np.full(self.loop.channels, _FIRST_WEIGHT))
 
     def judged(self, x: Array) -> Requirement:
-        return self.proof(self.coupling(x), self.weights(x).tolist()).requirement
+        loop, sent, c = self.loop, self.loop.sent(self.coupling(x)), self.weights(x).tolist()
+        return limiter_proof(sent, loop.theta, loop.delta, self.rho, c, T_max=loop.T_max).requirement
 
     def force(self, x: Array, responses: _Responses) -> Complex:
         return super().force(self._gains(x), responses)
@@ -312,14 +310,22 @@ class LimiterLoop(SampledLoop):
             self._undelayed = (at, (D, E, now))
         return self._undelayed[1]
 
+    def _least_of(self, block: Complex) -> tuple[Array, Complex]:
+        """Of the Schur complement of the slip's own corner, which is diagonal and positive for any c >= 0."""
+        m = self.loop.channels
+        corner, cross = np.diagonal(block[:, m:, m:], axis1=1, axis2=2).real, block[:, m:, :m]
+        follows = -cross / corner[:, :, None]
+        least, v = super()._least_of(block[:, :m, :m] + np.conj(np.swapaxes(cross, 1, 2)) @ follows)
+        return least, np.concatenate([v, (follows @ v[:, :, None])[:, :, 0]], axis=1)
+
     def _block(self, x: Array) -> Complex:
         loop = self.loop
         G = Sampled(on_circle(self.conditions)[None], self.force(x, self._now())[None], loop.T)
         demand = limiter_demand(G, loop.theta, loop.delta, self.rho, self.weights(x).tolist(), loop.T_max)
         return hermitian(demand.free.G[0] + (1 - _SAMPLED_RESERVE) * demand.gain.G[0])
 
-    def search(self, x: Array) -> OptimizeResult:
-        return self.minimised(x, [(0.0, _MOST_WEIGHT)] * self.loop.channels, self.room_slope)
+    def search(self, x: Array, most: int) -> OptimizeResult:
+        return self.minimised(x, most, [(0.0, _MOST_WEIGHT)] * self.loop.channels, self.room_slope)
 
     def weights(self, x: Array) -> Array:
         """c, a row of one lag per channel."""
@@ -337,7 +343,7 @@ def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[SpringDamper | 
     """(a local optimum that passes the refined sweep of its condition or None, searches)."""
     x = sampled.point(start)
     for searches in range(1, _MOST_ROUNDS + 1):
-        x = sampled.search(x).x
+        x = sampled.search(x, _MOST_STEPS[1 + (sampled.loop.channels <= FEW)]).x
         requirement = sampled.judged(x)
         if requirement.ratio <= 1 - RESERVE:
             return sampled.coupling(x), searches
@@ -353,7 +359,8 @@ def least_rms(
 ) -> tuple[SpringDamper | None, float, int]:
     """(gains, rms mismatch as a ratio, searches) of the best local optimum; gains None if none was found.
 
-    `sampled` makes the condition, fresh for every start.
+    `sampled` makes the condition, fresh for every start. Of more than FEW devices, where starts hardly matter and
+    steps are expensive, the first optimum is taken (`likeliest_first`).
     """
     best, least, searches = None, np.inf, 0
     for start in starts:
@@ -365,4 +372,13 @@ def least_rms(
         rms = transparency(loop.F(coupling), loop.E(), loop.lam, band_hz).rms_mismatch
         if rms < least:
             best, least = coupling, rms
+        if loop.channels > FEW:
+            break
     return best, least, searches
+
+
+def likeliest_first(sampled: SampledLoop, starts: Sequence[SpringDamper]) -> list[SpringDamper]:
+    """Where a few steps lead from each start, the least mismatch first; last what then still violates the condition."""
+    points = [sampled.search(sampled.point(start), _MOST_STEPS[0]).x for start in starts]
+    points.sort(key=lambda x: (sampled.room(x).min() < -_ROUGH, sampled.square_mismatch(x)))
+    return [sampled.coupling(x) for x in points]

@@ -1,6 +1,6 @@
 """Conditions with a multiplier that is searched: walls that make and break contact, delays that switch, limited forces.
 
-Each states its block once, and what it asks at the best multiplier is found by cutting planes: a sweep, no solver.
+Each states its block once, and what it asks at the best multiplier is found by cutting planes: a sweep judges.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from controller.lti import (
     taps,
     vstack,
 )
-from design import conditions
-from design.frequency import frequencies, hermitian, on_circle, supremum, sweeping, too_long
-from design.result import NotProved, Requirement, from_ratio, refusal
+from design import conditions, cone
+from design.frequency import frequencies, hermitian, on_circle, peaks, supremum, sweeping, too_long
+from design.result import DesignFailed, NotProved, Requirement, from_ratio, refusal
 
 #: c_ij >= 0 of the limiter's multiplier: for every channel i a weight per lag j = 1, 2, ..; none is zero
 Lags = Sequence[Sequence[Any]]
@@ -364,12 +364,12 @@ class _Search:
         """Collect the bounds at the local peaks near the worst sampled frequency; the worst value."""
         values = self._largest(a, N, Y)
         top, padded = float(values.max()), np.concatenate([[-np.inf], values, [-np.inf]])
-        peaks = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]) & (values >= top - _NEAR * abs(top)))
-        peaks = peaks[np.argsort(values[peaks])[-_MOST_PEAKS:]]
-        u = np.linalg.eigh(self._matrices(a, N[peaks], Y[peaks]))[1][:, :, -1]
-        self._n = np.append(self._n, np.einsum("ki,kij,kj->k", u.conj(), N[peaks], u).real)
+        local = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]) & (values >= top - _NEAR * abs(top)))
+        local = local[np.argsort(values[local])[-_MOST_PEAKS:]]
+        u = np.linalg.eigh(self._matrices(a, N[local], Y[local]))[1][:, :, -1]
+        self._n = np.append(self._n, np.einsum("ki,kij,kj->k", u.conj(), N[local], u).real)
         self._p = np.concatenate([self._p, np.abs(u[:, self.active]) ** 2 / 2])
-        self._q = np.concatenate([self._q, np.abs(np.einsum("kij,kj->ki", Y[peaks], u)) ** 2 / 2])
+        self._q = np.concatenate([self._q, np.abs(np.einsum("kij,kj->ki", Y[local], u)) ** 2 / 2])
         return top
 
     def _bound(self, a: Array) -> tuple[Array, float]:
@@ -400,9 +400,8 @@ class _Search:
 
 # the limiter: the best multiplier
 #
-# The block is affine in (s, c), so s(c) is convex, and each direction u at a frequency gives a linear bound:
-# u*(free(c) + s gain)u >= 0. The worst of them are collected, a linear program finds the least s that they allow, and
-# the search ends where the sweep attains it (Kelley's cutting planes).
+# The block is affine in (s, c), so the least s over all c at some frequencies is a matrix inequality (design.cone). It
+# bounds s(c) from below; where the sweep of the c found needs more, these frequencies join, until it attains the bound.
 
 BETA = 0.01  # of a limiter's lag under this-environment unless another is asked for
 
@@ -410,13 +409,11 @@ BETA = 0.01  # of a limiter's lag under this-environment unless another is asked
 _LARGEST_WEIGHT = 10.0  # that a search gives a c_ij
 
 
-_HOPELESS = 1e6  # times the available damping
-
-
 SPARE = 0.02  # of rho: what the block keeps, however large the damping, so that c may be rounded and the proof exact
 
 
-_LIMITER_SETTLED = 1e-6  # relative gap between the sweep at the best c and the bound that no c beats
+_LIMITER_SETTLED = 1e-5  # gap between the sweep at the best c and the bound that no c beats
+_FIRST_FREQUENCIES = 12  # that the bound begins with
 
 
 @dataclass(frozen=True)
@@ -496,69 +493,46 @@ class _LimiterSearch:
 
     def swept(self, c: Lags, spare: float = 0.0) -> tuple[float, float]:
         """(s(c), w [rad/sample]) by a sweep that is refined between its samples, with a reserve of rho."""
+        return supremum(self._needed(c, spare), self._grid)
+
+    def _needed(self, c: Lags, spare: float) -> Callable[[Array], Array]:
+        """The s that each frequency asks for, with a reserve of rho."""
         demand = self.demand(c)
         demand = replace(demand, free=demand.free - spare * self._lag)
-        return supremum(lambda w: conditions.least_scale(demand, w), self._grid)
+        return lambda w: conditions.least_scale(demand, w)
 
     def least(self) -> tuple[tuple[tuple[float, ...], ...], float, float, float]:
         """(c, s(c), where it binds, a lower bound on s over all c that have something to spare)."""
-        from scipy.optimize import linprog  # slow to load, and seldom needed
-
-        m, lags = self._shape
-        c, bound = np.zeros(m * lags), -np.inf
-        best: tuple[Array, float, float] = (c, np.inf, 0.0)
-        parts, cuts = self._parts(self._grid), np.zeros((0, m * lags + 2))
+        unknowns = range(int(np.prod(self._shape)) + 1)  # c and s
+        limits = cone.Inequality.least(unknowns, 0.0), cone.Inequality.most(unknowns[:-1], _LARGEST_WEIGHT)
+        first = self._grid[np.linspace(0, self._grid.size - 1, _FIRST_FREQUENCIES).astype(int)]
+        c, bound, blocks = np.zeros(len(unknowns) - 1), np.inf, [*limits, self._block(first, unknowns)]
         for _ in range(_MOST_ROUNDS):
-            found, top = self._cuts(c, *parts)
-            if top <= bound + _LIMITER_SETTLED * abs(bound):  # settled on the samples: look between them
-                ratio, w = self.swept(self._rows(c), SPARE)
-                best = min(best, (c, ratio, w), key=lambda found: found[1])
-                if best[1] <= bound + 10 * _LIMITER_SETTLED * abs(bound):
-                    break
-                between = self._parts(np.array([w]))
-                parts = tuple(np.concatenate(pair, axis=-3) for pair in zip(parts, between, strict=True))
-                found = np.concatenate([found, self._cuts(c, *between)[0]])
-            cuts = np.concatenate([cuts, found])
-            lowest = linprog(
-                np.eye(c.size + 1)[-1],
-                A_ub=-cuts[:, 1:],
-                b_ub=cuts[:, 0],
-                bounds=[*[(0.0, _LARGEST_WEIGHT)] * c.size, (0.0, None)],
-            )
-            if lowest.x is None:  # no c within the bounds makes the block positive, however large the damping
+            try:
+                x = cone.ConeProgram(np.eye(len(unknowns))[-1], blocks).solve("the multiplier of the limiter")
+            except DesignFailed:  # no c within the bounds makes the block positive, however large the damping
                 return self._rows(c), np.inf, self.swept(self._rows(c), SPARE)[1], np.inf
-            c, bound = np.maximum(lowest.x[:-1], 0.0), float(lowest.x[-1])
-        if np.isinf(best[1]):
-            best = (c, *self.swept(self._rows(c), SPARE))
-        c = np.round(best[0], 6)
+            c, bound = np.maximum(x[:-1], 0.0), float(x[-1])
+            needed = self._needed(self._rows(c), SPARE)
+            missed = peaks(needed, self._grid, bound + _LIMITER_SETTLED * max(bound, 1.0))
+            if not missed.size:
+                break
+            blocks.append(self._block(missed[np.argsort(-needed(missed))[:_MOST_PEAKS]], unknowns))
+        c = np.round(c, 6)
         return self._rows(c), *self.swept(self._rows(c)), bound
 
     def _rows(self, c: Array) -> tuple[tuple[float, ...], ...]:
         """c (m lags,) as a row per channel."""
         return tuple(tuple(row) for row in c.reshape(self._shape).tolist())
 
-    def _parts(self, w: Array) -> tuple[Complex, Complex, Complex]:
-        """The Hermitian parts at w (k,) of the block without c, (1, k, p, p), of its slopes in c, and of the gain."""
-        z, m = on_circle(w), len(self._delta)
-        none = self.demand(np.zeros(self._shape).tolist())
+    def _block(self, w: Array, unknowns: Sequence[int]) -> cone.Inequality:
+        """free(c) + s gain at w (k,) with something to spare, in units of Delta_D/T."""
+        z, root = on_circle(w), np.tile(np.sqrt(self._loop[0].T / np.array(self._delta)), 2)
+        none = self.demand(self._rows(np.zeros(len(unknowns) - 1)))
         free, gain = hermitian(none.free.at(z)), hermitian(none.gain.at(z))
-        units = np.eye(int(np.prod(self._shape)))
-        slopes = [hermitian(self.demand(self._rows(unit)).free.at(z)) - free for unit in units]
-        return (free - SPARE * self._lag)[None], np.array(slopes).reshape(-1, w.size, 2 * m, 2 * m), gain[None]
-
-    def _cuts(self, c: Array, free: Complex, slopes: Complex, gain: Complex) -> tuple[Array, float]:
-        """(rows, s): the bounds value + slope.c + s gain >= 0 at the worst peaks, and the worst s there."""
-        block, gain = free[0] + np.tensordot(c, slopes, axes=1), gain[0]
-        needed = conditions.least_multiple(block, gain)
-        padded = np.concatenate([[-np.inf], needed, [-np.inf]])
-        peaks = np.flatnonzero((needed >= padded[:-2]) & (needed >= padded[2:]))
-        peaks = peaks[np.argsort(needed[peaks])[-_MOST_PEAKS:]]
-        # beyond any damping the worst direction is sought at one so large that only the null space of the gain counts
-        s = np.where(np.isinf(needed[peaks]), _HOPELESS, needed[peaks])
-        u = np.linalg.eigh(block[peaks] + s[:, None, None] * gain[peaks])[1][:, :, 0]
-        terms = np.concatenate([free, slopes, gain[None]])[:, peaks]
-        rows = np.einsum("ka,tkab,kb->kt", u.conj(), terms, u).real
-        return rows / np.abs(rows).max(axis=1, keepdims=True), float(needed.max())
+        slopes = [hermitian(self.demand(self._rows(unit)).free.at(z)) - free for unit in np.eye(len(unknowns) - 1)]
+        constant, by = (root[:, None] * part * root for part in (free - SPARE * self._lag, np.array([*slopes, gain])))
+        return cone.Inequality(constant, by, unknowns)
 
 
 def half_widths(lo: Sequence[int], hi: Sequence[int]) -> Array:

@@ -20,7 +20,7 @@ from controller.lti import Array, Lti
 from design.conditions import any_environment, any_environment_delayed, even_damping, this_environment
 from design.cone import ConeProgram, Inequality
 from design.frequency import peaks, too_long
-from design.gain_search import LimiterLoop, SampledLoop, SwitchingLoop, least_rms, polynomials
+from design.gain_search import FEW, LimiterLoop, SampledLoop, SwitchingLoop, least_rms, likeliest_first, polynomials
 from design.lmi import RESERVE, Shaping, gain_block, least_phi, usable
 from design.multipliers import (
     limiter_refusal,
@@ -66,7 +66,7 @@ def solve_within(
     """
     N, own = len(theta), len(cost)
     both = [(i, N + i) for i in range(N)]
-    blocks = [*more, Inequality.of(np.diag, range(2 * N))]
+    blocks = [*more, Inequality.least(range(2 * N), 0.0)]
     spare = [(n + 1) * (n + 2) // 2 for n in theta]
     if sum(spare) <= largest_gram:
         ends = own + np.cumsum([0, *spare])
@@ -210,11 +210,11 @@ def design(
     raise ValueError(f"condition is {condition!r}, expected 'any-environment' or 'this-environment'")
 
 
-#: Digits that gains keep in a loop of more devices, finer than RESERVE: with all of them exact proofs take minutes.
-_DIGITS, _FEW = 5, 12
+#: Digits that gains keep in a loop of many devices, finer than RESERVE: with all of them exact proofs take minutes.
+_DIGITS = 5
 _SWEEPS = 150  # take as long as a search for gains in this environment
 #: Devices whose search ends within half a minute.
-_MOST_ANY, _MOST_LIMITED = 48, 12
+_MOST_ANY, _MOST_LIMITED = 48, 32
 
 
 def _require_few(loop: Loop, most: int, what: str) -> None:
@@ -264,7 +264,7 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
         if abs(before - norm) < _SETTLED * norm and norm < (1 + _SETTLED) * bound:
             break
     coupling = _short(_coupling(loop, gains))
-    if loop.channels > _FEW:
+    if loop.channels > FEW:
         norm, _ = shaping.norm(coupling.compliance(loop.T))
     requirement = _verified(loop, coupling, phi)
     return Design(coupling, "any-environment", "loop-norm", norm, requirement, sdps, time.perf_counter() - started, phi)
@@ -272,9 +272,10 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
 
 def _short(coupling: SpringDamper) -> SpringDamper:
     """The gains of many devices, in so few digits that a proof stays short."""
-    if coupling.K.size <= _FEW:
+    if coupling.K.size <= FEW:
         return coupling
-    return SpringDamper(*([float(f"{v:.{_DIGITS}g}") for v in gains] for gains in (coupling.K, coupling.B)))
+    K, B = ([float(f"{v:.{_DIGITS}g}") for v in gains] for gains in (coupling.K, coupling.B))
+    return SpringDamper(K, B)
 
 
 def _for_this_environment(
@@ -292,7 +293,10 @@ def _for_this_environment(
     if band_hz and switching:
         raise ValueError("band_hz: designs for delays that vary count 0.5 to 80 Hz, ask for one of them")
     sampled = partial(SwitchingLoop, loop, *switching) if switching else partial(SampledLoop, loop, band)
-    coupling, rms, searches = least_rms(sampled, starts, band)
+    many = loop.channels > FEW
+    if many:
+        starts = likeliest_first(sampled(), starts)
+    coupling, rms, searches = (None, np.inf, 0) if many and limiter else least_rms(sampled, starts, band)
     if limiter:  # a little softer than without limits: nearly always found from there
         limited = partial(LimiterLoop, loop, band)
         linear, before = coupling, searches
@@ -312,7 +316,7 @@ def _for_this_environment(
         )
         raise DesignFailed(None, (), line)
     coupling = _short(SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B)))
-    if loop.channels > _FEW:
+    if many:
         rms = transparency(loop.F(coupling), loop.E(), loop.lam, band).rms_mismatch
     requirement = this_environment(loop.F(coupling), loop.delta, loop.T_max)
     return Design(coupling, "this-environment", "rms", rms, requirement, searches, time.perf_counter() - started)

@@ -11,8 +11,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from controller.coupling import CASE_I, SpringDamper
+from controller.coupling import CASE_I, Coupling, SpringDamper
+from controller.loop import Loop
 from design import certify, design_coupling
+from design.certificate import prove_limiter
+from design.result import NotProved
 from sim.crowds import MIXED, Validation
 from sim.run import assemble, run
 from sim.scenario import Scenario, load, parse
@@ -35,6 +38,14 @@ def star(n: int) -> Scenario:
     return parse("".join(text))
 
 
+def limits(loop: Loop, coupling: Coupling) -> str:
+    """What limited forces need, by the best multiplier, and whether exact arithmetic proves it."""
+    try:
+        return f"{1 / prove_limiter(loop, coupling).margin:.4f}, proved"
+    except NotProved as refused:
+        return str(refused)
+
+
 def cpu(call: Callable[[], Any]) -> tuple[Any, float]:
     begin = time.process_time()
     done = call()
@@ -42,18 +53,20 @@ def cpu(call: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def devices() -> None:
-    """The run is of 2 s; the audit is both conditions with their exact proofs."""
+    """The run is of 2 s; the audit is both conditions with their exact proofs, the designs are searches and sweeps."""
     for n in (2, 4, 8, 16, 32):
         scenario = star(n)
         loop = scenario.loop("I")
-        design, designed = cpu(
-            lambda loop=loop: design_coupling(loop, "spring-damper", "this-environment", limiter=False)
-        )
+        _, clipped = cpu(lambda loop=loop: design_coupling(loop, "spring-damper", "this-environment", limiter=False))
+        design, designed = cpu(lambda loop=loop: design_coupling(loop, "spring-damper", "this-environment"))
+        _, soft = cpu(lambda loop=loop: design_coupling(loop, "spring-damper", "any-environment"))
+        limited, proved = cpu(lambda loop=loop, design=design: limits(loop, design.coupling))
         needs, audited = cpu(lambda loop=loop, design=design: certify(loop, design.coupling))
         simulation = assemble(scenario, design.coupling)
         trace, ran = cpu(lambda simulation=simulation: run(simulation))
         ratio = needs["this-environment"].ratio
-        print(f"| {n} devices | {ran:.2f} | {audited:.2f} | {designed:.2f} | needs {ratio:.4f}, {trace.t.size} ticks |")
+        seconds = " | ".join(f"{value:.2f}" for value in (ran, audited, clipped, designed, proved, soft))
+        print(f"| {n} devices | {seconds} | needs {ratio:.4f}, limited {limited}, {trace.t.size} ticks |")
 
 
 def delays() -> None:

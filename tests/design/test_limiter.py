@@ -298,3 +298,13 @@ def test_the_command_stores_a_coupling_that_is_proved_with_limited_forces(tmp_pa
     assert lag(stored.loop, stored.certificate) == LAG
     with pytest.raises(InputError, match=r"--limiter is for --coupling .*, not ccl"):
         design_main(["--coupling", "ccl", "--limiter", "--out", str(out)])
+
+
+def test_the_best_multiplier_attains_its_bound_and_no_other_does_better():
+    """Delays of 0 and 3 samples, where lines through the worst directions never settled: 1.263, not 31."""
+    loop = msgspec.structs.replace(PAIR, theta=(0, 3), lam=(0, 0))
+    G, rho = loop.sent(BUILT), limiter_lag(loop.delta, loop.T, 0.01)
+    found = limiter(G, loop.theta, loop.delta, rho)
+    assert found.requirement.ratio <= found.bound * (1 + 1e-5)
+    for c in np.random.default_rng(0).uniform(0, 1.5, (5, 2, 1)).tolist():
+        assert limiter(G, loop.theta, loop.delta, rho, c).requirement.ratio > found.requirement.ratio * (1 - 1e-3)
