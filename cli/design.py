@@ -230,7 +230,7 @@ def _best_rows(part: dict[str, Any]) -> render.Rows:
     """Rows that only an optimal coupling has."""
     limit = part["bound"]
     climbed = ", ".join(f"{rung.mismatch_db:.2f}" for rung in part["ladder"])
-    bounded = "no linear coupling can be better than {rms_mismatch_db:.2f} dB rms, {gap_db:.2f} dB less than this one"
+    bounded = "no linear coupling can be better than {rms_mismatch_db:.2f} dB rms: {gap_db:.2f} dB left"
     yield "bound", limit.get("reason") or bounded.format(**limit)
     yield "rendered stiffness", render.optional(part["rendered_stiffness"], "{:.3f} of the environment's")
     yield "ladder [dB]", climbed or None

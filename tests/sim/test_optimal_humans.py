@@ -15,7 +15,7 @@ from sim.scenario import load
 from sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
 
 DEVICES = ("omega-pair", "omega-pair-rigid")
-HUMANS = 300
+HUMANS = 200
 
 
 @cache
@@ -92,5 +92,5 @@ def test_mujoco_says_the_same(scenario, lossless):
 def test_no_adversary_succeeds(scenario):
     """A short search; `python -m sim.validate --coupling optimal --adversary` makes the long one."""
     place = load(scenario)
-    worst = search(place, assemble(place, optimal()).F, seed=3, generations=3)
+    worst = search(place, assemble(place, optimal()).F, seed=3, generations=2)
     assert not worst.destabilises
