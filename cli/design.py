@@ -15,7 +15,7 @@ from cli import options, render
 from cli.judged import Judged
 from controller.loop import Loop
 from design import coverage
-from design.api import Filed, store
+from design.api import Filed, proved, store
 from design.audit import LONGEST_DELAY
 from design.bound import bound_part
 from design.certificate import SAMPLES, assess, check_ranges
@@ -147,7 +147,7 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
     if loop.varying_delay and _for_switching(args):
         asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
     with options.refused(args=args), render.designing(loop, args.coupling, args.condition) as heard:
-        return design_by_kind(loop, args.coupling, args.condition, heard, **asked)
+        return proved(loop, design_by_kind(loop, args.coupling, args.condition, heard, **asked))
 
 
 # ----------------------------------------------------------------------------------------------------

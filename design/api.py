@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypedDict, Unpack
 
+import msgspec
+
 from controller.coupling import Coupling
 from controller.loop import Loop
 from controller.lti import Lti
 from design.arguments import known, of_kind, one_of, shown
-from design.certificate import RangesCheck, assess, check_ranges, lag, prove, switching_requirement
-from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save
+from design.certificate import RangesCheck, assess, check_ranges, lag, prove, prove_limiter, switching_requirement
+from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save, sealed
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import HERE, guarantee_of, switching_guarantee
 from design.result import Condition, Design, NotProved, Requirement
@@ -157,6 +159,17 @@ class Filed:
     limited_forces: bool
 
 
+def proved(loop: Loop, design: Design) -> Design:
+    """The design with its certificate, for judging and storing it; unchanged over ranges, which are searched first."""
+    if design.certificate or loop.ranges or loop.varying_delay:
+        return design
+    try:
+        limiter = prove_limiter(loop, design.coupling, c=design.c) if design.c else None
+        return replace(design, certificate=prove(loop, design.coupling, design.condition, _multiplier(design), limiter))
+    except NotProved:
+        return design
+
+
 def store(
     loop: Loop,
     design: Design,
@@ -191,12 +204,16 @@ def _proved(loop: Loop, design: Design, limiter: LimiterCertificate | None) -> t
     """The certificate of all that the loop claims, or why there is none."""
     held = design.certificate
     if held and held.scenario == digest(loop, design.coupling.form()):
-        return held, None
+        limited = limiter if design.condition == "this-environment" else None
+        return (sealed(msgspec.structs.replace(held, limiter=limited)) if limited else held), None
     try:
-        phi = None if design.phi is None else design.phi.tolist()
-        return prove(loop, design.coupling, design.condition, phi, limiter), None
+        return prove(loop, design.coupling, design.condition, _multiplier(design), limiter), None
     except NotProved as error:
         return None, str(error)
+
+
+def _multiplier(design: Design) -> list[float] | None:
+    return None if design.phi is None else design.phi.tolist()
 
 
 COUPLING = "a coupling (controller.coupling), or a Design"

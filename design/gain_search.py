@@ -21,6 +21,7 @@ from design.frequency import frequencies, hermitian, on_circle
 from design.lmi import RESERVE, Complex
 from design.multipliers import (
     BETA,
+    Lags,
     half_widths,
     limiter_demand,
     limiter_lag,
@@ -92,6 +93,10 @@ class SampledLoop:
         """Impose the condition at the frequency w [rad/sample] too."""
         self.conditions = np.append(self.conditions, w)
         self.loop_at_conditions = self._responses(self.conditions)
+
+    def multiplier(self, x: Array) -> Lags | None:
+        """The limiter's multiplier c in x, where the condition has one."""
+        return None
 
     def _responses(self, w: Array) -> _Responses:
         """(z-1)/(Tz), Psi E and Theta at exp(jw)."""
@@ -278,7 +283,7 @@ class LimiterLoop(SampledLoop):
         return np.append(super().point(coupling), np.full(self.loop.channels, _FIRST_WEIGHT))
 
     def judged(self, x: Array) -> Requirement:
-        loop, sent, c = self.loop, self.loop.sent(self.coupling(x)), self.weights(x).tolist()
+        loop, sent, c = self.loop, self.loop.sent(self.coupling(x)), self._weights(x).tolist()
         return limiter_proof(sent, loop.theta, loop.delta, self.rho, c, T_max=loop.T_max).requirement
 
     def force(self, x: Array, responses: _Responses) -> Complex:
@@ -294,7 +299,7 @@ class LimiterLoop(SampledLoop):
         loop, (_, E, theta), v = self.loop, self.loop_at_conditions, self._least(x)[1]
         (by, _, S, right), z = self._solved(self._gains(x), self._now()), on_circle(self.conditions)[:, None]
         first, second = np.split(v, 2, axis=1)
-        N = -np.stack([polynomials(n, self.conditions)[0] for n in loop.theta], axis=1) - self.weights(x).T
+        N = -np.stack([polynomials(n, self.conditions)[0] for n in loop.theta], axis=1) - self._weights(x).T
         late = np.diagonal(theta, axis1=1, axis2=2) / (z - 1)
         into = np.einsum("ki,kij->kj", first.conj() * late + second.conj() * N, E @ S)
         turned = into * np.einsum("kij,kj->ki", right, first)
@@ -321,13 +326,16 @@ class LimiterLoop(SampledLoop):
     def _block(self, x: Array) -> Complex:
         loop = self.loop
         G = Sampled(on_circle(self.conditions)[None], self.force(x, self._now())[None], loop.T)
-        demand = limiter_demand(G, loop.theta, loop.delta, self.rho, self.weights(x).tolist(), loop.T_max)
+        demand = limiter_demand(G, loop.theta, loop.delta, self.rho, self._weights(x).tolist(), loop.T_max)
         return hermitian(demand.free.G[0] + (1 - _SAMPLED_RESERVE) * demand.gain.G[0])
 
     def search(self, x: Array, most: int) -> OptimizeResult:
         return self.minimised(x, most, [(0.0, _MOST_WEIGHT)] * self.loop.channels, self.room_slope)
 
-    def weights(self, x: Array) -> Array:
+    def multiplier(self, x: Array) -> Lags:
+        return np.round(self._weights(x), 6).tolist()
+
+    def _weights(self, x: Array) -> Array:
         """c, a row of one lag per channel."""
         return np.maximum(x[2 * self.loop.channels :, None], 0.0)
 
@@ -339,14 +347,14 @@ class LimiterLoop(SampledLoop):
 # The search: frequencies are added where a refined sweep finds the condition violated between those sampled.
 
 
-def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[SpringDamper | None, int]:
-    """(a local optimum that passes the refined sweep of its condition or None, searches)."""
+def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, int]:
+    """(x of a local optimum that passes the refined sweep of its condition or None, searches)."""
     x = sampled.point(start)
     for searches in range(1, _MOST_ROUNDS + 1):
         x = sampled.search(x, _MOST_STEPS[1 + (sampled.loop.channels <= FEW)]).x
         requirement = sampled.judged(x)
         if requirement.ratio <= 1 - RESERVE:
-            return sampled.coupling(x), searches
+            return x, searches
         stuck = sampled.room(x).min() < -_STUCK
         if stuck or requirement.frequency_hz is None:  # None: unstable, so there is no frequency to add
             return None, searches
@@ -356,25 +364,26 @@ def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[SpringDamper | 
 
 def least_rms(
     sampled: Callable[[], SampledLoop], starts: Iterable[SpringDamper], band_hz: tuple[float, float] = BAND_HZ
-) -> tuple[SpringDamper | None, float, int]:
-    """(gains, rms mismatch as a ratio, searches) of the best local optimum; gains None if none was found.
+) -> tuple[SpringDamper | None, float, int, Lags | None]:
+    """(gains, rms mismatch as a ratio, searches, multiplier) of the best local optimum; gains None if none was found.
 
     `sampled` makes the condition, fresh for every start. Of more than FEW devices, where starts hardly matter and
     steps are expensive, the first optimum is taken (`likeliest_first`).
     """
-    best, least, searches = None, np.inf, 0
+    best, least, searches, multiplier = None, np.inf, 0, None
     for start in starts:
         loop = (condition := sampled()).loop
-        coupling, runs = _optimum(condition, start)
+        x, runs = _optimum(condition, start)
         searches += runs
-        if coupling is None:
+        if x is None:
             continue
+        coupling = condition.coupling(x)
         rms = transparency(loop.F(coupling), loop.E(), loop.lam, band_hz).rms_mismatch
         if rms < least:
-            best, least = coupling, rms
+            best, least, multiplier = coupling, rms, condition.multiplier(x)
         if loop.channels > FEW:
             break
-    return best, least, searches
+    return best, least, searches, multiplier
 
 
 def likeliest_first(sampled: SampledLoop, starts: Sequence[SpringDamper]) -> list[SpringDamper]:

@@ -134,4 +134,5 @@ class Design:
     wall_s: float = 0.0
     phi: Array | None = None  # (N,) multiplier Phi_E [N s/m] of Theorem 4, None where the environment has none
     certificate: Any = field(kw_only=True, default=None)  # the file's Certificate, where the design has proved it
+    c: Sequence[Sequence[float]] | None = field(kw_only=True, default=None)  # of the limiter, where its search is long
     hurried: bool = field(kw_only=True, default=False)  # its clock ended it: more time may find a better

@@ -296,13 +296,13 @@ def _for_this_environment(
     many = loop.channels > FEW
     if many:
         starts = likeliest_first(sampled(), starts)
-    coupling, rms, searches = (None, np.inf, 0) if many and limiter else least_rms(sampled, starts, band)
+    coupling, rms, searches, c = (None, np.inf, 0, None) if many and limiter else least_rms(sampled, starts, band)
     if limiter:  # a little softer than without limits: nearly always found from there
         limited = partial(LimiterLoop, loop, band)
         linear, before = coupling, searches
-        coupling, rms, searches = least_rms(limited, [linear] if linear else starts, band)
+        coupling, rms, searches, c = least_rms(limited, [linear] if linear else starts, band)
         if coupling is None and linear:
-            coupling, rms, searches = least_rms(limited, starts, band)
+            coupling, rms, searches, c = least_rms(limited, starts, band)
         searches += before
     if coupling is None:
         certifies = "the this-environment condition certifies"
@@ -319,7 +319,8 @@ def _for_this_environment(
     if many:
         rms = transparency(loop.F(coupling), loop.E(), loop.lam, band).rms_mismatch
     requirement = this_environment(loop.F(coupling), loop.delta, loop.T_max)
-    return Design(coupling, "this-environment", "rms", rms, requirement, searches, time.perf_counter() - started)
+    wall_s = time.perf_counter() - started
+    return Design(coupling, "this-environment", "rms", rms, requirement, searches, wall_s, c=c if many else None)
 
 
 def _default_starts(loop: Loop) -> list[SpringDamper]:

@@ -68,7 +68,7 @@ def proved(made: Design, loop: Loop) -> Certificate:
     certificate = prove(loop, made.coupling, made.condition)
     if made.condition == "this-environment":
         with suppress(NotProved):
-            limiter = prove_limiter(loop, made.coupling)
+            limiter = prove_limiter(loop, made.coupling, c=made.c)
             certificate = sealed(msgspec.structs.replace(certificate, limiter=limiter))
     return certificate
 
