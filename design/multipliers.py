@@ -583,7 +583,7 @@ _MOST_SEARCHED = 12  # devices
 def limiter_requirement(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> LimiterProof:
     """What this-environment asks with the limiter of rho = beta delta/T, at the multiplier `c` or the best one.
 
-    For many devices the best one takes minutes to find: there it is that at c = 0.
+    For many devices it takes long to find (22 s for 32): there it is that at c = 0, unless a design brings its own.
     `proof` of the requirement is "sampled"; `prove` gives the exact one.
     """
     rho = limiter_lag(loop.delta, loop.T, beta)

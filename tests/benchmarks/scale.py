@@ -11,11 +11,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from controller.coupling import CASE_I, Coupling, SpringDamper
+from controller.coupling import CASE_I, SpringDamper
 from controller.loop import Loop
 from design import certify, design_coupling
 from design.certificate import prove_limiter
-from design.result import NotProved
+from design.result import Design, NotProved
 from sim.crowds import MIXED, Validation
 from sim.run import assemble, run
 from sim.scenario import Scenario, load, parse
@@ -38,10 +38,10 @@ def star(n: int) -> Scenario:
     return parse("".join(text))
 
 
-def limits(loop: Loop, coupling: Coupling) -> str:
-    """What limited forces need, by the best multiplier, and whether exact arithmetic proves it."""
+def limits(loop: Loop, design: Design) -> str:
+    """What limited forces need, by the best multiplier or the design's own, and whether exact arithmetic proves it."""
     try:
-        return f"{1 / prove_limiter(loop, coupling).margin:.4f}, proved"
+        return f"{1 / prove_limiter(loop, design.coupling, c=design.c).margin:.4f}, proved"
     except NotProved as refused:
         return str(refused)
 
@@ -60,7 +60,7 @@ def devices() -> None:
         _, clipped = cpu(lambda loop=loop: design_coupling(loop, "spring-damper", "this-environment", limiter=False))
         design, designed = cpu(lambda loop=loop: design_coupling(loop, "spring-damper", "this-environment"))
         _, soft = cpu(lambda loop=loop: design_coupling(loop, "spring-damper", "any-environment"))
-        limited, proved = cpu(lambda loop=loop, design=design: limits(loop, design.coupling))
+        limited, proved = cpu(lambda loop=loop, design=design: limits(loop, design))
         needs, audited = cpu(lambda loop=loop, design=design: certify(loop, design.coupling))
         simulation = assemble(scenario, design.coupling)
         trace, ran = cpu(lambda simulation=simulation: run(simulation))
