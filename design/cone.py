@@ -45,7 +45,7 @@ INTERIOR = _Settings("interior")  # our own method, for large blocks in few unkn
 
 
 @dataclass(frozen=True)
-class Attempt:
+class _Attempt:
     """What one rung of the ladder gave."""
 
     settings: str
@@ -118,7 +118,7 @@ class ConeProgram:
 
         Raises Infeasible when two settings agree that there is no solution and none found one, DesignFailed otherwise.
         """
-        attempts: list[Attempt] = []
+        attempts: list[_Attempt] = []
         if ladder is None:
             ladder = (INTERIOR,) if any(block.large for block in self.blocks) else LADDER
         for settings in ladder:
@@ -139,7 +139,7 @@ class ConeProgram:
         least = (np.linalg.eigvalsh(block.at(x)).min(initial=np.inf) for block in self.blocks)
         return float(-min(least, default=np.inf))
 
-    def _attempt(self, settings: _Settings, accept: Callable[[Array], bool] | None) -> tuple[Array, Attempt]:
+    def _attempt(self, settings: _Settings, accept: Callable[[Array], bool] | None) -> tuple[Array, _Attempt]:
         started = time.perf_counter()
         x, status, reason = np.full(len(self.cost), np.nan), "panic", None
         try:
@@ -150,7 +150,7 @@ class ConeProgram:
             reason = str(error)
         reason = reason or self._doubt(x, status, accept)
         value = None if reason else float(self.cost @ x)
-        return x, Attempt(settings.name, status, value, time.perf_counter() - started, reason)
+        return x, _Attempt(settings.name, status, value, time.perf_counter() - started, reason)
 
     def _doubt(self, x: Array, status: str, accept: Callable[[Array], bool] | None) -> str | None:
         """Why x may not be used, or None."""

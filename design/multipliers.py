@@ -417,7 +417,7 @@ _FIRST_FREQUENCIES = 12  # that the bound begins with
 
 
 @dataclass(frozen=True)
-class LimiterProof:
+class _LimiterProof:
     """What the limiter asks of the devices."""
 
     requirement: Requirement  # condition "limiter"
@@ -439,7 +439,7 @@ def limiter(
     c: Lags | None = None,
     lags: int = 1,
     T_max: float | None = None,
-) -> LimiterProof:
+) -> _LimiterProof:
     """The least common factor on `delta` [N s/m] with which the limiter's block is positive real, at the best c.
 
     G is the force map without Theta, rho (m,) [N/m] the limiter's lag. With `c` given its figure is that of the
@@ -455,13 +455,13 @@ def limiter(
     linear = conditions.this_environment(delay(theta, G.T) @ G, available, T_max)
     if not np.isfinite(linear.ratio):
         reason = linear.reason or "the loop without limiter is not covered"
-        return LimiterProof(refusal("limiter", available, reason), tuple(rho), none, np.inf)
+        return _LimiterProof(refusal("limiter", available, reason), tuple(rho), none, np.inf)
     search = _LimiterSearch(G, theta, available, rho, lags, T_max)
     if c is not None:
         ratio, w = search.swept(none)
-        return LimiterProof(search.requirement(ratio, w), tuple(rho), none, ratio)
+        return _LimiterProof(search.requirement(ratio, w), tuple(rho), none, ratio)
     best, ratio, w, bound = search.least()
-    return LimiterProof(search.requirement(ratio, w), tuple(rho), best, bound)
+    return _LimiterProof(search.requirement(ratio, w), tuple(rho), best, bound)
 
 
 class _LimiterSearch:
@@ -580,7 +580,7 @@ def limiter_refusal(loop: Loop) -> str | None:
 _MOST_SEARCHED = 12  # devices
 
 
-def limiter_requirement(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> LimiterProof:
+def limiter_requirement(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> _LimiterProof:
     """What this-environment asks with the limiter of rho = beta delta/T, at the multiplier `c` or the best one.
 
     For many devices it takes long to find (22 s for 32): there it is that at c = 0, unless a design brings its own.
@@ -596,7 +596,7 @@ def limiter_requirement(loop: Loop, coupling: Coupling, beta: float = BETA, c: L
                 return limiter(loop.sent(coupling), loop.theta, loop.delta, rho, c, T_max=loop.T_max)
     except (SingularLoop, TooLong) as error:
         reason = str(error)
-    return LimiterProof(refusal("limiter", loop.delta, reason), rho, ((),) * loop.channels, math.inf)
+    return _LimiterProof(refusal("limiter", loop.delta, reason), rho, ((),) * loop.channels, math.inf)
 
 
 #: What a certificate calls the multipliers of walls that make and break contact, one each.

@@ -77,7 +77,7 @@ DEFAULT = Options()
 
 
 @dataclass(frozen=True, eq=False)
-class Constraint:
+class _Constraint:
     """A linear matrix inequality that the forces G = R Psi E as they leave are to keep at every frequency.
 
     `block` is a condition's own statement, He[block(G, x)] > 0, affine in G and in own unknowns x together.
@@ -99,7 +99,7 @@ class Constraint:
 # what is asked --------------------------------------------------------------------------------------------------------
 
 
-def this_environment(loop: Loop) -> Constraint:
+def this_environment(loop: Loop) -> _Constraint:
     """design.conditions.this_environment_demand with a little of the damping unused, in units of Delta/T."""
 
     def block(G: Sampled, own: Array) -> Sampled:
@@ -107,14 +107,14 @@ def this_environment(loop: Loop) -> Constraint:
         return demand.free + demand.gain * (1 - MARGIN)
 
     gain = _demand(loop, Lti.constant(np.zeros((loop.channels, loop.channels)), loop.T)).gain
-    return Constraint("this-environment", block, 1 / np.sqrt(np.diag(gain.D)))
+    return _Constraint("this-environment", block, 1 / np.sqrt(np.diag(gain.D)))
 
 
 def _demand(loop: Loop, F: Any) -> Demand[Any]:
     return this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
 
 
-def switching(loop: Loop, span: DelayRange) -> Constraint:
+def switching(loop: Loop, span: DelayRange) -> _Constraint:
     """design.multipliers.switching_block for delays that switch within the span; alpha T/Delta are its unknowns."""
     scale = even_damping(loop.delta, loop.T, loop.T_max) / loop.T
     moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
@@ -126,7 +126,7 @@ def switching(loop: Loop, span: DelayRange) -> Constraint:
         return switching_block(G, span.lo, span.hi, usable, alpha.tolist(), loop.T_max)[0]
 
     unit = 1 / np.sqrt(np.concatenate([scale, scale[moves]]))
-    return Constraint("switching delays", block, unit, start=(0.5,) * moves.size, cost=(0.0,) * moves.size)
+    return _Constraint("switching delays", block, unit, start=(0.5,) * moves.size, cost=(0.0,) * moves.size)
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class Slip:
         return cls(beta, ((c,),) * loop.channels)
 
 
-def limiter(loop: Loop, slip: Slip) -> Constraint:
+def limiter(loop: Loop, slip: Slip) -> _Constraint:
     """design.multipliers.limiter_demand: forces that are limited. A little of rho stays unused, as of the damping."""
     rho = limiter_lag(loop.delta, loop.T, slip.beta)
     spare = np.diag([*rho, *rho]) * SPARE
@@ -150,10 +150,10 @@ def limiter(loop: Loop, slip: Slip) -> Constraint:
         demand = limiter_demand(G, loop.theta, loop.delta, rho, slip.c, loop.T_max)
         return demand.free + demand.gain * (1 - MARGIN) - spare
 
-    return Constraint("limiter", block, np.tile(1 / np.sqrt(even_damping(loop.delta, loop.T, loop.T_max) / loop.T), 2))
+    return _Constraint("limiter", block, np.tile(1 / np.sqrt(even_damping(loop.delta, loop.T, loop.T_max) / loop.T), 2))
 
 
-def most_gain(loop: Loop, cap: float) -> Constraint:
+def most_gain(loop: Loop, cap: float) -> _Constraint:
     """|F| < cap |E| above 100 Hz."""
     E = loop.E()
 
@@ -161,10 +161,10 @@ def most_gain(loop: Loop, cap: float) -> Constraint:
         return _within(_late(loop, G), E.at(G.z), cap)
 
     low = min(2 * np.pi * HIGH_HZ * loop.T, np.pi)
-    return Constraint("high-frequency gain", block, np.ones(2 * E.inputs), low=low)
+    return _Constraint("high-frequency gain", block, np.ones(2 * E.inputs), low=low)
 
 
-def worst_mismatch(loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> Constraint:
+def worst_mismatch(loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> _Constraint:
     """|F - Lambda E| < tau |E| over the band, with tau its own unknown and its cost."""
     E = loop.E()
 
@@ -172,7 +172,7 @@ def worst_mismatch(loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> Constr
         return _within(_late(loop, G) - as_like(G, delay(loop.lam, loop.T) @ E), E.at(G.z), own[0])
 
     low, high = _band(loop, band_hz)
-    return Constraint("mismatch", block, np.ones(2 * E.inputs), low, high, start=(2.0,), cost=(1.0,))
+    return _Constraint("mismatch", block, np.ones(2 * E.inputs), low, high, start=(2.0,), cost=(1.0,))
 
 
 def _late(loop: Loop, G: Sampled) -> Sampled:
@@ -297,7 +297,7 @@ class Case:
 
     loop: Loop  # around this environment alone
     E: Lti
-    constraints: tuple[Constraint, ...] = ()
+    constraints: tuple[_Constraint, ...] = ()
     weight: float = 1.0
 
     def delayed(self, z: Complex) -> Sampled:
@@ -387,7 +387,7 @@ class Problem:
         G[np.arange(1, len(G)), :, which[:, 1]] = np.swapaxes(through, 0, 1)
         return Sampled(z[None], G, case.loop.T)
 
-    def block(self, case: Case, constraint: Constraint, own: tuple[int, int], w: Array) -> Block:
+    def block(self, case: Case, constraint: _Constraint, own: tuple[int, int], w: Array) -> Block:
         """The inequality of a constraint at these frequencies: an affine map, by what it makes of each unknown."""
         slopes = self._slopes(case, on_circle(w))
         nothing, units = Sampled(slopes.z, np.zeros_like(slopes.G[:1]), slopes.T), np.eye(own[1] - own[0])
@@ -406,7 +406,7 @@ class Problem:
         slope[0, 0] = 1
         return Block.of(np.zeros((1, 1, 1), dtype=complex), slope)
 
-    def least(self, case: Case, constraint: Constraint, own: tuple[int, int], x: Array, w: Array) -> Array:
+    def least(self, case: Case, constraint: _Constraint, own: tuple[int, int], x: Array, w: Array) -> Array:
         """The least eigenvalue of a constraint at x, (k,)."""
         z = on_circle(w)
         R = self.span.matrices(x) @ self.span.sources()
@@ -416,7 +416,7 @@ class Problem:
         G = Sampled(delayed.z, filtered @ delayed.G, delayed.T)
         return np.linalg.eigvalsh(constraint.at(G, x[own[0] : own[1]])[0])[:, 0]
 
-    def grid(self, case: Case, constraint: Constraint) -> Array:
+    def grid(self, case: Case, constraint: _Constraint) -> Array:
         """The frequencies at which a constraint is imposed first."""
         even = np.linspace(constraint.low, constraint.high, 50)
         rising = np.geomspace(max(constraint.low, _SMALLEST), constraint.high, 60)
@@ -435,7 +435,7 @@ class Problem:
                 rooms.append(self.least(case, constraint, next(own), x, w).min())
         return float(min(rooms))
 
-    def _sweep(self, case: Case, constraint: Constraint) -> Array:
+    def _sweep(self, case: Case, constraint: _Constraint) -> Array:
         """A grid that knows every pole, over the band of a constraint."""
         return frequencies(case.E, self.span.chain(case.E.T), low=max(constraint.low, _SMALLEST), high=constraint.high)
 
