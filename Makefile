@@ -3,7 +3,7 @@
 # make check  lint and the tests of what your change touches, under a minute
 # make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
-# make validate  every check that a verdict rests on: a report in out/validate/report.md, about ten minutes
+# make validate  every check that a verdict rests on: a report in out/validate/report.md, and the slow pages: half an hour
 # make mutate  small mistakes in what verdicts rest on, and whether a test notices: about ten minutes
 # make oldest  the tests of models, blocks and files with the oldest packages that pyproject.toml allows, in .venv-oldest
 # make installed  a plain installation in an empty environment, and its console script

@@ -254,10 +254,6 @@ def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
     return options.exit_code(True, interrupted)
 
 
-def _decibels(value: float | None) -> str:
-    return render.optional(value, "{:.2f}", "exact")
-
-
 #: what stands in a column, given a row; a bound has no damping and only an rms error, a failed design neither
 _LADDER: dict[str, str | Callable[[LadderRow], str]] = {
     "design": "{r.design}",

@@ -26,7 +26,10 @@ _Rows = tuple[tuple[float, ...], ...]
 
 
 class Coupling(ABC):
-    """Anything that can be closed around the (delayed) environment. `around` is all that a new one must have."""
+    """Anything that can be closed around the (delayed) environment.
+
+    A new one has `around` and `form`, which judging asks for; `compliance` where any-environment is to judge it.
+    """
 
     kind: ClassVar[str] = "own"  # how reports name it
     holds_model: ClassVar[bool] = False  # a linear model of the environment: it cannot face walls

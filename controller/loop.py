@@ -21,7 +21,8 @@ from controller.environment import Environment, Network, RigidWall, walled_force
 from controller.lti import Complex, Lti, Number, Sampled, rational
 from controller.ranges import Member, Ranges, members
 
-Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=100)], ...]
+MOST_SAMPLES = 1000  # of delay on a channel; every one is a state
+Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=MOST_SAMPLES)], ...]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 

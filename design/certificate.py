@@ -22,7 +22,16 @@ from controller.loop import Loop
 from controller.lti import Array, Lti, SingularLoop, TooLong, rational, within
 from controller.ranges import Member, inside, number_of_vertices
 from design import conditions, multipliers
-from design.coupling_file import Certificate, Guarantee, LimiterCertificate, Stored, SwitchingProof, digest, sealed
+from design.coupling_file import (
+    Certificate,
+    Guarantee,
+    LimiterCertificate,
+    Stored,
+    SwitchingProof,
+    digest,
+    own_fields,
+    sealed,
+)
 from design.environments import Progress, Searched, in_each, search_ranges, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
 from design.frequency import frequencies, on_circle, rounding
@@ -286,7 +295,7 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
     """Raises NotProved, in a moment, where a sweep or a proof would take minutes."""
     late = sum(loop.delays.hi) + sum(loop.psi)
     _require_size(late)
-    for value in _coefficients(msgspec.to_builtins((loop, coupling.form()))):
+    for value in _coefficients(msgspec.to_builtins((loop, coupling.form()), enc_hook=own_fields)):
         if rational(value).denominator.bit_length() > _MOST_BITS:
             raise NotProved(f"the coefficient {value:g} has too many digits for exact arithmetic")
     try:

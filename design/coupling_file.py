@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
+import numpy as np
 
 from controller.coupling import Coupling, Form, Strict, require_channels
+from controller.environment import Network
 from controller.loop import Loop
 from controller.older import CONDITIONS, GUARANTEES, named_first, named_today
 from design.files import InputError, counted, read, write
@@ -99,11 +101,20 @@ def digest(*parts: msgspec.Struct) -> str:
 
 
 def _read_back(part: _Part) -> _Part:
-    return msgspec.json.decode(msgspec.json.encode(part), type=type(part))
+    """The part as a file gives it back; itself where it holds a class of the user's own, which no file can hold."""
+    try:
+        return msgspec.json.decode(msgspec.json.encode(part), type=type(part))
+    except (TypeError, msgspec.ValidationError):
+        return part
 
 
 def _canonical(part: Any) -> bytes:
-    return msgspec.json.encode(part, order="deterministic")
+    return msgspec.json.encode(part, order="deterministic", enc_hook=own_fields)
+
+
+def own_fields(part: Any) -> Any:
+    """An environment or an array of the user's own as plain data: its class and what it holds."""
+    return part.tolist() if isinstance(part, np.ndarray) else {"class": type(part).__qualname__} | vars(part)
 
 
 def sealed(certificate: Certificate) -> Certificate:
@@ -171,4 +182,8 @@ def _place(content: bytes, message: str) -> str:
 
 def save(stored: Stored, path: str | Path) -> None:
     """Write through a temporary file beside `path`, so that a reader never sees half of it. Raises InputError."""
+    if _read_back(stored) is stored:
+        known = *getattr(stored.loop.environment, "springs", ()), stored.loop.environment
+        own = next((type(part).__name__ for part in known if type(part).__module__ != Network.__module__), "own")
+        raise InputError(f"{path}: a file holds no class of your own, the environment has one ({own})")
     write(Path(path), msgspec.json.format(msgspec.json.encode(stored), indent=1) + b"\n")

@@ -22,11 +22,11 @@ from design import program
 from design.certificate import prove, prove_limiter
 from design.conditions import this_environment as requirement_of
 from design.coupling_file import Certificate, LimiterCertificate
-from design.designs import design_by_kind
 from design.environments import Searched, in_each, ratio_in, search_ranges, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.result import Design, DesignFailed, NotProved, finite
 from design.robustness import at, robustness, robustness_part, vertices
+from design.spring_damper import design as design_spring_damper
 from design.transparency import Transparency, decibels, transparency
 
 _MINIMISED = {"rms": "rms_mismatch", "sup": "relative_mismatch"}
@@ -322,7 +322,7 @@ class _Climb:
         if len(self.cases) > 1 or self.constrained or self.loop.latency:
             return None
         try:
-            gains = design_by_kind(self.loop, "spring-damper", "this-environment", limiter=False).coupling
+            gains = design_spring_damper(self.loop, "this-environment").coupling
             return self._proved(self._assessed(gains, np.nan), None)
         except (DesignFailed, ValueError):
             return None

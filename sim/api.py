@@ -80,6 +80,8 @@ def run_scenario(
         choices = compare_engines(simulation, error)
         kept = pick(choices, error)
         integrator, substeps = kept.integrator, kept.substeps
+        if net is not None:
+            remarks.append("speed against error is of the loop without the energy budget, whose own work comes on top")
     else:
         integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)
     ran = simulation if net is None else netted(simulation, coupling, net)

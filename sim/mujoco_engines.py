@@ -199,6 +199,7 @@ class MujocoEngine:
     def start(self, buffer: StepBuffer) -> None:
         self._buffer, self.stretch, access = buffer, None, self._access
         access.put(buffer, 0)
+        self._warnings[:] = 0
         self._advance: Callable[[int], None] | None = None
         if buffer.calm and not self._timing and not (self._rubs and buffer.limited):
             if self._whole:

@@ -26,4 +26,7 @@ def _command_starts() -> bool:
     """Whether this process is one of our commands that Python is still looking for."""
     words = sys.orig_argv
     module = words[words.index("-m") + 1] if "-m" in words[:-1] else ""
-    return sys.argv[:1] == ["-m"] and module.split(".")[0] in ("design", "sim", "hw")
+    if sys.argv[:1] == ["-m"]:
+        return module.split(".")[0] in ("design", "sim", "hw", "cli")
+    started = sys.argv[0] if sys.argv else ""
+    return os.path.basename(started) == "haptic-loop" or started.endswith(os.path.join("cli", "__main__.py"))

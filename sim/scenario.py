@@ -22,7 +22,7 @@ import numpy as np
 
 from controller.delay import VaryingDelay
 from controller.environment import RIGID_WALL, Network, Spring, Wall, environment
-from controller.loop import DelayRange, Loop
+from controller.loop import MOST_SAMPLES, DelayRange, Loop
 from controller.older import SCENARIOS as OLDER_SCENARIOS
 from controller.older import named_first, named_today
 from controller.ranges import Ranges, UncertainSpring
@@ -35,7 +35,7 @@ CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
-LONGEST_DELAY = 1000  # [samples]; every one is a state
+LONGEST_DELAY = MOST_SAMPLES
 _MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many states take ten seconds, of 2000 a minute
 _LONGEST_NAME = 200  # characters, that a table and a picture can show
 _TIMING_STREAM = 6  # keeps these draws apart from those of the humans with the same seed

@@ -1,5 +1,5 @@
 /* The device's side of the serial link in portable C99 (and C++11): no floats, no malloc, no clock and no port.
- * The rules and every byte: docs/protocol.md; the frames: haptic_frame.h. The tests hold it to hw/device.py, the same
+ * The rules and every byte: docs/protocol.md; the frames: haptic_frame.h. The tests hold it to hw/device_state.py, the same
  * machine, byte for byte.
  *
  *   hl_init     once; the device is silent and its motors carry nothing

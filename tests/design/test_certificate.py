@@ -468,3 +468,11 @@ def test_walls_without_a_solution_are_refused(monkeypatch):
     monkeypatch.setattr(design_certificate.multipliers, "walls_demand", singular)
     with pytest.raises(NotProved, match="algebraic loop without solution"):
         design_certificate._walls_block(scenario("one-wall").loop("I"), SpringDamper((400.0,), (0.1,)), [Fraction(1)])
+
+
+def test_a_long_delay_is_proved_stored_and_read_again(tmp_path):
+    """Scenarios take up to a thousand samples of delay: so do files."""
+    loop, soft = scenario().replace(theta=(1, 101)).loop("I"), SpringDamper((400.0, 5.0), (0.0, 0.0))
+    kept = Stored.of(loop, soft, prove(loop, soft, "this-environment"))
+    save(kept, tmp_path / "late.json")
+    assert load(tmp_path / "late.json").loop.theta == (1, 101)

@@ -8,9 +8,11 @@ from dataclasses import fields
 from inspect import signature
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from worlds import SOFT
 
 import design
@@ -20,6 +22,7 @@ from cli.design import main as design_command
 from cli.run import main as run_command
 from cli.validate import main as validate_command
 from controller.coupling import NoCoupling, SpringDamper
+from controller.environment import Spring
 from design import DesignOptions, certify, coupling_file, design_coupling, guarantee, transparency_of
 from design.designs import KINDS, Kind
 from hw import rehearse
@@ -264,11 +267,37 @@ def test_a_design_of_ones_own_is_one_function_and_one_row(monkeypatch, tmp_path)
     page = (Path(__file__).parents[2] / "docs" / "architecture.md").read_text()
     snippet = page.split("**A design.**")[1].split("```python\n")[1].split("```")[0]
     row = page.split("the row\n`")[1].split("` in")[0]
-    own = ModuleType("design.half_stiff")
+    own: Any = ModuleType("design.half_stiff")
     exec("loop = __import__('sim').load('omega-pair').loop('I')\n" + snippet, own.__dict__)
     own.design = own.half_stiff
     monkeypatch.setitem(sys.modules, own.__name__, own)
     name, kind = row.split(": ", 1)
     monkeypatch.setitem(KINDS, name.strip('"'), eval(kind, {"Kind": Kind}))
     assert design_command(["--coupling", "half-stiff", "--out", str(tmp_path / "own.json")]) == 0
-    assert coupling_file.load(tmp_path / "own.json").certificate.matrices
+    certificate = coupling_file.load(tmp_path / "own.json").certificate
+    assert certificate
+    assert certificate.matrices
+
+
+class _Inerter(Spring, frozen=True):
+    inertance: float = 0.0  # [kg]
+
+    def amounts(self, number):
+        return number(self.inertance), number(self.damping), number(self.stiffness)
+
+
+def test_an_element_of_ones_own_is_designed_for_and_proved_but_in_no_file(tmp_path):
+    """An inerter to ground is a mass at its node: the same needs, proved; a file of it could not be read."""
+    loop = load("omega-pair").loop("I")
+    own = (*loop.network.springs, _Inerter(("mass", "ground"), 1.0, inertance=0.25))
+    same = (*loop.network.springs, Spring(("mass", "ground"), 1.0))
+    inert, massive = (
+        loop.at(replace(loop.network, springs=springs, masses={"mass": mass}))
+        for springs, mass in ((own, 1.0), (same, 1.25))
+    )
+    here, there = (certify(each, SOFT)["this-environment"] for each in (inert, massive))
+    assert here.required == pytest.approx(there.required, rel=1e-9)
+    assert here.proof == "rational"
+    with pytest.raises(InputError, match="_Inerter"):
+        coupling_file.save(coupling_file.Stored.of(inert, SOFT), tmp_path / "own.json")
+    assert not any(tmp_path.iterdir())
