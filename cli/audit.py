@@ -20,6 +20,7 @@ from design.audit import LONGEST_DELAY, Audit, ConditionAudit, Help, audit
 from design.certificate import check_ranges
 from design.coverage import ranges_rows
 from design.designs import KINDS
+from design.files import unseen
 from design.result import CONDITIONS, listed
 from models.device import CATALOGUE, listed_device
 from sim.couplings import check_stored, fitted, read_coupling
@@ -41,10 +42,10 @@ class _Report:
     scenario: str | None
     device: dict[str, Any] | None
     gains: str | None  # the source of a device's gains
-    audit: Audit = render.unseen("beside")
-    encoder: dict[str, Any] | None = render.unseen()
-    notes: tuple[str, ...] = render.unseen()
-    wall_s: float = render.unseen()
+    audit: Audit = unseen("beside")
+    encoder: dict[str, Any] | None = unseen()
+    notes: tuple[str, ...] = unseen()
+    wall_s: float = unseen()
 
 
 def main(argv: list[str]) -> int:

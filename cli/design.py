@@ -12,7 +12,6 @@ import msgspec
 from rich.table import Table
 
 from cli import options, render
-from cli.judged import Judged
 from controller.loop import Loop
 from design import coverage
 from design.api import Filed, proved, store
@@ -29,6 +28,7 @@ from design.result import Design, listed
 from design.robustness import ranges_around
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts
+from sim.judged import Judged
 from sim.scenario import InputError, Scenario
 
 

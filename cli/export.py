@@ -26,7 +26,7 @@ from design.export import (
     trial,
     with_origin,
 )
-from design.files import out_file, write
+from design.files import out_file, unseen, write
 from design.result import listed
 from sim.couplings import read_coupling
 from sim.scenario import InputError
@@ -55,7 +55,7 @@ class _Exported:
     channels: int = render.figure("block", "{} channels, {r.states} states, T = {r.T_s:g} s")
     certificate: _Proof = render.figure("certificate")
     multiplications: int = render.figure("one tick", "{} multiplications")
-    force_limit: Array | None = render.unseen()
+    force_limit: Array | None = unseen()
     forces: str | None = render.figure("forces")
     test: dict[str, Any] = render.figure("test vector", "{[ticks]} ticks, in the file")
 

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from cli import options, render
 from cli.session_cli import add_link_options, check_link, hold_session, steady_scenario
-from design.files import plain, write
+from design.files import plain, unseen, write
 from hw.control import link_delay
 from hw.emulator import nobody
 from hw.identify import Estimate, Excitation, capped, chirp, estimate, held, settled
@@ -45,23 +45,23 @@ class _Sitting:
 
     axes: list[Estimate]  # none where there is a reason
     reason: str | None
-    report: SessionReport = render.unseen("no")
-    session: Session = render.unseen("no")
-    trace: Path | None = render.unseen("no")
-    signals: Sequence[int] = render.unseen("no")
+    report: SessionReport = unseen("no")
+    session: Session = unseen("no")
+    trace: Path | None = unseen("no")
+    signals: Sequence[int] = unseen("no")
 
 
 @dataclass(frozen=True, eq=False)
 class _Report:
     """The last session, one estimate per axis from all sittings, and whether each has a bound above zero."""
 
-    session: SessionReport = render.unseen("beside")
-    axes: list[Estimate] = render.unseen()
-    sittings: list[_Sitting] = render.unseen()
-    bounded: bool = render.unseen()
-    warnings: list[str] = render.unseen()
-    reason: str | None = render.unseen("given")
-    limits: str = render.unseen(default=_LIMITS)
+    session: SessionReport = unseen("beside")
+    axes: list[Estimate] = unseen()
+    sittings: list[_Sitting] = unseen()
+    bounded: bool = unseen()
+    warnings: list[str] = unseen()
+    reason: str | None = unseen("given")
+    limits: str = unseen(default=_LIMITS)
 
     def lines(self) -> list[str]:
         """What stands below the table."""

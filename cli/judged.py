@@ -8,7 +8,7 @@ from cli import render
 from design.coverage import ranges_rows
 from sim import judged
 from sim.couplings import Chosen
-from sim.judged import Judged as Judged
+from sim.judged import Judged
 from sim.scenario import Scenario
 
 

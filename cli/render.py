@@ -24,7 +24,6 @@ from rich.text import Text
 from controller.loop import Loop
 from controller.older import REPORTS, with_older
 from design.files import nobody_reads, plain, printable, write_json
-from design.files import unseen as unseen
 from design.result import CONDITIONS, DesignFailed, listed
 
 # ----------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cli import options, render
-from cli.judged import Judged, judge
+from cli.judged import judge
 from cli.judged import rows as judged_rows
 from controller.environment import GROUND
 from controller.loop import Loop
@@ -23,6 +23,7 @@ from sim import passivity_layer as layer
 from sim.alternatives import Alternative, alternatives
 from sim.api import ScenarioRun, run_scenario
 from sim.couplings import NAMES, Chosen, choose
+from sim.judged import Judged
 from sim.mujoco_engines import INTEGRATORS
 from sim.run import ENGINES
 from sim.run_report import Ran, RunReport, run_report

@@ -11,16 +11,18 @@ from pathlib import Path
 import numpy as np
 
 from cli import options, render
-from cli.judged import Judged, judge
+from cli.judged import judge
 from controller.ranges import Member
 from design.certificate import RangesCheck
 from design.conditions import this_environment
+from design.files import unseen
 from design.guarantees import ANY
 from models.human import Human, Population
 from sim import report, verdicts
 from sim.adversary import Worst, search, search_population
 from sim.couplings import NAMES, Chosen, choose
 from sim.crowds import ENGINES, MIXED, Findings, Validation
+from sim.judged import Judged
 from sim.run import assemble
 from sim.scenario import InputError, Scenario, require_linear, save_humans
 from sim.shards import Table, validate, validate_on_cluster
@@ -194,8 +196,8 @@ class _Own:
     """What the exact loop does in the hands of the scenario, or of --human FILE."""
 
     from_: str
-    exact: Eigenvalues = render.unseen("beside")
-    holds: bool = render.unseen()
+    exact: Eigenvalues = unseen("beside")
+    holds: bool = unseen()
 
     def rows(self) -> render.Rows:
         growth = f"{self.exact.exact_growth_rate_per_s:+.4g} 1/s at {self.exact.exact_frequency_hz:.2f} Hz"
@@ -232,9 +234,9 @@ class _Report:
     adversary_population: verdicts.Attacked | None = render.figure("adversary, own population", json="given")
     certified: bool = render.figure("certified", lambda yes: "yes" if yes else "no")
     holds: bool | None = render.figure("holds", lambda yes: "[green]yes[/]" if yes else "[red]no[/]", absent=_NOTHING)
-    reason: str | None = render.unseen("given")
+    reason: str | None = unseen("given")
     interrupted: bool
-    kept: str = render.unseen("table")
+    kept: str = unseen("table")
     ended: str | None = render.figure("interrupted", "{r.kept}", json="table")
     unfinished: str | None = render.figure("unfinished", "{}; {r.kept}")
     wall_s: float = render.figure("time", "{:.1f} s, {r.simulated_s_per_s:.0f} simulated seconds per second")

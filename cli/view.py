@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from cli import options, render
-from design.files import write_json
+from design.files import unseen, write_json
 from design.result import CONDITIONS, certificate_part
 from sim.scenario import InputError, require_even_ticks
 from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, PreparedLoop, Script, first_loop, parse_script
@@ -112,8 +112,8 @@ class _Ended:
 
     interrupted: bool
     remarks: list[str] = field(default_factory=list)
-    video: _Film | None = render.unseen("given", None)
-    clock: _Clock | None = render.unseen("given", None)
+    video: _Film | None = unseen("given", None)
+    clock: _Clock | None = unseen("given", None)
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class _Report:
     simulated_s: float
     clipped_ticks: int
     events: list[_Event]
-    ended: _Ended = render.unseen("beside")
+    ended: _Ended = unseen("beside")
 
     def lines(self) -> Iterator[str]:
         """One line per event, and where the film is."""

@@ -30,6 +30,7 @@ from design.spring_damper import design as design_spring_damper
 from design.transparency import Transparency, decibels, transparency
 
 _MINIMISED = {"rms": "rms_mismatch", "sup": "relative_mismatch"}
+_FEW = 3  # devices for which the price of a range is worked out
 _SETTLED_DB = 0.05  # a rung that gains less ends the climb
 _FEWEST_RUNGS = 3
 _KEPT_STIFFNESS = 0.5  # of the static stiffness of the best rung so far: a rung that renders less is not taken
@@ -121,7 +122,7 @@ def design(
     rungs: list[_Rung] = []
     hurried = False
     for taps, poles in options.ladder:
-        if rungs and not climb.room(taps, poles, rungs[-1].states):
+        if rungs and not climb.room(taps, poles, max((r.states for r in rungs if r.reason is None), default=0)):
             continue
         found, rung = climb.rung(taps, poles, best)
         rungs.append(rung)
@@ -408,9 +409,10 @@ def spread(loop: Loop, options: program.Options = program.DEFAULT, percent: floa
 def robustness_parts(loop: Loop, coupling: Coupling, options: program.Options = program.DEFAULT) -> dict[str, Any]:
     """A report's `robustness` of a coupling for this environment, and what a design for that range would cost.
 
-    The latter is null with walls, with ranges, and for a coupling that is no force filter.
+    The latter is null with walls, with ranges, for a coupling that is no force filter, and for more than _FEW devices,
+    where it takes far longer than the design.
     """
     alone = isinstance(coupling, ForceFilter) and not (loop.ranges or loop.environment.walls)
-    price = spread(loop, options) if alone else None
+    price = spread(loop, options) if alone and loop.channels <= _FEW else None
     parts = price and {name: finite(value) for name, value in asdict(price).items()}
     return {"robustness": robustness_part(loop, coupling), "designed_for_it": parts}
