@@ -23,9 +23,10 @@ from controller.lti import Array
 from design import compare
 from design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
 from design.program import Options
-from design.result import CONDITIONS, DesignFailed
+from design.result import CONDITIONS, DesignFailed, finite
+from design.robustness import Robustness
 from sim import baselines
-from sim.compare_report import ComparedCoupling, Comparison
+from sim.compare_report import ComparedCoupling, Comparison, ConditionCurve
 from sim.couplings import NAMES, Chosen, choose
 from sim.scenario import InputError, Scenario
 
@@ -181,28 +182,27 @@ def _guarantees(report: Comparison) -> Table:
         "at 10 %": lambda c: _robust(c.robustness, scale),
         "any-env.": lambda c: _needs(c.conditions["any-environment"], scale),
         "at Hz ": lambda c: _binds(c.conditions["any-environment"]),
-        "sup dB": lambda c: render.optional(c.transparency["relative_mismatch_db"], "{:.2f}", "-inf"),
-        "rms dB": lambda c: render.optional(c.transparency["rms_mismatch_db"], "{:.2f}", "-inf"),
+        "sup dB": lambda c: render.optional(finite(c.transparency.mismatch_db), "{:.2f}", "-inf"),
+        "rms dB": lambda c: render.optional(finite(c.transparency.rms_mismatch_db), "{:.2f}", "-inf"),
     }
     return render.columns(title, cells, report.couplings)
 
 
-def _binds(part: dict[str, Any]) -> str:
-    return render.optional(part["binding_frequency_hz"], "{:.4g}")
+def _binds(part: ConditionCurve) -> str:
+    return render.optional(part.requirement.frequency_hz, "{:.4g}")
 
 
-def _needs(part: dict[str, Any], scale: float) -> str:
+def _needs(part: ConditionCurve, scale: float) -> str:
     """The worst device's figure, green where it is certified."""
-    need = "infinite" if np.isinf(part["ratio"]) else f"{scale * part['ratio']:.5g}"
-    return f"[{'green' if part['certified'] else 'red'}]{need}[/]"
+    need = "infinite" if np.isinf(part.ratio) else f"{scale * part.ratio:.5g}"
+    return f"[{'green' if part.requirement.certified else 'red'}]{need}[/]"
 
 
-def _robust(part: dict[str, Any] | None, scale: float = 1.0) -> str:
+def _robust(part: Robustness | None, scale: float = 1.0) -> str:
     """The need at the worst stiffness or mass within ten percent."""
     if part is None:
         return "-"
-    need = part["required_over_available"]
-    return "infinite" if need is None else f"{scale * need:.4g}"
+    return f"{scale * part.required_over_available:.4g}"
 
 
 def _feel(report: Comparison) -> Table:
