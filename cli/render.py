@@ -164,8 +164,7 @@ def pictures(args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping
         return []
     from sim import plots
 
-    outcome = plain(report)
-    return [drawing(plots)(outcome, folder / file) for file, drawing in drawn.items()]
+    return [drawing(plots)(report, folder / file) for file, drawing in drawn.items()]
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from controller.older import CONDITIONS as OLDER
 from controller.older import with_older
 from design import compare
 from design.files import unseen
+from design.program import Options
 from design.result import CONDITIONS, Requirement
 from design.robustness import Robustness, robustness_nearby
 from design.transparency import Transparency, transparency
@@ -59,6 +60,33 @@ class ComparedCoupling:
             CouplingFigures.of(chosen.kind, chosen.coupling, loop.T),
             with_older(conditions, OLDER),
         )
+
+
+@dataclass(frozen=True)
+class Here:
+    """Where the scenario's own loop stands on the axes of a comparison."""
+
+    delta: tuple[float, ...]  # [N s/m]
+    theta: tuple[int, ...]
+    psi: tuple[int, ...]
+    T_s: float
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How good a coupling can be, along axes of the loop."""
+
+    scenario: str
+    seed: int
+    case: str
+    objective: str
+    delays_kept_in: str
+    options: Options = unseen(older="wish")
+    here: Here = unseen()
+    sweeps: dict[str, compare.Sweep] = unseen()
+    gains: list[str] = unseen()
+    wall_s: float = unseen()
+    interrupted: bool = unseen()
 
 
 @dataclass(frozen=True, eq=False)
