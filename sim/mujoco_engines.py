@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -31,7 +31,7 @@ from controller.tick import FusedTicks, StepBuffer, Stretch
 from controller.timing import Timing
 from design.files import InputError
 from models.hold import Product, exponential_step, product_of
-from models.scene import Scene, Variants, impeded
+from models.scene import Plant, Scene, Variants, impeded
 
 if TYPE_CHECKING:
     import mujoco
@@ -178,7 +178,7 @@ class MujocoEngine:
         self.data = mujoco.MjData(self.model)
         self._warnings = self.data.warning.number
         self.stretch: Stretch | None = None
-        moves = cache(lambda h: exponential_step(_rates(scene, None), h)[0])
+        moves = partial(_step_of, scene.plant)
         self._whole = moves if integrator == EXPONENTIAL and substeps == 1 else None
         self._timing, both, q, v = timing, (self.model, self.data), self.data.qpos, self.data.qvel
         self._access = _Access(
@@ -216,18 +216,19 @@ class MujocoEngine:
     def _fused(self, buffer: StepBuffer, move: Array) -> Stretch:
         access, states = self._access, len(move)
         fused = FusedTicks(buffer, move[:, :states], G=move[:, states:])
-        ctrl, state, qacc, forward = access.ctrl, access.state, access.qacc, access.forward
-        product, held, before, after, rates = fused.product, fused.held, fused.before, fused.next, fused.further
-        shaped = list(fused.states.reshape(-1, *state.shape))
+        ctrl, qacc, forward, (q, v) = access.ctrl.data, access.qacc.data, access.forward, access.state
+        q, v = q.data, v.data
+        rows, product = list(zip(*fused.copied(), fused.before, fused.next, strict=False)), fused.product
 
         def stretch(ticks: int) -> None:
             for count in fused.parts(ticks):
-                for inputs, rate, now, then, moved in zip(held[:count], rates, before, after, shaped, strict=False):
-                    ctrl[...] = inputs
+                for inputs, rate, q_then, v_then, now, then in rows[:count]:
+                    ctrl[:] = inputs
                     forward()
-                    rate[...] = qacc
+                    rate[:] = qacc
                     product(now, then)
-                    state[...] = moved
+                    q[:] = q_then
+                    v[:] = v_then
 
         return stretch
 
@@ -315,6 +316,11 @@ class MujocoBatchEngine:
         return bool(np.any(self.batch.warning))
 
 
+@lru_cache(64)  # runs of the same plant follow each other
+def _step_of(plant: Plant, h: float) -> Array:
+    return exponential_step(plant.A[None], h)[0]
+
+
 def _rates(scene: Scene, fields: Mapping[str, Array] | None) -> Array:
     """J of s' = J s + .., (nsim or 1, 2n, 2n), from the matrices of the compiled model, or of every variant of it."""
     if not fields:
@@ -325,10 +331,7 @@ def _rates(scene: Scene, fields: Mapping[str, Array] | None) -> Array:
 
 
 def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
-    """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T.
-
-    Of the exponential one it is the scene's own where nothing rubs: accelerations alone know no step.
-    """
+    """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T."""
     import mujoco
 
     if integrator not in INTEGRATORS:
@@ -337,8 +340,6 @@ def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoc
         raise ValueError(f"substeps is {substeps}, allowed are whole numbers from 1")
     if impeded(scene.model):
         raise InputError("a human has an impedance (A, B, C, D), which MuJoCo does not simulate: use the exact engine")
-    if integrator == default_integrator(scene) == EXPONENTIAL:
-        return scene.model
     model = copy(scene.model)
     model.opt.timestep = T / substeps
     model.opt.integrator = getattr(mujoco.mjtIntegrator, INTEGRATORS[integrator])
