@@ -116,15 +116,15 @@ def test_an_impedance_runs_in_uneven_ticks_with_forces_that_latch_late():
     uneven = {"period": Periods(1e-3, 1.2e-3), "latency": ((1e-4, 5e-4), (0.0, 3e-4)), "duration": 0.3}
     simulation = assemble(held_by(Light(), MuscleBySpace()).replace(**uneven), CASE_I)
     exact = run(simulation, "exact")
-    for integrator, close in (("exponential", 1e-10), ("RK4", 1e-5)):
-        assert rms(run(simulation, make_engine(simulation, "mujoco", integrator)).x, exact.x) < close
+    for integrator, least in (("exponential", 1e-10), ("RK4", 1e-5)):
+        assert rms(run(simulation, make_engine(simulation, "mujoco", integrator)).x, exact.x) < least
 
 
 def test_where_devices_rub_runge_kutta_moves_an_impedance():
     rubbing = held_by(Light(), Light())
     devices = tuple(msgspec.structs.replace(device, friction=0.2) for device in rubbing.device)
     simulation = assemble(rubbing.replace(device=devices), CASE_I)
-    with pytest.raises(InputError, match="a human has an impedance .* and a device rubs: use integrator RK4"):
+    with pytest.raises(InputError, match=r"a human has an impedance .* and a device rubs: use integrator RK4"):
         make_engine(simulation, "mujoco", "exponential")
     coarse, fine = (run(simulation, make_engine(simulation, "mujoco", "RK4", n)).x for n in (4, 16))
     assert rms(coarse, fine) < 1e-4  # of first order where a device sticks
