@@ -210,7 +210,7 @@ class MapReport:
     coupling: CouplingFigures | None
     ratios: dict[str, _Ratio] = unseen("beside")
     fixed: FixedCoupling | None = unseen("beside")  # of a map over environments
-    error: dict[str, MapError] | None = unseen("given")
+    error: dict[str, MapError | None] | None = unseen("given")
     marks: list[Marked] | None = unseen("given")
     not_covered: str = CAVEATS
 
