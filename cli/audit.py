@@ -115,7 +115,7 @@ def _with_device(args: argparse.Namespace) -> argparse.Namespace:
     if args.delta is None:
         if device.damping is None:
             raise InputError(f"--device {name}: nobody publishes its damping: give --delta, as measured by hw.identify")
-        found["delta"] = (device.damping.least,)
+        found["delta"] = (device.damping.value,)
     gained = args.coupling or args.case == "none" or (args.K and args.B)
     if device.stiffness and device.framework_damping and not gained:
         found["source"] = f"K and B: {device.stiffness.source}; T: the 1 kHz that haptic loops customarily run at"
@@ -139,8 +139,7 @@ def _list_devices(args: argparse.Namespace) -> int:
     def cell(fact: dict[str, Any] | None, scale: float) -> str:
         if fact is None:
             return "unknown"
-        value: float = fact["value"] if "value" in fact else fact["least"]
-        return f"{value * scale:g}[{numbered[fact['source']]}]"
+        return f"{fact['value'] * scale:g}[{numbered[fact['source']]}]"
 
     heads = ("device", "damping N s/m", "mass g", "force N", "encoder um", "friction N", "CHAI3D N/m")
     rows = [(name, *(cell(part[field], scale) for field, scale in _UNITS.items())) for name, part in parts.items()]
