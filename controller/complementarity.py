@@ -144,10 +144,9 @@ class BoxProblem(_Problem):
                 below, above = np.where(free[:, None], -f, pushed), np.where(free[:, None], f, pushed)
                 room_below = np.where(free, self.upper - f_one, pushed_one)
                 room_above = np.where(free, f_one - self.lower, pushed_one)
-                found.append(
-                    (signs[:, None], np.vstack([v, f]), np.append(v_one, f_one)[:, None])
-                    + (np.vstack([below, above]), np.append(room_below, room_above)[:, None])
-                )
+                solved = np.vstack([v, f]), np.append(v_one, f_one)[:, None]
+                room = np.vstack([below, above]), np.append(room_below, room_above)[:, None]
+                found.append((signs[:, None], *solved, *room))
         signs, by_q, by_one, room, room_one = map(np.stack, zip(*found, strict=True))
         return signs, by_q, by_one, room.reshape(-1, n), room_one.reshape(-1, 1)
 
