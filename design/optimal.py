@@ -412,7 +412,9 @@ def robustness_parts(loop: Loop, coupling: Coupling, options: program.Options = 
     The latter is null with walls, with ranges, for a coupling that is no force filter, and for more than _FEW devices,
     where it takes far longer than the design.
     """
-    alone = isinstance(coupling, ForceFilter) and not (loop.ranges or loop.environment.walls)
+    alone = isinstance(coupling, ForceFilter) and not (
+        loop.ranges or loop.environment.walls or loop.environment.one_period
+    )
     price = spread(loop, options) if alone and loop.channels <= _FEW else None
     parts = price and {name: finite(value) for name, value in asdict(price).items()}
     return {"robustness": robustness_part(loop, coupling), "designed_for_it": parts}

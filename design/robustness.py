@@ -76,8 +76,8 @@ def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> _Robust
 
 
 def robustness_part(loop: Loop, coupling: Coupling) -> dict[str, Any] | None:
-    """The worst need within ten percent as plain data; None with walls, and for an environment that is no network."""
-    if loop.environment.walls or not isinstance(loop.environment, Network):
+    """The worst need within ten percent as plain data; None with walls, and for what is not all springs and masses."""
+    if loop.environment.walls or not isinstance(loop.environment, Network) or loop.environment.block:
         return None
     return robustness(loop, coupling).part()
 
