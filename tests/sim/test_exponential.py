@@ -4,9 +4,6 @@
 the position that the fastest spring turns it into.
 """
 
-from copy import copy
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 import pytest
@@ -120,9 +117,8 @@ def test_the_forces_are_mujocos(simulation):
     wrong = 1.5
     errors = []
     for substeps in (8, 16):
-        scene = replace(simulation.scene, model=copy(simulation.scene.model))
-        engine, _ = MujocoEngine(scene, SCENARIO.T, EXPONENTIAL, substeps), scene.plant
-        engine.model.tendon_stiffness[...] *= wrong
+        engine = MujocoEngine(simulation.scene, SCENARIO.T, EXPONENTIAL, substeps)
+        engine.model.tendon_stiffness[...] *= wrong  # of this engine alone
         errors.append(_one_period(simulation.process, engine, simulation.scene.outside))
     truth = hold(plant(engine.model), SCENARIO.T).A
     old = hold(plant(simulation.scene.model), SCENARIO.T).A
@@ -328,7 +324,8 @@ def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
     assert (sound.integrator, sound.substeps, sound.agrees) == ("RK4", 4, True)
     assert sound.position_relative_rms < 1e-6  # of RK4 x 4 here
     assert abs(sound.growth_rate_difference_per_s) < 1e-3
-    monkeypatch.setattr(mujoco_engines, "exponential_step", lambda J, *rest: exponential_step(1.001 * J, *rest))
+    wrong_step = exponential_step(1.001 * loop.scene.plant.A[None], SCENARIO.T, loop.scene.model.nv)[0]
+    monkeypatch.setattr(mujoco_engines, "_step_of", lambda *_: wrong_step)
     wrong = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), "mujoco", EXPONENTIAL, 1)
     assert wrong.position_relative_rms > 30 * sound.position_relative_rms
     assert abs(wrong.growth_rate_difference_per_s) > 1e-3
