@@ -410,17 +410,6 @@ def spread(loop: Loop, options: program.Options = program.DEFAULT, percent: floa
 class Nearby:
     """What a coupling for this environment needs in one that is 10 % off, and what a design for that would cost."""
 
-<<<<<<< HEAD
-    The latter is null with walls, with ranges, for a coupling that is no force filter, and for more than _FEW devices,
-    where it takes far longer than the design.
-    """
-    alone = isinstance(coupling, ForceFilter) and not (
-        loop.ranges or loop.environment.walls or loop.environment.one_period
-    )
-    price = spread(loop, options) if alone and loop.channels <= _FEW else None
-    parts = price and {name: finite(value) for name, value in asdict(price).items()}
-    return {"robustness": robustness_part(loop, coupling), "designed_for_it": parts}
-=======
     robustness: Robustness | None = None
     designed_for_it: Spread | None = None
 
@@ -429,7 +418,7 @@ class Nearby:
         """Without the design before walls, with ranges, for a coupling that is no force filter, and for more than _FEW
         devices, where it takes far longer than the coupling's own.
         """
-        alone = isinstance(coupling, ForceFilter) and not (loop.ranges or loop.environment.walls)
+        known = loop.ranges or loop.environment.walls or loop.environment.one_period
+        alone = isinstance(coupling, ForceFilter) and not known
         price = spread(loop, options) if alone and loop.channels <= _FEW else None
         return cls(robustness_nearby(loop, coupling), price)
->>>>>>> main

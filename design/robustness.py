@@ -63,15 +63,9 @@ def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> Robustn
     return Robustness(percent, worst, where, worst < 1)
 
 
-<<<<<<< HEAD
-def robustness_part(loop: Loop, coupling: Coupling) -> dict[str, Any] | None:
-    """The worst need within ten percent as plain data; None with walls, and for what is not all springs and masses."""
-    if loop.environment.walls or not isinstance(loop.environment, Network) or loop.environment.block:
-=======
 def robustness_nearby(loop: Loop, coupling: Coupling) -> Robustness | None:
-    """The worst need within ten percent; None with walls, and for an environment that is no network."""
-    if loop.environment.walls or not isinstance(loop.environment, Network):
->>>>>>> main
+    """The worst need within ten percent; None with walls, and for what is not all springs and masses."""
+    if loop.environment.walls or not isinstance(loop.environment, Network) or loop.environment.block:
         return None
     return robustness(loop, coupling)
 
