@@ -30,11 +30,9 @@ from controller.tick import Process
 from controller.walls import contact
 from design import conditions
 from design.audit import check_loop, edge
-from design.certificate import any_environment_of
 from design.coverage import covered_limits
-from design.guarantees import LATE
-from design.lmi import least_phi
-from design.result import CONDITIONS, DesignFailed, Requirement, refusal
+from design.lmi import ANY_ENVIRONMENT
+from design.result import CONDITIONS, Requirement, refusal
 from models.device import Device
 from models.human import Population
 from sim import limit_cycles
@@ -118,14 +116,7 @@ class CouplingSweep(_Sweep):
     @cached_property
     def multiplier(self) -> tuple[Array | None, str | None]:
         """Phi of Theorem 4 [N s/m], (m,), which only delay in the environment needs; or why there is none."""
-        if self.loop.latency:
-            return None, LATE
-        if any(self.loop.psi) and self.loop.environment.walls:
-            return None, "with delay in the environment its multiplier is of a linear one: no walls"
-        try:
-            return least_phi(self.loop), None
-        except (ValueError, DesignFailed) as error:
-            return None, " ".join(str(error).split())
+        return ANY_ENVIRONMENT.least_multiplier(self.loop)
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """F of every coupling, a stack for each frozen contact state of the environment, all walls touching first.
@@ -194,8 +185,7 @@ class CouplingSweep(_Sweep):
                 conditions.this_environment(s.F(coupling), loop.delta, loop.T_max, loop.latency) for s in self._states
             ]
             return max(states, key=lambda requirement: requirement.ratio)
-        phi, reason = self.multiplier
-        return refusal("any-environment", loop.delta, reason) if reason else any_environment_of(loop, coupling, phi)
+        return ANY_ENVIRONMENT.required(loop, coupling, self.multiplier[0])
 
     def _couplings(self, K: Array, B: Array, channels: int | None = None) -> SpringDamper:
         m = channels or self.loop.channels
@@ -234,6 +224,10 @@ class EnvironmentSweep(_Sweep):
     def __post_init__(self) -> None:
         if self.loop.environment.walls:
             raise ValueError("environment.walls: with --coupling the map is over linear environments; take them out")
+        if self.loop.network.block:
+            raise ValueError(
+                "environment.block: with --coupling the map varies springs at contacts; leave --coupling out"
+            )
         if not contact_springs(self.loop.network):
             raise ValueError("environment: no spring or damper ends at a contact, so there is no K and B to vary")
 
@@ -298,9 +292,7 @@ class EnvironmentSweep(_Sweep):
         """any-environment's requirement, which no spring of the environment changes."""
         if any(self.loop.psi):
             return refusal("any-environment", self.loop.delta, "not asked")
-        if self.loop.latency:
-            return refusal("any-environment", self.loop.delta, LATE)
-        return any_environment_of(self.loop, self.coupling)
+        return ANY_ENVIRONMENT.required(self.loop, self.coupling)
 
     def _facing(self, condition: str) -> Coupling:
         """The coupling; for MODEL_KEPT as the V whose model stays that of the scenario's environment."""
@@ -571,7 +563,7 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class _MapError:
+class MapError:
     """How far the map is from single sweeps, over the columns that were compared."""
 
     figure_relative: float  # largest relative error of the figure beside the edge
@@ -597,7 +589,7 @@ def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: fl
     return Mark(K, B, requirement, float(growth.max()), int((growth > MARGINAL).sum()), stiffest)
 
 
-def map_error(sweep: Sweep, drawn: Map, condition: str) -> _MapError | None:
+def map_error(sweep: Sweep, drawn: Map, condition: str) -> MapError | None:
     """Columns of the map that cross the edge, evenly chosen; None where there is none."""
     grid, ratio = drawn.grid, drawn.ratio[condition].reshape(drawn.grid.shape)
     inside = ratio < 1
@@ -614,7 +606,7 @@ def map_error(sweep: Sweep, drawn: Map, condition: str) -> _MapError | None:
             ratio_errors.append(abs(ratio[row, column] / true - 1))
         true_edge = _edge(sweep, condition, float(grid.K[k]), float(grid.K[k + 1]), B)
         edge_errors.append(abs(_interpolated(grid.K, ratio[:, column], k, grid.scale) / true_edge - 1))
-    return _MapError(max(ratio_errors), max(edge_errors), chosen.size)
+    return MapError(max(ratio_errors), max(edge_errors), chosen.size)
 
 
 def _interpolated(K: Array, ratio: Array, k: int, scale: str) -> float:
