@@ -210,9 +210,11 @@ def test_the_short_tick_is_the_tick(channels, weakest):
 def test_a_wall_and_every_limit_at_once(i):
     """All forces beyond their limits in the same tick, a wall pushing: each leaves with its limit."""
     network = Network(WALLED.contacts, WALLED.springs, WALLED.masses, WALLED.walls[i : i + 1])
-    process = closed(limited(network, STIFF, (0, 0), (0, 0), T, (3.0, 1.5), (0.0, 0.0)))
-    x = 0.05 * np.array([[1, 1, -1, -1], [1, -1, 1, -1]])[None]
-    np.testing.assert_allclose(np.abs(drive(process, x).f[0]), np.array([[3.0] * 4, [1.5] * 4]), rtol=1e-12)
+    limiter = limited(network, STIFF, (0, 0), (0, 0), T, (3.0, 1.5), (0.0, 0.0))
+    signs = np.array([[1, 1, -1, -1], [1, -1, 1, -1]])
+    buffer = drive(closed(limiter), np.repeat(0.05 * signs[None], 60, axis=0))
+    assert (limiter.depths(buffer.z)[:60] > 0).any(axis=(0, 1)).sum() == 2
+    np.testing.assert_allclose(buffer.f[:60], np.broadcast_to(signs * [[3.0], [1.5]], (60, 2, 4)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
