@@ -56,7 +56,8 @@ def _parser() -> options.Parser:
     parser = options.Parser("design", "Design a coupling, prove its certificate and store both.", example)
     options.add_loop_options(parser)
     kind = parser.add_mutually_exclusive_group()
-    kind.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
+    kinds = f"{', '.join(KINDS)}, or package.module:function of your own (default spring-damper)"
+    kind.add_argument("--coupling", metavar="NAME", default="spring-damper", help=kinds)
     best = "the coupling of the least transparency error: --coupling optimal"
     kind.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
     around = "certify for every stiffness and mass this much more or less, as [ranges] of a scenario does"
@@ -108,7 +109,8 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
         with options.refused(f"--ranges {args.ranges:g}: "):
             loop = msgspec.structs.replace(loop, ranges=ranges_around(loop.network, args.ranges))
             loop.members()
-    args.condition = args.condition or usual_condition(loop, args.coupling)
+    if args.coupling in KINDS:
+        args.condition = args.condition or usual_condition(loop, args.coupling)
     if args.varying_delay is not None:
         if not _for_switching(args):
             raise InputError("--varying-delay is for --coupling optimal or --condition this-environment")
@@ -122,8 +124,7 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 
 def _for_switching(args: argparse.Namespace) -> bool:
     """Whether this design can be made for delays that vary; any other is only judged under them."""
-    condition = args.condition or KINDS[args.coupling].conditions[0]
-    return args.coupling in ("spring-damper", "optimal") and condition == "this-environment"
+    return args.coupling in ("spring-damper", "optimal") and args.condition in (None, "this-environment")
 
 
 def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:

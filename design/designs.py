@@ -13,6 +13,7 @@ import msgspec
 from controller.loop import Loop
 from design.environments import THIS_ENVIRONMENT
 from design.lmi import LATE
+from design.own import called, named
 from design.result import Design, DesignFailed
 
 
@@ -71,8 +72,15 @@ def design_by_kind(
     Raises ValueError for a kind or condition that does not exist, Infeasible or DesignFailed (design.result) where
     there is nothing to return.
     """
+    if kind not in KINDS and ":" in kind:
+        found = own_coupling(kind, loop)
+        if not isinstance(found, Design):
+            raise ValueError(f"coupling {kind} is {found!r} for this loop, expected a design.result.Design")
+        if condition not in (None, found.condition):
+            raise ValueError(f"condition is {condition!r}, but {kind} is designed for {found.condition}")
+        return found
     if kind not in KINDS:
-        raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)}")
+        raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)} and package.module:function")
     condition = condition or usual_condition(loop, kind)
     chosen = KINDS[kind]
     if condition not in chosen.conditions:
@@ -88,6 +96,11 @@ def design_by_kind(
     if kind == "optimal" or condition == "any-environment" or not (loop.latency or loop.environment.walls):
         return made(loop)
     return _with_less_damping(loop, made)
+
+
+def own_coupling(name: str, loop: Loop) -> Any:
+    """What a user's own function, named as `package.module:function`, makes of a loop. Raises InputError."""
+    return called(f"--coupling {name}", named("--coupling", name), loop)
 
 
 #: A design for forces that latch late, or for walls, leaves at most this share of the damping, and is sought so often.
