@@ -6,8 +6,8 @@ import argparse
 
 from cli import render
 from design.coverage import ranges_rows
+from design.result import Chosen
 from sim import judged
-from sim.couplings import Chosen
 from sim.judged import Judged
 from sim.scenario import Scenario
 

@@ -14,7 +14,7 @@ from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
 from design.conditions import this_environment
 from design.coupling_file import LimiterCertificate
-from design.designs import design_by_kind
+from design.designs import KINDS, design_by_kind
 from design.environments import SEARCH, Searched, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.result import Design, DesignFailed, NotProved, Requirement, certificate_part, finite
@@ -130,12 +130,12 @@ def switching_part(loop: Loop, coupling: Coupling) -> dict[str, Any]:
 
 
 def price(loop: Loop, design: Design, kind: str, asked: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """A design over the ranges; an optimal one beside the one for the nominal environment alone, `asked` the same.
+    """A design over the ranges; one made for all of them beside that for the nominal environment, `asked` the same.
 
     SI units; null for a mismatch of zero, or where no damping is enough.
     """
     couplings = {kind: design.coupling}
-    if kind == "optimal":
+    if KINDS[kind].model:
         couplings = {"whole ranges": design.coupling}
         try:
             alone = design_by_kind(loop.at(loop.environment), kind, None, **asked)

@@ -27,7 +27,7 @@ from controller.lti import Array, Lti
 from design.certificate import assess
 from design.coverage import Limits
 from design.guarantees import guarantee_of
-from design.result import Design, DesignFailed, Requirement, certificate_part
+from design.result import Chosen, Design, DesignFailed, Requirement, certificate_part
 from hw import monitor
 from hw.limits import (
     Gain,
@@ -42,7 +42,7 @@ from hw.limits import (
     shape,
 )
 from hw.protocol import MAX_THETA, Config, State
-from sim.couplings import Chosen, choose, given, limits_of
+from sim.couplings import choose, given, limits_of
 from sim.report import coupling_part
 from sim.scenario import InputError, Scenario
 

@@ -12,11 +12,10 @@ from controller.lti import Array
 from controller.older import CONDITIONS as OLDER
 from controller.older import with_older
 from design import compare
-from design.result import CONDITIONS, certificate_part
+from design.result import CONDITIONS, Chosen, certificate_part
 from design.robustness import robustness_part
 from design.transparency import transparency
 from sim import report
-from sim.couplings import Chosen
 from sim.scenario import Scenario
 
 

@@ -18,9 +18,8 @@ from controller.older import CONDITIONS, with_older
 from controller.timing import Timing
 from design.certificate import assess
 from design.guarantees import encoder_part
-from design.result import Requirement, certificate_part, finite, listed
+from design.result import Chosen, Requirement, certificate_part, finite, listed
 from design.transparency import Transparency, decibels
-from sim.couplings import Chosen
 from sim.run import Simulation
 from sim.scenario import Scenario, load
 from sim.stability import Stability, close, dominant_mode, eigenvalues, linear_growth

@@ -8,12 +8,11 @@ from typing import Any
 from controller.lti import Array
 from design.files import unseen
 from design.guarantees import ANY, CAVEATS, MAKING
-from design.result import listed
+from design.result import Chosen, listed
 from design.transparency import transparency
 from sim import accuracy
 from sim.alternatives import Alternative
 from sim.api import ScenarioRun
-from sim.couplings import Chosen
 from sim.judged import Judged
 from sim.passivity_layer import idle
 from sim.report import (
