@@ -101,7 +101,9 @@ class SampledLoop:
 
     def _of_one(self) -> Complex:
         """The block of this-environment without its damping where F is 1, (k,): it is proportional to F."""
-        F = Sampled(on_circle(self.conditions)[None], np.ones((1, self.conditions.size, 1, 1)), self.loop.T)
+        F = Sampled(
+            on_circle(self.conditions)[None], np.ones((1, self.conditions.size, 1, 1), dtype=np.complex128), self.loop.T
+        )
         return this_environment_demand(F, [1.0]).free.G[0, :, 0, 0]
 
     def _responses(self, w: Array) -> _Responses:
@@ -306,7 +308,7 @@ class LimiterLoop(SampledLoop):
         (by, _, S, right), z = self._solved(self._gains(x), self._now()), on_circle(self.conditions)[:, None]
         first, second = np.split(v, 2, axis=1)
         N = -np.stack([polynomials(n, self.conditions)[0] for n in loop.theta], axis=1) - self._weights(x).T
-        late = np.diagonal(theta, axis1=1, axis2=2) / (z - 1)
+        late = np.diagonal(theta, axis1=1, axis2=2) * self.of_one[:, None]
         into = np.einsum("ki,kij->kj", first.conj() * late + second.conj() * N, E @ S)
         turned = into * np.einsum("kij,kj->ki", right, first)
         steps = np.einsum("kij,kj->ki", self.force(x, self._now()), first) - (1 - 1 / z) * np.array(self.rho) * second
