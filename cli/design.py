@@ -17,7 +17,7 @@ from design.api import Filed, proved, store
 from design.audit import LONGEST_DELAY
 from design.bound import BoundBeside
 from design.certificate import SAMPLES, assess, check_ranges
-from design.designs import KINDS, design_by_kind, usual_condition
+from design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
 from design.guarantees import ANY
@@ -124,14 +124,15 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 
 def _for_switching(args: argparse.Namespace) -> bool:
     """Whether this design can be made for delays that vary; any other is only judged under them."""
-    return args.coupling in ("spring-damper", "optimal") and args.condition in (None, "this-environment")
+    kind = kind_of(args.coupling)
+    return "switching" in kind.options and (args.condition or kind.conditions[0]) == "this-environment"
 
 
 def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     """What is asked of a design, in its own words. Raises InputError for options of another coupling."""
     known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
     given = {name: value for name in known if options.given(value := getattr(args, name, None))}
-    if kind == "spring-damper" and args.limiter is not None:
+    if kind_of(kind).limited and args.limiter is not None:
         given["limiter"] = args.limiter
     for name in given:
         taking = [other for other, design in KINDS.items() if name in design.options]
