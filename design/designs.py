@@ -66,7 +66,8 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     that vary. Other kinds for their own condition.
     """
     less = loop.environment.walls or loop.ranges or loop.varying_delay
-    return "any-environment" if less and "any-environment" in KINDS[kind].conditions else KINDS[kind].conditions[0]
+    conditions = kind_of(kind).conditions
+    return "any-environment" if less and "any-environment" in conditions else conditions[0]
 
 
 def design_by_kind(
