@@ -19,10 +19,9 @@ import numpy as np
 
 from controller.budget import EPS, EnergyBudget
 from controller.coupling import Coupling
-from controller.environment import environment
-from controller.limiter import Limiter, limited
-from controller.loop import force_map
-from controller.lti import Array, Lti
+from controller.law import Law
+from controller.loop import Loop
+from controller.lti import Array
 from design.certificate import assess
 from design.coverage import Limits
 from design.guarantees import guarantee_of
@@ -59,38 +58,19 @@ class Controller(Protocol):
         ...
 
 
-class LinearController:
-    """[f; z+] = [C D; A B] [z; x], from rest."""
+class LawController:
+    """A law at work, from rest."""
 
-    def __init__(self, F: Lti) -> None:
-        self.F, self.T = F, F.T
-        n, m = F.order, F.inputs
-        self._product = np.ascontiguousarray(np.block([[F.A, F.B], [F.C, F.D]]))
-        self._input, self._output = np.zeros(n + m), np.zeros(n + F.outputs)
-        self._order = n
-
-    def step(self, x: Sequence[float]) -> list[float]:
-        """Forces (m,) [N] for the displacements x (m,) [m]; the state moves on by one tick."""
-        n = self._order
-        self._input[n:] = x
-        np.dot(self._product, self._input, out=self._output)
-        self._input[:n] = self._output[:n]
-        return self._output[n:].tolist()
-
-
-class _LimitedController:
-    """The loop whose forces leave through a limiter, from rest."""
-
-    def __init__(self, limiter: Limiter) -> None:
-        F = limiter.open
-        self.limiter, self.T = limiter, F.T
-        self._tick = limiter.transition()
+    def __init__(self, law: Law) -> None:
+        F = law.open
+        self.law, self.T = law, F.T
+        self._tick = law.transition()
         m = F.inputs
         before, after = self._buffers = np.zeros((F.order + m, 1)), np.zeros((F.order + m, 1))
         self._state, self._x, self._next, self._f = before[:-m], before[-m:, 0], after[m:], after[:m, 0]
 
     def step(self, x: Sequence[float]) -> list[float]:
-        """Forces (m,) [N] within the limits for the displacements x (m,) [m]; the state moves on by one tick."""
+        """Forces (m,) [N] for the displacements x (m,) [m]; the state moves on by one tick."""
         self._x[:] = x
         self._tick(*self._buffers)
         self._state[:] = self._next
@@ -98,21 +78,13 @@ class _LimitedController:
 
 
 def host_controller(
-    scenario: Scenario,
-    coupling: Coupling,
-    link: int,
-    lag: Sequence[float] | None = None,
-    cap: Sequence[float] = (),
-) -> LinearController | _LimitedController:
-    """F as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where link is too long.
+    loop: Loop, coupling: Coupling, link: int, cap: Sequence[float], lag: Sequence[float] | None = None
+) -> LawController:
+    """The loop as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where it is too long.
 
     With `lag`, rho (m,) [N/m], forces leave through a limiter of `cap` (m,) [N].
     """
-    host = [n - link for n in scenario.theta]
-    if lag is not None:
-        return _LimitedController(limited(scenario.environment, coupling, host, scenario.psi, scenario.T, cap, lag))
-    E = environment(scenario.environment, scenario.T)
-    return LinearController(force_map(E, coupling, host, scenario.psi))
+    return LawController(loop.delayed(tuple(n - link for n in loop.theta)).law(coupling, cap, lag))
 
 
 def fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tuple[float, ...]]:
@@ -398,8 +370,8 @@ class CertifiedCoupling:
         span = self.chosen.switching
         return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
 
-    def controller(self, cap: Sequence[float]) -> LinearController | _LimitedController:
-        return host_controller(self.scenario, self.chosen.coupling, self.link, self.limits.rho, cap)
+    def controller(self, cap: Sequence[float]) -> LawController:
+        return host_controller(self.scenario.loop(self.case), self.chosen.coupling, self.link, cap, self.limits.rho)
 
     def part(self, cap: Sequence[float]) -> dict[str, Any]:
         """As plain data: coupling, certificates, guarantee, for forces of up to `cap` (m,) [N]."""

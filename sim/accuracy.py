@@ -309,7 +309,7 @@ def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> For
     if process.walls:
         return ForceError.of(trace.f, trace.f, "walls have no linear ideal to compare with")
     F = process.F
-    asked = trace.f if process.delays is not None or process.limiter else trace.z @ F.C.T + trace.x @ F.D.T
+    asked = trace.f if process.delays is not None or process.law.bounds else trace.z @ F.C.T + trace.x @ F.D.T
     return ForceError.of(asked, response(delay(lam, F.T) @ simulation.E, trace.x))
 
 

@@ -74,7 +74,7 @@ def run_scenario(
     """
     simulation, period = assemble(scenario, coupling, lag, seed), None
     if scenario.switches:
-        simulation, period = switching(simulation, coupling, seed, scenario.samples)
+        simulation, period = switching(simulation, seed, scenario.samples)
     choices, remarks = (), []
     if error is not None:
         choices = compare_engines(simulation, error)
@@ -84,7 +84,7 @@ def run_scenario(
             remarks.append("speed against error is of the loop without the energy budget, whose own work comes on top")
     else:
         integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)
-    ran = simulation if net is None else netted(simulation, coupling, net)
+    ran = simulation if net is None else netted(simulation, net)
     stepped = make_engine(simulation, engine, integrator, substeps)
     begin = time.perf_counter()
     trace = run(ran, stepped, progress=progress)

@@ -173,4 +173,4 @@ def measured_hold(
 def simulated_growth(simulation: Simulation, integrator: str, substeps: int) -> float:
     """The growth rate [1/s] of the loop that MuJoCo simulates with these settings; of walls, in the worst state."""
     held = measured_hold(simulation, "mujoco", integrator, substeps)
-    return max(float(dominant_mode(close(held, F)).growth) for F in simulation.process.frozen().values())
+    return max(float(dominant_mode(close(held, F)).growth) for F in simulation.process.law.frozen().values())

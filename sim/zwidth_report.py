@@ -77,11 +77,11 @@ class _Simulated:
             "encoder_step_m": [device.encoder_step for device in devices],
             "friction_n": [device.friction for device in devices],
             "force_limit_n": [d.force_limit for d in devices] if plan.effects.saturation else None,
-            "one_sided": sweep.walled is not None,
+            "one_sided": bool(sweep.simulated.environment.walls),
         }
         return cls(
             effects,
-            plan.effects.nonlinear(sweep.devices) or sweep.walled is not None,
+            plan.effects.nonlinear(sweep.devices) or bool(sweep.simulated.environment.walls),
             plan.trials,
             plan.duration,
             plan.start,
@@ -153,7 +153,7 @@ class MapReport:
             loop.psi,
             loop.delta,
             sweep.cutoff,
-            sweep.walled is not None,
+            bool(sweep.simulated.environment.walls),
             list(drawn.ratio),
             {"K": drawn.grid.K, "B": drawn.grid.B, "scale": drawn.grid.scale},
             _population(drawn, humans, seed),

@@ -9,9 +9,10 @@ from sessions import AT_REST, FAST, rehearsal_of, session_with
 from worlds import FakePort
 
 from cli import bridge
+from controller.law import Law
 from design.coupling_file import Stored
 from design.coupling_file import save as save_coupling
-from hw.control import LinearController, certified_coupling, certified_couplings, link_delay
+from hw.control import LawController, certified_coupling, certified_couplings, link_delay
 from hw.emulator import Emulator, FaultInjection
 from hw.faults import CASES, Fault, at, lively, person, rehearse_case
 from hw.haptic_device import Driver, SerialDevice
@@ -185,7 +186,7 @@ def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
     simulation = assemble(scenario, rungs[0].chosen.coupling)
     held = hold(plant(simulation.scene.model), scenario.T)
     n = len(recorder) - first
-    w, law = outside_forces(scenario, simulation.scene, 0, n), LinearController(simulation.F)
+    w, law = outside_forces(scenario, simulation.scene, 0, n), LawController(Law(simulation.F))
     s, counts, applied = np.zeros(held.A.shape[0]), [], []
     for k in range(n):
         x = np.round(s[:2] / 1e-6)
@@ -222,7 +223,7 @@ def test_the_host_and_the_link_share_the_delay(scenario, rungs):
     """What the host runs, delayed by the link, is the F that was certified."""
     z = np.exp(1j * np.linspace(0.01, 3, 50))
     F = assemble(rungs[0].scenario, rungs[0].chosen.coupling).F
-    on_host = rungs[0].controller((12.0, 12.0)).limiter.open.at(z) * z[:, None, None] ** -rungs[0].link
+    on_host = rungs[0].controller((12.0, 12.0)).law.open.at(z) * z[:, None, None] ** -rungs[0].link
     np.testing.assert_allclose(on_host, F.at(z), rtol=1e-9, atol=1e-9)  # two orders of the same sums
 
 
