@@ -18,7 +18,8 @@ from rich.console import Console
 
 from cli import options, render, session_cli
 from design.files import plain, write_json
-from design.guarantees import CAVEATS, LATE
+from design.guarantees import CAVEATS
+from design.lmi import LATE
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages

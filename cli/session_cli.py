@@ -186,7 +186,7 @@ def hold_session(
         if args.port and not args.no_preflight:
             with progress("looking at this machine"):
                 found = preflight(args.port)
-            console(args).print(found.line(), soft_wrap=True, highlight=False)
+            console(args).print(found, soft_wrap=True, highlight=False)
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
         dashboard = stack.enter_context(closing(Dashboard())) if sys.stderr.isatty() else None
 

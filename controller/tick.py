@@ -31,7 +31,7 @@ from controller.lti import Array, Lti, ReadOnly, frozen
 
 Stretch = Callable[[int], None]  # so many ticks from row 0 on
 
-_PART = 512  # ticks of a stretch whose memory and views stay in the cache
+_PART = 128  # ticks of a stretch whose memory and views stay in the cache
 _CALM = 1 - 1e-9  # of the limiter's forces: above that they are being limited
 
 
@@ -295,11 +295,17 @@ class FusedTicks:
         self.product = np.vstack([law @ seen, step]).dot
         to_z, to_s, to_a = np.cumsum([outside + m, nz, states]).tolist()
         memory = np.zeros((min(_PART, buffer.ticks) + 1, to_a + G.shape[1]))
-        self.held, self.before = list(memory[:, :to_z]), list(memory[:, to_z - B.shape[1] :])
-        self.next, self.states = list(memory[1:, outside:to_a]), memory[1:, to_s:to_a]
-        self.further = list(memory[:, to_a:])
+        self.before, self.next = list(memory[:, to_z - B.shape[1] :]), list(memory[1:, outside:to_a])
+        self._numbers, self._row, self._ends = memory.ravel().data, memory.shape[1], (to_z, to_s, to_a)
         self._w, self._after, self._s = memory[:, :outside], memory[:, outside:to_s], memory[:, to_s:to_a]
         self._buffer, self._law = buffer, partial(law.dot, buffer.rows[0, : nz + m], buffer.after[0])
+
+    def copied(self, n: int) -> tuple[list[memoryview], ...]:
+        """[w, f] and a of each row, n positions and velocities of the next: copied in half the time of an array's."""
+        numbers, row, (to_z, to_s, to_a) = self._numbers, self._row, self._ends
+        q = row + to_s
+        ranges = (0, to_z), (to_a, row), (q, q + n), (q + n, q + 2 * n)
+        return tuple([numbers[i + a : i + b] for i in range(0, len(numbers) - row, row)] for a, b in ranges)
 
     def parts(self, ticks: int) -> Iterator[int]:
         """Ticks to be made from row 0 of the memory on, again and again, until the first rows of the buffer are."""

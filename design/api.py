@@ -17,7 +17,7 @@ from design.certificate import RangesCheck, assess, check_ranges, lag, prove, pr
 from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save, sealed
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import HERE, guarantee_of, switching_guarantee
-from design.result import Condition, Design, NotProved, Requirement
+from design.result import ConditionName, Design, NotProved, Requirement
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 _Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
@@ -43,7 +43,7 @@ class DesignOptions(TypedDict, total=False):
 
 
 def design_coupling(
-    loop: Loop, kind: _Kind = "spring-damper", condition: Condition | None = None, **options: Unpack[DesignOptions]
+    loop: Loop, kind: _Kind = "spring-damper", condition: ConditionName | None = None, **options: Unpack[DesignOptions]
 ) -> Design:
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
@@ -65,7 +65,7 @@ def design_coupling(
 
 
 #: kinds and conditions that are quick to try in the place of something else; of the optimal coupling the first rung
-_QUICK: tuple[tuple[_Kind, Condition, DesignOptions], ...] = (
+_QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
     ("optimal", "this-environment", {"seconds": 0.0}),
     ("spring-damper", "this-environment", {}),
     ("spring-damper", "any-environment", {}),

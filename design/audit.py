@@ -19,13 +19,13 @@ from controller.coupling import (
 from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
 from controller.lti import TooLong
-from design.certificate import RangesCheck, any_environment_of
+from design.certificate import RangesCheck, named
 from design.conditions import any_environment
 from design.coverage import ranges_part, switching_part
 from design.frequency import sweeping, too_long
-from design.guarantees import ANY, CAVEATS, LATE, guarantee_of
-from design.multipliers import this_environment_of
-from design.result import Condition, Requirement, certificate_part, listed, refusal
+from design.guarantees import ANY, CAVEATS, guarantee_of
+from design.lmi import LATE
+from design.result import ConditionName, Requirement, certificate_part, listed, refusal
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling in its loop, judged by either condition.
@@ -35,18 +35,17 @@ from design.result import Condition, Requirement, certificate_part, listed, refu
 LONGEST_DELAY = 100
 
 
-def requirement(loop: Loop, coupling: Coupling, condition: Condition) -> Requirement:
+def requirement(loop: Loop, coupling: Coupling, condition: ConditionName) -> Requirement:
     """The damping that the condition asks of the devices."""
-    ask = this_environment_of if condition == "this-environment" else any_environment_of
     try:
-        return ask(loop, coupling)
+        return named(condition).required(loop, coupling)
     except TooLong:
         raise
     except ValueError as error:  # no solution of the algebraic loop
         return refusal(condition, loop.delta, str(error))
 
 
-def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any) -> Requirement:
+def _varied(loop: Loop, coupling: Coupling, condition: ConditionName, **changes: Any) -> Requirement:
     """The same with some of the loop's fields changed; a loop that cannot be is refused."""
     try:
         return requirement(msgspec.structs.replace(loop, **changes), coupling, condition)
@@ -56,7 +55,7 @@ def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any
         return refusal(condition, loop.delta, str(error))
 
 
-def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -> Requirement:
+def _at_period(loop: Loop, coupling: Coupling, condition: ConditionName, T: float) -> Requirement:
     """The same with the gains, or coefficients, and the delays in samples at another T [s]."""
     longest = loop.T_max and loop.T_max * (T / loop.T)  # periods vary in proportion
     return _varied(loop, coupling.at_period(T), condition, T=T, T_max=longest)
@@ -115,7 +114,7 @@ class _Sensitivity:
     reason: str | None = field(default=None, metadata=_GIVEN)
 
 
-def stiffest(loop: Loop, coupling: Coupling, condition: Condition) -> _Stiffest:
+def stiffest(loop: Loop, coupling: Coupling, condition: ConditionName) -> _Stiffest:
     """any-environment: channel by channel; this-environment: the largest common scale of all K."""
     unknown = (None,) * loop.channels
     if not isinstance(coupling, SpringDamper):
@@ -186,7 +185,7 @@ def _of_delta(needs: Requirement, reason: str | None) -> _Sensitivity:
     return _Sensitivity(needs.required, 1 - needs.ratio, reason=reason)
 
 
-def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> float | None:
+def _largest_period(loop: Loop, coupling: Coupling, condition: ConditionName) -> float | None:
     @cache
     def ratio(T: float) -> float:
         return _at_period(loop, coupling, condition, T).ratio
@@ -200,7 +199,7 @@ def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> flo
     return None
 
 
-def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int | None:
+def _extra_samples(loop: Loop, coupling: Coupling, condition: ConditionName) -> int | None:
     for extra in range(1, MOST_EXTRA_SAMPLES + 1):
         later = tuple(n + extra for n in loop.theta)
         if not _varied(loop, coupling, condition, theta=later).certified:
@@ -264,7 +263,7 @@ def remedies(loop: Loop, coupling: Coupling, needs: Requirement) -> list[_Remedy
     return [r for r in found if r and (r.requirement.certified or r.requirement.ratio < least)]
 
 
-def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
+def _fewer_samples(loop: Loop, coupling: Coupling, condition: ConditionName, name: str) -> _Remedy | None:
     """One sample less at a time, on every channel that has one; the reference is none later than the loop."""
     steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):
@@ -356,7 +355,7 @@ def audit(
     """
     loop = loop.at(loop.environment).switching(None)
     check_loop(loop)
-    requirements = {name: requirement(loop, coupling, name) for name in reversed(get_args(Condition))}
+    requirements = {name: requirement(loop, coupling, name) for name in reversed(get_args(ConditionName))}
     here = requirements["this-environment"].certified
     proved = bool(whole and whole.proved)
     guaranteed = guarantee_of(requirements, loop, proved)

@@ -19,12 +19,13 @@ from controller.loop import Loop
 from controller.lti import Array, Lti
 from design import conditions
 from design.bound import MOST, NO_BOUND, bound
-from design.certificate import any_environment_of, prove
+from design.certificate import prove
 from design.coupling_file import digest
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
+from design.lmi import ANY_ENVIRONMENT
 from design.program import LADDER, Options
-from design.result import Condition, Design, DesignFailed, NotProved, Requirement, finite
+from design.result import ConditionName, Design, DesignFailed, NotProved, Requirement, finite
 from design.robustness import robustness_part
 from design.transparency import decibels, transparency
 
@@ -71,7 +72,7 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Demands:
     phi = _multiplier(loop, coupling) if phi is None and any(loop.psi) else phi
     requirements = {
         "this-environment": conditions.this_environment(F, loop.delta, loop.T_max, loop.latency),
-        "any-environment": any_environment_of(loop, coupling, phi),
+        "any-environment": ANY_ENVIRONMENT.required(loop, coupling, phi),
     }
     demands: dict[str, Response | None] = dict.fromkeys(requirements)
     if np.isfinite(requirements["this-environment"].ratio):
@@ -139,7 +140,7 @@ def _multiplier(loop: Loop, coupling: Coupling) -> Array | None:
     try:
         return least_phi(loop)
     except ValueError:
-        return None  # any_environment_of says why
+        return None  # the condition says why
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -248,12 +249,12 @@ def optimum(point: Point) -> Limit:
     return measured(point, "optimal", None, vars(point.options))
 
 
-def spring_damper(condition: Condition) -> _Designer:
+def spring_damper(condition: ConditionName) -> _Designer:
     """The designed spring-damper of a point."""
     return lambda point: measured(point, "spring-damper", condition, {})
 
 
-def measured(point: Point, kind: str, condition: Condition | None, options: dict[str, Any]) -> Limit:
+def measured(point: Point, kind: str, condition: ConditionName | None, options: dict[str, Any]) -> Limit:
     """One design and its figures, from the coupling alone; a request without a solution gives its reason."""
     loop, begin = point.loop, time.perf_counter()
     names = ("states", "rms_mismatch_db", "relative_mismatch_db", "required_damping", "dc_ratio")
@@ -319,7 +320,7 @@ class Sweep:
 
 
 def limits(
-    plan: Mapping[str, Sequence[Point]], beside: Sequence[Condition], progress: _Progress
+    plan: Mapping[str, Sequence[Point]], beside: Sequence[ConditionName], progress: _Progress
 ) -> tuple[dict[str, Sweep], bool]:
     """The optimum at every point of a plan, beside it the spring-dampers by these conditions; what an interruption
     leaves, and whether there was one.
@@ -389,7 +390,7 @@ class _Entry:
 
     name: str
     kind: str
-    condition: Condition = "this-environment"
+    condition: ConditionName = "this-environment"
     options: Mapping[str, Any] = field(default_factory=dict)
 
 

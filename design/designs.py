@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from controller.loop import Loop
-from design.guarantees import LATE
-from design.multipliers import this_environment_of
+from design.environments import THIS_ENVIRONMENT
+from design.lmi import LATE
 from design.result import Design, DesignFailed
 
 
@@ -103,7 +103,7 @@ def _with_less_damping(loop: Loop, made: Callable[[Loop], Design]) -> Design:
     for _ in range(_MOST_ROUNDS):
         part = msgspec.structs.replace(loop, latency=None, delta=tuple(share * d for d in loop.delta))
         found = made(part)
-        needs = this_environment_of(loop, found.coupling)
+        needs = THIS_ENVIRONMENT.required(loop.at(loop.environment), found.coupling)
         if needs.certified:
             best = replace(found, requirement=needs)
             if needs.ratio > 1 - _UNUSED:

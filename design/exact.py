@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from controller.lti import Array, Lti, on_time, rational
 from design.frequency import frequencies, hermitian, on_circle, supremum
+from design.result import NotProved, Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # Matrices over the rationals: integers over one common denominator, and exact tests of definiteness.
@@ -269,6 +270,12 @@ def too_large(states: int) -> str | None:
     if states <= LARGEST:
         return None
     return f"a proof over {states} states takes long: up to {LARGEST} are tried"
+
+
+def require_size(states: int, requirement: Requirement | None = None) -> None:
+    """Raises NotProved where exact arithmetic over so many states would take minutes."""
+    if reason := too_large(states):
+        raise NotProved(reason, requirement)
 
 
 def prove_positive_real(G: Lti, P: Matrix) -> str | None:

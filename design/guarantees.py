@@ -85,14 +85,3 @@ def encoder_part(
 def making_covered(loop: Loop) -> bool:
     """Whether this-environment covers walls that make and break contact: in one environment, not over ranges."""
     return bool(loop.environment.walls) and not loop.ranges
-
-
-#: Why any-environment says nothing of forces that latch between ticks.
-LATE = "a latency of a fraction of a sample is derived for this environment only: count it as a whole sample of theta"
-
-
-def no_compliance(coupling: Coupling) -> str:
-    """Why Theorem 4 does not apply to a coupling that has no V(z) of its own."""
-    if coupling.holds_model:
-        return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
-    return "without a coupling there is nothing that Theorem 4 could use"

@@ -12,16 +12,18 @@ import numpy as np
 from controller.coupling import Coupling
 from controller.lti import Array
 
-Condition = Literal["this-environment", "any-environment"]
+ConditionName = Literal["this-environment", "any-environment"]
+#: for which environments a certificate holds
+Guarantee = Literal["any passive environment", "these ranges", "this environment"]
 
 #: the conditions in the order of tables, each with the environments for which it holds
-CONDITIONS: dict[Condition, str] = {
+CONDITIONS: dict[ConditionName, str] = {
     "this-environment": "this environment",
     "any-environment": "any passive environment",
 }
 
 
-C = TypeVar("C", bound=str)  # a Condition, "switching" or "limiter"
+C = TypeVar("C", bound=str)  # a ConditionName, "switching" or "limiter"
 
 
 # How much damping a condition asks: sweeps, without a solver.
@@ -126,7 +128,7 @@ class Design:
     """A coupling, what it was designed for and what was verified from the coupling alone."""
 
     coupling: Coupling
-    condition: Condition
+    condition: ConditionName
     figure: str  # what was minimised: "loop-norm" (23), "rms" (mismatch), "stiffness" (maximised)
     objective: float  # its value, of the coupling as returned
     requirement: Requirement  # by `condition`, on a refined sweep

@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from operator import sub
 from typing import Any, NamedTuple, Protocol
 
@@ -53,38 +54,36 @@ class Controller(Protocol):
 
     T: float  # [s]
 
-    def step(self, x: Sequence[float]) -> Sequence[float]:
-        """Forces fed back (m,) [N] for the displacements x (m,) [m]."""
-        ...
+    def step(self, x: Sequence[float]) -> Sequence[float]: ...  # (m,) [N] fed back for the displacements x (m,) [m]
 
 
-class LawController:
-    """A law at work, from rest."""
+class HostController:
+    """A law at work, tick by tick and from rest."""
 
     def __init__(self, law: Law) -> None:
         F = law.open
-        self.law, self.T = law, F.T
-        self._tick = law.transition()
-        m = F.inputs
-        before, after = self._buffers = np.zeros((F.order + m, 1)), np.zeros((F.order + m, 1))
-        self._state, self._x, self._next, self._f = before[:-m], before[-m:, 0], after[m:], after[:m, 0]
+        n, m = F.order, F.inputs
+        before, after = np.zeros((n + m, 1)), np.zeros((n + m, 1))
+        self.F, self.T = F, F.T
+        self._state, self._x, self._f, self._next = before[:n], before[n:, 0], after[:m, 0], after[m:]
+        self._tick = partial(law.transition(), before, after)
 
     def step(self, x: Sequence[float]) -> list[float]:
         """Forces (m,) [N] for the displacements x (m,) [m]; the state moves on by one tick."""
         self._x[:] = x
-        self._tick(*self._buffers)
+        self._tick()
         self._state[:] = self._next
         return self._f.tolist()
 
 
 def host_controller(
     loop: Loop, coupling: Coupling, link: int, cap: Sequence[float], lag: Sequence[float] | None = None
-) -> LawController:
+) -> HostController:
     """The loop as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where it is too long.
 
     With `lag`, rho (m,) [N/m], forces leave through a limiter of `cap` (m,) [N].
     """
-    return LawController(loop.delayed(tuple(n - link for n in loop.theta)).law(coupling, cap, lag))
+    return HostController(loop.delayed(tuple(n - link for n in loop.theta)).law(coupling, cap, lag))
 
 
 def fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tuple[float, ...]]:
@@ -314,28 +313,14 @@ class Armable(Protocol):
     """What a session can be armed with."""
 
     @property
-    def link(self) -> int:
-        """Ticks from a sample to the latch of its force."""
-        ...
-
+    def link(self) -> int: ...  # ticks from a sample to the latch of its force
     @property
-    def certified(self) -> bool:
-        """Whether it is certified for every passive human."""
-        ...
-
+    def certified(self) -> bool: ...  # for every passive human
     @property
-    def name(self) -> str:
-        """For the log."""
-        ...
-
+    def name(self) -> str: ...  # for the log
     @property
-    def margin_us(self) -> float:
-        """How long before its latch, or the end of its tick, a force must come; one that comes later is late [us]."""
-        ...
-
-    def controller(self, cap: Sequence[float]) -> Controller:
-        """A fresh one, at rest, for forces of up to `cap` (m,) [N]."""
-        ...
+    def margin_us(self) -> float: ...  # [us] before its latch, or the end of its tick, by which a force must come
+    def controller(self, cap: Sequence[float]) -> Controller: ...  # a fresh one, for forces up to `cap` (m,) [N]
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,7 +355,7 @@ class CertifiedCoupling:
         span = self.chosen.switching
         return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
 
-    def controller(self, cap: Sequence[float]) -> LawController:
+    def controller(self, cap: Sequence[float]) -> HostController:
         return host_controller(self.scenario.loop(self.case), self.chosen.coupling, self.link, cap, self.limits.rho)
 
     def part(self, cap: Sequence[float]) -> dict[str, Any]:

@@ -305,7 +305,7 @@ def _simulate(
     scene, ticks = held_by.scene, round(plan.duration / T)
     substeps = pace(held_by.plants().A).substeps(T)
     timing = Timing(np.array([T]), np.array([held.late])) if held.late else None
-    n, processes = 2 * scene.model.nv + len(held.late or ()), [trial.process for trial in trials]
+    n, processes = held_by.states + len(held.late or ()), [trial.process for trial in trials]
     law, starts = processes[0].law, np.stack([trial.start for trial in trials], axis=1)
     together = law.together([process.law for process in processes])
     buffer = StepBuffer(processes[0], min(_BLOCK, ticks), n, scene.outside, len(trials), together)
@@ -314,7 +314,7 @@ def _simulate(
         buffer.z[0] = starts[n:]
     seen, kept, done = list(_motors_and_handles(scene)), [], 0
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
-        engine = MujocoBatchEngine(scene, T, substeps=substeps, nsim=len(trials), fields=held_by.fields, timing=timing)
+        engine = MujocoBatchEngine(scene, T, substeps=substeps, nsim=len(trials), humans=held_by, timing=timing)
         engine.start(buffer)
         while done < ticks:
             count = min(buffer.ticks, ticks - done)

@@ -30,11 +30,9 @@ from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
 from controller.tick import Process
 from design import conditions
 from design.audit import check_loop, edge
-from design.certificate import any_environment_of
 from design.coverage import covered_limits
-from design.guarantees import LATE
-from design.lmi import least_phi
-from design.result import CONDITIONS, DesignFailed, Requirement, refusal
+from design.lmi import ANY_ENVIRONMENT
+from design.result import CONDITIONS, Requirement, refusal
 from models.device import Device
 from models.human import Population
 from sim import limit_cycles
@@ -114,14 +112,7 @@ class CouplingSweep(_Sweep):
     @cached_property
     def multiplier(self) -> tuple[Array | None, str | None]:
         """Phi of Theorem 4 [N s/m], (m,), which only delay in the environment needs; or why there is none."""
-        if self.loop.latency:
-            return None, LATE
-        if any(self.loop.psi) and self.loop.environment.walls:
-            return None, "with delay in the environment its multiplier is of a linear one: no walls"
-        try:
-            return least_phi(self.loop), None
-        except (ValueError, DesignFailed) as error:
-            return None, " ".join(str(error).split())
+        return ANY_ENVIRONMENT.least_multiplier(self.loop)
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """F of every coupling, a stack for each frozen contact state of the environment, all walls touching first.
@@ -177,8 +168,7 @@ class CouplingSweep(_Sweep):
                 conditions.this_environment(s.F(coupling), loop.delta, loop.T_max, loop.latency) for s in self._states
             ]
             return max(states, key=lambda requirement: requirement.ratio)
-        phi, reason = self.multiplier
-        return refusal("any-environment", loop.delta, reason) if reason else any_environment_of(loop, coupling, phi)
+        return ANY_ENVIRONMENT.required(loop, coupling, self.multiplier[0])
 
     def _coupling(self, K: float, B: float) -> SpringDamper:
         return SpringDamper([K] * self.loop.channels, [B] * self.loop.channels, self.cutoff)
@@ -282,9 +272,7 @@ class EnvironmentSweep(_Sweep):
         """any-environment's requirement, which no spring of the environment changes."""
         if any(self.loop.psi):
             return refusal("any-environment", self.loop.delta, "not asked")
-        if self.loop.latency:
-            return refusal("any-environment", self.loop.delta, LATE)
-        return any_environment_of(self.loop, self.coupling)
+        return ANY_ENVIRONMENT.required(self.loop, self.coupling)
 
     def _facing(self, condition: str) -> Coupling:
         """The coupling; for MODEL_KEPT as the V whose model stays that of the scenario's environment."""

@@ -23,7 +23,8 @@ from controller.loop import Loop
 from controller.lti import Array
 from controller.tick import Process, StepBuffer
 from design.conditions import any_environment, encoder_friction, this_environment
-from design.multipliers import BETA, limiter, limiter_lag, walls_of
+from design.environments import THIS_ENVIRONMENT
+from design.multipliers import BETA, limiter, limiter_lag
 from models.device import RigidDevice
 from models.hold import HeldPlant, hold
 from models.human import Human, Link
@@ -285,7 +286,7 @@ def _walls(rng: np.random.Generator, factor: float) -> _Case:
     walls = Wall(("tip", GROUND), 3000.0, damping[0], 1e-3), Wall((GROUND, "mass"), 2000.0, damping[1], 2e-3)
     network, theta = Network(("tip",), springs, {"mass": mass}, walls), (int(rng.integers(0, 3)),)
     loop, coupling = Loop(1e-3, theta, (0,), theta, (1.0,), network), SpringDamper([K], [B])
-    needed = np.array(walls_of(loop, coupling).requirement.required)
+    needed = np.array(THIS_ENVIRONMENT.required(loop, coupling).required)
     made = assemble(_scenario(loop, needed), coupling).process
     process = replace(made, force_limit=np.full(1, np.inf))
     return _Case(lambda nsim, ticks: process, factor * needed, loop.T, 1e-3)

@@ -16,9 +16,9 @@ from design.certificate import assess, prove, verify
 from design.conditions import any_environment, this_environment
 from design.coupling_file import Stored, sealed
 from design.designs import design_by_kind
+from design.environments import walls_demand, walls_of, walls_proof
 from design.exact import find_storage
 from design.guarantees import MAKING, guarantee_of, making_covered
-from design.multipliers import walls_demand, walls_of, walls_proof
 from design.result import NotProved
 
 change = msgspec.structs.replace

@@ -4,9 +4,6 @@
 the position that the fastest spring turns it into.
 """
 
-from copy import copy
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 import pytest
@@ -16,7 +13,7 @@ from scipy.linalg import expm
 from controller.coupling import CASE_I, NoCoupling
 from controller.tick import Process, StepBuffer
 from models.device import CompliantDevice
-from models.hold import expm_each, hold
+from models.hold import expm_each, exponential_step, hold
 from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
 from sim import mujoco_engines
@@ -120,9 +117,8 @@ def test_the_forces_are_mujocos(simulation):
     wrong = 1.5
     errors = []
     for substeps in (8, 16):
-        scene = replace(simulation.scene, model=copy(simulation.scene.model))
-        engine, _ = MujocoEngine(scene, SCENARIO.T, EXPONENTIAL, substeps), scene.plant
-        engine.model.tendon_stiffness[...] *= wrong
+        engine = MujocoEngine(simulation.scene, SCENARIO.T, EXPONENTIAL, substeps)
+        engine.model.tendon_stiffness[...] *= wrong  # of this engine alone
         errors.append(_one_period(simulation.process, engine, simulation.scene.outside))
     truth = hold(plant(engine.model), SCENARIO.T).A
     old = hold(plant(simulation.scene.model), SCENARIO.T).A
@@ -200,7 +196,7 @@ def test_many_hands_are_each_their_own_scene(substeps):
     held_by = variants(SCENARIO.device, crowd)
     loop = assemble(SCENARIO, CASE_I)
     start = 1e-3 * np.random.default_rng(1).normal(size=(8, 5))
-    batch = MujocoBatchEngine(held_by.scene, SCENARIO.T, EXPONENTIAL, substeps, 5, fields=held_by.fields)
+    batch = MujocoBatchEngine(held_by.scene, SCENARIO.T, EXPONENTIAL, substeps, 5, humans=held_by)
     together = knocked(loop, batch, 300, start).s
     for i in range(5):
         own = assemble(SCENARIO.replace(human=crowd.humans(i)), CASE_I)
@@ -324,12 +320,13 @@ def test_a_wrong_verdict_is_shown_and_never_chosen():
 def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
     """The exponential engine with a J that is off by one part in a thousand; RK4 knows no J."""
     loop = assemble(SCENARIO.replace(duration=0.5), CASE_I)
-    sound = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), EXPONENTIAL, 1)
+    sound = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), "mujoco", EXPONENTIAL, 1)
     assert (sound.integrator, sound.substeps, sound.agrees) == ("RK4", 4, True)
     assert sound.position_relative_rms < 1e-6  # of RK4 x 4 here
     assert abs(sound.growth_rate_difference_per_s) < 1e-3
-    monkeypatch.setattr(mujoco_engines, "_rates", lambda scene, fields: 1.001 * scene.plant.A[None])
-    wrong = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), EXPONENTIAL, 1)
+    wrong_step = exponential_step(1.001 * loop.scene.plant.A[None], SCENARIO.T, loop.scene.model.nv)[0]
+    monkeypatch.setattr(mujoco_engines, "_step_of", lambda *_: wrong_step)
+    wrong = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), "mujoco", EXPONENTIAL, 1)
     assert wrong.position_relative_rms > 30 * sound.position_relative_rms
     assert abs(wrong.growth_rate_difference_per_s) > 1e-3
 
