@@ -248,7 +248,7 @@ class StepBuffer:
                 return None
             return lambda k: transition(seen[k], after[k])
         # a single simulation spends its time in calls: its forces are looked at without numpy, of two channels by name
-        linear, force, clips = process.linear.dot, self.force, self.clips
+        linear, force, clips, limiter = process.linear.dot, self.force, self.clips, process.limiter
         first = self._width - process.channels
         asked = [(self._memory[first + i :: self._width, 0].data, -limit, limit) for i, limit in self._bounds]
         (one, low, high), (other, lowest, highest), *others = asked if len(asked) > 1 else 2 * asked
@@ -256,10 +256,16 @@ class StepBuffer:
         def tick(k: int) -> None:
             linear(seen[k], after[k])
             within = low <= one[k] <= high and lowest <= other[k] <= highest
-            if not within or (others and not all(least <= asked[k] <= most for asked, least, most in others)):
+            if within and (not others or all(least <= asked[k] <= most for asked, least, most in others)):
+                return
+            if limiter:
                 transition(seen[k], after[k])
                 if clips:
                     process.applied(force[k], force[k])
+                return
+            for numbers, least, most in asked:  # what numpy's clip does, in a third of its time
+                if not least <= numbers[k] <= most:
+                    numbers[k] = least if numbers[k] < least else most if numbers[k] > most else numbers[k]
 
         return tick
 
