@@ -21,7 +21,7 @@ import numpy as np
 
 from controller.coupling import Coupling, NoCoupling
 from controller.lti import Array, Lti
-from design.multipliers import this_environment_of
+from design.environments import THIS_ENVIRONMENT
 from models.human import Hand, Person
 from models.scene import Crowd, HumanSets, variants
 from sim.couplings import choose
@@ -177,7 +177,7 @@ def attempts(
     rows = []
     for name, (scenario, coupling) in loops.items():
         loop = scenario.loop("I")  # the reference does not matter
-        F, required = loop.F(coupling), np.array(this_environment_of(loop, coupling).required)
+        F, required = loop.F(coupling), np.array(THIS_ENVIRONMENT.required(loop, coupling).required)
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
             rows.append(_Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))
