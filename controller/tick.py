@@ -248,7 +248,7 @@ class StepBuffer:
                 return None
             return lambda k: transition(seen[k], after[k])
         # a single simulation spends its time in calls: its forces are looked at without numpy, of two channels by name
-        linear, force, clips, limiter = process.linear.dot, self.force, self.clips, process.limiter
+        linear, force, clips, limited = process.linear.dot, self.force, self.clips, process.law.bounds
         first = self._width - process.channels
         asked = [(self._memory[first + i :: self._width, 0].data, -limit, limit) for i, limit in self._bounds]
         (one, low, high), (other, lowest, highest), *others = asked if len(asked) > 1 else 2 * asked
@@ -258,7 +258,7 @@ class StepBuffer:
             within = low <= one[k] <= high and lowest <= other[k] <= highest
             if within and (not others or all(least <= asked[k] <= most for asked, least, most in others)):
                 return
-            if limiter:
+            if limited:
                 transition(seen[k], after[k])
                 if clips:
                     process.applied(force[k], force[k])
