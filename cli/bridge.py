@@ -11,7 +11,6 @@ import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -20,6 +19,7 @@ from cli import options, render, session_cli
 from design.files import plain, write_json
 from design.guarantees import CAVEATS
 from design.lmi import LATE
+from design.result import listed
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages
@@ -107,24 +107,26 @@ def print_certificate(
     console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)
     heads = ("coupling", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee")
     title = "certified for the delay measured, and softer in reserve"
-    console.print(render.grid(title, heads, [_certified(program.part(caps)) for program in programs], left=range(6)))
+    console.print(render.grid(title, heads, [_certified(program, caps) for program in programs], left=range(6)))
     for program in programs:
-        for remark in (program.limits.words(caps), *program.remarks()):
+        for remark in (program.limits.within(caps).words, *program.remarks()):
             console.print(f"[dim]·[/] theta = {list(program.scenario.theta)}: {remark}", highlight=False)
     if len(programs) == 1:
         console.print("no reserve: nothing softer is certified, so late answers end the session")
 
 
-def _certified(part: dict[str, Any]) -> tuple[str, ...]:
+def _certified(program: CertifiedCoupling, caps: Sequence[float]) -> tuple[str, ...]:
     """A row: the coupling, and the first condition that certifies it."""
-    coupling = part["coupling"]
-    found = next(c for c in (part["certificate"], *part["certificates"].values()) if c["certified"])
+    part = program.figures(caps)
+    coupling, asked = part.coupling, (part.certificate, *(part.certificates or {}).values())
+    found = next(need for need in asked if need and need.certified)
+    assert coupling
     return (
-        f"{coupling['kind']}, theta = {', '.join(map(str, part['theta']))}",
-        *(_list(coupling[name]) for name in "KB"),
-        f"{_list(found['required_damping'])} ({found['condition']}, {found['proof']})",
-        _list(found["available_damping"]),
-        part["promise"],
+        f"{coupling.kind}, theta = {', '.join(map(str, program.scenario.theta))}",
+        *("-" if gains is None else listed(gains, 5) for gains in (coupling.K, coupling.B)),
+        f"{listed(found.required, 5)} ({found.condition}, {found.proof})",
+        listed(found.available, 5),
+        part.guarantee or "none",
     )
 
 
@@ -163,10 +165,6 @@ def print_session(report: SessionReport, console: Console) -> None:
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link.counters.items() if n)
     console.print(f"counted: {counted or 'nothing'}")
     console.print(f"[dim]·[/] {CAVEATS}")
-
-
-def _list(values: Sequence[float | None] | None) -> str:
-    return "-" if values is None else ", ".join("inf" if v is None else f"{v:.5g}" for v in values)
 
 
 def _colour(stage: str) -> str:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from rich.table import Table
 
 from cli import options, render
 from design.certificate import Verdict, lag, verify, violated_between
 from design.coupling_file import Stored, SwitchingProof
-from design.coverage import search_part, search_words
+from design.coverage import SearchFigures
 from design.environments import Searched, search_ranges
 from design.guarantees import HERE, RANGES, switching_guarantee
 from design.result import listed
@@ -21,11 +20,11 @@ from sim.couplings import read_coupling
 
 @dataclass(frozen=True)
 class _Switching:
-    """The claim for delays that vary; promise and proof are null where it fails."""
+    """The claim for delays that vary; guarantee and proof are null where it fails."""
 
     lo: Sequence[int]
     hi: Sequence[int]
-    promise: str | None = render.figure("switching, guarantee")  # older name, as JSON has it
+    guarantee: str | None = render.figure("switching, guarantee", older="promise")
     proof: str | None = render.figure("switching, proof")
     required_damping: Sequence[float] | None = render.figure("switching, required damping [N s/m]", listed)
     margin: float | None = render.figure("switching, margin", "{:.6g}")
@@ -38,10 +37,10 @@ class _Checked:
     proved: bool
     reason: str | None = render.figure("reason")
     condition: str | None = render.figure("condition")
-    promise: str | None = render.figure("guarantee")  # older name, as JSON has it
+    guarantee: str | None = render.figure("guarantee", older="promise")
     proof: str | None = render.figure("proof")
     vertices: int | None = render.figure("vertices")
-    between: Mapping[str, Any] | None = render.figure("between", search_words)
+    between: SearchFigures | None = render.figure("between")
     required_damping: Sequence[float] | None = render.figure("required damping [N s/m]", listed)
     available_damping: Sequence[float] = render.figure("available damping [N s/m]", listed)
     margin: float | None = render.figure("margin", "{:.6g}")
@@ -96,7 +95,7 @@ def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, second
         claim.guarantee if claim and proved else None,
         claim.proof if claim and proved else None,
         len(loop.members()) - 1 if loop.ranges else None,
-        searched and search_part(searched),
+        searched and SearchFigures.of(searched),
         claim and claim.required,
         loop.delta,
         claim and claim.margin,

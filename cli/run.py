@@ -15,7 +15,7 @@ from controller.environment import GROUND
 from controller.loop import Loop
 from design.files import write
 from design.guarantees import ANY
-from design.optimal import robustness_parts
+from design.optimal import Nearby
 from design.result import CONDITIONS, finite, listed
 from design.transparency import BAND_HZ
 from sim import accuracy
@@ -42,12 +42,12 @@ def main(argv: list[str]) -> int:
     environment, simulated = _environment(args, scenario)
     chosen = _chosen(args, scenario)  # V, Q or R
     judged = judge(args, scenario, chosen, simulated)  # what each condition asks of the devices, and what is proved
-    done = _run(args, simulated, chosen, engine, judged.limits.rho)  # sample, compute, limit, hold, advance
+    done = _run(args, simulated, chosen, engine, judged.limiter.rho)  # sample, compute, limit, hold, advance
     same = args.limiter is None and not scenario.ranges and args.case != "none"
-    others = _alternatives(args, scenario, done, (chosen, judged.requirements, judged.limits) if same else None)
-    robustness = _robustness(chosen, scenario.loop(args.case), judged)
+    others = _alternatives(args, scenario, done, (chosen, judged.requirements, judged.limiter) if same else None)
+    nearby = _nearby(chosen, scenario.loop(args.case), judged)
     asked = {"seed": args.seed, "band_hz": args.band_hz or BAND_HZ, "check": args.cross_check}
-    report = run_report(scenario, args.case, chosen, judged, done, environment, others, robustness, **asked)
+    report = run_report(scenario, args.case, chosen, judged, done, environment, others, nearby, **asked)
     files = _save(args, out, done, report)
     if args.side_by_side:
         files.append(_side_by_side(others, out / "couplings.png", scenario.environment.contacts))
@@ -156,20 +156,20 @@ def _side_by_side(others: list[Alternative], path: Path, names: tuple[str, ...])
 
 def _panel_title(other: Alternative) -> str:
     kind = ", spring-damper" if other.coupling == "spring-damper" else ""
-    guarantee = f"guarantee: {other.promise}" if other.promise else "no guarantee"
+    guarantee = f"guarantee: {other.guarantee}" if other.guarantee else "no guarantee"
     felt = f"grows: {render.optional(other.growth_rate_per_s, '{:+.2f} 1/s')}"
     if other.force_error_percent is not None:
         felt = f"force error {other.force_error_percent:.2g} %"
     return f"{'no coupling' if other.coupling == 'none' else other.name + kind}\n{felt}; {guarantee}"
 
 
-def _robustness(chosen: Chosen, loop: Loop, judged: Judged) -> dict[str, Any]:
+def _nearby(chosen: Chosen, loop: Loop, judged: Judged) -> Nearby:
     """What a wrong model of the environment costs a guarantee for this environment alone."""
-    alone = chosen.condition == "this-environment" and judged.certificates[chosen.condition]["certified"]
-    if not alone or judged.promise == ANY:
-        return {"robustness": None, "designed_for_it": None}
+    alone = chosen.condition == "this-environment" and judged.certificates[chosen.condition].certified
+    if not alone or judged.guarantee == ANY:
+        return Nearby()
     with render.progress("working out robustness and its price"):
-        return robustness_parts(loop, chosen.coupling)
+        return Nearby.of(loop, chosen.coupling)
 
 
 def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
@@ -209,14 +209,14 @@ def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
 
 def _title(what: str, report: RunReport) -> str:
     """Of the picture."""
-    stability, kind = report.stability, report.judged.coupling["kind"]
+    stability, kind = report.stability, report.judged.coupling.kind
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
-    if kind != "none" and report.judged.promise:
-        coupling += f" for {report.judged.promise}"
+    if kind != "none" and report.judged.guarantee:
+        coupling += f" for {report.judged.guarantee}"
     rate, hertz = stability.exact_growth_rate_per_s, stability.exact_frequency_hz
     growth = f"grows by {rate:.3f} 1/s at {hertz:.1f} Hz" if rate > 0 else f"slowest motion decays by {-rate:.3f} 1/s"
     if report.varying_delay and report.switched:
-        growth = f"{report.varying_delay['pattern']} delays, {stability.verdict}"
+        growth = f"{report.varying_delay.span.pattern} delays, {stability.verdict}"
     return f"{what.removesuffix(', no coupling').removesuffix(', case none')}, {coupling}: {growth}"
 
 
@@ -225,7 +225,7 @@ def _title(what: str, report: RunReport) -> str:
 
 
 def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
-    title = f"{scenario.title(report.case)}: coupling {report.judged.coupling['kind']}"
+    title = f"{scenario.title(report.case)}: coupling {report.judged.coupling.kind}"
     shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(report)], ("", ""))]
     if report.run.engines:
         shown.append(_speed_against_error(report.run, report.run.engines))
@@ -243,19 +243,19 @@ def _rows(report: RunReport) -> render.Rows:
         report.judged.coupling,
         report.stability,
         report.run,
-        report.transparency["dc_ratio"],
+        finite(report.transparency.dc_ratio),
     )
     how = "switching" if report.switched else "simulated trace"
     if run.timing and "impulse" in (stability.reason or ""):
         how = "uneven ticks"
     measured = render.optional(stability.growth_rate_per_s, "{:+.4f} 1/s")
-    if coupling["K"]:
-        yield "coupling K / B", f"{listed(coupling['K'], 5)} N/m / {listed(coupling['B'], 5)} N s/m"
-    if coupling.get("stiffness"):
-        yield "coupling, static", f"{listed(coupling['stiffness'], 5)} N/m"
+    if coupling.K and coupling.B:
+        yield "coupling K / B", f"{listed(coupling.K, 5)} N/m / {listed(coupling.B, 5)} N s/m"
+    if coupling.stiffness:
+        yield "coupling, static", f"{listed(coupling.stiffness, 5)} N/m"
     yield from judged_rows(report.judged)
     yield "transparency error", render.transparency_error(report.transparency)
-    yield from render.robustness_rows(report.robustness)
+    yield from render.robustness_rows(report.nearby)
     apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
     yield "force error", f"{apart}, before the force limits" if apart else f"- ({report.ideal_force.reason})"
     yield "rendered stiffness", f"{100 * ratio:.1f} %" if ratio else "-"
@@ -270,7 +270,7 @@ def _rows(report: RunReport) -> render.Rows:
             name = f"wall{'s' * (len(state.touching) > 1)} {', '.join(map(str, state.touching))}"
             yield f"growth, {name if state.touching else 'no wall'} touching", _growth(state)
     yield "simulated in", run.environment if report.judged.ranges else None
-    yield "force limits", report.judged.limiter["words"]
+    yield "force limits", report.judged.limiter.words
     yield "limited ticks", f"{stability.clipped_ticks} of {run.samples}"
     yield "speed", _speed(run)
     size = render.optional(report.error.position_max_m, "{:.1e} m at most")
@@ -298,7 +298,7 @@ def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> 
 
 def _beside(report: RunReport) -> Any:
     """The price of each guarantee; the run's own coupling is marked where it is one of them."""
-    own = report.judged.coupling["kind"], report.certificate["condition"]
+    own = report.judged.coupling.kind, report.certificate.condition
     cells = []
     for other in report.alternatives:
         if other.reason:
@@ -309,7 +309,7 @@ def _beside(report: RunReport) -> Any:
         grows = other.growth_rate_per_s is None or other.growth_rate_per_s > MARGINAL
         error = "grows" if grows else render.optional(other.force_error_percent, "{:.3g} %")
         felt = _share(other.dc_ratio, "-")
-        cells.append((other.name + "*" * same, *needs, other.promise or "none", felt, error))
+        cells.append((other.name + "*" * same, *needs, other.guarantee or "none", felt, error))
     heads = ("coupling", "this-env.", "any-env.", "guarantee", "stiffness", "error")
     marked = " (*: this run)" if any(cell[0].endswith("*") for cell in cells) else ""
     title = f"the same devices with other couplings{marked}: required damping\nin % of theirs"

@@ -124,7 +124,7 @@ def _measured(check: Check, place: Path, seed: int) -> int:
     if check.picture and rows:
         from sim import plots
 
-        check.picture(plots)(rows, place / f"{check.name}.png")
+        check.picture(plots)(found, place / f"{check.name}.png")
     holds = all(row["holds"] for row in rows)
     write_json(place / "report.json", {"rows": rows, "holds": holds, "seed": seed, "interrupted": interrupted})
     return options.exit_code(holds, interrupted)

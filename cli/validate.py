@@ -18,16 +18,17 @@ from design.conditions import this_environment
 from design.files import unseen
 from design.guarantees import ANY
 from models.human import Human, Population
-from sim import report, verdicts
+from sim import verdicts
 from sim.adversary import Worst, search, search_population
 from sim.couplings import NAMES, Chosen, choose
 from sim.crowds import ENGINES, MIXED, Findings, Validation
 from sim.judged import Judged
+from sim.report import DelaySpan, UnevenTicks, VaryingDelays
 from sim.run import assemble
 from sim.scenario import InputError, Scenario, require_linear, save_humans
 from sim.shards import Table, validate, validate_on_cluster
 from sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
-from sim.switching import certified_part
+from sim.switching import DelaysCovered
 
 _ENVIRONMENTS = ("nominal", "ranges", "box")  # the last is the older name of the second
 _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
@@ -48,7 +49,10 @@ def main(argv: list[str]) -> int:
     report = _reported(args, chosen, judged, question, findings, wall, searched)
     files = _save(args, out, question, findings, searched.worst, chosen.kind)
     title = f"{scenario.title(args.case)}: coupling {chosen.kind}"
-    lines = [*([f"Delays that vary: {report.switching.met['covers']}."] if report.switching else []), *report.remarks]
+    lines = [
+        *([f"Delays that vary: {report.switching.met.certified.covers}."] if report.switching else []),
+        *report.remarks,
+    ]
     render.publish(args, report, [render.facts(title, render.rows_of(report), ("", ""))], lines, out, files)
     if report.unfinished and not report.interrupted:
         return options.UNFINISHED
@@ -115,7 +119,7 @@ def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, judg
     """What is asked of whom. Raises InputError."""
     links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
     work, met = (args.humans, links, args.engine, args.duration), _environments(args, judged.whole)
-    return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=judged.limits.rho)
+    return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=judged.limiter.rho)
 
 
 def _findings(args: argparse.Namespace, question: Validation, table: Table) -> tuple[Findings, float]:
@@ -225,11 +229,15 @@ class _Report:
         "MuJoCo's growth rates", "within {:.1e} 1/s of the exact ones"
     )
     traces: verdicts.Traces | None = render.several(verdicts.Traces.rows)
-    judged: Judged = render.figure("force limits", "{.limiter[words]}", json="beside")
+    judged: Judged = render.figure("force limits", "{.limiter.words}", json="beside")
     settled: str | None = render.figure("handles come to rest", json="table")
     energy_audit: verdicts.EnergyAudit | None = render.figure("energy audit W >= 0", json="given")
-    switching: verdicts.Growing | None = render.several(lambda g: [*render.delay_rows(g.met), g.row("delays")], "given")
-    timing: verdicts.Growing | None = render.several(lambda g: [render.timing_row(g.met), g.row("ticks")], "given")
+    switching: verdicts.Growing[VaryingDelays] | None = render.several(
+        lambda grow: [*render.delay_rows(grow.met), grow.row("delays")], "given"
+    )
+    timing: verdicts.Growing[UnevenTicks] | None = render.several(
+        lambda grow: [render.timing_row(grow.met), grow.row("ticks")], "given"
+    )
     adversary: verdicts.Attacked | None = render.figure("adversary", json="given")
     adversary_population: verdicts.Attacked | None = render.figure("adversary, own population", json="given")
     certified: bool = render.figure("certified", lambda yes: "yes" if yes else "no")
@@ -246,15 +254,15 @@ class _Report:
 
 def _varying(
     question: Validation, chosen: Chosen, findings: Findings, certified: bool
-) -> tuple[verdicts.Growing | None, verdicts.Growing | None]:
+) -> tuple[verdicts.Growing[VaryingDelays] | None, verdicts.Growing[UnevenTicks] | None]:
     """How many hands grow while delays vary, and while ticks do; None where they do not vary."""
     scenario, switching, timing = question.scenario, None, None
     if scenario.varying_delay:
-        covered = report.delay_range_part(scenario.varying_delay) | certified_part(scenario, chosen, certified)
-        switching = verdicts.Growing.of(findings, covered)
-    if scenario.uneven:
-        met = report.timing_part(scenario.timing(question.seed, max(1, question.ticks)), scenario) or {}
-        timing = verdicts.Growing.of(findings, met | {"covered": certified})
+        covered = DelaysCovered.of(scenario, chosen, certified)
+        met = VaryingDelays(DelaySpan.of(scenario.varying_delay), None, covered)
+        switching = verdicts.Growing.of(findings, met, covered.covered)
+    if scenario.uneven and (ticks := scenario.timing(question.seed, max(1, question.ticks))):
+        timing = verdicts.Growing.of(findings, UnevenTicks.of(ticks, scenario), certified)
     return switching, timing
 
 
@@ -269,7 +277,7 @@ def _reported(
 ) -> _Report:
     """Everything that was found, and whether all of it holds."""
     scenario, any_done = question.scenario, bool(findings.index.size)
-    guarantee = judged.promise
+    guarantee = judged.guarantee
     certified = guarantee is not None and (not question.environments or guarantee == ANY or judged.proved)
     mode = worst_mode(assemble(scenario, chosen.coupling))
     own = _Own(args.human or scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))

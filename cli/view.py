@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from math import inf, isfinite
 from pathlib import Path
-from typing import Any
 
 from cli import options, render
+from design.coverage import Limits
 from design.files import unseen, write_json
-from design.result import CONDITIONS, certificate_part
+from design.result import CONDITIONS, Requirement
 from sim.scenario import InputError, require_even_ticks
 from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, PreparedLoop, Script, first_loop, parse_script
 from sim.view.film import Picture, check_film, painter, save_film
@@ -67,20 +67,18 @@ class _Event:
     psi: tuple[int, ...]
     exact_growth_rate_per_s: float  # null in JSON where there is none
     exact_frequency_hz: float
-    certificates: dict[str, Any]
-    promise: str | None
-    limiter: dict[str, Any]
+    certificates: Mapping[str, Requirement]
+    guarantee: str | None = unseen(older="promise")
+    limiter: Limits = unseen()
 
     @classmethod
     def of(cls, t: float, what: str, prepared: PreparedLoop) -> _Event:
         scenario, mode = prepared.scenario, prepared.mode
         loop = prepared.label, scenario.theta, scenario.psi, float(mode.growth), float(mode.frequency_hz)
-        certificates = {name: certificate_part(need) for name, need in prepared.requirements.items()}
-        limiter = prepared.limits.part([device.force_limit for device in scenario.device])
-        return cls(t, what, *loop, certificates, prepared.guarantee, limiter)
+        return cls(t, what, *loop, prepared.requirements, prepared.guarantee, prepared.limits)
 
     def line(self) -> str:
-        held = [name for name in CONDITIONS if self.certificates[name]["certified"]]
+        held = [name for name in CONDITIONS if self.certificates[name].certified]
         growth = f"{self.exact_growth_rate_per_s:+.3g} 1/s at {self.exact_frequency_hz:.1f} Hz"
         grows = growth if isfinite(self.exact_growth_rate_per_s) else "no growth"
         proved = f"certified ({', '.join(held)})" if held else "NOT certified"

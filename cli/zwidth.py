@@ -6,24 +6,21 @@ options -> CouplingSweep or EnvironmentSweep: whose K and B -> Grid -> Map -> fi
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import msgspec
-import numpy as np
 
 from cli import options, render
 from cli.judged import judge
 from controller.lti import Array
-from controller.older import with_older
-from design.result import CONDITIONS
+from design.result import CONDITIONS, Requirement
 from sim import zwidth
 from sim.couplings import NAMES, Chosen, choose
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from sim.scenario import InputError, Scenario, require_constant_delay
 from sim.trace import SUSTAINED
-from sim.zwidth_report import MapReport, save_csv
+from sim.zwidth_report import FixedCoupling, MapReport, Shown, save_csv
 
 _EXAMPLE = """python -m sim.zwidth --theta 1 --grid 30
   python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0
@@ -43,10 +40,10 @@ def main(argv: list[str]) -> int:
         raise InputError("period: a map simulates even periods; give T_max alone, which its certificates are for")
     _check_case(args)
     chosen = _chosen(args, scenario)
-    sweep, fixed = _sweep(args, scenario, chosen), {"axes": "coupling", "coupling": None}
+    sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
-        fixed = _fixed(args, scenario, chosen)
-        sweep = replace(sweep, lag=fixed["limiter"]["rho"])
+        fixed = FixedCoupling.of(judge(args, scenario, chosen), scenario.loop(args.case).network, chosen.notes)
+        sweep = replace(sweep, lag=fixed.limiter.rho)
     marks = tuple(args.mark)
     grid = zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, marks)
     plan, out = _plan(args, sweep), options.out_folder(args, "zwidth")
@@ -62,7 +59,7 @@ def main(argv: list[str]) -> int:
     if not args.no_plot:
         from sim.map_plot import plot_zwidth
 
-        files.append(plot_zwidth(drawn, render.plain(report), out / "zwidth.png"))
+        files.append(plot_zwidth(drawn, report, out / "zwidth.png"))
     title = f"{_span(grid.K)} N/m, B {_span(grid.B)} N s/m, {report.cells} couplings"
     table = render.facts(f"K {title}", _rows(report), left=True)
     render.publish(args, report, [table], [*_marked(report), *_remarks(report)], out, files)
@@ -160,24 +157,6 @@ def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) 
         return zwidth.CouplingSweep(devices, scenario.population, loop, args.velocity_filter, wall, clip)
 
 
-def _fixed(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> dict[str, Any]:
-    """The fixed coupling and what is guaranteed of it where it was designed, in the scenario's own environment."""
-    judged, springs = judge(args, scenario, chosen), zwidth.contact_springs(scenario.loop(args.case).network)
-    designed_for = {
-        "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
-        "certificates": judged.certificates,
-        "promise": judged.promise,
-        "ranges": judged.ranges,
-    }
-    return {
-        "axes": "environment",
-        "coupling": judged.coupling,
-        "designed_for": with_older(designed_for, {"set": "ranges"}),
-        "limiter": judged.limiter,
-        "remarks": list(chosen.notes),
-    }
-
-
 def _plan(args: argparse.Namespace, sweep: zwidth.Sweep) -> Plan:
     effects = Effects(args.quantisation, args.friction, args.saturation)
     coarsest = max(device.encoder_step for device in effects.on(sweep.devices))
@@ -194,8 +173,8 @@ def _plan(args: argparse.Namespace, sweep: zwidth.Sweep) -> Plan:
 
 def _rows(report: MapReport) -> render.Rows:
     crowd, simulation = report.population, report.simulation
-    if report.fixed["axes"] == "environment":
-        yield from _designed_rows(report.fixed, simulation.effects["force_limit_n"])
+    if report.fixed:
+        yield from _designed_rows(report.fixed, simulation.effects.force_limit_n is not None)
     for name in report.conditions:
         error = (report.error or {}).get(name)
         near = f"; edge within {100 * error.edge_relative_in_K:.2g} % of the condition's own sweep" if error else ""
@@ -213,28 +192,28 @@ def _share(count: int, report: MapReport) -> str:
     return f"{100 * count / report.cells:.1f} % of the map"
 
 
-def _designed_rows(fixed: Mapping[str, Any], limited: list[float] | None) -> render.Rows:
+def _designed_rows(fixed: FixedCoupling, limited: bool) -> render.Rows:
     """The fixed coupling in the environment that it was designed for."""
-    designed = fixed["designed_for"]
-    each = (f"{' - '.join(s['between'])} {s['K']:g} N/m, {s['B']:g} N s/m" for s in designed["contact_springs"])
-    asked = [(name, designed["certificates"][name]) for name in CONDITIONS]
+    there = fixed.designed_for
+    asked = [(name, there.certificates[name]) for name in CONDITIONS]
     needs = "; ".join(
-        f"{name} needs {100 / part['margin']:.4g} % of the damping ({part['proof']})"
-        for name, part in asked
-        if part["margin"]
+        f"{name} needs {100 / need.margin:.4g} % of the damping ({need.proof})" for name, need in asked if need.margin
     )
-    yield "coupling", f"{fixed['coupling']['kind']}, fixed"
-    yield "designed for", ", ".join(each)
-    yield "there", f"guarantee: {designed['promise'] or 'none'}; {needs or 'no damping is enough'}"
-    yield "force limits there", fixed["limiter"]["words"] if limited else None
+    yield "coupling", f"{fixed.coupling.kind}, fixed"
+    yield (
+        "designed for",
+        ", ".join(f"{' - '.join(s.between)} {s.K:g} N/m, {s.B:g} N s/m" for s in there.contact_springs),
+    )
+    yield "there", f"guarantee: {there.guarantee or 'none'}; {needs or 'no damping is enough'}"
+    yield "force limits there", fixed.limiter.words if limited else None
 
 
-def _effects(effects: Mapping[str, Any]) -> str:
+def _effects(effects: Shown) -> str:
     on = {
-        "quantisation": any(effects["encoder_step_m"]),
-        "friction": any(effects["friction_n"]),
-        "saturation": effects["force_limit_n"] is not None,
-        "one-sided contact": effects["one_sided"],
+        "quantisation": any(effects.encoder_step_m),
+        "friction": any(effects.friction_n),
+        "saturation": effects.force_limit_n is not None,
+        "one-sided contact": effects.one_sided,
     }
     names = [name for name, present in on.items() if present]
     return f" with {', '.join(names)}" if names else ", linear loop"
@@ -243,28 +222,27 @@ def _effects(effects: Mapping[str, Any]) -> str:
 def _marked(report: MapReport) -> Iterator[str]:
     """A line for every coupling that was asked about."""
     for mark in report.marks or ():
-        stiffest = mark["stiffest_K_at_this_B"]
+        stiffest = mark.stiffest_K_at_this_B
         ends = ", ".join(f"{name} {_limit(K)}" for name, K in stiffest.items())
-        needs = ", ".join(f"{name} {_needs(mark[name])}" for name in stiffest if name != "population")
-        met = f"{mark['unstable_humans']} of {report.population.humans} humans make it unstable"
-        yield f"K {mark['K']:g}, B {mark['B']:g}: {needs}; {met}; stiffest at this B: {ends}"
+        needs = ", ".join(f"{name} {_needs(mark.requirements[name])}" for name in stiffest if name != "population")
+        met = f"{mark.unstable_humans} of {report.population.humans} humans make it unstable"
+        yield f"K {mark.K:g}, B {mark.B:g}: {needs}; {met}; stiffest at this B: {ends}"
 
 
 def _limit(K: float | str | None) -> str:
     return "none" if K is None else K if isinstance(K, str) else f"{K:.5g} N/m"
 
 
-def _needs(part: Mapping[str, Any]) -> str:
+def _needs(need: Requirement) -> str:
     """Of the worst channel."""
-    required = max(np.inf if d is None else d for d in part["required_damping"])
-    least = min(part["available_damping"])
-    return f"needs {required:.6g} of {least:.6g} N s/m ({render.certified({**part, 'proof': None})})"
+    worst, least = max(need.required), min(need.available)
+    return f"needs {worst:.6g} of {least:.6g} N s/m ({render.certified(need, proof=False)})"
 
 
 def _remarks(report: MapReport) -> Iterator[str]:
     simulation = report.simulation
-    if report.fixed["axes"] == "environment":
-        yield from report.fixed["remarks"]
+    if report.fixed:
+        yield from report.fixed.remarks
         yield _about(report.conditions)
     for name in report.conditions:
         ratio = report.ratios[name]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Literal, TypedDict, Unpack
 
 import msgspec
 
@@ -16,6 +16,7 @@ from design.arguments import known, of_kind, one_of, shown
 from design.certificate import RangesCheck, assess, check_ranges, lag, prove, prove_limiter, switching_requirement
 from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save, sealed
 from design.designs import KINDS, design_by_kind, usual_condition
+from design.files import unseen
 from design.guarantees import HERE, guarantee_of, switching_guarantee
 from design.result import ConditionName, Design, NotProved, Requirement
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
@@ -149,13 +150,22 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
 
 
 @dataclass(frozen=True)
+class _SwitchingFiled:
+    """The guarantee for delays that vary, with its proof or why there is none."""
+
+    guarantee: str = unseen(older="promise")
+    proof: str | None = unseen()
+    reason: str | None = unseen()
+
+
+@dataclass(frozen=True)
 class Filed:
     """What was stored of a design, and what is proved of it; `reason` says why a proof is missing."""
 
     file: Path
     proof: str | None
     reason: str | None
-    switching: dict[str, Any] | None  # the guarantee for delays that vary, by its older name, with its proof
+    switching: _SwitchingFiled | None
     limited_forces: bool
 
 
@@ -191,7 +201,7 @@ def store(
     if loop.varying_delay:
         proof = certificate.proof if certificate else None
         words = f"{switching_guarantee(loop.varying_delay)}, in {HERE}"
-        switching = {"promise": words, "proof": proof, "reason": reason}
+        switching = _SwitchingFiled(words, proof, reason)
         if certificate is None:
             loop = loop.switching(None)
             certificate, reason = _proved(loop, design, limiter)

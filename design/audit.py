@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from typing import Any, TypeVar, cast, get_args
@@ -19,13 +19,15 @@ from controller.coupling import (
 from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
 from controller.lti import TooLong
+from controller.older import CONDITIONS, with_older
 from design.certificate import RangesCheck, named
 from design.conditions import any_environment
-from design.coverage import ranges_part, switching_part
+from design.coverage import RangesFigures, Switching
+from design.files import unseen
 from design.frequency import sweeping, too_long
 from design.guarantees import ANY, CAVEATS, guarantee_of
 from design.lmi import LATE
-from design.result import ConditionName, Requirement, certificate_part, listed, refusal
+from design.result import ConditionName, Requirement, listed, refusal
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling in its loop, judged by either condition.
@@ -88,15 +90,12 @@ _EDGE = 1e-7  # relative accuracy of an edge
 _NOT_CERTIFIED = "not certified: there is nothing to lose"
 
 
-_GIVEN: dict[str, Any] = {"json": "given"}  # a key only where there is something to say
-
-
 @dataclass(frozen=True)
 class _Stiffest:
     """The largest certified stiffness of each channel beside its B [N/m]; None where the reason says why."""
 
     K: tuple[float | None, ...]
-    reason: str | None = field(default=None, metadata=_GIVEN)
+    reason: str | None = unseen("given", None)
 
 
 @dataclass(frozen=True)
@@ -111,7 +110,7 @@ class _Sensitivity:
     largest_T_s: float | None = None  # gains and delays in samples kept
     T_error: float | None = None
     extra_samples: int | None = None  # of delay, on all channels at once
-    reason: str | None = field(default=None, metadata=_GIVEN)
+    reason: str | None = unseen("given", None)
 
 
 def stiffest(loop: Loop, coupling: Coupling, condition: ConditionName) -> _Stiffest:
@@ -315,9 +314,9 @@ class _Loop:
 class ConditionAudit:
     """What one condition says, and how far the coupling is from its edge."""
 
-    certificate: dict[str, Any] = field(metadata={"json": "beside"})
-    stiffest: _Stiffest
-    sensitivity: _Sensitivity
+    requirement: Requirement = unseen("beside")
+    stiffest: _Stiffest = unseen()
+    sensitivity: _Sensitivity = unseen()
 
 
 @dataclass(frozen=True)
@@ -336,12 +335,12 @@ class Audit:
 
     coupling: _Coupling
     loop: _Loop
-    conditions: dict[str, ConditionAudit] = field(metadata={"json": "beside"})
-    switching: dict[str, Any] | None
-    ranges: dict[str, Any] | None
-    certified: bool
-    promise: str | None  # the guarantee, by its older name
-    helps: list[Help]
+    conditions: dict[str, ConditionAudit] = unseen("beside")  # also under the names that they had before
+    switching: Switching | None = unseen(older="jitter-proof")
+    ranges: RangesFigures | None = unseen(older="set")
+    certified: bool = unseen()
+    guarantee: str | None = unseen(older="promise")
+    helps: list[Help] = unseen()
     not_covered: str = CAVEATS
 
 
@@ -363,9 +362,9 @@ def audit(
     return Audit(
         _Coupling(coupling.kind, figures.get("K"), figures.get("B")),
         _Loop(loop.T, loop.T_max, loop.latency, loop.theta, loop.psi, loop.delta, rigid),
-        {name: _judged(loop, coupling, needs) for name, needs in requirements.items()},
-        _switching_part(loop, coupling, switching) if switching else None,
-        whole and ranges_part(whole),
+        with_older({name: _judged(loop, coupling, needs) for name, needs in requirements.items()}, CONDITIONS),
+        _switching(loop, coupling, switching) if switching else None,
+        whole and RangesFigures.of(whole),
         here and (whole is None or proved or guaranteed == ANY),
         guaranteed,
         _helps(loop, coupling, requirements["any-environment" if here else "this-environment"]),
@@ -393,7 +392,7 @@ def _in_time(loop: Loop, coupling: Coupling, search: Callable[[], _Found], witho
 def _judged(loop: Loop, coupling: Coupling, needs: Requirement) -> ConditionAudit:
     unknown = (None,) * loop.channels
     return ConditionAudit(
-        certificate_part(needs),
+        needs,
         _in_time(
             loop, coupling, lambda: stiffest(loop, coupling, needs.condition), lambda why: _Stiffest(unknown, why)
         ),
@@ -401,10 +400,10 @@ def _judged(loop: Loop, coupling: Coupling, needs: Requirement) -> ConditionAudi
     )
 
 
-def _switching_part(loop: Loop, coupling: Coupling, span: DelayRange) -> dict[str, Any]:
+def _switching(loop: Loop, coupling: Coupling, span: DelayRange) -> Switching:
     """Of an environment with walls, while all of them touch."""
     touching = msgspec.structs.replace(loop.at(loop.environment.frozen()[-1]), latency=None).switching(span)
-    return switching_part(touching, coupling)
+    return Switching.of(touching, coupling)
 
 
 def _helps(loop: Loop, coupling: Coupling, needs: Requirement) -> list[Help]:

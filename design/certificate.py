@@ -484,8 +484,8 @@ def assess(
 ) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
-    this-environment is about the nominal environment alone (design.coverage.ranges_part asks for the rest of its
-    ranges) and the constant theta (sim.switching.certified_part asks for the rest of its range). What `known`, a
+    this-environment is about the nominal environment alone (design.coverage.RangesFigures asks for the rest of its
+    ranges) and the constant theta (sim.switching.DelaysCovered asks for the rest of its range). What `known`, a
     certificate just made, proves is not proved again.
     """
     loop = loop.at(loop.environment).switching(None)

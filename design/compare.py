@@ -26,7 +26,7 @@ from design.frequency import Response, frequencies, on_circle
 from design.lmi import ANY_ENVIRONMENT
 from design.program import LADDER, Options
 from design.result import ConditionName, Design, DesignFailed, NotProved, Requirement, finite
-from design.robustness import robustness_part
+from design.robustness import Robustness, robustness_nearby
 from design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------
@@ -411,7 +411,7 @@ class LadderRow:
     wall_s: float  # of the design, with its check
     proof_s: float
     reason: str | None = None
-    robustness: dict[str, Any] | None = None  # the worst need within ten percent of every spring and mass
+    robustness: Robustness | None = None  # the worst need within ten percent of every spring and mass
 
 
 SHORT = (
@@ -468,7 +468,7 @@ def ladder_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:
     mismatch = finite(decibels(figures.relative_mismatch)), finite(decibels(figures.rms_mismatch))
     proof_s, certified = time.perf_counter() - begin, requirement.certified
     place = _name(entry, case), case, required, certified, entry.condition
-    return LadderRow(*place, *mismatch, proof, wall, proof_s, reason, robustness_part(loop, coupling))
+    return LadderRow(*place, *mismatch, proof, wall, proof_s, reason, robustness_nearby(loop, coupling))
 
 
 def _bound_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:

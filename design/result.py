@@ -50,6 +50,24 @@ class Requirement(Generic[C]):
     def certified(self) -> bool:
         return self.ratio < 1
 
+    def part(self) -> dict[str, Any]:
+        """As JSON has it; `reason` only where there is one."""
+        part = {
+            "condition": self.condition,
+            "required_damping": self.required,
+            "available_damping": self.available,
+            "margin": self.margin,
+            "binding_frequency_hz": self.frequency_hz,
+            "certified": self.certified,
+            "proof": self.proof,
+        }
+        return part | ({"reason": self.reason} if self.reason else {})
+
+    @property
+    def margin(self) -> float | None:
+        """Available over required damping; None where none or infinitely much is required."""
+        return finite(1 / self.ratio) if self.ratio > 0 else None
+
     @property
     def shortfall(self) -> str:
         """Why it is not certified."""
@@ -70,20 +88,6 @@ def refusal(condition: C, available: tuple[float, ...], reason: str) -> Requirem
 def finite(value: float) -> float | None:
     """JSON knows neither infinity nor not-a-number."""
     return float(value) if math.isfinite(value) else None
-
-
-def certificate_part(requirement: Requirement) -> dict[str, Any]:
-    """Required against available damping."""
-    part = {
-        "condition": requirement.condition,
-        "required_damping": [finite(b) for b in requirement.required],
-        "available_damping": list(requirement.available),
-        "margin": finite(1 / requirement.ratio) if requirement.ratio > 0 else None,
-        "binding_frequency_hz": requirement.frequency_hz,
-        "certified": requirement.certified,
-        "proof": requirement.proof,
-    }
-    return part | ({"reason": requirement.reason} if requirement.reason else {})
 
 
 class NotProved(ValueError):
@@ -115,7 +119,7 @@ class Infeasible(DesignFailed):
 
 
 def listed(values: Iterable[float | None], digits: int = 6) -> str:
-    """1.37, 0.5 with so many significant digits; None stands for infinity in plain data."""
+    """1.37, 0.5 with so many significant digits; None, as JSON has infinity, is inf."""
     return ", ".join("inf" if v is None else f"{v:.{digits}g}" for v in values)
 
 

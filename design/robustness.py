@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import msgspec
 
@@ -13,27 +12,16 @@ from controller.environment import Network
 from controller.loop import Loop
 from controller.ranges import Ranges, UncertainSpring
 from design.environments import ratio_in
-from design.result import finite
 
 
 @dataclass(frozen=True)
-class _Robustness:
+class Robustness:
     """What a coupling needs where the environment is not quite the one that it was designed for."""
 
     percent: float
-    worst: float  # times the damping that there is
+    required_over_available: float  # of the damping, at the worst
     where: str  # which parameter, and which way
-    kept: bool  # whether it is certified there
-
-    def part(self) -> dict[str, Any]:
-        """As plain data."""
-        worst = finite(self.worst)
-        return {
-            "percent": self.percent,
-            "required_over_available": worst,
-            "where": self.where,
-            "certified": self.kept,
-        }
+    certified: bool  # there
 
 
 def at(loop: Loop, network: Network) -> Loop:
@@ -65,21 +53,21 @@ def vertices(network: Network, percent: float = 10.0) -> dict[str, Network]:
     return found
 
 
-def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> _Robustness:
+def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> Robustness:
     """The worst need of a coupling over `vertices`, by the refined sweep."""
     worst, where = 0.0, "nominal"
     for name, network in {"nominal": loop.environment, **vertices(loop.network, percent)}.items():
         ratio = ratio_in(at(loop, network), coupling)
         if ratio > worst:
             worst, where = ratio, name
-    return _Robustness(percent, worst, where, worst < 1)
+    return Robustness(percent, worst, where, worst < 1)
 
 
-def robustness_part(loop: Loop, coupling: Coupling) -> dict[str, Any] | None:
-    """The worst need within ten percent as plain data; None with walls, and for an environment that is no network."""
+def robustness_nearby(loop: Loop, coupling: Coupling) -> Robustness | None:
+    """The worst need within ten percent; None with walls, and for an environment that is no network."""
     if loop.environment.walls or not isinstance(loop.environment, Network):
         return None
-    return robustness(loop, coupling).part()
+    return robustness(loop, coupling)
 
 
 def ranges_around(network: Network, percent: float) -> Ranges:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from operator import sub
@@ -25,8 +25,9 @@ from controller.loop import Loop
 from controller.lti import Array
 from design.certificate import assess
 from design.coverage import Limits
+from design.files import unseen
 from design.guarantees import guarantee_of
-from design.result import Design, DesignFailed, Requirement, certificate_part
+from design.result import Design, DesignFailed, Requirement
 from hw import monitor
 from hw.limits import (
     Gain,
@@ -42,7 +43,7 @@ from hw.limits import (
 )
 from hw.protocol import MAX_THETA, Config, State
 from sim.couplings import Chosen, choose, given, limits_of
-from sim.report import coupling_part
+from sim.report import CouplingFigures
 from sim.scenario import InputError, Scenario
 
 _SPEED_SECONDS = 0.01  # over which a speed is taken: one count of the coarsest encoder is 0.03 m/s
@@ -324,6 +325,22 @@ class Armable(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class ProgramFigures:
+    """A certified coupling as reports have it; null where a session had none."""
+
+    theta: tuple[int, ...] | None = None
+    coupling: CouplingFigures | None = None
+    certificate: Requirement | None = None
+    certificates: Mapping[str, Requirement] | None = None
+    guarantee: str | None = unseen(default=None, older="promise")
+    link_delay: int | None = None
+    latency_s: tuple[tuple[float, float], ...] | None = None
+    T_max_s: float | None = None
+    limiter: Limits | None = None
+    remarks: list[str] | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class CertifiedCoupling:
     """A coupling with the delay that it is certified for."""
 
@@ -358,20 +375,21 @@ class CertifiedCoupling:
     def controller(self, cap: Sequence[float]) -> HostController:
         return host_controller(self.scenario.loop(self.case), self.chosen.coupling, self.link, cap, self.limits.rho)
 
-    def part(self, cap: Sequence[float]) -> dict[str, Any]:
-        """As plain data: coupling, certificates, guarantee, for forces of up to `cap` (m,) [N]."""
-        return {
-            "link_delay": self.link,
-            "theta": list(self.scenario.theta),
-            "latency_s": self.scenario.latency and [list(span) for span in self.scenario.latency],
-            "T_max_s": self.scenario.T_max,
-            "coupling": coupling_part(self.chosen.kind, self.chosen.coupling, self.scenario.T),
-            "certificate": certificate_part(self.requirements[self.chosen.condition]),
-            "certificates": {name: certificate_part(r) for name, r in self.requirements.items()},
-            "promise": guarantee_of(self.requirements, self.scenario.loop(self.case)),
-            "limiter": self.limits.part(cap),
-            "remarks": self.remarks(),
-        }
+    def figures(self, cap: Sequence[float]) -> ProgramFigures:
+        """Coupling, certificates and guarantee, for forces of up to `cap` (m,) [N]."""
+        scenario, requirements = self.scenario, self.requirements
+        return ProgramFigures(
+            scenario.theta,
+            CouplingFigures.of(self.chosen.kind, self.chosen.coupling, scenario.T),
+            requirements[self.chosen.condition],
+            requirements,
+            guarantee_of(requirements, scenario.loop(self.case)),
+            self.link,
+            scenario.latency,
+            scenario.T_max,
+            self.limits.within(cap),
+            self.remarks(),
+        )
 
     def remarks(self) -> list[str]:
         """What a reader should know of the coupling's file, and of the clock."""

@@ -230,7 +230,7 @@ def _worst(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets, evaluated: int)
 
 
 @dataclass(frozen=True)
-class _Shortage:
+class Shortage:
     """Whether a passive human destabilises a loop whose devices lack a share of the damping that is required."""
 
     loop: str
@@ -249,13 +249,13 @@ class _Shortage:
 
 def shortages(
     couplings: Sequence[str], short: Sequence[float], generations: int, **changes: Any
-) -> Callable[[int], Iterator[_Shortage]]:
+) -> Callable[[int], Iterator[Shortage]]:
     """From a seed: the search against the default loop with these couplings, by name, at these shortages.
 
     Where it succeeds close to the required damping, the condition is tight.
     """
 
-    def rows(seed: int) -> Iterator[_Shortage]:
+    def rows(seed: int) -> Iterator[Shortage]:
         scenario = load().replace(**changes)
         for name in couplings:
             coupling = NoCoupling() if name == "none" else choose(scenario, "I", name).coupling
@@ -264,6 +264,6 @@ def shortages(
                 (attempt,) = attempts(loop, np.array([share]), seed, generations)
                 worst, found = attempt.worst, (attempt.worst.destabilises, attempt.worst.growth)
                 about = worst.frequency_hz, bool(worst.persons), worst.evaluated
-                yield _Shortage(attempt.name, attempt.short, *found, *about)
+                yield Shortage(attempt.name, attempt.short, *found, *about)
 
     return rows

@@ -43,7 +43,7 @@ class Alternative:
 
     coupling: str  # its kind
     condition: str | None
-    promise: str | None = None  # the guarantee, by its older name
+    guarantee: str | None = unseen(default=None, older="promise")
     dc_ratio: float | None = None  # share of the static stiffness that is felt
     rms_mismatch_db: float | None = None
     growth_rate_per_s: float | None = None  # of the exact loop
@@ -122,7 +122,7 @@ def _alternative(
     made = Alternative(
         kind,
         condition,
-        promise=guarantee_of(requirements, loop, False),
+        guarantee=guarantee_of(requirements, loop, False),
         dc_ratio=finite(felt.dc_ratio),
         rms_mismatch_db=decibels(felt.rms_mismatch),
         growth_rate_per_s=finite(growth),

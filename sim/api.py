@@ -150,7 +150,7 @@ def simulate(
         "integrator": done.integrator,
         "substeps": done.substeps,
         "seed": seed,
-        "limiter": limits.part([device.force_limit for device in scenario.device]),
+        "limiter": plain(limits),
         "stability": None if scenario.switches or environment else plain(stability_of(done.simulation, trace)),
         "remarks": done.remarks,
         "energy_budget": trace.net.part() if trace.net else None,

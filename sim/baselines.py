@@ -8,7 +8,7 @@ certified couplings; what counts is whether something is faster at the end than 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +53,21 @@ class Rival:
     moving: int  # of PAIRS: faster in the last second than at the start
     fastest_m_s: float  # in the last second
     reason: str | None = None  # why a figure does not exist
+
+
+@dataclass(frozen=True)
+class Baselines:
+    """The classics and our couplings on the same runs."""
+
+    scenario: str
+    case: str
+    seed: int
+    rows: Sequence[Rival]
+    wall_s: float
+    interrupted: bool
+    hands: int = PAIRS
+    hands_s: float = SECONDS
+    start_m_s: float = SLOW
 
 
 def rivals(

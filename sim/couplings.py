@@ -105,13 +105,15 @@ def limits_of(
     limiter: bool | None = None,
 ) -> Limits:
     """How forces are limited in a loop: by the limiter that a guarantee covers, unless `limiter` is False."""
+    within = tuple(device.force_limit for device in scenario.device)
     if limiter is False:
-        return Limits(None, "forces are clipped, as asked")
+        return Limits(None, "forces are clipped, as asked", force_limit=within)
     if scenario.varying_delay:
-        return Limits(None, "limiter: limited forces are proved for constant delays")
+        return Limits(None, "limited forces are proved for constant delays", force_limit=within)
     loop = scenario.loop("I")  # the reference does not matter
     coupling, proof = chosen.coupling, chosen.limiter
-    return covered_limits(loop, coupling, requirements or assess(loop, coupling, chosen.phi, chosen.known), proof)
+    asked = requirements or assess(loop, coupling, chosen.phi, chosen.known)
+    return covered_limits(loop, coupling, asked, proof).within(within)
 
 
 def read_coupling(path: str | Path) -> Stored:

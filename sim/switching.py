@@ -16,9 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
-from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +24,8 @@ from controller.delay import LOST, Ticks, VaryingDelay, realising
 from controller.loop import DelayRange
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
-from design.coverage import switching_part
+from design.coverage import Switching
+from design.files import unseen
 from design.guarantees import switching_guarantee
 from models.hold import HeldPlant, hold
 from models.scene import Scene, Variants
@@ -254,54 +253,47 @@ def _crowd_delays(
 # ---- what is certified: by the coupling's file, or judged anew
 
 
-def certified_part(scenario: Scenario, chosen: Chosen, certified: bool) -> dict[str, Any]:
-    """What switching asks, and what the certificates cover; `certified` is about the constant theta."""
-    assert scenario.varying_delay is not None
-    if not scenario.switches:
-        nothing = {"switching": None, "jitter_proof": None, "on_file": None}
-        return nothing | _coverage(scenario.varying_delay, certified, None)
-    span = scenario.delay_range
-    loop = scenario.loop("I").switching(span)  # the case does not matter to stability
-    on_file = chosen.switching if chosen.switching and chosen.switching.contains(span) else None
-    figures = switching_part(loop, chosen.coupling)
-    proof = _how_proved(figures, on_file)
-    parts = {"switching": figures, "jitter_proof": figures, "on_file": on_file and msgspec.to_builtins(on_file)}
-    return parts | _coverage(
-        scenario.varying_delay, certified, proof, figures.get("playout", {}).get("certified", False)
-    )
+@dataclass(frozen=True)
+class DelaysCovered:
+    """Whether what is certified covers the delays of a scenario, and what switching asks."""
+
+    covered: bool
+    covers: str  # which delays, in words
+    switching: Switching | None = unseen(default=None, older="jitter_proof")
+    on_file: DelayRange | None = None
+
+    @classmethod
+    def of(cls, scenario: Scenario, chosen: Chosen, certified: bool) -> DelaysCovered:
+        """`certified` is about the constant theta."""
+        varying, span = scenario.varying_delay, scenario.delay_range
+        assert varying is not None
+        constants = "certificates are about constant delays"
+        if not certified:
+            constants = "nothing is certified, even for constant delays"
+        if not scenario.switches:
+            text = "the delay is constant after all (theta): the certificates cover it"
+            return cls(certified, text if certified else constants)
+        loop = scenario.loop("I").switching(span)  # the case does not matter to stability
+        on_file = chosen.switching if chosen.switching and chosen.switching.contains(span) else None
+        figures = Switching.of(loop, chosen.coupling)
+        lossy = varying.loss > 0 or any(LOST in row for row in varying.recorded)
+        if proof := _how_proved(figures, on_file):
+            what = "any switching of the delays within their range is covered"
+            losses = ", but a lost packet makes a force older than hi, which is not" if lossy else ""
+            words = f"certified for switching delays in this environment ({proof}): {what}{losses}"
+            return cls(not lossy, words, figures, on_file)
+        buffered = figures.playout is not None and figures.playout.certified
+        verdict = "for which it is certified" if buffered else "for which it is not certified either"
+        constant = f"the constant {list(varying.hi)}" + (" but for lost packets" if lossy else "")
+        advice = f"a playout buffer (--playout) makes the delay {constant}, {verdict}"
+        words = f"{constants}; switching is not covered, as this coupling is not certified for it; {advice}"
+        return cls(False, words, figures, on_file)
 
 
-def _coverage(varying: VaryingDelay, certified: bool, proof: str | None, buffered: bool = False) -> dict[str, Any]:
-    """Whether what is certified covers these delays: {"covered", "covers"}.
-
-    `certified` is about the constant theta, `proof` says what shows that every switching within the range is safe
-    ("" if nothing does, None where the delay is constant), `buffered` is about the constant delay hi.
-    """
-    constants = (
-        "certificates are about constant delays" if certified else "nothing is certified, even for constant delays"
-    )
-    if proof is None:
-        text = "the delay is constant after all (theta): the certificates cover it" if certified else constants
-        return {"covered": certified, "covers": text}
-    lossy = varying.loss > 0 or any(LOST in row for row in varying.recorded)
-    if proof:
-        what = "any switching of the delays within their range is covered"
-        within = f"certified for switching delays in this environment ({proof}): {what}"
-        losses = ", but a lost packet makes a force older than hi, which is not"
-        return {"covered": not lossy, "covers": within + (losses if lossy else "")}
-    verdict = "for which it is certified" if buffered else "for which it is not certified either"
-    constant = f"the constant {list(varying.hi)}" + (" but for lost packets" if lossy else "")
-    advice = f"a playout buffer (--playout) makes the delay {constant}, {verdict}"
-    return {
-        "covered": False,
-        "covers": f"{constants}; switching is not covered, as this coupling is not certified for it; {advice}",
-    }
-
-
-def _how_proved(part: dict[str, Any], on_file: DelayRange | None) -> str:
+def _how_proved(figures: Switching, on_file: DelayRange | None) -> str:
     """What shows that any switching within the range is safe, "" where nothing does."""
     if on_file:
         return f"proved in the coupling's file for {switching_guarantee(on_file)}"
-    if not part["certified"]:
+    if not figures.requirement.certified:
         return ""
-    return "proved exactly" if part["proof"] == "rational" else "by a refined sweep, without an exact proof"
+    return "proved exactly" if figures.requirement.proof == "rational" else "by a refined sweep, without an exact proof"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import msgspec
 import numpy as np
@@ -161,11 +161,15 @@ class EnergyAudit:
         return f"{self.audited - self.violated} of {self.audited}{left}"
 
 
+Met = TypeVar("Met")  # which delays, or which ticks
+
+
 @dataclass(frozen=True)
-class Growing:
+class Growing(Generic[Met]):
     """How many humans grow while delays or ticks vary; it holds unless certificates cover these and one grows."""
 
-    met: Mapping[str, Any] = unseen("beside")
+    met: Met = unseen("beside")
+    covered: bool = unseen()  # by certificates
     unstable: Unstable = unseen()
     humans: int = unseen()
     mujoco_unclipped: int = unseen()
@@ -174,13 +178,13 @@ class Growing:
     holds: bool = unseen()
 
     @classmethod
-    def of(cls, findings: Findings, met: Mapping[str, Any]) -> Growing:
+    def of(cls, findings: Findings, met: Met, covered: bool) -> Growing[Met]:
         exact, mujoco = findings.switching, findings.switching_mujoco
         seen, mujoco = ~np.isnan(exact), mujoco[~np.isnan(mujoco)]
         grow = Unstable(int((exact > 0).sum()), int((mujoco > 0).sum()) if mujoco.size else None)
         worst = int(np.nanargmax(exact)) if seen.any() else None
         figures = (None, None) if worst is None else (float(exact[worst]), int(findings.index[worst]))
-        return cls(met, grow, int(seen.sum()), mujoco.size, *figures, not (met["covered"] and grow.exact))
+        return cls(met, covered, grow, int(seen.sum()), mujoco.size, *figures, not (covered and grow.exact))
 
     def row(self, what: str) -> tuple[str, str | None]:
         mujoco, growth = self.unstable.mujoco, self.largest_growth_per_s

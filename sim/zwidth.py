@@ -537,7 +537,7 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class _MapError:
+class MapError:
     """How far the map is from single sweeps, over the columns that were compared."""
 
     figure_relative: float  # largest relative error of the figure beside the edge
@@ -563,7 +563,7 @@ def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: fl
     return Mark(K, B, requirement, float(growth.max()), int((growth > MARGINAL).sum()), stiffest)
 
 
-def map_error(sweep: Sweep, drawn: Map, condition: str) -> _MapError | None:
+def map_error(sweep: Sweep, drawn: Map, condition: str) -> MapError | None:
     """Columns of the map that cross the edge, evenly chosen; None where there is none."""
     grid, ratio = drawn.grid, drawn.ratio[condition].reshape(drawn.grid.shape)
     inside = ratio < 1
@@ -580,7 +580,7 @@ def map_error(sweep: Sweep, drawn: Map, condition: str) -> _MapError | None:
             ratio_errors.append(abs(ratio[row, column] / true - 1))
         true_edge = _edge(sweep, condition, float(grid.K[k]), float(grid.K[k + 1]), B)
         edge_errors.append(abs(_interpolated(grid.K, ratio[:, column], k, grid.scale) / true_edge - 1))
-    return _MapError(max(ratio_errors), max(edge_errors), chosen.size)
+    return MapError(max(ratio_errors), max(edge_errors), chosen.size)
 
 
 def _interpolated(K: Array, ratio: Array, k: int, scale: str) -> float:

@@ -264,7 +264,7 @@ def test_a_stiffer_coupling_is_promised_for_walls_that_make_and_break():
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
     assert requirement(loop, coupling, "this-environment").certified
     assert not requirement(loop, coupling, "any-environment").certified
-    assert audit(loop, coupling).promise == MAKING
+    assert audit(loop, coupling).guarantee == MAKING
     stiff = SpringDamper([1772.0], [0.453])
     assert not requirement(loop, stiff, "this-environment").certified
     assert all(this_environment(state.F(stiff), loop.delta).certified for state in loop.frozen())
