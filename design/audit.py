@@ -166,10 +166,12 @@ def sensitivity(loop: Loop, coupling: Coupling, needs: Requirement) -> _Sensitiv
         return _Sensitivity(reason=_NOT_CERTIFIED)
     if needs.condition == "any-environment" and any(loop.psi):
         return _of_delta(needs, "with psi >= 1 every T and delay needs a multiplier of its own: not searched")
-    largest = _largest_period(loop, coupling, needs.condition)
+    fixed = loop.environment.one_period
+    largest = None if fixed else _largest_period(loop, coupling, needs.condition)
     extra = _extra_samples(loop, coupling, needs.condition)
+    tried = "environment.block is of one T" if fixed else f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s"
     reasons = [
-        f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s" if largest is None else "",
+        tried if largest is None else "",
         f"certified with {MOST_EXTRA_SAMPLES} samples more, the most that were tried" if extra is None else "",
     ]
     error = None if largest is None else largest / loop.T - 1
