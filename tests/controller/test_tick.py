@@ -111,7 +111,7 @@ def test_encoders_round_to_whole_steps():
 
 
 def test_an_encoder_of_one_channel_rounds_that_one():
-    each = Process(Lti.constant(1000 * np.eye(2), T), np.full(2, np.inf), np.array([1e-3, 0.0]))
+    each = Process(Law(Lti.constant(1000 * np.eye(2), T)), np.full(2, np.inf), np.array([1e-3, 0.0]))
     np.testing.assert_allclose(drive(each, np.full((1, 2), 0.6e-3)), [[1.0, 0.6]], atol=1e-12)
 
 
