@@ -54,6 +54,11 @@ class Parser(argparse.ArgumentParser):
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
+        self._only: list[tuple[str, Callable[[argparse.Namespace], Any], tuple[str, ...]]] = []
+
+    def only(self, where: str, acts: Callable[[argparse.Namespace], Any], *names: str) -> None:
+        """Refuse the options of these destinations where `acts` is false of what is given: they would be ignored."""
+        self._only.append((where, acts, names))
 
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
         """As argparse's; an empty word is refused for every option."""
@@ -61,6 +66,11 @@ class Parser(argparse.ArgumentParser):
         for action in self._actions:
             if getattr(found, action.dest, None) == "":
                 raise InputError(f"{action.option_strings[-1] if action.option_strings else action.dest} is empty")
+        for where, acts, names in self._only:
+            for name in names if not acts(found) else ():
+                if getattr(found, name) != self.get_default(name):
+                    option = next(a.option_strings[-1] for a in self._actions if a.dest == name and a.option_strings)
+                    raise InputError(f"{option} is only {where}")
         return found, rest
 
     def error(self, message: str) -> NoReturn:
