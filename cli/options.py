@@ -146,7 +146,7 @@ def energy_budget(text: str) -> tuple[float, float]:
     return start, cap
 
 
-def delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
+def _delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
     """'1,2' as one range for all channels, '1-2,0-3' as one per channel [samples]."""
     parts = _parts(text, int, expected := "LO,HI or LO-HI,LO-HI,.. in whole samples", "-")
     if [len(part) for part in parts] == [1, 1]:
@@ -380,8 +380,8 @@ _DRAWN = ("constant", "random", "bursty", "adversarial")
 
 def add_varying_delay_option(parser: argparse._ActionsContainer, what: str) -> None:
     """--varying-delay, and --jitter, as it was called."""
-    parser.add_argument("--varying-delay", type=delay_ranges, metavar="LO,HI", help=what)
-    parser.add_argument("--jitter", dest="varying_delay", type=delay_ranges, help=argparse.SUPPRESS)
+    parser.add_argument("--varying-delay", type=_delay_ranges, metavar="LO,HI", help=what)
+    parser.add_argument("--jitter", dest="varying_delay", type=_delay_ranges, help=argparse.SUPPRESS)
 
 
 def add_varying_delay_options(parser: argparse.ArgumentParser) -> None:
