@@ -22,11 +22,11 @@ from controller.lti import Array
 from design import compare
 from design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
 from design.program import Options
-from design.result import CONDITIONS, DesignFailed, finite
+from design.result import CONDITIONS, Chosen, DesignFailed, finite
 from design.robustness import Robustness
 from sim import baselines
 from sim.compare_report import ComparedCoupling, Comparison, ConditionCurve, Here, Limits
-from sim.couplings import NAMES, Chosen, choose
+from sim.couplings import NAMES, choose
 from sim.scenario import InputError, Scenario
 
 _MOST = 6  # curves that can be told apart in one panel

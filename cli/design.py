@@ -123,14 +123,14 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 def _for_switching(args: argparse.Namespace) -> bool:
     """Whether this design can be made for delays that vary; any other is only judged under them."""
     condition = args.condition or KINDS[args.coupling].conditions[0]
-    return args.coupling in ("spring-damper", "optimal") and condition == "this-environment"
+    return "switching" in KINDS[args.coupling].options and condition == "this-environment"
 
 
 def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     """What is asked of a design, in its own words. Raises InputError for options of another coupling."""
     known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
     given = {name: value for name in known if options.given(value := getattr(args, name, None))}
-    if kind == "spring-damper" and args.limiter is not None:
+    if KINDS[kind].limited and args.limiter is not None:
         given["limiter"] = args.limiter
     for name in given:
         taking = [other for other, design in KINDS.items() if name in design.options]

@@ -16,13 +16,13 @@ from controller.loop import Loop
 from design.files import write
 from design.guarantees import ANY
 from design.optimal import Nearby
-from design.result import CONDITIONS, finite, listed
+from design.result import CONDITIONS, Chosen, finite, listed
 from design.transparency import BAND_HZ
 from sim import accuracy
 from sim import passivity_layer as layer
 from sim.alternatives import Alternative, alternatives
 from sim.api import ScenarioRun, run_scenario
-from sim.couplings import NAMES, Chosen, choose
+from sim.couplings import NAMES, choose
 from sim.judged import Judged
 from sim.mujoco_engines import INTEGRATORS
 from sim.run import ENGINES, AnyEngine

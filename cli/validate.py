@@ -17,10 +17,11 @@ from design.certificate import RangesCheck
 from design.conditions import this_environment
 from design.files import unseen
 from design.guarantees import ANY
+from design.result import Chosen
 from models.human import Human, Population
 from sim import verdicts
 from sim.adversary import Worst, search, search_population
-from sim.couplings import NAMES, Chosen, choose
+from sim.couplings import NAMES, choose
 from sim.crowds import ENGINES, MIXED, Findings, Validation
 from sim.judged import Judged
 from sim.report import DelaySpan, UnevenTicks, VaryingDelays

@@ -14,9 +14,9 @@ import msgspec
 from cli import options, render
 from cli.judged import judge
 from controller.lti import Array
-from design.result import CONDITIONS, Requirement
+from design.result import CONDITIONS, Chosen, Requirement
 from sim import zwidth
-from sim.couplings import NAMES, Chosen, choose
+from sim.couplings import NAMES, choose
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from sim.scenario import InputError, Scenario, require_constant_delay
 from sim.trace import SUSTAINED

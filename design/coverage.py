@@ -15,7 +15,7 @@ from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
 from design.conditions import this_environment
 from design.coupling_file import LimiterCertificate
-from design.designs import design_by_kind
+from design.designs import KINDS, design_by_kind
 from design.environments import SEARCH, Searched, worst
 from design.files import unseen
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
@@ -182,9 +182,9 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, asked: Mapping[str, Any]) -> list[OverRanges]:
-    """A design over the ranges; an optimal one beside the one for the nominal environment alone, `asked` the same."""
+    """A design over the ranges; one made for all of them beside that for the nominal environment, `asked` the same."""
     couplings = {kind: design.coupling}
-    if kind == "optimal":
+    if KINDS[kind].model:
         couplings = {"whole ranges": design.coupling}
         try:
             alone = design_by_kind(loop.at(loop.environment), kind, None, **asked)

@@ -24,6 +24,8 @@ class Kind(NamedTuple):
     function: str  # from a loop to a Design
     takes: tuple[str, ...] = ()  # besides the loop and its options: condition, progress
     options: tuple[str, ...] = ()  # in words of design.api.DesignOptions
+    model: bool = False  # of the environment, in the coupling: made for late forces and whole ranges, not for walls
+    limited: bool = False  # made for limited forces, too, unless it is asked not to be
 
 
 KINDS = {
@@ -33,6 +35,7 @@ KINDS = {
         "design_with",
         ("condition",),
         ("switching", "limiter", "band_hz"),
+        limited=True,
     ),
     "moving-average": Kind(("any-environment",), "design.spring_damper", "moving_average"),
     "ccl": Kind(("any-environment",), "design.fixed_order", "design", options=("order", "method", "diagonal")),
@@ -42,6 +45,7 @@ KINDS = {
         "design_with",
         ("progress",),
         ("objective", "band_hz", "high_gain", "limiter", "seconds", "switching"),
+        model=True,
     ),
 }
 
@@ -77,15 +81,15 @@ def design_by_kind(
     chosen = KINDS[kind]
     if condition not in chosen.conditions:
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(chosen.conditions)}")
-    if kind == "optimal" and loop.environment.walls:
-        raise ValueError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
+    if chosen.model and loop.environment.walls:
+        raise ValueError(f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls")
     own = (("condition", condition), ("progress", progress))
     further = {name: value for name, value in own if name in chosen.takes}
     made = partial(getattr(import_module(chosen.module), chosen.function), **further, **options)
 
-    if condition == "any-environment" and loop.latency and kind != "optimal":
+    if condition == "any-environment" and loop.latency:
         raise ValueError(f"latency: {LATE}, or design for this-environment")
-    if kind == "optimal" or condition == "any-environment" or not (loop.latency or loop.environment.walls):
+    if chosen.model or condition == "any-environment" or not (loop.latency or loop.environment.walls):
         return made(loop)
     return _with_less_damping(loop, made)
 

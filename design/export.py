@@ -12,7 +12,6 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from controller.complementarity import GROUNDED, PIVOT_ROUNDING
-from controller.coupling import SpringDamperForm
 from controller.delay import delay
 from controller.limiter import Limiter
 from controller.loop import Loop
@@ -607,10 +606,10 @@ def with_origin(block: ExportedBlock, file: str, stored: Stored, verdict: Verdic
 
 
 def _gains(stored: Stored) -> str:
-    coupling = stored.coupling
-    if isinstance(coupling, SpringDamperForm):
-        return f"spring-damper, K = {listed(coupling.K)} N/m, B = {listed(coupling.B)} N s/m"
-    return f"coupling of kind {coupling.__struct_config__.tag}"
+    coupling = stored.built()
+    if "K" in (gains := coupling.figures(stored.loop.T)):
+        return f"{coupling.kind}, K = {listed(gains['K'])} N/m, B = {listed(gains['B'])} N s/m"
+    return f"coupling of kind {stored.coupling.__struct_config__.tag}"
 
 
 def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:

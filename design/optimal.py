@@ -418,6 +418,7 @@ class Nearby:
         """Without the design before walls, with ranges, for a coupling that is no force filter, and for more than _FEW
         devices, where it takes far longer than the coupling's own.
         """
-        alone = isinstance(coupling, ForceFilter) and not (loop.ranges or loop.environment.walls)
+        known = loop.ranges or loop.environment.walls or loop.environment.one_period
+        alone = isinstance(coupling, ForceFilter) and not known
         price = spread(loop, options) if alone and loop.channels <= _FEW else None
         return cls(robustness_nearby(loop, coupling), price)

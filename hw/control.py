@@ -28,7 +28,7 @@ from design.certificate import assess
 from design.coverage import Limits
 from design.files import unseen
 from design.guarantees import guarantee_of
-from design.result import Design, DesignFailed, Requirement
+from design.result import Chosen, Design, DesignFailed, Requirement
 from hw import monitor
 from hw.limits import (
     Gain,
@@ -43,7 +43,7 @@ from hw.limits import (
     shape,
 )
 from hw.protocol import MAX_THETA, Config, State
-from sim.couplings import Chosen, choose, given, limits_of
+from sim.couplings import choose, given, limits_of
 from sim.report import CouplingFigures
 from sim.scenario import InputError, Scenario
 

@@ -355,27 +355,34 @@ class EngineChoice:
         return f"{self.integrator} x {self.substeps}"
 
 
-def compare_engines(simulation: Simulation, error: float, ticks: int | None = None) -> tuple[EngineChoice, ...]:
+def compare_engines(
+    simulation: Simulation, error: float, ticks: int | None = None, linear: Simulation | None = None
+) -> tuple[EngineChoice, ...]:
     """Every setting that is stable on the scene's plant, the cheapest first, over `ticks` of the scenario (all).
 
-    Where something rubs the reference is refined until RK4 keeps `error`. Raises InputError where it cannot.
+    Walls, limits, encoder steps, varying delays and nets are those of `simulation`; verdicts are of `linear`, the loop
+    without a net and with constant delays, by default the same. Where something rubs the reference is refined until RK4
+    keeps `error`. Raises InputError where it cannot.
     """
     if not error > 0:
         raise InputError(f"--error is {error:g}, expected a positive relative error")
     ticks = simulation.scenario.samples if ticks is None else ticks
+    linear = (linear or simulation).smooth.even
     runs: dict[tuple[str, int], tuple[Array, float]] = {}
     if default_integrator(simulation.scene) == EXPONENTIAL:
-        settings = list(dict.fromkeys((*_CANDIDATES, ("RK4", default_substeps(simulation, "RK4")))))
+        settings = list(dict.fromkeys((*_CANDIDATES, ("RK4", default_substeps(linear, "RK4")))))
         truth, missed = _positions(simulation, ticks, "exact")[0], 0.0
     else:
         truth, missed = _refined(simulation, error, ticks, runs)
-        settings = [*runs, *((name, n) for name, n in _CANDIDATES if name != "RK4")]
+        rest = ("RK4",) if simulation.scene.plant.felt is None else ("RK4", EXPONENTIAL)  # which knows no such scene
+        settings = [*runs, *(one for one in _CANDIDATES if one[0] not in rest)]
     choices = []
     for name, n in settings:
-        if name != EXPONENTIAL and step_radius(simulation.smooth.even, name, n) > 1 + NEUTRAL:
+        if name != EXPONENTIAL and step_radius(linear, name, n) > 1 + NEUTRAL:
             continue
         own, cost = runs.get((name, n)) or _positions(simulation, ticks, "mujoco", name, n)
-        choices.append(EngineChoice(name, n, _apart(own, truth) + missed, _right(simulation, name, n), cost))
+        right = not disagree(exact_growth(linear), simulated_growth(linear, name, n))
+        choices.append(EngineChoice(name, n, _apart(own, truth) + missed, right, cost))
     return tuple(sorted(choices, key=lambda choice: choice.cpu_s))
 
 
@@ -435,11 +442,6 @@ def _refined(
         if 2 * missed <= error:
             return runs["RK4", substeps][0], missed
     raise InputError(f"--error {error:g}: RK4 comes within {best:.1g} with up to {_MOST_COMPARED // 2} substeps")
-
-
-def _right(simulation: Simulation, integrator: str, substeps: int) -> bool:
-    linear = simulation.smooth.even
-    return not disagree(exact_growth(linear), simulated_growth(linear, integrator, substeps))
 
 
 def _positions(

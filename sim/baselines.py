@@ -16,11 +16,11 @@ import numpy as np
 from controller.coupling import NoCoupling
 from controller.lti import Array
 from controller.tick import StepBuffer
-from design.result import DesignFailed
+from design.result import Chosen, DesignFailed
 from models.hold import hold
 from models.scene import Crowd, variants
 from sim.accuracy import force_error
-from sim.couplings import Chosen, choose, limits_of
+from sim.couplings import choose, limits_of
 from sim.engines import ExactEngine
 from sim.passivity_layer import BASELINES, Classic, EnergyNet, netted
 from sim.run import Simulation, assemble, run, run_blocks

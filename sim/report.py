@@ -13,8 +13,7 @@ from controller.timing import Timing
 from design.certificate import assess
 from design.files import unseen
 from design.guarantees import EncoderSteps
-from design.result import finite, listed
-from sim.couplings import Chosen
+from design.result import Chosen, finite, listed
 from sim.run import Simulation
 from sim.scenario import Scenario, load
 from sim.stability import Stability, close, dominant_mode, eigenvalues, linear_growth

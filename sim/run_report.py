@@ -9,12 +9,11 @@ from controller.lti import Array
 from design.files import unseen
 from design.guarantees import ANY, CAVEATS, MAKING, EncoderSteps
 from design.optimal import Nearby
-from design.result import Requirement, listed
+from design.result import Chosen, Requirement, listed
 from design.transparency import Transparency, transparency
 from sim import accuracy
 from sim.alternatives import Alternative
 from sim.api import ScenarioRun
-from sim.couplings import Chosen
 from sim.judged import Judged
 from sim.passivity_layer import idle
 from sim.report import (

@@ -28,9 +28,9 @@ from controller.tick import Process, StepBuffer
 from design.coverage import Switching
 from design.files import unseen
 from design.guarantees import switching_guarantee
+from design.result import Chosen
 from models.hold import HeldPlant, hold
 from models.scene import Scene, Variants
-from sim.couplings import Chosen
 from sim.engines import Engine, ExactEngine, ExactTimedEngine
 from sim.mujoco_engines import MujocoBatchEngine
 from sim.run import Simulation

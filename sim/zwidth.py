@@ -224,6 +224,10 @@ class EnvironmentSweep(_Sweep):
     def __post_init__(self) -> None:
         if self.loop.environment.walls:
             raise ValueError("environment.walls: with --coupling the map is over linear environments; take them out")
+        if self.loop.network.block:
+            raise ValueError(
+                "environment.block: with --coupling the map varies springs at contacts; leave --coupling out"
+            )
         if not contact_springs(self.loop.network):
             raise ValueError("environment: no spring or damper ends at a contact, so there is no K and B to vary")
 

@@ -76,6 +76,12 @@ def test_pivoting_finds_what_the_list_finds(n):
         np.testing.assert_allclose(problem._pivoted(q), problem._listed(q)[0], atol=1e-9)
 
 
+def test_a_force_that_moves_another_one_way_only():
+    """One entry beside the diagonal: what the second slips takes from the first."""
+    v, f = BoxProblem(np.array([[1.0, 0.5], [0.0, 1.0]]), -np.ones(2), np.ones(2)).solve(np.array([[0.5], [2.0]]))
+    np.testing.assert_allclose([v[:, 0], f[:, 0]], [[0.0, 1.0], [0.0, 1.0]], atol=1e-12)
+
+
 def test_two_channels_by_hand():
     upper = np.array(LIMITS)
     e, f = BoxProblem(np.array([[1000.0, -900.0], [-900.0, 1000.0]]), -upper, upper).solve(np.array([[20.0], [5.0]]))
@@ -173,14 +179,17 @@ def test_many_simulations_are_as_many_runs_of_one():
     np.testing.assert_allclose(together, alone, atol=1e-9)
 
 
+@pytest.mark.parametrize("weakest", [np.inf, 2.0], ids=["limiter", "actuators"])
 @pytest.mark.parametrize("channels", [1, 2, 4])
-def test_the_short_tick_is_the_tick(channels):
+def test_the_short_tick_is_the_tick(channels, weakest):
     """One simulation looks at its forces in another way than many; each channel meets both of its limits."""
     names, limit = tuple("abcd"[:channels]), np.linspace(2.6, 2.9, channels)
     network = Network(names, tuple(Spring((name, GROUND), 900.0, 0.3) for name in names))
     coupling = SpringDamper([2000.0] * channels, [0.5] * channels)
     theta = tuple(i % 2 for i in range(channels))
-    process = closed(limited(network, coupling, theta, (0,) * channels, T, limit, (5.0,) * channels))
+    limiter = limited(network, coupling, theta, (0,) * channels, T, limit, (5.0,) * channels)
+    actuators = np.array([weakest] + [np.inf] * (channels - 1))  # the first one's may be weaker than its limiter
+    process = Process(limiter.open, actuators, np.zeros(channels), limiter)
     phases = np.arange(400)[:, None] / 15 + np.arange(channels)
     slow = 5e-3 * np.sin(phases)
     x = np.stack([1e-3 * slow, slow], axis=-1)  # the first is never limited: who looks at it alone misses the second
@@ -193,8 +202,19 @@ def test_the_short_tick_is_the_tick(channels):
     f = drive(process, x).f[:400]
     np.testing.assert_allclose(together.f[:400], f, atol=1e-12)
     np.testing.assert_allclose(alone.f[:400], f[:, :, 1:], atol=1e-12)
-    np.testing.assert_allclose(f[:, :, 1].max(axis=0), limit)
-    np.testing.assert_allclose(f[:, :, 1].min(axis=0), -limit)
+    np.testing.assert_allclose(f[:, :, 1].max(axis=0), np.minimum(limit, actuators))
+    np.testing.assert_allclose(f[:, :, 1].min(axis=0), -np.minimum(limit, actuators))
+
+
+@pytest.mark.parametrize("i", [0, 1])
+def test_a_wall_and_every_limit_at_once(i):
+    """All forces beyond their limits in the same tick, a wall pushing: each leaves with its limit."""
+    network = Network(WALLED.contacts, WALLED.springs, WALLED.masses, WALLED.walls[i : i + 1])
+    limiter = limited(network, STIFF, (0, 0), (0, 0), T, (3.0, 1.5), (0.0, 0.0))
+    signs = np.array([[1, 1, -1, -1], [1, -1, 1, -1]])
+    buffer = drive(closed(limiter), np.repeat(0.05 * signs[None], 60, axis=0))
+    assert (limiter.depths(buffer.z)[:60] > 0).any(axis=(0, 1)).sum() == 2
+    np.testing.assert_allclose(buffer.f[:60], np.broadcast_to(signs * [[3.0], [1.5]], (60, 2, 4)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -263,9 +283,10 @@ def test_bad_limits_are_named():
     with pytest.raises(ValueError, match="rho has 1 entries for 2 channels"):
         Limiter(G, (0, 0), np.ones(2), np.ones(1))
     with pytest.raises(ValueError, match="expected positive forces"):
-        Limiter(G, (0, 0), np.zeros(2), np.ones(2))
-    with pytest.raises(ValueError, match="expected stiffnesses >= 0"):
-        Limiter(G, (0, 0), np.ones(2), -np.ones(2))
+        Limiter(G, (0, 0), np.array([1.0, 0.0]), np.ones(2))
+    for rho in (-1.0, np.inf):
+        with pytest.raises(ValueError, match="expected stiffnesses >= 0"):
+            Limiter(G, (0, 0), np.ones(2), np.array([1.0, rho]))
     with pytest.raises(ValueError, match="a block of 2 x 2 cannot serve 3 channels"):
         Limiter(G, (0, 0, 0), np.ones(3), np.ones(3))
 

@@ -109,6 +109,11 @@ def test_encoders_round_to_whole_steps():
     np.testing.assert_allclose(f[:, 0], [0.0, 1.0, -2.0], atol=1e-12)
 
 
+def test_an_encoder_of_one_channel_rounds_that_one():
+    each = Process(Lti.constant(1000 * np.eye(2), T), np.full(2, np.inf), np.array([1e-3, 0.0]))
+    np.testing.assert_allclose(drive(each, np.full((1, 2), 0.6e-3)), [[1.0, 0.6]], atol=1e-12)
+
+
 def test_encoders_do_not_move_the_device():
     """What the loop sees is rounded, where the device is stays: else a free device would creep from step to step."""
     buffer = StepBuffer(process(wall(1000.0), step=1e-3), 2, 2)

@@ -14,9 +14,9 @@ from controller.complementarity import Complementarity
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
 from controller.loop import force_map
-from controller.lti import SingularLoop
+from controller.lti import Lti, SingularLoop
 from controller.tick import Process, StepBuffer
-from controller.walls import contact
+from controller.walls import Contact, contact
 from design.audit import audit, requirement
 from design.certificate import assess, prove
 from design.conditions import this_environment
@@ -91,6 +91,10 @@ def test_the_wall_forces_solve_the_complementarity_problem(walls):
 def test_wall_forces_that_are_not_determined_are_refused():
     with pytest.raises(SingularLoop, match=r"forces of walls \[2\] are not determined"):
         Complementarity(np.array([[1.0, 0.0], [0.0, -1.0]]))
+    with pytest.raises(SingularLoop, match=r"forces of walls \[1, 2\] are not determined"):
+        Complementarity(np.ones((2, 2)))
+    with pytest.raises(ValueError, match="a block of 2 inputs cannot serve 2 walls"):
+        Contact(Lti.constant(np.ones((1, 2)), T), (Wall(("a", GROUND), 1.0),) * 2)
 
 
 def test_a_wall_behind_a_coupling_against_a_root_finder():
@@ -216,6 +220,7 @@ def test_both_engines_see_the_same_contacts():
     exact, own = run(loop, "exact"), run(loop, "mujoco")
     depths = [loop.process.contact.depths(record.z) > 0 for record in (exact, own)]
     np.testing.assert_array_equal(*depths)
+    assert depths[0].shape == (len(exact.z) - 1, 1)
     assert (depths[0][1:] & ~depths[0][:-1]).sum() >= 1
     assert np.abs(exact.s[:, 0] - own.s[:, 0]).max() < 1e-6 * np.abs(exact.s[:, 0]).max()
 

@@ -16,10 +16,10 @@ from PIL import Image
 
 from cli import view as command
 from controller.coupling import SpringDamper
+from design.result import Chosen
 from models.hold import hold
 from models.human import Human, Link, Person
 from models.scene import build, plant
-from sim.couplings import Chosen
 from sim.run import run as close_loop
 from sim.scenario import InputError, load
 from sim.stability import close, dominant_mode
@@ -145,7 +145,7 @@ def test_a_process_that_runs_away_starts_again():
     """Soft springs and dampers against an environment with delay are unstable by themselves: radius 1.63."""
     soft = SpringDamper(np.array([879.0, 552.0]), np.array([0.39, 0.52]))  # the design for psi = 0
     before = first_loop(Menu("I"), SCENARIO, "published")
-    prepared = changed(replace(before, chosen=Chosen("spring-damper", soft, "any-environment")), Delay("psi", 1))
+    prepared = changed(replace(before, chosen=Chosen(soft, "any-environment", kind="spring-damper")), Delay("psi", 1))
     assert np.abs(prepared.simulation.F.poles()).max() > 1.6
     running = session(prepared)
     noted = [running.frame(t).note for t in (1.0, 2.0, 3.0)]  # 1.63^k passes 1e308 at k = 1450, 1.7 s
