@@ -91,7 +91,7 @@ class Row:
     cycle_amplitude_error: float | None  # relative
     cycle_frequency_error_hz: float | None
     wall_s_per_simulated_s: float
-    pareto: bool = False  # see `with_front`
+    pareto: bool = False  # see `_with_front`
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
         free = run(uncoupled, "exact")
         if free.t.size > _TAIL and not free.diverged:
             channel = int(np.argmax(free.f[-_TAIL:].std(axis=0)))
-            cycle = (channel, *limit_cycle(free, channel))
+            cycle = (channel, *_limit_cycle(free, channel))
     return _Reference(coupled, uncoupled, run(coupled, "exact"), cycle)
 
 
@@ -136,8 +136,8 @@ def measure_all(
             except ValueError as error:
                 skipped.append(f"{integrator} x {substeps}: {error}")
     except KeyboardInterrupt:
-        return with_front(rows), skipped, True
-    return with_front(rows), skipped, False
+        return _with_front(rows), skipped, True
+    return _with_front(rows), skipped, False
 
 
 def measure(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
@@ -151,7 +151,7 @@ def measure(truth: _Reference, engine: str, integrator: str | None, substeps: in
     return Row(*settings, position, *_growth(truth, *settings), *_cycle(truth, *settings), share)
 
 
-def with_front(rows: Sequence[Row]) -> list[Row]:
+def _with_front(rows: Sequence[Row]) -> list[Row]:
     """Set `pareto`: no other row of that kind of engine is at least as good in cost and both errors, and better in one.
 
     The exact engine is on it by itself: only a linear plant has one.
@@ -164,7 +164,7 @@ def with_front(rows: Sequence[Row]) -> list[Row]:
     return marked
 
 
-def limit_cycle(trace: Trace, channel: int) -> tuple[float, float]:
+def _limit_cycle(trace: Trace, channel: int) -> tuple[float, float]:
     """Standard deviation [N] and frequency [Hz] of a force's tail; the spectral peak is refined by a parabola."""
     force = trace.f[-_TAIL:, channel]
     level = np.log(np.abs(np.fft.rfft((force - force.mean()) * np.hanning(force.size))) + 1e-300)
@@ -204,7 +204,7 @@ def _cycle(
     trace = run(truth.uncoupled, make_engine(truth.uncoupled, engine, integrator, substeps))
     if trace.diverged:
         return None, None, None, None
-    own, turns = limit_cycle(trace, channel)
+    own, turns = _limit_cycle(trace, channel)
     return own, turns, own / amplitude - 1, turns - frequency
 
 

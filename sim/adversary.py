@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
 _MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
-DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
+_DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
 
 
 class _Pass(NamedTuple):
@@ -63,7 +63,7 @@ class Worst:
 
     @property
     def destabilises(self) -> bool:
-        return self.growth > DESTABILISED
+        return self.growth > _DESTABILISED
 
 
 def search(
@@ -87,7 +87,7 @@ def search(
         nonlocal done
         done += 1
         progress(done, len(passes) * generations)
-        return first and bool(-intermediate_result.fun > 10 * DESTABILISED)
+        return first and bool(-intermediate_result.fun > 10 * _DESTABILISED)
 
     best, evaluated = None, 0
     for trial, kind in enumerate(passes):
@@ -151,7 +151,7 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
     for alike in layouts.values():
         loops = _loops(scenario, F, HumanSets(tuple(alike), scenario.person))
         fast, growth = (_growth(loops, least) for least in (_PASSES[0].min_frequency_hz, 0.0))
-        ranked += zip(np.where(growth > DESTABILISED, growth, fast).tolist(), alike, strict=True)
+        ranked += zip(np.where(growth > _DESTABILISED, growth, fast).tolist(), alike, strict=True)
     return ranked
 
 

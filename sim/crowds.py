@@ -45,7 +45,7 @@ from sim.switching import Switched, switched_crowd
 
 ENGINES = ("exact", "mujoco", "both")
 MIXED = 0  # as a number of links: half the humans are simple, half are networks of two links
-BATCH = 125  # humans that are decided together
+_BATCH = 125  # humans that are decided together
 
 
 # ---- random passive humans, each from its own seed
@@ -127,10 +127,10 @@ class Validation:
         return round(self.duration / self.scenario.T)
 
     def batches(self) -> list[range]:
-        """All indices, BATCH of them at a time, all in one environment."""
+        """All indices, _BATCH of them at a time, all in one environment."""
         spread = max(1, len(self.environments))
         each = [range(i, self.humans, spread) for i in range(min(spread, self.humans))]
-        return [indices[i : i + BATCH] for indices in each for i in range(0, len(indices), BATCH)]
+        return [indices[i : i + _BATCH] for indices in each for i in range(0, len(indices), _BATCH)]
 
     def environment(self, index: int) -> Member | None:
         """What the humans of this index meet, None for the scenario's own environment: each in turn."""

@@ -115,7 +115,7 @@ def dominant_mode(loop: ClosedLoop) -> Mode:
     return Mode(np.take_along_axis(values, largest, axis=-1)[..., 0].astype(complex), loop.T)
 
 
-def left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
+def _left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
     """The dominant mode's, (..., n), of unit length: left* A = lambda left*. No other mode contributes to left* xi."""
     values, vectors = np.linalg.eig(np.swapaxes(loop.A, -1, -2))
     largest = np.argmax(np.abs(values), axis=-1)[..., None, None]
@@ -185,7 +185,7 @@ _UNLIKE = 0.05  # rms of what y does beside the mode, relative to it: above, it 
 _AT_ONCE = 1 << 16  # ticks of a trace, whose states may be more than memory holds
 
 
-def measured_growth(
+def _measured_growth(
     loop: ClosedLoop, trace: Trace, force_limit: Array, ahead: int = 0
 ) -> tuple[float | None, str | None]:
     """The growth rate [1/s] of the loop's dominant mode in a trace, or None with the reason.
@@ -199,7 +199,7 @@ def measured_growth(
     if usable < _SHORTEST_TRACE:
         which = "ticks before the first clipped one" if clipped.any() else "ticks"
         return None, f"only {max(usable, 0)} {which}; a growth rate needs {_SHORTEST_TRACE}"
-    left = left_eigenvector(loop).conj()
+    left = _left_eigenvector(loop).conj()
     pushed = trace.w[:usable] @ (loop.B.T @ left)
     # what rounding is relative to: large parts that cancel in y, and the eigenvector's own zeros
     sizes = np.abs(left) + _VECTOR_ROUNDING / _NOISE_FLOOR * np.abs(left).max()
@@ -286,7 +286,7 @@ def stability_of(simulation: Simulation, trace: Trace) -> Stability:
     else:
         loop = close(simulation.plant, simulation.F)
         ahead = max(simulation.scenario.theta) if simulation.process.limiter else 0
-        growth, reason = measured_growth(loop, trace, simulation.process.force_limit, ahead)
+        growth, reason = _measured_growth(loop, trace, simulation.process.force_limit, ahead)
     if trace.diverged:
         reason = "the simulation left the range of finite numbers: reported as unstable"
     exact = eigenvalues(worst_mode(simulation))
@@ -467,7 +467,7 @@ class _Audit:
         self._contact = process.contact if process.walls else None
         self._made, self._touching = np.zeros(nsim, dtype=int), np.zeros((len(process.walls), nsim), dtype=bool)
         self._B, self._T, self._damping = loops.B, loops.T, delta[:, None] / loops.T
-        self._left = left_eigenvector(loops)  # (nsim, n)
+        self._left = _left_eigenvector(loops)  # (nsim, n)
         self._speeds = _Speeds(scene, nsim, (ticks // 4, ticks // 2), (ticks - ticks // 4, ticks))
         self._linear = np.ones(nsim, dtype=bool)
         self._usable, self._clipped = np.zeros(nsim, dtype=int), np.zeros(nsim, dtype=int)

@@ -64,7 +64,7 @@ def switching(
     """The loop with the scenario's varying delays, and their period where they are adversarial."""
     varying = simulation.scenario.varying_delay
     assert varying is not None
-    period = worst_switching(simulation, coupling, varying) if varying.pattern == "adversarial" else None
+    period = _worst_switching(simulation, coupling, varying) if varying.pattern == "adversarial" else None
     given = period.delays if period else None
     delays = _draw_delays(simulation.scenario, seed, index, max(ticks, _SHORTEST), given)
     return with_delays(simulation, coupling, delays[:, :, None]), period
@@ -79,11 +79,11 @@ def with_delays(simulation: Simulation, coupling: Coupling, delays: Ticks) -> Si
     return replace(simulation, process=process)
 
 
-def worst_switching(simulation: Simulation, coupling: Coupling, varying: VaryingDelay) -> Period:
+def _worst_switching(simulation: Simulation, coupling: Coupling, varying: VaryingDelay) -> Period:
     """The periodic switching within the range that was found to grow fastest in this loop."""
     G, plant = without_theta(simulation, coupling), simulation.plant
     one = HeldPlant(plant.A[None], plant.B[None], plant.C, plant.T)
-    ages = greedy_ages(replace(simulation.process, F=G), one, simulation.scene, varying, _SEARCHED)
+    ages = _greedy_ages(replace(simulation.process, F=G), one, simulation.scene, varying, _SEARCHED)
     return _worst_period(ages[:, :, 0], plant, G, varying)
 
 
@@ -103,7 +103,7 @@ def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: T
 # ---- the worst delays
 
 
-def mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[int]) -> Array:
+def _mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[int]) -> Array:
     """A of xi[k+1] = A xi[k] while the forces in use have these ages [samples], age_i <= depth_i."""
     states, m = plant.A.shape[0], G.outputs
     n, first = states + G.order + sum(depth), states + G.order
@@ -126,7 +126,7 @@ def mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[i
     return A
 
 
-def greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: VaryingDelay, ticks: int) -> Ticks:
+def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: VaryingDelay, ticks: int) -> Ticks:
     """Ages (ticks, m, nsim) that feed the linear loop of every plant; `process` is that without Theta."""
     nsim, states, nv = plants.A.shape[0], plants.A.shape[1], scene.model.nv
     m, free = process.channels, np.full(process.channels, np.inf)
@@ -160,7 +160,7 @@ def greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Vary
 def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay) -> Period:
     """The fastest growing repetition of a window of `ages` (ticks, m), or of one delay at an end of its range."""
     ticks = ages.shape[0]
-    matrix = cache(lambda *now: mode_matrix(plant, G, varying.hi, now))
+    matrix = cache(lambda *now: _mode_matrix(plant, G, varying.hi, now))
     best, chosen = -np.inf, ages[:1]
     starts = np.linspace(ticks // 3, max(ticks - _LONGEST_PERIOD, ticks // 3), _STARTS, dtype=int)
     ends = [np.array([row]) for row in product(*zip(varying.lo, varying.hi, strict=True))][:_MOST_ENDS]
@@ -263,7 +263,7 @@ def _crowd_delays(
     assert scenario.varying_delay is not None
     given: list[Ticks | None] = [None] * len(index)
     if scenario.varying_delay.pattern == "adversarial":
-        worst = realising(greedy_ages(process, plants, scene, scenario.varying_delay, ticks))
+        worst = realising(_greedy_ages(process, plants, scene, scenario.varying_delay, ticks))
         given = [worst[:, :, j] for j in range(len(index))]
     numbered = zip(index.tolist(), given, strict=True)
     return np.stack([_draw_delays(scenario, seed, i, ticks, own) for i, own in numbered], axis=2)

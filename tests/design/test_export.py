@@ -134,10 +134,10 @@ def test_force_limits_that_no_certificate_covers_are_refused(place, limited_file
     folder = limited_files[0]
     with pytest.raises(InputError, match="its certificate covers no limited forces"):
         main([str(place / "full.json"), "--process", "--force-limit", "3", "--out", str(place / "x.c")])
-    with pytest.raises(InputError, match="--force-limit is for --process"):
+    with pytest.raises(InputError, match="--force-limit is only with --process"):
         main([str(folder / "pair.json"), "--force-limit", "3", "--out", str(place / "x.c")])
     control = ["--process", "--format", "control", "--force-limit", "3", "--out", str(place / "x.py")]
-    with pytest.raises(InputError, match="--format control: that is linear"):
+    with pytest.raises(InputError, match="without --format control: that is linear"):
         main([str(folder / "pair.json"), *control])
 
 
@@ -304,7 +304,7 @@ def test_a_hostile_name_stays_inside_the_comments(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["{gains}", "--without-theta"], "without --process"),
+        (["{gains}", "--without-theta"], "--without-theta is only with --process"),
         (["{gains}", "--out", "{gains}"], "name another file"),
         (["{gains}", "--out", "{place}"], "is a folder"),
         (["{gains}", "--seed", "-1"], "from 0"),

@@ -18,7 +18,7 @@ from models.device import RigidDevice
 from models.hold import hold
 from models.scene import build, plant
 from sim import adversary
-from sim.adversary import DESTABILISED, attempts, search, shortages
+from sim.adversary import _DESTABILISED, attempts, search, shortages
 from sim.run import assemble
 from sim.scenario import load
 from sim.stability import close, dominant_mode
@@ -38,7 +38,7 @@ def test_nobody_destabilises_a_loop_with_the_damping_it_requires():
     rows = attempts(LOOPS, np.array([-1e-3]), generations=12)
     assert not any(row.worst.destabilises for row in rows)
     # lossless hands come to the edge: 0 from below, to the rounding of the eigenvalues
-    assert all(abs(row.worst.growth) < DESTABILISED for row in rows)
+    assert all(abs(row.worst.growth) < _DESTABILISED for row in rows)
 
 
 def test_where_the_condition_binds_slowly_it_is_tight():

@@ -168,10 +168,10 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--coupling", "optimal", "--rigid"], "--rigid with --coupling optimal: it is about a map of spring-dampers"),
-        (["--coupling", "none", "--velocity-filter", "50"], "--velocity-filter with --coupling none"),
+        (["--coupling", "optimal", "--rigid"], "--rigid is only for a map of spring-dampers"),
+        (["--coupling", "none", "--velocity-filter", "50"], "--velocity-filter is only for a map of spring-dampers"),
         (["--coupling", "optimal", "--condition", "any-environment"], "for optimal allowed are this-environment"),
-        (["--condition", "any-environment"], "--condition any-environment: without --coupling nothing is designed"),
+        (["--condition", "any-environment"], "--condition is only with --coupling"),
         (["--coupling", "optimal", "--scenario", "one-wall"], "an optimal coupling holds a linear model"),
         (["--coupling", "published", "--scenario", "one-wall"], "the paper prints gains for 2 channels"),
     ],

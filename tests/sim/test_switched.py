@@ -22,13 +22,13 @@ from sim.run import run as close_loop
 from sim.scenario import SCENARIOS, InputError, load, parse
 from sim.stability import impulse_growth, unlimited
 from sim.switching import (
-    greedy_ages,
-    mode_matrix,
+    _greedy_ages,
+    _mode_matrix,
+    _worst_switching,
     switched_crowd,
     switching,
     with_delays,
     without_theta,
-    worst_switching,
 )
 
 ASSEMBLY = assemble(load(), STIFF)
@@ -67,7 +67,7 @@ def test_the_product_of_mode_matrices_is_the_simulated_map():
     xi[:states] = buffer.s[0, :, 0]
     held = own_hold()
     for row in wanted:
-        xi = mode_matrix(held, G, depth, row) @ xi
+        xi = _mode_matrix(held, G, depth, row) @ xi
     size = np.abs(buffer.s[:, :, 0]).max()
     # both are products of the same 60 matrices up to rounding, 1e-16 each, of numbers up to `size`
     np.testing.assert_allclose(xi[:states], buffer.s[ticks, :, 0], atol=1e-11 * size)
@@ -83,13 +83,13 @@ def test_constant_delays_give_the_trace_of_the_constant_loop():
 
 def test_the_worst_period_grows_more_than_any_constant_delay():
     """(1, 2) is certified; switching within 1 to 2 makes the loop with its ordinary humans grow, exactly."""
-    worst = worst_switching(ASSEMBLY, STIFF, VaryingDelay((1, 1), (2, 2), "adversarial"))
+    worst = _worst_switching(ASSEMBLY, STIFF, VaryingDelay((1, 1), (2, 2), "adversarial"))
     assert worst.growth > 1.5  # found by a search: 2.05 1/s at the time of writing
     assert set(np.unique(worst.ages)) <= {1, 2}
     period, held = len(worst.ages), own_hold()
     G, product = without_theta(ASSEMBLY, STIFF), None
     for row in worst.ages:
-        A = mode_matrix(held, G, (2, 2), row)
+        A = _mode_matrix(held, G, (2, 2), row)
         product = A if product is None else A @ product
     radius = np.abs(np.linalg.eigvals(product)).max()
     # eigenvalues of a product of 134 matrices: their rounding adds up
@@ -97,7 +97,7 @@ def test_the_worst_period_grows_more_than_any_constant_delay():
     met = ages(np.tile(worst.delays, (3, 1))[:, :, None])[2 * period :, :, 0]
     np.testing.assert_array_equal(met, worst.ages)
     growth = {
-        ages: np.log(np.abs(np.linalg.eigvals(mode_matrix(held, G, (2, 2), ages))).max()) / G.T
+        ages: np.log(np.abs(np.linalg.eigvals(_mode_matrix(held, G, (2, 2), ages))).max()) / G.T
         for ages in ((1, 1), (1, 2), (2, 1), (2, 2))
     }
     assert growth[1, 2] < 0
@@ -108,7 +108,7 @@ def test_greedy_ages_repeat_the_trajectory_that_chose_them():
     """The growth under the packet delays of greedy ages is positive, and random delays do not reach it."""
     G, varying_delay, ticks = without_theta(ASSEMBLY, STIFF), VaryingDelay((1, 1), (2, 2)), 1600
     process, held = replace(ASSEMBLY.process, F=G), one(ASSEMBLY.plant)
-    delays = realising(greedy_ages(process, held, ASSEMBLY.scene, varying_delay, ticks))
+    delays = realising(_greedy_ages(process, held, ASSEMBLY.scene, varying_delay, ticks))
     drawn = varying_delay.draw(np.random.default_rng(0), ticks)[:, :, None]
     rates = []
     for each in (delays, drawn):
