@@ -40,7 +40,7 @@ def main(argv: list[str]) -> int:
     scenario = options.scenario_from(args)
     loop = _loop(args, scenario)
     if args.samples is not None and loop.ranges is None:
-        raise InputError("--samples without ranges: give --ranges, or a scenario with [ranges]")
+        raise InputError("--samples is only with ranges: give --ranges, or a scenario with [ranges]")
     design = _design(args, loop)
     judged = _judged(args, scenario, loop, design)
     stored = store(loop, design, out, judged.whole, judged.limiter.certificate)

@@ -54,6 +54,11 @@ class Parser(argparse.ArgumentParser):
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
+        self._only: list[tuple[str, Callable[[argparse.Namespace], Any], tuple[str, ...]]] = []
+
+    def only(self, where: str, acts: Callable[[argparse.Namespace], Any], *names: str) -> None:
+        """Refuse the options of these destinations where `acts` is false of what is given: they would be ignored."""
+        self._only.append((where, acts, names))
 
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
         """As argparse's; an empty word is refused for every option."""
@@ -61,6 +66,11 @@ class Parser(argparse.ArgumentParser):
         for action in self._actions:
             if getattr(found, action.dest, None) == "":
                 raise InputError(f"{action.option_strings[-1] if action.option_strings else action.dest} is empty")
+        for where, acts, names in self._only:
+            for name in names if not acts(found) else ():
+                if getattr(found, name) != self.get_default(name):
+                    option = next(a.option_strings[-1] for a in self._actions if a.dest == name and a.option_strings)
+                    raise InputError(f"{option} is only {where}")
         return found, rest
 
     def error(self, message: str) -> NoReturn:
@@ -136,7 +146,7 @@ def energy_budget(text: str) -> tuple[float, float]:
     return start, cap
 
 
-def delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
+def _delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
     """'1,2' as one range for all channels, '1-2,0-3' as one per channel [samples]."""
     parts = _parts(text, int, expected := "LO,HI or LO-HI,LO-HI,.. in whole samples", "-")
     if [len(part) for part in parts] == [1, 1]:
@@ -372,8 +382,8 @@ _DRAWN = ("constant", "random", "bursty", "adversarial")
 
 def add_varying_delay_option(parser: argparse._ActionsContainer, what: str) -> None:
     """--varying-delay, and --jitter, as it was called."""
-    parser.add_argument("--varying-delay", type=delay_ranges, metavar="LO,HI", help=what)
-    parser.add_argument("--jitter", dest="varying_delay", type=delay_ranges, help=argparse.SUPPRESS)
+    parser.add_argument("--varying-delay", type=_delay_ranges, metavar="LO,HI", help=what)
+    parser.add_argument("--jitter", dest="varying_delay", type=_delay_ranges, help=argparse.SUPPRESS)
 
 
 def add_varying_delay_options(parser: argparse.ArgumentParser) -> None:

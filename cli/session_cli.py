@@ -34,7 +34,7 @@ _SHOWN_US = 100_000  # of a rehearsal, between two looks
 _PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
 
 
-def add_link_options(parser: argparse.ArgumentParser) -> None:
+def add_link_options(parser: options.Parser) -> None:
     """Which device, over which line, and how its delay is judged."""
     link = parser.add_argument_group("the link")
     add, number = link.add_argument, options.number
@@ -55,6 +55,9 @@ def add_link_options(parser: argparse.ArgumentParser) -> None:
     add("--quantile", type=number(0.5, 1.0), default=0.99, metavar="Q", help=share)
     guard = "spare time added to that age (default 1e-4)"
     add("--guard", type=number(0.0, 0.1), default=1e-4, metavar="SECONDS", help=guard)
+    parser.only("with --emulate or --rehearse: a device has faults of its own", lambda args: not args.port, "fault")
+    parser.only("with --port: an emulated device arms by itself", lambda args: args.port, "arm")
+    parser.only("without --rehearse, whose time is virtual", lambda args: not args.rehearse, "pace")
 
 
 def add_pace_option(parser: argparse._ActionsContainer, what: str) -> None:
@@ -62,7 +65,7 @@ def add_pace_option(parser: argparse._ActionsContainer, what: str) -> None:
     parser.add_argument("--pace", type=options.number(0.01, 1), default=1.0, metavar="P", help=what)
 
 
-def add_safety_options(parser: argparse.ArgumentParser) -> None:
+def add_safety_options(parser: options.Parser) -> None:
     """What the bridge never does, and who has to be there."""
     add, number = parser.add_argument_group("safety").add_argument, options.number
     cap = "largest force (default 2, for first sessions)"
@@ -78,6 +81,8 @@ def add_safety_options(parser: argparse.ArgumentParser) -> None:
     who = "forces act only while somebody presses a key or touches FILE once a second, or holds the device's own switch"
     add("--deadman", metavar="key|device|FILE", help=who)
     add("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
+    parser.only("with --port", lambda args: args.port, "no_preflight")
+    parser.only("with --continuous-force", lambda args: args.continuous_force, "thermal_time")
 
 
 def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
@@ -128,8 +133,6 @@ def check_link(args: argparse.Namespace) -> LinkSettings:
     """The settings of a session. Raises InputError where the options contradict each other."""
     if bool(args.port) + args.emulate + args.rehearse != 1:
         raise InputError("give either --port PATH or --emulate or --rehearse")
-    if args.fault and args.port:
-        raise InputError("--fault is for --emulate and --rehearse; a device behind --port has its own")
     if args.port and not args.arm and not sys.stdin.isatty():
         raise InputError("no keyboard to arm with: give --arm, if nobody can get hurt")
     return LinkSettings(baud=_baud(args), measure=args.measure)

@@ -16,7 +16,7 @@ from sim.stability import unstable
 
 
 @dataclass(frozen=True)
-class Part:
+class _Part:
     """A table of a check; `answer` is its gist, shown in the table of verdicts."""
 
     answer: str
@@ -36,7 +36,7 @@ class Answer:
     holds: bool
     trouble: str | None
     wall_s: float
-    parts: tuple[Part, ...]
+    parts: tuple[_Part, ...]
     printed: str  # by a command
     pictures: tuple[str, ...]  # paths from the report's folder
     report: dict[str, Any]
@@ -83,40 +83,40 @@ def machine() -> dict[str, str]:
 
 
 _Row = dict[str, Any]
-Figures = Callable[[dict[str, Any]], list[Part]]
+Figures = Callable[[dict[str, Any]], list[_Part]]
 
 
-def verdicts(report: dict[str, Any]) -> list[Part]:
+def verdicts(report: dict[str, Any]) -> list[_Part]:
     """Of sim.validate."""
     gist = f"{'certified' if report['certified'] else 'not certified'}; "
     gist += f"{report['unstable']['exact']} of {report['humans']} hands unstable"
     if adversary := report.get("adversary"):
         gist += f", adversary {'succeeds' if adversary['found'] else 'fails'}"
-    return [Part(f"{gist}, {report['disagreements']} disagreements")]
+    return [_Part(f"{gist}, {report['disagreements']} disagreements")]
 
 
-def accuracy(report: dict[str, Any]) -> list[Part]:
+def accuracy(report: dict[str, Any]) -> list[_Part]:
     """Of sim.accuracy."""
     default = report["default_substeps"]
     ours = next((r for r in report["rows"] if (r["integrator"], r["substeps"]) == ("RK4", default)), None)
     gist = f"default RK4 x {default}: growth off by {ours['growth_rate_error']:+.0e} 1/s" if ours else ""
-    return [Part(gist)]
+    return [_Part(gist)]
 
 
-def gain_map(report: dict[str, Any]) -> list[Part]:
+def gain_map(report: dict[str, Any]) -> list[_Part]:
     """Of sim.zwidth."""
     contradicted = sum(report[name]["contradicted_cells"] for name in CONDITIONS)
-    return [Part(f"{contradicted} certified cells that a hand destabilises")]
+    return [_Part(f"{contradicted} certified cells that a hand destabilises")]
 
 
 def _table(gist: str, columns: dict[str, str | Callable[[_Row], str]]) -> Figures:
     """A row for each row: its cells as formats of its figures."""
 
-    def figures(report: dict[str, Any]) -> list[Part]:
+    def figures(report: dict[str, Any]) -> list[_Part]:
         rows, cells = report["rows"], columns.values()
         good = sum(row["holds"] for row in rows)
         shown = tuple(tuple(c(row) if callable(c) else c.format(**row) for c in cells) for row in rows)
-        return [Part(gist.format(good=good, count=len(rows)), tuple(columns), shown)]
+        return [_Part(gist.format(good=good, count=len(rows)), tuple(columns), shown)]
 
     return figures
 
@@ -175,7 +175,7 @@ _uneven_rows = _table(
 )
 
 
-def uneven(report: dict[str, Any]) -> list[Part]:
+def uneven(report: dict[str, Any]) -> list[_Part]:
     """Of uneven ticks."""
     (part,) = _uneven_rows(report)
     found = sum(row["grow"] > 0 for row in report["rows"])
@@ -183,7 +183,7 @@ def uneven(report: dict[str, Any]) -> list[Part]:
     return [replace(part, answer=f"{part.answer}; at half of it {below}")]
 
 
-def tightness(report: dict[str, Any]) -> list[Part]:
+def tightness(report: dict[str, Any]) -> list[_Part]:
     """Of loops that lack damping: the adversary's success by shortage."""
     found = {short: [row["found"] for row in rows] for short, rows in sorted(_by(report["rows"], "short").items())}
     rows = tuple((f"{short:.1%}", str(len(f)), f"{sum(f) / len(f):.0%}") for short, f in found.items())
@@ -191,7 +191,7 @@ def tightness(report: dict[str, Any]) -> list[Part]:
     gist = "at no shortage that was tried does a human destabilise every loop"
     if first is not None:
         gist = f"a human destabilises every loop whose devices lack {first:.1%} of the damping required"
-    whole = Part(gist, ("damping missing", "loops", "destabilised"), rows, "Success rate of the adversary")
+    whole = _Part(gist, ("damping missing", "loops", "destabilised"), rows, "Success rate of the adversary")
     return [whole, *(replace(part, title="Each loop") for part in _each_loop(report))]
 
 
@@ -220,7 +220,7 @@ _each_loop = _table(
 )
 
 
-def edges(report: dict[str, Any]) -> list[Part]:
+def edges(report: dict[str, Any]) -> list[_Part]:
     """Of guarantees at their edge: a row for each and each share of what it asks."""
     rows, taken = [], []
     for (name, factor), some in _by(report["rows"], "guarantee", "factor").items():
@@ -231,20 +231,20 @@ def edges(report: dict[str, Any]) -> list[Part]:
         if factor >= 1:
             taken.append(took + grew)
     columns = ("guarantee", "times what it asks", "motions that took energy", "hands that grew", "limited", "least J")
-    return [Part(f"{sum(taken)} violations at 1.02 times what {len(taken)} guarantees ask", columns, tuple(rows))]
+    return [_Part(f"{sum(taken)} violations at 1.02 times what {len(taken)} guarantees ask", columns, tuple(rows))]
 
 
-def proved(report: dict[str, Any]) -> list[Part]:
+def proved(report: dict[str, Any]) -> list[_Part]:
     """Of proofs of random networks: by what the sweep says."""
     rows, good = [], sum(row["holds"] for row in report["rows"])
     for says, enough in (("there is enough damping", True), ("there is too little", False)):
         some = [row for row in report["rows"] if (row["required"] is not None and row["required"] < 1) == enough]
         rows.append((says, str(len(some)), str(sum(row["proved"] for row in some))))
     gist = f"proof and sweep agree about {good} of {len(report['rows'])} networks"
-    return [Part(gist, ("the sweep says that", "networks", "proved"), tuple(rows))]
+    return [_Part(gist, ("the sweep says that", "networks", "proved"), tuple(rows))]
 
 
-def told(report: dict[str, Any]) -> list[Part]:
+def told(report: dict[str, Any]) -> list[_Part]:
     """Of traces of random scenarios: by what their eigenvalues say."""
     rows, good = [], sum(row["holds"] for row in report["rows"])
     for says, grows in (("stable", False), ("unstable", True)):
@@ -255,7 +255,7 @@ def told(report: dict[str, Any]) -> list[Part]:
         rows.append((says, *map(str, (len(some), same, len(read) - same, quiet, len(some) - len(read) - quiet))))
     answers = ("the trace agrees", "says the opposite", "not excited", "no rate, for another reason")
     gist = f"{good} of {len(report['rows'])} traces tell no other than the eigenvalues"
-    return [Part(gist, ("by the eigenvalues", "runs", *answers), tuple(rows))]
+    return [_Part(gist, ("by the eigenvalues", "runs", *answers), tuple(rows))]
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -86,6 +86,7 @@ def _parser() -> options.Parser:
     met = "nominal (default), or ranges: in turn all vertices of the scenario's ranges and as many others inside"
     add("--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
     options.add_output_options(parser, picture=True)
+    parser.only("with --adversary", lambda args: args.adversary, "generations")
     return parser
 
 
@@ -95,8 +96,6 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     require_linear(scenario, "sim.validate", walls=True)
     if args.dask is not None and args.shards > 1:
         raise InputError(f"--shards {args.shards} with --dask: the cluster decides who does what, give one of them")
-    if args.generations is not None and not args.adversary:
-        raise InputError("--generations without --adversary: it is how long that searches")
     if not (args.duration == 0 or 4 * scenario.T <= args.duration <= 1e5):
         allowed = f"allowed are 0 and {4 * scenario.T:g} to 100000 s"
         raise InputError(f"--duration is {args.duration:g}, {allowed}")
@@ -154,7 +153,7 @@ def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, ju
     try:
         for seek in (search, search_population)[: 1 if isinstance(scenario.population, Population) else 2]:
             with render.progress("searching the worst human") as move:
-                frozen = assemble(scenario, chosen.coupling).process.frozen().values()
+                frozen = assemble(scenario, chosen.coupling).process.law.frozen().values()
                 F = max(frozen, key=lambda F: this_environment(F, scenario.delta).ratio)  # the state that asks most
                 found.append(seek(scenario, F, args.seed, args.generations or 150, progress=move))
     except KeyboardInterrupt:

@@ -155,6 +155,7 @@ def _parser() -> options.Parser:
     add("--fps", type=options.whole(1, 100), default=10, metavar="N", help=rate)
     drawn = "by OpenGL, or flat without it (default: by what works)"
     add("--draw", choices=_DRAWN, default="auto", help=drawn)
+    parser.only("with --video", lambda args: args.video, "fps", "draw")
     return parser
 
 

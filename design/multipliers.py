@@ -363,7 +363,7 @@ class _LimiterSearch:
     def requirement(self, ratio: float, w: float) -> Requirement:
         T = self._loop[0].T
         if np.isinf(ratio):
-            reason = f"no proof found with the limiter, for {w / (2 * np.pi * T):.4g} Hz"
+            reason = "no limiter is proved for this coupling"
             return refusal("limiter", self._delta, reason)
         return from_ratio("limiter", max(ratio, 0.0), self._delta, w / (2 * np.pi * T))
 

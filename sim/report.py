@@ -53,7 +53,7 @@ def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> EncoderS
 
 
 #: The transparency indices (25) printed beside the gains [dB]; no reading of Figure 4 that we tried gives them.
-PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
+_PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def _printed_gains(scenario: Scenario, case: str, got: CouplingFigures) -> tuple
 
 def _tau(case: str) -> PaperRow:
     why = "inf sigma_min(E) = 0: moving both contacts together costs no static force"
-    return PaperRow("transparency index tau (25)", f"{PRINTED_TAU_DB[case]} dB", "infinite", why)
+    return PaperRow("transparency index tau (25)", f"{_PRINTED_TAU_DB[case]} dB", "infinite", why)
 
 
 def _figure(case: str, stability: Stability) -> PaperRow:
