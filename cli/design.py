@@ -127,7 +127,7 @@ def _for_switching(args: argparse.Namespace) -> bool:
 
 
 def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
-    """What is asked of a design, in its own words. Raises InputError for options of another coupling."""
+    """The options of a design by the names of its arguments. Raises InputError for options of another coupling."""
     known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
     given = {name: value for name in known if options.given(value := getattr(args, name, None))}
     if KINDS[kind].limited and args.limiter is not None:
@@ -141,7 +141,7 @@ def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 
 def _design(args: argparse.Namespace, loop: Loop) -> Design:
-    """Raises InputError for a request that contradicts itself, DesignFailed where there is no such coupling."""
+    """Design and prove. Raises InputError for options that contradict each other, DesignFailed where no coupling exists."""
     asked = asked_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
         asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
