@@ -208,9 +208,9 @@ def _verdict(found: Audit) -> str:
     return f"{coupling.kind}{gains}: {verdict}"
 
 
-def _percent(error: float | None, sign: str) -> str:
+def _percent(error: float | None) -> str:
     """A relative error in percent, rounded down, so that the printed one is tolerated."""
-    return render.optional(error and math.floor(1e4 * error) / 100, sign + "{:.2f} %")
+    return render.optional(error and math.floor(1e4 * error) / 100, "{:.2f} %")
 
 
 def _stiffest(K: Sequence[float | None]) -> str:
@@ -227,9 +227,9 @@ _ROWS: dict[str, Callable[[ConditionAudit], str]] = {
     "margin": lambda c: render.optional(c.requirement.margin, "{:.5g}"),
     "binds at": lambda c: render.optional(c.requirement.frequency_hz, "{:.5g} Hz"),
     "stiffest K here": lambda c: _stiffest(c.stiffest.K),
-    "delta error": lambda c: _percent(c.sensitivity.delta_error, "-"),
-    "T error": lambda c: _percent(c.sensitivity.T_error, "+"),
-    "spare samples": lambda c: render.optional(c.sensitivity.extra_samples, "{:.5g}"),
+    "delta may be less by": lambda c: _percent(c.sensitivity.delta_error),
+    "T may be longer by": lambda c: _percent(c.sensitivity.T_error),
+    "delay may be longer by": lambda c: render.optional(c.sensitivity.extra_samples, "{:.5g} samples"),
 }
 
 

@@ -141,7 +141,7 @@ def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 
 def _design(args: argparse.Namespace, loop: Loop) -> Design:
-    """Design and prove. Raises InputError for options that contradict each other, DesignFailed where no coupling exists."""
+    """Design and prove. Raises InputError for options that contradict each other, DesignFailed without a coupling."""
     asked = asked_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
         asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
@@ -184,6 +184,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         price=coverage.price(loop, design, args.coupling, asked_of(args, args.coupling)) if judged.whole else None,
         judged=judged,
         switching=switching,
+        delays=stored.switching.guarantee if stored.switching and stored.switching.proof else None,
         transparency=transparency(loop.F(design.coupling), loop.E(), loop.lam, band),
         nearby=nearby,
         best=best and _Best(limit, best.g, best.ladder),
@@ -242,7 +243,6 @@ def _switching_words(proof: coverage.Switching) -> str:
 
 def _stored_rows(stored: Filed) -> render.Rows:
     delays = stored.switching
-    yield "guarantee, delays", delays.guarantee if delays and delays.proof else None
     yield "stored", f"{stored.file} (proof: {stored.proof or stored.reason})"
     yield "", f"for constant delays only: {delays.reason}" if delays and not delays.proof else None
 
@@ -259,6 +259,7 @@ class _Report:
     price: list[coverage.OverRanges] | None
     judged: Judged = render.several(_judged_rows, "beside")
     switching: coverage.Switching | None = render.figure("damping, any switching", _switching_words)
+    delays: str | None = render.figure("guarantee, delays", json="table")
     objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
     transparency: Transparency = render.figure("transparency error", render.transparency_error)
     nearby: Nearby = render.several(render.robustness_rows, "beside")

@@ -175,9 +175,9 @@ Rows = Iterable[tuple[str, str | None]]
 _Form = str | Callable[[Any], str | None]
 
 
-def facts(title: str, rows: Rows, heads: Sequence[str] = (), left: bool = False) -> Table:
+def facts(title: str, rows: Rows, left: bool = False) -> Table:
     """A table of names and texts; a text of None is left out."""
-    table = Table(*heads, title=title, title_justify="left" if left else "center", show_header=bool(heads))
+    table = Table(title=title, title_justify="left" if left else "center", show_header=False)
     for name, text in rows:
         if text is not None:
             table.add_row(name, text)
@@ -262,7 +262,8 @@ def needs(need: Requirement, digits: int = 6) -> str:
 def certificate_rows(requirements: Mapping[str, Requirement], digits: int = 6, proof: bool = True) -> Rows:
     """The damping that each condition needs; with `proof` also whether it is proved in exact arithmetic."""
     for name, need in requirements.items():
-        yield f"damping, {name}", f"needs {needs(need, digits)}: {certified(need, proof)}"
+        asks = f"needs {needs(need, digits)}" if math.isfinite(need.ratio) else "no damping is enough"
+        yield f"damping, {name}", f"{asks}: {certified(need, proof)}"
 
 
 def channel_row(contacts: Sequence[str]) -> tuple[str, str | None]:

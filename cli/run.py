@@ -226,7 +226,7 @@ def _title(what: str, report: RunReport) -> str:
 
 def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
     title = f"{scenario.title(report.case)}: coupling {report.judged.coupling.kind}"
-    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(report)], ("", ""))]
+    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(report)])]
     if report.run.engines:
         shown.append(_speed_against_error(report.run, report.run.engines))
     if report.alternatives:

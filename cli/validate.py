@@ -54,7 +54,7 @@ def main(argv: list[str]) -> int:
         *([f"Delays that vary: {report.switching.met.certified.covers}."] if report.switching else []),
         *report.remarks,
     ]
-    render.publish(args, report, [render.facts(title, render.rows_of(report), ("", ""))], lines, out, files)
+    render.publish(args, report, [render.facts(title, render.rows_of(report))], lines, out, files)
     if report.unfinished and not report.interrupted:
         return options.UNFINISHED
     return options.exit_code(bool(report.holds), report.interrupted)
