@@ -193,8 +193,8 @@ def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunRepo
 
 def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
     """Walls between a contact and ground, (channel, place, name), and in which ticks any wall was touched, (N,)."""
-    contact, network = run.simulation.process.contact, run.simulation.scenario.environment
-    if not network.walls or contact is None:
+    law, network = run.simulation.process.law, run.simulation.scenario.environment
+    if not network.walls:
         return [], None
     found = []
     for number, wall in enumerate(network.walls, start=1):
@@ -204,7 +204,7 @@ def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
         if second == GROUND and first in network.contacts:
             name = f"wall {number}, {1e3 * wall.gap:g} mm from {first} at rest"
             found.append((network.contacts.index(first), sign * wall.gap, name))
-    return found, (contact.depths(run.trace.z)[:, : len(network.walls)] > 0).any(axis=1)
+    return found, (law.depths(run.trace.z) > 0).any(axis=1)
 
 
 def _title(what: str, report: RunReport) -> str:

@@ -309,7 +309,7 @@ def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> For
     if process.walls:
         return ForceError.of(trace.f, trace.f, "walls have no linear ideal to compare with")
     F = process.F
-    asked = trace.f if process.delays is not None or process.limiter else trace.z @ F.C.T + trace.x @ F.D.T
+    asked = trace.f if process.delays is not None or process.law.bounds else trace.z @ F.C.T + trace.x @ F.D.T
     return ForceError.of(asked, response(delay(lam, F.T) @ simulation.E, trace.x))
 
 
@@ -355,19 +355,17 @@ class EngineChoice:
         return f"{self.integrator} x {self.substeps}"
 
 
-def compare_engines(
-    simulation: Simulation, error: float, ticks: int | None = None, linear: Simulation | None = None
-) -> tuple[EngineChoice, ...]:
+def compare_engines(simulation: Simulation, error: float, ticks: int | None = None) -> tuple[EngineChoice, ...]:
     """Every setting that is stable on the scene's plant, the cheapest first, over `ticks` of the scenario (all).
 
-    Walls, limits, encoder steps, varying delays and nets are those of `simulation`; verdicts are of `linear`, the loop
-    without a net and with constant delays, by default the same. Where something rubs the reference is refined until RK4
-    keeps `error`. Raises InputError where it cannot.
+    With its walls, limits, encoder steps, varying delays and net; verdicts are of the loop without a net and with
+    constant delays. Where something rubs the reference is refined until RK4 keeps `error`. Raises InputError where it
+    cannot.
     """
     if not error > 0:
         raise InputError(f"--error is {error:g}, expected a positive relative error")
     ticks = simulation.scenario.samples if ticks is None else ticks
-    linear = (linear or simulation).smooth.even
+    linear = simulation.smooth.even
     runs: dict[tuple[str, int], tuple[Array, float]] = {}
     if default_integrator(simulation.scene) == EXPONENTIAL:
         settings = list(dict.fromkeys((*_CANDIDATES, ("RK4", default_substeps(linear, "RK4")))))

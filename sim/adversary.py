@@ -20,10 +20,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from controller.coupling import Coupling, NoCoupling
-from controller.environment import environment
-from controller.loop import force_map
 from controller.lti import Array, Lti
-from design.conditions import this_environment
+from design.environments import THIS_ENVIRONMENT
 from models.human import Hand, Person
 from models.scene import Crowd, HumanSets, variants
 from sim.couplings import choose
@@ -178,8 +176,8 @@ def attempts(
     """
     rows = []
     for name, (scenario, coupling) in loops.items():
-        F = force_map(environment(scenario.environment, scenario.T), coupling, scenario.theta, scenario.psi)
-        required = np.array(this_environment(F, scenario.delta, scenario.longest_period, scenario.latency).required)
+        loop = scenario.loop("I")  # the reference does not matter
+        F, required = loop.F(coupling), np.array(THIS_ENVIRONMENT.required(loop, coupling).required)
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
             rows.append(_Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))

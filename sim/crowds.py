@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from controller.coupling import Coupling
+from controller.law import Law
 from controller.lti import Array
 from controller.ranges import Member
 from controller.timing import Timing
@@ -238,7 +239,7 @@ def _group(
     held_by = variants(scenario.device, crowd)
     late, mujoco = scenario.usual_latency, nowhere
     loops = exact_loops(held_by, simulation.F, late=late)
-    frozen = [replace(simulation.process, F=F, contact=None) for F in simulation.process.frozen().values()]
+    frozen = [replace(simulation.process, law=Law(F)) for F in simulation.process.law.frozen().values()]
     mode = Mode.worst([dominant_mode(exact_loops(held_by, process.F, late=late)) for process in frozen])
     if validation.engine != "exact":
         maps = (mujoco_loops(held_by, process, nthread=validation.threads, late=late) for process in frozen)
@@ -247,8 +248,8 @@ def _group(
     switched = Switched(nowhere, nowhere)
     if scenario.switches or scenario.uneven:
         with_mujoco = validation.engine != "exact" and validation.ticks > 0
-        arguments = (held_by, index, validation.seed, validation.duration, with_mujoco, validation.threads)
-        switched = switched_crowd(simulation, validation.coupling, *arguments)
+        asked = (validation.seed, validation.duration, with_mujoco, validation.threads)
+        switched = switched_crowd(simulation, held_by, index, *asked)
     return Findings(
         index=index,
         radius=mode.spectral_radius,

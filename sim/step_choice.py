@@ -175,4 +175,4 @@ def simulated_growth(
 ) -> float:
     """The growth rate [1/s] of the loop that an engine simulates with these settings; of walls, in the worst state."""
     held = measured_hold(simulation, engine, integrator, substeps)
-    return max(float(dominant_mode(close(held, F)).growth) for F in simulation.process.frozen().values())
+    return max(float(dominant_mode(close(held, F)).growth) for F in simulation.process.law.frozen().values())

@@ -163,11 +163,11 @@ class _Simulated:
             [device.encoder_step for device in devices],
             [device.friction for device in devices],
             [d.force_limit for d in devices] if plan.effects.saturation else None,
-            sweep.walled is not None,
+            bool(sweep.simulated.environment.walls),
         )
         return cls(
             effects,
-            plan.effects.nonlinear(sweep.devices) or sweep.walled is not None,
+            plan.effects.nonlinear(sweep.devices) or bool(sweep.simulated.environment.walls),
             plan.trials,
             plan.duration,
             plan.start,
@@ -241,7 +241,7 @@ class MapReport:
             loop.psi,
             loop.delta,
             sweep.cutoff,
-            sweep.walled is not None,
+            bool(sweep.simulated.environment.walls),
             list(drawn.ratio),
             _Grid(drawn.grid.K, drawn.grid.B, drawn.grid.scale),
             _population(drawn, humans, seed),

@@ -259,7 +259,7 @@ class LiveLoop:
         outside = prepared.simulation.plant.B.shape[1] - process.channels
         buffer = StepBuffer(process, _STRETCH, s.size, outside)
         buffer.s[0, :, 0] = s
-        buffer.z[0, :, 0] = process.at_rest(s[: process.channels])
+        buffer.z[0, :, 0] = process.ticked.at_rest(s[: process.channels])
         self.prepared, self._buffer = prepared, buffer
         self._start_engine()
 

@@ -15,7 +15,6 @@ from worlds import SOFT, STIFF
 
 from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
-from controller.limiter import limited
 from controller.loop import Loop, force_map
 from controller.lti import Lti
 from design.conditions import any_environment, this_environment
@@ -390,7 +389,7 @@ def test_saturation_is_outside_every_certificate():
     assert np.abs(late(unlimited)).max() < 0.01
     for beta in (0.0, 0.01):  # the limiter in the place of clipping: every start comes to rest
         rho = limiter_lag((DELTA, DELTA), T, beta)
-        limits = limited(base.environment, STIFF, base.theta, base.psi, T, (12.0, 5.657), rho)
+        limits = base.loop("I").law(STIFF, (12.0, 5.657), rho)
         limiting = replace(simulation, process=replace(simulation.process, F=limits.open, contact=limits))
         assert np.abs(late(limiting)).max() < 0.01
 

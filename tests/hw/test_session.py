@@ -10,6 +10,7 @@ from worlds import FakePort
 
 from cli import bridge
 from cli.checks.faults import CASES, Fault, _rehearse_case, at, person
+from controller.law import Law
 from design.coupling_file import Stored
 from design.coupling_file import save as save_coupling
 from hw.control import HostController, certified_coupling, certified_couplings, link_delay
@@ -185,7 +186,7 @@ def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
     simulation = assemble(scenario, rungs[0].chosen.coupling)
     held = hold(plant(simulation.scene.model), scenario.T)
     n = len(recorder) - first
-    w, law = outside_forces(scenario, simulation.scene, 0, n), HostController(simulation.F)
+    w, law = outside_forces(scenario, simulation.scene, 0, n), HostController(Law(simulation.F))
     s, counts, applied = np.zeros(held.A.shape[0]), [], []
     for k in range(n):
         x = np.round(s[:2] / 1e-6)
@@ -360,7 +361,7 @@ def test_forces_at_the_cap_are_limited_under_the_guarantee_and_replay(scenario, 
     session.record = recorder
     Rehearsal(session, Emulator(scenario), lambda ages: rungs).run_until_armed(2.0)
     report = outcome("I", session, recorder, 0)
-    assert report.program["limiter"]["words"].startswith("proved, also while forces are limited to 0.3, 0.2 N")
+    assert report.program.limiter.words.startswith("proved, also while forces are limited to 0.3, 0.2 N")
     asked = np.abs(recorder.link()["asked"])
     assert (asked <= (0.3, 0.2)).all()
     assert (asked == (0.3, 0.2)).any(axis=1).mean() > 1 / 3

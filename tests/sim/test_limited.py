@@ -67,8 +67,8 @@ def test_both_engines_agree_on_limited_forces(coupling, rho):
     np.testing.assert_allclose(own.x, exact.x, atol=3e-11)
     assert (np.abs(exact.f) <= limits).all()
     assert 0.2 < exact.clipped(limits).mean() < 0.95
-    assert simulation.process.limiter is not None
-    assert np.abs(simulation.process.limiter.slips(exact.z)).max() > 1e-4
+    assert simulation.process.law.bounds
+    assert np.abs(simulation.process.law.slips(exact.z)).max() > 1e-4
 
 
 @pytest.mark.parametrize(("engine", "apart"), [("exact", 1e-12), ("exponential", 1e-12), ("RK4", 0.0)])

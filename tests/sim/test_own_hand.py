@@ -322,7 +322,7 @@ def test_a_population_on_a_wall():
     simulation = assemble(scenario, coupling.coupling)
     crowd = Validation(scenario, coupling.coupling, 0, 20, 1, "exact", 0.0).crowd(7)
     plant = hold(variants(scenario.device, crowd).plants(), scenario.T)
-    states = simulation.process.frozen().values()
+    states = simulation.process.law.frozen().values()
     growth = max(float(dominant_mode(close(plant, F)).growth[0]) for F in states)
     assert found.exact[7] == pytest.approx(growth, rel=1e-9)
     assert (validate(scenario, None, humans=20, duration=0.0).exact > 0).any()

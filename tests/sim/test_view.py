@@ -107,7 +107,7 @@ def test_frames_tell_the_forces_since_the_last_one(none):
 def test_rest_is_where_a_held_position_leads(published):
     """z = A z + B x, and the force is F(1) x; F(1) from the transfer function itself."""
     F, x = published.simulation.F, np.array([0.01, -0.004])
-    z = published.simulation.process.at_rest(x)
+    z = published.simulation.process.law.at_rest(x)
     assert np.allclose(F.A @ z + F.B @ x, z, atol=1e-12)
     # rounding: forces of 10 N as differences of numbers about 1e4 larger
     assert np.allclose(F.C @ z + F.D @ x, F.at(1.0 + 0j).real @ x, atol=1e-8)
