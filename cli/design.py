@@ -129,7 +129,7 @@ def _for_switching(args: argparse.Namespace) -> bool:
 
 
 def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
-    """What is asked of a design, in its own words. Raises InputError for options of another coupling."""
+    """The options of a design by the names of its arguments. Raises InputError for options of another coupling."""
     known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
     given = {name: value for name in known if options.given(value := getattr(args, name, None))}
     if kind_of(kind).limited and args.limiter is not None:
@@ -143,7 +143,7 @@ def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 
 def _design(args: argparse.Namespace, loop: Loop) -> Design:
-    """Raises InputError for a request that contradicts itself, DesignFailed where there is no such coupling."""
+    """Design and prove. Raises InputError for options that contradict each other, DesignFailed without a coupling."""
     asked = asked_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
         asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
@@ -186,6 +186,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         price=coverage.price(loop, design, args.coupling, asked_of(args, args.coupling)) if judged.whole else None,
         judged=judged,
         switching=switching,
+        delays=stored.switching.guarantee if stored.switching and stored.switching.proof else None,
         transparency=transparency(loop.F(design.coupling), loop.E(), loop.lam, band),
         nearby=nearby,
         best=best and _Best(limit, best.g, best.ladder),
@@ -244,7 +245,6 @@ def _switching_words(proof: coverage.Switching) -> str:
 
 def _stored_rows(stored: Filed) -> render.Rows:
     delays = stored.switching
-    yield "guarantee, delays", delays.guarantee if delays and delays.proof else None
     yield "stored", f"{stored.file} (proof: {stored.proof or stored.reason})"
     yield "", f"for constant delays only: {delays.reason}" if delays and not delays.proof else None
 
@@ -261,6 +261,7 @@ class _Report:
     price: list[coverage.OverRanges] | None
     judged: Judged = render.several(_judged_rows, "beside")
     switching: coverage.Switching | None = render.figure("damping, any switching", _switching_words)
+    delays: str | None = render.figure("guarantee, delays", json="table")
     objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
     transparency: Transparency = render.figure("transparency error", render.transparency_error)
     nearby: Nearby = render.several(render.robustness_rows, "beside")
