@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 from cli import render
+from design.result import Chosen
 from sim import judged
-from sim.couplings import Chosen
 from sim.judged import Judged
 from sim.scenario import Scenario
 

@@ -116,15 +116,16 @@ class _Sensitivity:
 def stiffest(loop: Loop, coupling: Coupling, condition: ConditionName) -> _Stiffest:
     """any-environment: channel by channel; this-environment: the largest common scale of all K."""
     unknown = (None,) * loop.channels
-    if not isinstance(coupling, SpringDamper):
+    gains = coupling.figures(loop.T)
+    if "K" not in gains:
         return _Stiffest(unknown, "only a spring-damper has a K")
     if condition == "any-environment":
-        return _stiffest_for_any_environment(loop, coupling)
-    K, B = coupling.K, coupling.B
+        return _stiffest_for_any_environment(loop, gains["B"])
+    K = np.array(gains["K"])
 
     @cache
     def ratio(scale: float) -> float:
-        return requirement(loop, SpringDamper(scale * K, B), condition).ratio
+        return requirement(loop, coupling.scaled(stiffness=scale), condition).ratio
 
     scale = _STIFFEST / K.max()
     if ratio(scale) < 1:
@@ -137,14 +138,14 @@ def stiffest(loop: Loop, coupling: Coupling, condition: ConditionName) -> _Stiff
     return _Stiffest(unknown, "no scale of K is certified beside this B")
 
 
-def _stiffest_for_any_environment(loop: Loop, coupling: SpringDamper) -> _Stiffest:
+def _stiffest_for_any_environment(loop: Loop, dampers: Sequence[float]) -> _Stiffest:
     """Between 0 and 2 (delta - B)/T, the bound where z^-n = -1; the set of gains is convex and contains K -> 0."""
     if any(loop.psi):
         return _Stiffest((None,) * loop.channels, "with psi >= 1 each K needs a multiplier of its own: not searched")
     if loop.latency:
         return _Stiffest((None,) * loop.channels, LATE)
     stiffest, reasons = [], []
-    for B, theta, delta in zip(coupling.B.tolist(), loop.theta, loop.delta, strict=True):
+    for B, theta, delta in zip(dampers, loop.theta, loop.delta, strict=True):
         if delta <= B:
             stiffest.append(None)
             reasons.append(f"B = {B:g} N s/m alone uses up delta = {delta:g} N s/m")
@@ -166,10 +167,12 @@ def sensitivity(loop: Loop, coupling: Coupling, needs: Requirement) -> _Sensitiv
         return _Sensitivity(reason=_NOT_CERTIFIED)
     if needs.condition == "any-environment" and any(loop.psi):
         return _of_delta(needs, "with psi >= 1 every T and delay needs a multiplier of its own: not searched")
-    largest = _largest_period(loop, coupling, needs.condition)
+    fixed = loop.environment.one_period
+    largest = None if fixed else _largest_period(loop, coupling, needs.condition)
     extra = _extra_samples(loop, coupling, needs.condition)
+    tried = "environment.block is of one T" if fixed else f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s"
     reasons = [
-        f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s" if largest is None else "",
+        tried if largest is None else "",
         f"certified with {MOST_EXTRA_SAMPLES} samples more, the most that were tried" if extra is None else "",
     ]
     error = None if largest is None else largest / loop.T - 1
@@ -245,11 +248,11 @@ def remedies(loop: Loop, coupling: Coupling, needs: Requirement) -> list[_Remedy
     if needs.certified or (condition == "any-environment" and any(loop.psi)):
         return []
     found = [_fewer_samples(loop, coupling, condition, name) for name in ("theta", "psi")]
-    if isinstance(coupling, SpringDamper) and coupling.B.any():
+    if any(B := coupling.figures(loop.T).get("B", ())):
         found.append(
             _smaller(
-                lambda x: requirement(loop, SpringDamper(coupling.K, x * coupling.B), condition),
-                lambda x: f"smaller B: {listed((x * coupling.B).tolist(), 5)} N s/m",
+                lambda x: requirement(loop, coupling.scaled(damping=x), condition),
+                lambda x: f"smaller B: {listed([x * b for b in B], 5)} N s/m",
             )
         )
     found.append(

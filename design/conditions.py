@@ -6,11 +6,11 @@ G/(z - 1) into G(1)/(z - 1), whose Hermitian part on the circle is -G(1)/2, and 
 same expression is evaluated in floating point (a sweep: the required damping), over Fractions (an exact proof), over
 stacks and over sampled responses (maps and designs). docs/theory.md derives them.
 
-this-environment   He[F/(z-1)] > -Delta_D/T,  F stable,  F(1) symmetric positive semidefinite
-any-environment    Lemma 4 of the paper for Psi = I and any passive environment under backward Euler:
-                   He[(z-1) V/(Tz)] >= diag((1 - cos n_i w) / (2 delta_i)),   n_i = theta_i + 1
-latency            this-environment for forces that latch a fraction of a sample after the tick, anew at every tick
+this-environment   `this_environment_demand`; of forces that latch a fraction of a sample late `latency_demand`
+any-environment    Lemma 4 of the paper for any passive environment under backward Euler: `v_hat`,
+                   `any_environment_demand`, and where the environment holds delay `delayed_coupling_demand`
 
+design/environments.py and lmi.py have the two as a `Condition` of a loop and a coupling: which form applies.
 design/multipliers.py has those of this-environment that weigh an error with a multiplier: walls that make and break
 contact, delays that switch, forces that leave through the limiter of controller.limiter.
 

@@ -15,7 +15,7 @@ from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
 from design.conditions import this_environment
 from design.coupling_file import LimiterCertificate
-from design.designs import design_by_kind
+from design.designs import KINDS, design_by_kind
 from design.environments import SEARCH, Searched, worst
 from design.files import unseen
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
@@ -46,7 +46,8 @@ class Limits:
         amounts = [f"{f:.4g}" for f in self.force_limit]
         limit = f"{', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N"
         if self.rho is None:
-            return f"clipped at {limit}: a guarantee holds while forces stay below ({self.reason})"
+            why = self.reason.removeprefix("limiter: ")
+            return f"clipped at {limit}: a guarantee holds while forces stay below ({why})"
         if not self.proved:
             return f"certified, also while forces are limited to {limit} ({self.reason})"
         return f"proved, also while forces are limited to {limit}"
@@ -182,9 +183,9 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, asked: Mapping[str, Any]) -> list[OverRanges]:
-    """A design over the ranges; an optimal one beside the one for the nominal environment alone, `asked` the same."""
+    """A design over the ranges; one made for all of them beside that for the nominal environment, `asked` the same."""
     couplings = {kind: design.coupling}
-    if kind == "optimal":
+    if KINDS[kind].model:
         couplings = {"whole ranges": design.coupling}
         try:
             alone = design_by_kind(loop.at(loop.environment), kind, None, **asked)
@@ -284,7 +285,7 @@ class RangesFigures:
         ratio = max(d / a for d, a in zip(self.required_damping, self.available_damping, strict=True))
         most = f"{ratio:.4f} of the damping" if math.isfinite(ratio) else _NEVER
         exact, found, count, every = self.proof == "rational", self.inside, self.vertices, self.all_vertices
-        proof = "[green]proved exactly[/] at all" if exact else f"[red]not proved[/]: {self.reason}"
+        proof = "[green]all proved exactly[/]" if exact else f"[red]not proved[/]: {self.reason}"
         of = f", of all {every}: any three parameters have all their ends among them" if every > count + 1 else ""
         yield "ranges, vertices", f"{self.vertices_certified} of {count} certified, {proof}{of}"
         yield "ranges, worst vertex", f"{most}, at {self.worst}"

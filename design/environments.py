@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.coupling import Coupling, ForceFilter
+from controller.coupling import Coupling
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Block, Lti, Sampled, SingularLoop, TooLong, constant_like, numbers, vstack
@@ -414,13 +414,12 @@ def search_ranges(
 def ratio_in(loop: Loop, coupling: Coupling) -> float:
     """The damping that this-environment requires over the available damping, by a refined sweep of a stable coupling.
 
-    Of a force filter the responses of environment and filter are multiplied: the poles of their series are defective
-    and cost digits, and time.
+    Of one in series, a force filter, the responses of environment and filter are multiplied: the poles of their series
+    are defective and cost digits, and time.
     """
-    if not isinstance(coupling, ForceFilter):
+    if (chain := coupling.in_series(loop.T)) is None:
         return _required(loop, coupling, Member("", loop.environment)).ratio
-    E, one = loop.E(), np.append(np.zeros(len(coupling.R) - 1), 1.0)[:, None, None]
-    chain = ForceFilter(coupling.poles, coupling.pairs, one).filter(loop.T)  # a block with all of its poles
+    E = loop.E()
     late, delayed = delay(loop.theta, loop.T), delay(loop.psi, loop.T) @ E
 
     def needed(w: Array) -> Array:

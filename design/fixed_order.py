@@ -481,7 +481,7 @@ class _Search:
         self.gains = start or self._structured()
 
     def requirement(self, V: Lti) -> Requirement:
-        return spring_damper.any_environment_with(self.loop, V, self.phi)
+        return lmi.ANY_ENVIRONMENT.required(self.loop, Compliance(V), self.phi)
 
     def run(self, method: str, most_sdps: int) -> Lti:
         """The coupling found, certified."""

@@ -16,7 +16,7 @@ from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.loop import Loop, force_map
 from controller.lti import Array, Sampled
-from design.conditions import even_damping, this_environment
+from design.conditions import even_damping, this_environment, this_environment_demand
 from design.frequency import frequencies, hermitian, on_circle
 from design.lmi import RESERVE, Complex
 from design.multipliers import (
@@ -69,7 +69,8 @@ class SampledLoop:
         low, high = (per_hz * f for f in band_hz)
         self.band = frequencies(self.E, low=low, high=min(high, np.pi), points=80)
         self.conditions = frequencies(self.E, low=1e-3, points=80)
-        self.loop_in_band, self.loop_at_conditions = self._responses(self.band), self._responses(self.conditions)
+        self.loop_in_band = self._responses(self.band)
+        self.loop_at_conditions, self.of_one = self._responses(self.conditions), self._of_one()
         E = self.E.at(on_circle(self.band))
         self.size2 = (np.abs(E) ** 2).sum(axis=(1, 2))
         self.target = delay(loop.lam, loop.T).at(on_circle(self.band)) @ E
@@ -92,11 +93,18 @@ class SampledLoop:
     def add(self, w: float) -> None:
         """Impose the condition at the frequency w [rad/sample] too."""
         self.conditions = np.append(self.conditions, w)
-        self.loop_at_conditions = self._responses(self.conditions)
+        self.loop_at_conditions, self.of_one = self._responses(self.conditions), self._of_one()
 
     def multiplier(self, x: Array) -> Lags | None:
         """The limiter's multiplier c in x, where the condition has one."""
         return None
+
+    def _of_one(self) -> Complex:
+        """The block of this-environment without its damping where F is 1, (k,): it is proportional to F."""
+        F = Sampled(
+            on_circle(self.conditions)[None], np.ones((1, self.conditions.size, 1, 1), dtype=np.complex128), self.loop.T
+        )
+        return this_environment_demand(F, [1.0]).free.G[0, :, 0, 0]
 
     def _responses(self, w: Array) -> _Responses:
         """(z-1)/(Tz), Psi E and Theta at exp(jw)."""
@@ -157,7 +165,7 @@ class SampledLoop:
         by, _, S, right = self._solved(x, self.loop_at_conditions)
         v = self._least(x)[1][:, :, None]
         into = (v.conj().swapaxes(1, 2) @ theta @ E @ S)[:, 0]
-        turned = into * (right @ v)[:, :, 0] / (on_circle(self.conditions) - 1)[:, None]
+        turned = into * (right @ v)[:, :, 0] * self.of_one[:, None]
         slope = np.concatenate([*(turned * by).real], axis=1)
         if not any(self.loop.psi):
             return slope
@@ -180,7 +188,7 @@ class SampledLoop:
 
     def _block(self, x: Array) -> Complex:
         """What must be positive definite with the damping, at each sampled frequency, Hermitian."""
-        return hermitian(self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None])
+        return hermitian(self.force(x, self.loop_at_conditions) * self.of_one[:, None, None])
 
     def stability(self, x: Array) -> float:
         """By how much more than CLOSEST_POLE the poles keep away from the circle."""
@@ -300,7 +308,7 @@ class LimiterLoop(SampledLoop):
         (by, _, S, right), z = self._solved(self._gains(x), self._now()), on_circle(self.conditions)[:, None]
         first, second = np.split(v, 2, axis=1)
         N = -np.stack([polynomials(n, self.conditions)[0] for n in loop.theta], axis=1) - self._weights(x).T
-        late = np.diagonal(theta, axis1=1, axis2=2) / (z - 1)
+        late = np.diagonal(theta, axis1=1, axis2=2) * self.of_one[:, None]
         into = np.einsum("ki,kij->kj", first.conj() * late + second.conj() * N, E @ S)
         turned = into * np.einsum("kij,kj->ki", right, first)
         steps = np.einsum("kij,kj->ki", self.force(x, self._now()), first) - (1 - 1 / z) * np.array(self.rho) * second

@@ -47,7 +47,7 @@ def switching_block(
     alpha: Any,
     T_max: float | None = None,
 ) -> tuple[Block, Array]:
-    """[[F/(z-1) + Delta_D/T - diag(alpha)/2, 0], [2 h G, 2 diag(alpha)]], which must be positive real; and F(1).
+    """[[this-environment - diag(alpha)/2, 0], [2 h G, 2 diag(alpha)]], which must be positive real; and F(1).
 
     F = Theta_nom G with Theta_nom = (z^-lo + z^-hi)/2 and 2 h = hi - lo; G are the forces as they leave,
     alpha (m,) [N/m] is a multiplier, positive where the delay varies. Channels whose delay does not vary have no row
@@ -65,8 +65,9 @@ def switching_block(
     )
     both: Any = as_like(G, vstack(half, spread)) @ G
     m = len(lo)
-    F1, R = both.rows(slice(None, m)).split_at_one()
-    upper = R - F1 / 2 + np.diag(conditions.even_damping(delta, T, T_max) / T - a / 2)
+    linear = conditions.this_environment_demand(both.rows(slice(None, m)), delta, T_max)
+    F1 = linear.static["F(1)"]
+    upper = linear.free + np.diag(conditions.even_damping(delta, T, T_max) / T - a / 2)
     if not varying:
         return upper, F1
     lower = np.zeros((m + len(varying), len(varying)), dtype=object)
@@ -182,8 +183,8 @@ _Found = tuple[Array, float, float, float]  # a, s(a), where it binds [rad/sampl
 class _Search:
     """s(a) = sup over w of the largest eigenvalue of N + diag(a)/2 + Y* diag(1/2a) Y, over the channels that vary.
 
-    A Schur complement of `switching_block`, scaled by W = diag(sqrt(T/delta)): N = -W He[F/(z-1)] W,
-    F = Theta_nom G, Y = h W G W.
+    A Schur complement of `switching_block`, scaled by W = diag(sqrt(T/delta)): N = -W He[free] W with
+    this-environment's block of F = Theta_nom G, Y = h W G W.
     """
 
     def __init__(self, G: Lti, lo: Sequence[int], hi: Sequence[int], delta: Array) -> None:
@@ -362,7 +363,7 @@ class _LimiterSearch:
     def requirement(self, ratio: float, w: float) -> Requirement:
         T = self._loop[0].T
         if np.isinf(ratio):
-            reason = f"no proof found with the limiter, for {w / (2 * np.pi * T):.4g} Hz"
+            reason = "no limiter is proved for this coupling"
             return refusal("limiter", self._delta, reason)
         return from_ratio("limiter", max(ratio, 0.0), self._delta, w / (2 * np.pi * T))
 

@@ -451,8 +451,10 @@ class Nearby:
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, options: program.Options = program.DEFAULT) -> Nearby:
-        """Without the design before walls, with ranges, and for a coupling that is no optimal one."""
-        known = robustness_nearby(loop, coupling)
-        if known is None or loop.ranges or not isinstance(coupling, ForceFilter | NoCoupling):
+        """Without the design before walls, with ranges, for an environment that is no network of springs, and for a
+        coupling that is no optimal one.
+        """
+        known, there = robustness_nearby(loop, coupling), loop.environment
+        if known is None or loop.ranges or there.one_period or not isinstance(coupling, ForceFilter | NoCoupling):
             return cls(known)
         return cls(known, spread(loop, coupling, options))

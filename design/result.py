@@ -10,6 +10,7 @@ from typing import Any, Generic, Literal, TypeVar
 import numpy as np
 
 from controller.coupling import Coupling
+from controller.loop import DelayRange
 from controller.lti import Array
 
 ConditionName = Literal["this-environment", "any-environment"]
@@ -128,17 +129,27 @@ def listed(values: Iterable[float | None], digits: int = 6) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Design:
-    """A coupling, what it was designed for and what was verified from the coupling alone."""
+class Chosen:
+    """A coupling, the condition that it was made for or is judged by, and how it came about."""
 
     coupling: Coupling
-    condition: ConditionName
+    condition: str
+    kind: str = field(kw_only=True, default="given")
+    phi: Array | None = field(kw_only=True, default=None)  # (m,) multiplier Phi_E [N s/m] of Theorem 4, if it needs one
+    certificate: Any = field(kw_only=True, default=None)  # the file's Certificate, where it was proved in this process
+    limiter: Any = field(kw_only=True, default=None)  # LimiterCertificate: what it comes with for limited forces
+    switching: DelayRange | None = field(kw_only=True, default=None)  # its file proves any switching within it
+    notes: tuple[str, ...] = field(kw_only=True, default=())  # what a reader should know of its origin
+
+
+@dataclass(frozen=True, eq=False)
+class Design(Chosen):
+    """A coupling, what it was designed for and what was verified from the coupling alone."""
+
     figure: str  # what was minimised: "loop-norm" (23), "rms" (mismatch), "stiffness" (maximised)
     objective: float  # its value, of the coupling as returned
     requirement: Requirement  # by `condition`, on a refined sweep
     sdps: int = 0  # convex problems solved (local searches count their runs)
     wall_s: float = 0.0
-    phi: Array | None = None  # (N,) multiplier Phi_E [N s/m] of Theorem 4, None where the environment has none
-    certificate: Any = field(kw_only=True, default=None)  # the file's Certificate, where the design has proved it
     c: Sequence[Sequence[float]] | None = field(kw_only=True, default=None)  # of the limiter, where its search is long
     hurried: bool = field(kw_only=True, default=False)  # its clock ended it: more time may find a better

@@ -64,8 +64,8 @@ def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> Robustn
 
 
 def robustness_nearby(loop: Loop, coupling: Coupling) -> Robustness | None:
-    """The worst need within ten percent; None with walls, and for an environment that is no network."""
-    if loop.environment.walls or not isinstance(loop.environment, Network):
+    """The worst need within ten percent; None with walls, and for what is not all springs and masses."""
+    if loop.environment.walls or not isinstance(loop.environment, Network) or loop.environment.block:
         return None
     return robustness(loop, coupling)
 

@@ -169,7 +169,7 @@ def check_range(counts: Sequence[int], units: Units) -> None:
 class Gain:
     """The factor in front of every force. It moves linearly in time, never jumps, and starts at 0.
 
-    Any constant gain within [0, 1] keeps a certificate: He[g F/(z-1)] > -Delta_D/T holds for g F if it does for F.
+    Any constant gain within [0, 1] keeps a certificate: this-environment holds for g F if it does for F.
     """
 
     limits: SafetyLimits

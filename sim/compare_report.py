@@ -13,10 +13,9 @@ from controller.older import with_older
 from design import compare
 from design.files import unseen
 from design.program import Options
-from design.result import CONDITIONS, Requirement
+from design.result import CONDITIONS, Chosen, Requirement
 from design.robustness import Robustness, robustness_nearby
 from design.transparency import Transparency, transparency
-from sim.couplings import Chosen
 from sim.report import CouplingFigures
 from sim.scenario import Scenario
 

@@ -12,8 +12,8 @@ from design.certificate import RangesCheck, assess, check_ranges
 from design.coverage import Limits, RangesFigures
 from design.files import unseen
 from design.guarantees import guarantee_of
-from design.result import Requirement
-from sim.couplings import Chosen, limits_of
+from design.result import Chosen, Requirement
+from sim.couplings import limits_of
 from sim.report import CouplingFigures
 from sim.scenario import Scenario
 
@@ -39,7 +39,7 @@ class Judged:
         whole: RangesCheck | None,
         limits: Limits,
     ) -> Judged:
-        """What is to be said of a coupling of this kind in a loop."""
+        """The verdicts on a coupling of this kind in a loop."""
         return cls(
             whole,
             CouplingFigures.of(kind, coupling, loop.T),
@@ -51,12 +51,12 @@ class Judged:
 
     @property
     def requirements(self) -> dict[str, Requirement]:
-        """By the conditions' names of today."""
+        """The certificates under today's names alone."""
         return {name: need for name, need in self.certificates.items() if name not in CONDITIONS}
 
     @property
     def proved(self) -> bool:
-        """For the whole ranges."""
+        """Whether the guarantee is proved for the ranges."""
         return bool(self.whole and self.whole.proved)
 
 
@@ -71,6 +71,6 @@ def judge(
 ) -> Judged:
     """The coupling in the scenario's loop; conditions are asked of `met`, one environment of its ranges."""
     whole = check_ranges(scenario.loop(case), chosen.coupling, seed, progress=progress)
-    requirements = assess(met.loop(case), chosen.coupling, chosen.phi, chosen.known)
+    requirements = assess(met.loop(case), chosen.coupling, chosen.phi, chosen.certificate)
     limits = limits_of(met, chosen, requirements, limiter)
     return Judged.of(chosen.kind, chosen.coupling, met.loop(case), requirements, whole, limits)

@@ -1,4 +1,4 @@
-"""What a run came to: the figures of its report, and what a reader must know to read them rightly."""
+"""The report of a run: its figures, and remarks that explain them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from controller.lti import Array
 from design.files import unseen
 from design.guarantees import ANY, CAVEATS, MAKING, EncoderSteps
 from design.optimal import Nearby
-from design.result import Requirement, listed
+from design.result import Chosen, Requirement, listed
 from design.transparency import Transparency, transparency
 from sim import accuracy
 from sim.alternatives import Alternative
 from sim.api import ScenarioRun
-from sim.couplings import Chosen
 from sim.judged import Judged
 from sim.passivity_layer import idle
 from sim.report import (
@@ -85,7 +84,7 @@ class RunReport:
         return bool(self.varying_delay and self.varying_delay.met)
 
     def notes(self) -> list[str]:
-        """What a reader must know to read the figures rightly."""
+        """Remarks that explain the figures."""
         lines, guarantee = [], self.judged.guarantee
         certificates = self.judged.requirements
         name = "any-environment" if self.certificate.condition == "any-environment" else "this-environment"

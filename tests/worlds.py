@@ -37,6 +37,11 @@ DIAGONAL = (
 VERTICES_ONLY = InternalModel(POLES, np.array([np.diag(pair) for pair in DIAGONAL]))
 
 
+def loop_of(network, theta, psi, period: float = T) -> Loop:
+    """A loop whose tick is looked at: no damping and no reference matter to it."""
+    return Loop(period, tuple(theta), tuple(psi), (0,) * len(theta), (1.0,) * len(theta), network)
+
+
 def environment_by_hand(network: Network, z: np.ndarray, period: float = T) -> np.ndarray:
     """(M s^2 + D s + K)^-1 as the contacts feel it, the inner node eliminated: shape (k, 2, 2) at k points z."""
     M, D, K = network.matrices()

@@ -18,10 +18,12 @@ from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
 from sim import mujoco_engines
 from sim.accuracy import compare_engines, cross_check, pick
+from sim.api import run_scenario
 from sim.engines import Engine, ExactEngine
 from sim.mujoco_engines import EXPONENTIAL, INTEGRATORS, MujocoBatchEngine, MujocoEngine, default_integrator
+from sim.passivity_layer import EnergyNet
 from sim.run import assemble, make_engine, run
-from sim.scenario import InputError, load
+from sim.scenario import InputError, VaryingDelay, load
 from sim.stability import exact_growth
 from sim.step_choice import check_substeps, default_substeps, measured_hold, pace, simulated_growth
 
@@ -315,6 +317,18 @@ def test_a_wrong_verdict_is_shown_and_never_chosen():
     assert not choices["Euler x 1"].verdict_correct
     assert choices["RK4 x 1"].verdict_correct
     assert pick(list(choices.values()), 1.0).verdict_correct
+
+
+def test_speed_against_error_is_of_the_run_with_its_budget_and_its_delays():
+    scenario, found = SCENARIO.replace(duration=0.5, varying_delay=VaryingDelay((1, 1), (3, 2))), []
+    for net in (None, EnergyNet(0.0)):
+        done = run_scenario(scenario, NoCoupling(), error=1e-9, net=net)
+        assert (done.integrator, done.substeps) == (EXPONENTIAL, 1)
+        truth, own = (run(done.ran, make_engine(done.ran, *how)).x for how in (("exact",), ("mujoco", "RK4", 2)))
+        apart = np.sqrt(np.mean((own - truth) ** 2) / np.mean(truth**2))
+        found += [c.position_relative_rms for c in done.choices if c.name == "RK4 x 2"]
+        assert found[-1] == pytest.approx(apart)
+    assert found[0] != found[1]  # the budget acts
 
 
 def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
