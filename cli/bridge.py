@@ -138,7 +138,7 @@ def _link(link: int, scenario: Scenario) -> str:
 
 
 def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
-    """How long ticks are, and what one longer than the certificate counts with may cost."""
+    """How long ticks are, and how much energy a tick longer than the certified one may give."""
     least, most = (f"{1e-3 * side(ages.ticks, default=1e6 * scenario.T):.4g}" for side in (min, max))
     span = least if least == most else f"{least} to {most}"
     longest = 1e3 * (scenario.T_max or scenario.T)

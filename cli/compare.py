@@ -188,7 +188,7 @@ def _needs(part: ConditionCurve, scale: float) -> str:
 
 
 def _robust(part: Robustness | None, scale: float = 1.0) -> str:
-    """The need at the worst stiffness or mass within ten percent."""
+    """The damping that is needed at the worst stiffness or mass within ten percent."""
     if part is None:
         return "-"
     return f"{scale * part.required_over_available:.4g}"
@@ -208,7 +208,7 @@ def _feel(report: Comparison) -> Table:
 
 
 def _list(values: Iterable[float]) -> str:
-    """'1, 2', or '1' where all are equal."""
+    """The values with commas between them; a single one where all are equal."""
     shown = [format(v, ".0f" if abs(v) >= 1000 else ".3g") for v in values]
     return shown[0] if len(set(shown)) == 1 else ", ".join(shown)
 
@@ -361,7 +361,7 @@ def _error(limit: Limit | None, objective: str) -> str:
 
 
 def _proofs(limits: dict[str, Limit | None]) -> str:
-    """Rational where every design of a row is proved exactly, else which are only sampled."""
+    """'rational' where every design of a row is proved exactly, else the names of those that are only sampled."""
     found = {name: limit.proof for name, limit in limits.items() if limit and limit.proof}
     sampled = [name for name, proof in found.items() if proof != "rational"]
     if not found:

@@ -1,4 +1,4 @@
-"""What the commands at a port share: their options, the keyboard, and the session from HELLO to the end."""
+"""What hw.bridge and hw.identify share: options, the keyboard, and the session from HELLO to its end."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from sim.scenario import InputError, Scenario, require_constant_delay, require_e
 
 _USUAL_BAUD = 921_600
 _SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself
-_SHOWN_US = 100_000  # of a rehearsal, between two looks
+_SHOWN_US = 100_000  # of a rehearsal, between two moves of its progress bar
 _PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
 
 
@@ -66,7 +66,7 @@ def add_pace_option(parser: argparse._ActionsContainer, what: str) -> None:
 
 
 def add_safety_options(parser: options.Parser) -> None:
-    """What the bridge never does, and who has to be there."""
+    """Limits of force and speed, and the switch that somebody has to hold."""
     add, number = parser.add_argument_group("safety").add_argument, options.number
     cap = "largest force (default 2, for first sessions)"
     add("--force-cap", type=number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
@@ -107,16 +107,19 @@ def touched(path: str) -> Callable[[], bool]:
     """Whether a file was touched since the last call; False where there is no such file."""
     last = [_mtime(path)]
 
-    def look() -> bool:
+    def touched_again() -> bool:
         now, before = _mtime(path), last[0]
         last[0] = now
         return now is not None and now != before
 
-    return look
+    return touched_again
 
 
 def _deadman(named: str | None) -> Callable[[], bool] | None:
-    """Whether somebody is there, beside the keys of the keyboard; None: nobody has to be, or the device knows."""
+    """A function that says whether somebody touched the file of --deadman; keys are read elsewhere.
+
+    None where no one has to be present, or where the device has a switch of its own.
+    """
     if named in (None, "device"):
         return None
     return touched(named) if named != "key" else lambda: False
@@ -139,9 +142,9 @@ def check_link(args: argparse.Namespace) -> LinkSettings:
 
 
 def _baud(args: argparse.Namespace) -> int | None:
-    """Of the UART in the line, None where there is none.
+    """The speed of the UART in the line, or None without a UART.
 
-    A pseudo-terminal has none. Of /dev/ttyACM0 nobody can tell: native USB, or a chip with a UART behind it.
+    A pseudo-terminal has none. /dev/ttyACM0 may be native USB, or a USB chip with a UART behind it: a UART is assumed.
     """
     if args.baud is None:
         pseudo = not args.port or host_clocked(args) or os.path.realpath(args.port).startswith("/dev/pts/")
@@ -154,13 +157,13 @@ def _baud_or_none(text: str) -> int:
 
 
 def host_clocked(args: argparse.Namespace) -> bool:
-    """Whether the device has no clock, so that the host is it."""
+    """Whether the host gives the clock, because the device has none."""
     return (args.port or "").split(":")[0] == FORCE_DIMENSION
 
 
 @dataclass(frozen=True)
 class _Held:
-    """What happens beside the session: signals, and bytes that the port did not take at once."""
+    """Signals that came during the session, and how many bytes the port did not take at once."""
 
     signals: Sequence[int] = ()
     dropped: int = 0

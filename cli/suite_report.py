@@ -1,4 +1,4 @@
-"""The report of the suite for a stranger: how each answer reads; verdicts first, then figures with their commands."""
+"""The report of the suite: verdicts first, then the figures of each check with the command that repeats it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sim.stability import unstable
 
 @dataclass(frozen=True)
 class _Part:
-    """A table of a check; `answer` is its gist, shown in the table of verdicts."""
+    """A table of a check; `answer` sums it up for the table of verdicts."""
 
     answer: str
     columns: tuple[str, ...] = ()
@@ -69,7 +69,7 @@ class Suite:
 
 
 def machine() -> dict[str, str]:
-    """What figures of speed, and the last digits of all others, depend on."""
+    """The versions and the machine, on which speeds and the last digits of other figures depend."""
     packages = {name: version(name) for name in ("mujoco", "numpy", "scipy", "clarabel")}
     return {
         "Python": platform.python_version(),
@@ -110,7 +110,7 @@ def gain_map(report: dict[str, Any]) -> list[_Part]:
 
 
 def _table(gist: str, columns: dict[str, str | Callable[[_Row], str]]) -> Figures:
-    """A row for each row: its cells as formats of its figures."""
+    """A table of rows, each cell a format, or a function, of the row's figures."""
 
     def figures(report: dict[str, Any]) -> list[_Part]:
         rows, cells = report["rows"], columns.values()
@@ -126,7 +126,7 @@ def _optional(name: str, form: str) -> Callable[[_Row], str]:
 
 
 def _failing(row: _Row) -> str:
-    """The setting that fails, how and by how much."""
+    """The coarsest setting that fails, what is wrong with it, and by how much."""
     if not row["fails"]:
         return "none tried"
     off = "" if row["off"] is None else f" {row['off']:+.1e}"
@@ -184,7 +184,7 @@ def uneven(report: dict[str, Any]) -> list[_Part]:
 
 
 def tightness(report: dict[str, Any]) -> list[_Part]:
-    """Of loops that lack damping: the adversary's success by shortage."""
+    """How often the adversary succeeds, by the share of the damping that is missing."""
     found = {short: [row["found"] for row in rows] for short, rows in sorted(_by(report["rows"], "short").items())}
     rows = tuple((f"{short:.1%}", str(len(f)), f"{sum(f) / len(f):.0%}") for short, f in found.items())
     first = next((short for short, f in found.items() if all(f)), None)
@@ -196,7 +196,7 @@ def tightness(report: dict[str, Any]) -> list[_Part]:
 
 
 def _by(rows: Sequence[_Row], *names: str) -> dict[Any, list[_Row]]:
-    """The rows in groups of those that are alike in these figures."""
+    """The rows, grouped by these figures."""
     groups: dict[Any, list[_Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[name] for name in names) if names[1:] else row[names[0]], []).append(row)
@@ -221,7 +221,7 @@ _each_loop = _table(
 
 
 def edges(report: dict[str, Any]) -> list[_Part]:
-    """Of guarantees at their edge: a row for each and each share of what it asks."""
+    """Guarantees at their limit: one row for each guarantee and each multiple of the damping that it asks."""
     rows, taken = [], []
     for (name, factor), some in _by(report["rows"], "guarantee", "factor").items():
         motions, took, grew = (sum(row[of] for row in some) for of in ("motions", "took", "grew"))
@@ -235,7 +235,7 @@ def edges(report: dict[str, Any]) -> list[_Part]:
 
 
 def proved(report: dict[str, Any]) -> list[_Part]:
-    """Of proofs of random networks: by what the sweep says."""
+    """How many random networks are proved, by what the sweep says of them."""
     rows, good = [], sum(row["holds"] for row in report["rows"])
     for says, enough in (("there is enough damping", True), ("there is too little", False)):
         some = [row for row in report["rows"] if (row["required"] is not None and row["required"] < 1) == enough]
@@ -244,8 +244,8 @@ def proved(report: dict[str, Any]) -> list[_Part]:
     return [_Part(gist, ("the sweep says that", "networks", "proved"), tuple(rows))]
 
 
-def told(report: dict[str, Any]) -> list[_Part]:
-    """Of traces of random scenarios: by what their eigenvalues say."""
+def traced(report: dict[str, Any]) -> list[_Part]:
+    """What the traces of random scenarios show, by what their eigenvalues say."""
     rows, good = [], sum(row["holds"] for row in report["rows"])
     for says, grows in (("stable", False), ("unstable", True)):
         some = [row for row in report["rows"] if bool(unstable(row["exact_per_s"])) == grows]
@@ -254,7 +254,7 @@ def told(report: dict[str, Any]) -> list[_Part]:
         quiet = sum(row["not_excited"] for row in some)
         rows.append((says, *map(str, (len(some), same, len(read) - same, quiet, len(some) - len(read) - quiet))))
     answers = ("the trace agrees", "says the opposite", "not excited", "no rate, for another reason")
-    gist = f"{good} of {len(report['rows'])} traces tell no other than the eigenvalues"
+    gist = f"{good} of {len(report['rows'])} traces agree with the eigenvalues"
     return [_Part(gist, ("by the eigenvalues", "runs", *answers), tuple(rows))]
 
 

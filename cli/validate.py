@@ -36,7 +36,7 @@ _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
 
 def main(argv: list[str]) -> int:
-    """Meet random humans. 0: the claims hold, 1: not, 3: workers were lost, 130: interrupted."""
+    """Test random humans. 0: what is claimed holds, 1: it does not, 3: workers were lost, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
     with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
@@ -54,7 +54,7 @@ def main(argv: list[str]) -> int:
         *([f"Delays that vary: {report.switching.met.certified.covers}."] if report.switching else []),
         *report.remarks,
     ]
-    render.publish(args, report, [render.facts(title, render.rows_of(report), ("", ""))], lines, out, files)
+    render.publish(args, report, [render.facts(title, render.rows_of(report))], lines, out, files)
     if report.unfinished and not report.interrupted:
         return options.UNFINISHED
     return options.exit_code(bool(report.holds), report.interrupted)
@@ -103,9 +103,9 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environments(args: argparse.Namespace, whole: RangesCheck | None) -> tuple[Member, ...]:
-    """Vertices and as many others of the ranges, the worst that was found first; none where all meet the nominal one.
+    """The vertices of the ranges, and as many other points of them, the worst one found first. Raises InputError.
 
-    Raises InputError.
+    Without --environments ranges there are none: every loop has the nominal environment.
     """
     if args.environments == "nominal":
         return ()
@@ -116,7 +116,7 @@ def _environments(args: argparse.Namespace, whole: RangesCheck | None) -> tuple[
 
 
 def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, judged: Judged) -> Validation:
-    """What is asked of whom. Raises InputError."""
+    """The loop, the humans that are to hold it, and the engines that decide. Raises InputError."""
     links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
     work, met = (args.humans, links, args.engine, args.duration), _environments(args, judged.whole)
     return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=judged.limiter.rho)
@@ -135,7 +135,7 @@ def _findings(args: argparse.Namespace, question: Validation, table: Table) -> t
 
 @dataclass(frozen=True)
 class _Searched:
-    """What the adversary found; None where it was not asked, or the keyboard ended its search."""
+    """What the adversary found; None where none was asked for, or where Ctrl-C ended its search."""
 
     worst: Worst | None = None
     drawn: Worst | None = None  # the worst that the scenario's own population draws
@@ -144,7 +144,7 @@ class _Searched:
 
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, judged: Judged) -> _Searched:
-    """The worst humans, in the environment that asks most; what was found before Ctrl-C is kept."""
+    """The worst humans, in the environment that needs the most damping; what was found before Ctrl-C is kept."""
     scenario, ratio = question.scenario, judged.requirements["this-environment"].ratio
     if question.environments and judged.whole:
         member, requirement = judged.whole.worst_found
@@ -210,7 +210,7 @@ class _Own:
 
 @dataclass(frozen=True, kw_only=True)
 class _Report:
-    """What a validation found; parts are null, or left out, where there is none of them."""
+    """What a validation found; a part that does not exist is null or left out."""
 
     case: str
     scenario: str

@@ -128,7 +128,7 @@ def _mark(text: str) -> tuple[float, float]:
 
 
 def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
-    """The coupling that stays as it is over the whole map, or None where the axes are the coupling's own gains."""
+    """The coupling of a map over environments; None where the axes are the gains of the coupling."""
     if args.coupling is None:
         return None
     with render.designing() as heard:
@@ -136,7 +136,7 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
 
 
 def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) -> zwidth.Sweep:
-    """The loop whose couplings, or environments behind the coupling chosen, the map is of. Raises InputError."""
+    """What varies over the map: the couplings of a loop, or the environments behind one coupling. Raises InputError."""
     devices, loop = scenario.device, scenario.loop("I")
     if args.rigid:
         devices, loop = devices[:1], options.rigid_loop(args, scenario)
@@ -227,7 +227,7 @@ def _limit(K: float | str | None) -> str:
 
 
 def _needs(need: Requirement) -> str:
-    """Of the worst channel."""
+    """The damping that the worst channel needs."""
     worst, least = max(need.required), min(need.available)
     return f"needs {worst:.6g} of {least:.6g} N s/m ({render.certified(need, proof=False)})"
 

@@ -202,7 +202,7 @@ class _Fit:
 
     @property
     def price(self) -> float:
-        """Akaike's penalty for the friction terms in use beside the viscous one: of equal fits the simplest wins."""
+        """Akaike's penalty for friction that is not viscous: of laws that fit alike the simplest is taken."""
         return 2.0 * int(np.count_nonzero(self.p[[_DRAG, _DRY, _STATIC]]))
 
 

@@ -98,12 +98,12 @@ class _Player:
 def chirp(
     channels: int, T: float, link: int, amplitude: float, band: tuple[float, float], seconds: float
 ) -> Excitation:
-    """Three sweeps of `seconds` each, then silence for half as long; forces in N, frequencies rise exponentially.
+    """The force [N] that is played to a device: three cosines of exponentially rising frequency, then silence.
 
-    The first goes through `band` [Hz] at `amplitude` [N]. The second and third are slow, with the same width of motion,
-    the third at half the force: two levels tell dry from viscous friction. Sweeps begin with a cosine and end at whole
-    cycles, so that a free mass does not drift away; the third ends a quarter later, so that the device is released
-    while it moves.
+    The first passes through `band` [Hz]; the second and the third are slow, the third at half the force. Each takes
+    `seconds`, the silence half of that. Two slow motions at two levels of force show friction that is not viscous.
+    Each cosine ends at a whole cycle, so that a free mass does not drift away; the last one ends a quarter of a cycle
+    later, so that the device is released with a speed.
     """
     t = np.arange(round(seconds / T)) / round(seconds / T)
 

@@ -385,7 +385,7 @@ def compare_engines(simulation: Simulation, error: float, ticks: int | None = No
 
 
 def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
-    """The cheapest that keeps the error and the verdict. Raises InputError where none does."""
+    """The cheapest setting with an error small enough and the right verdict. Raises InputError without one."""
     kept = [choice for choice in choices if choice.verdict_correct and choice.position_relative_rms <= error]
     if kept:
         return min(kept, key=lambda choice: choice.cpu_s)
@@ -455,7 +455,7 @@ def _positions(
 
 
 def _apart(own: Array, truth: Array) -> float:
-    """Relative rms difference; infinite where one of them ended before its time."""
+    """Relative rms difference; infinite where one of the runs ended early."""
     if own.shape != truth.shape:
         return math.inf
     scale = float(np.mean(truth**2))

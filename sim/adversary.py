@@ -213,7 +213,7 @@ def _losses(x: Array, scenario: Scenario, F: Lti, kind: _Pass) -> Array:
 
 
 def _growth(loops: ClosedLoop, min_frequency_hz: float) -> Array:
-    """Of the modes from this frequency on [1/s], (nsim,)."""
+    """Growth of the modes above this frequency [1/s], (nsim,)."""
     values, T = np.linalg.eigvals(loops.A), loops.T
     fast = np.abs(np.angle(values)) / (2 * np.pi * T) >= min_frequency_hz
     return np.log(np.where(fast, np.abs(values), 1e-300).max(axis=1)) / T
@@ -243,7 +243,7 @@ class Shortage:
 
     @property
     def holds(self) -> bool:
-        """With the damping that is required no human may succeed."""
+        """Whether the row is as the theory says: with the required damping no human makes the loop unstable."""
         return self.short > 0 or not self.found
 
 

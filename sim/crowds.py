@@ -139,7 +139,7 @@ class Validation:
 
     @property
     def digest(self) -> str:
-        """Of all that the findings depend on."""
+        """A digest of everything that the findings depend on."""
         how = (
             self.coupling.form(),
             self.seed,

@@ -202,7 +202,7 @@ class Points:
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:
-        """The cells of all parts; of none, no cell."""
+        """The cells of all parts in one; no cells where there are no parts."""
         if not parts:
             return cls(np.zeros(0, dtype=int), np.zeros(0, dtype=bool), *np.zeros((3, 0)))
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))

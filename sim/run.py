@@ -307,7 +307,7 @@ def make_engine(
 
 
 def engine_name(engine: AnyEngine) -> str:
-    """How reports name it."""
+    """The name of an engine in reports."""
     if isinstance(engine, str):
         return engine
     kind: Any = engine if hasattr(engine, "__qualname__") else type(engine)

@@ -233,6 +233,6 @@ def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
 
 
 def largest(values: Array) -> float | None:
-    """Of the finite ones; None where there is none."""
+    """The largest finite value; None where there is none."""
     values = values[np.isfinite(values)]
     return float(values.max()) if values.size else None

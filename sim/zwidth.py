@@ -100,12 +100,12 @@ class CouplingSweep(_Sweep):
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """What is asked of every cell."""
+        """The conditions that every cell is judged by."""
         return tuple(CONDITIONS)
 
     @property
     def refusals(self) -> dict[str, str]:
-        """Conditions that say nothing of any cell, and why."""
+        """Conditions that do not apply to this map, with the reason."""
         reason = self.multiplier[1]
         return {"any-environment": reason} if reason else {}
 
@@ -227,12 +227,12 @@ class EnvironmentSweep(_Sweep):
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """What is asked of every cell."""
+        """The conditions that every cell is judged by."""
         return (*CONDITIONS, MODEL_KEPT) if self._kept else tuple(CONDITIONS)
 
     @property
     def refusals(self) -> dict[str, str]:
-        """Conditions that say nothing of any cell, and why."""
+        """Conditions that do not apply to this map, with the reason."""
         if any(self.loop.psi):
             why = "with delay in the environment it takes a multiplier for each: ask design.audit about single ones"
             return {"any-environment": why}
@@ -304,7 +304,7 @@ Sweep = CouplingSweep | EnvironmentSweep
 
 
 def contact_springs(network: environment.Network) -> tuple[environment.Spring, ...]:
-    """Those that end at a contact."""
+    """The springs that end at a contact."""
     return tuple(s for s in network.springs if set(s.between) & set(network.contacts))
 
 
@@ -599,7 +599,7 @@ def _edge(sweep: Sweep, condition: str, low: float, high: float, B: float) -> fl
 
 
 def _growth(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: float) -> Array:
-    """Of every human, in the worst contact state."""
+    """Growth with every human, in the worst contact state [1/s]."""
     states = sweep.force_maps(np.array([K]), np.array([B]))
     return np.max([held.growth(F[0])[0] for F in states], axis=0)
 
@@ -612,7 +612,7 @@ def _bisected(calm: Callable[[float], bool], low: float, high: float) -> float:
 
 
 def _last(tried: Array, safe: NDArray[np.bool_], between: Callable[[float, float], float]) -> float | None:
-    """Where safety ends for the last time; inf where it does not, None where nothing is safe."""
+    """The largest value that is safe; inf where all are, None where none is."""
     if not safe.any():
         return None
     last = int(np.flatnonzero(safe)[-1])

@@ -226,7 +226,7 @@ class MapReport:
         humans: int,
         seed: int,
     ) -> MapReport:
-        """Of a map that met `humans` random humans for each device."""
+        """The report of a map; `humans` were drawn for each device."""
         loop, whole, rigid = sweep.loop, not drawn.interrupted, sweep.loop.environment is RIGID_WALL
         ratios = {name: _ratio(sweep, drawn, name) for name in drawn.ratio}
         simulation = _Simulated.of(sweep, drawn, plan)
@@ -269,7 +269,7 @@ def _ratio(sweep: Sweep, drawn: Map, name: str) -> _Ratio:
 
 
 def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
-    """Why a condition has cells without a figure, in words of one such cell; None where it has none."""
+    """Why some cells have no figure, by the example of one of them; None where all have one."""
     if name in sweep.refusals:
         return sweep.refusals[name]
     ratio, (K, B) = drawn.ratio[name], drawn.grid.flat

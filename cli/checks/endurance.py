@@ -92,7 +92,7 @@ def endurance(seed: int) -> Iterator[_Endured]:
 
 
 def _alone(work: _Work, allowed: float, there: Connection) -> None:
-    """Of the process that does it, which ends with the one that waits."""
+    """Run in a process of its own, which ends when the waiting one does."""
     as_worker()
     there.send(_endure(work, allowed))
 
