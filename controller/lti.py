@@ -13,7 +13,7 @@ and a stored float stands for its shortest decimal, the one that a person wrote:
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -152,7 +152,8 @@ class Lti(ReadOnly):
     def diag(cls, *blocks: Lti) -> Self:
         """The blocks side by side, each with its own inputs and outputs."""
         A, B, C, D = (_block_diagonal([getattr(g, name) for g in blocks]) for name in "ABCD")
-        return cls(A, B, C, D, _common_period(*blocks))
+        whole = cls(A, B, C, D, _common_period(*blocks))
+        return _made(whole, lambda: tuple(map(_block_diagonal, zip(*(g._rest for g in blocks), strict=True))))
 
     @classmethod
     def stacked(cls, blocks: Sequence[Lti]) -> Self:
@@ -275,7 +276,26 @@ class Lti(ReadOnly):
 
     def dc(self) -> Array:
         """G(1), shape (..., p, m)."""
-        return self.C @ _solve(_identity(self) - self.A, self.B) + self.D
+        return self._rest[0] if self.is_exact else self.C @ _solve(_identity(self) - self.A, self.B) + self.D
+
+    @cached_property
+    def _rest(self) -> tuple[Array, Array]:
+        """G(1) and C (I - A)^-1, (..., p, m) and (..., p, n): what constant inputs and pushes of states add up to.
+
+        Of an exact block that was made of others they are made of theirs: the states of a loop all feed each other, and
+        to eliminate them costs far more than to close the loop at z = 1. Raises SingularLoop where A has the
+        eigenvalue one.
+        """
+        if made := self.__dict__.get("_made"):
+            try:
+                return made()
+            except SingularLoop:  # of a part, perhaps not of the whole
+                pass
+        R = np.swapaxes(_solve(np.swapaxes(_identity(self) - self.A, -1, -2), np.swapaxes(self.C, -1, -2)), -1, -2)
+        return self.D + _times(R, self.B), R
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ("A", "B", "C", "D", "T")}
 
     def poles(self) -> Complex:
         """Eigenvalues of A, shape (..., n); delays at the outputs have theirs at zero, exactly."""
@@ -294,8 +314,8 @@ class Lti(ReadOnly):
 
         Raises SingularLoop where A has the eigenvalue one.
         """
-        C = -np.swapaxes(_solve(np.swapaxes(_identity(self) - self.A, -1, -2), np.swapaxes(self.C, -1, -2)), -1, -2)
-        return self.D - _times(C, self.B), Lti(self.A, self.B, C, np.zeros_like(self.D), self.T)
+        static, R = self._rest
+        return static, Lti(self.A, self.B, -R, np.zeros_like(self.D), self.T)
 
     def quotient_at_one(self) -> Lti:
         """(G(z) - G(1))/(z - 1)."""
@@ -304,12 +324,19 @@ class Lti(ReadOnly):
     def __matmul__(self, other: Lti | Array) -> Lti:
         B, D = self.B, self.D
         if not isinstance(other, Lti):
-            return Lti(self.A, _times(B, other), self.C, _times(D, other), self.T)
+            whole = Lti(self.A, _times(B, other), self.C, _times(D, other), self.T)
+            return _made(whole, lambda: (_times(self._rest[0], other), self._rest[1]))
         T = _common_period(self, other)
         zero = np.zeros((other.order, self.order), dtype=int)
         A = _block([[other.A, zero], [_times(B, other.C), self.A]])
         C = _block([[_times(D, other.C), self.C]])
-        return Lti(A, _block([[other.B], [_times(B, other.D)]]), C, _times(D, other.D), T)
+        whole = Lti(A, _block([[other.B], [_times(B, other.D)]]), C, _times(D, other.D), T)
+
+        def rest() -> tuple[Array, Array]:
+            (own, R), (static, S) = self._rest, other._rest
+            return _times(own, static), _block([[_times(own, S), R]])
+
+        return _made(whole, rest)
 
     def __rmatmul__(self, matrix: Array) -> Lti:
         return Lti(self.A, self.B, _times(matrix, self.C), _times(matrix, self.D), self.T)
@@ -339,7 +366,8 @@ class Lti(ReadOnly):
 
     def rows(self, which: Any) -> Lti:
         """Some of the outputs, with the same states."""
-        return Lti(self.A, self.B, self.C[..., which, :], self.D[..., which, :], self.T)
+        some = Lti(self.A, self.B, self.C[..., which, :], self.D[..., which, :], self.T)
+        return _made(some, lambda: tuple(part[..., which, :] for part in self._rest))
 
     def feedback(self, other: Lti) -> Lti:
         """(I + G H)^-1 G: this block with H = `other` in negative feedback around it.
@@ -354,7 +382,14 @@ class Lti(ReadOnly):
         u_x = _block([[np.zeros((self.inputs, self.order), dtype=int), -other.C]]) - _times(other.D, y_x)
         u_u = _eye(self.inputs, T) - _times(other.D, y_u)
         A = _block_diagonal([self.A, other.A]) + _block([[_times(self.B, u_x)], [_times(other.B, y_x)]])
-        return Lti(A, _block([[_times(self.B, u_u)], [_times(other.B, y_u)]]), y_x, y_u, T)
+        whole = Lti(A, _block([[_times(self.B, u_u)], [_times(other.B, y_u)]]), y_x, y_u, T)
+
+        def rest() -> tuple[Array, Array]:
+            (own, R), (static, Q) = self._rest, other._rest
+            closed = inverse(_eye(self.outputs, T) + _times(own, static))
+            return _times(closed, own), _times(closed, _block([[R, -_times(own, Q)]]))
+
+        return _made(whole, rest)
 
     def inverse(self) -> Lti:
         """G^-1, where D has an inverse. Raises SingularLoop where it has none."""
@@ -476,7 +511,15 @@ def hstack(*blocks: Any) -> Any:
         return first._with(_block([[b.G for b in blocks]]))
     T = _common_period(*blocks)
     A, B = _block_diagonal([b.A for b in blocks]), _block_diagonal([b.B for b in blocks])
-    return Lti(A, B, _block([[b.C for b in blocks]]), _block([[b.D for b in blocks]]), T)
+    whole = Lti(A, B, _block([[b.C for b in blocks]]), _block([[b.D for b in blocks]]), T)
+    return _made(whole, lambda: tuple(_block([parts]) for parts in zip(*(b._rest for b in blocks), strict=True)))
+
+
+def _made(block: Any, rest: Callable[[], tuple[Array, ...]]) -> Any:
+    """The block, which knows how to make its `_rest` of its parts' where it is exact."""
+    if block.is_exact:
+        object.__setattr__(block, "_made", rest)
+    return block
 
 
 def as_like(block: Lti | Sampled, system: Lti) -> Any:

@@ -133,13 +133,18 @@ class _Definiteness:
         return f"the leading minor of order {self.minor} is {sign}"
 
 
+_MANY_ROWS = 8
+
+
 def definiteness(S: Matrix) -> _Definiteness:
     """Whether the symmetric matrix S is positive (semi)definite, by fraction-free LDL' (Bareiss).
 
     The pivots of the elimination are the leading minors themselves. A zero pivot leaves a semidefinite
-    matrix only if its whole row of the Schur complement is zero; that row is then passed over.
-    Raises ValueError if S is not exactly symmetric.
+    matrix only if its whole row of the Schur complement is zero; that row is then passed over. A large matrix is tried
+    by `strictly_positive` first. Raises ValueError if S is not exactly symmetric.
     """
+    if S.shape[0] > _MANY_ROWS and strictly_positive(S):
+        return _Definiteness(True, True)
     work = S.reduced().num.copy()
     if not (work == work.T).all():
         raise ValueError(f"a {S.shape[0]} x {S.shape[1]} matrix is not exactly symmetric")
