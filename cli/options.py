@@ -16,7 +16,7 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from controller.loop import DelayRange, Loop
 from controller.lti import SingularLoop
 from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
+from design.own import named, place_of
 from design.result import CONDITIONS, DesignFailed
 from models.device import MOST_DAMPING
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
@@ -263,6 +264,13 @@ def add_band_option(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--band", dest="band_hz", type=_band_of, metavar="LOW,HIGH", help=band)
 
 
+def own_or(option: str, text: str, names: Collection[str]) -> Any:
+    """One of these names as it is, or what `package.module:Name` names. Raises InputError."""
+    if text in names or ":" in text:
+        return text if text in names else named(option, text)
+    raise InputError(f"{option} is {text!r}, allowed are {', '.join(names)} and package.module:Name")
+
+
 def add_human_option(parser: argparse.ArgumentParser, more: str = "") -> None:
     """--human."""
     who = f"other humans: [[human]] per channel in a .toml, or `humans`{more} in a .py"
@@ -485,9 +493,11 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
         code = _say("error: there is not enough memory for this", UNFINISHED)
     except OSError as error:  # a full disk behind standard output, mostly
         code = _cannot(error)
-    except Exception:  # a mistake of ours: not 1, which says that what was asked does not hold
+    except Exception as error:  # not 1, which says that what was asked does not hold
         traceback.print_exc()
-        code = UNFINISHED
+        place, code = place_of(error), UNFINISHED  # a mistake of ours, or one in a class that the user named
+        if place:
+            code = _say(f"error: {place}, which is your own: {type(error).__name__}: {error}", BAD_INPUT)
     try:
         sys.stdout.flush()
     except BrokenPipeError:

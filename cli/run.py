@@ -25,7 +25,7 @@ from sim.api import ScenarioRun, run_scenario
 from sim.couplings import NAMES, Chosen, choose
 from sim.judged import Judged
 from sim.mujoco_engines import INTEGRATORS
-from sim.run import ENGINES
+from sim.run import ENGINES, AnyEngine
 from sim.run_report import Ran, RunReport, run_report
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, ExactVerdict
@@ -35,13 +35,14 @@ from sim.step_choice import MOST
 def main(argv: list[str]) -> int:
     """Simulate and report. 0: the run was completed, stable or not; 130: interrupted."""
     args = _parser().parse_args(argv)
-    if args.error is not None and (args.engine == "exact" or args.integrator or args.substeps):
-        raise InputError("--error chooses integrator and substeps of MuJoCo: give no --engine exact, --integrator, ..")
+    engine = options.own_or("--engine", args.engine, ENGINES)
+    if args.error is not None and (engine != "mujoco" or args.integrator or args.substeps):
+        raise InputError("--error chooses integrator and substeps of MuJoCo: give no other --engine, --integrator, ..")
     scenario, out = _scenario(args), options.out_folder(args, "run")
     environment, simulated = _environment(args, scenario)
     chosen = _chosen(args, scenario)  # V, Q or R
     judged = judge(args, scenario, chosen, simulated)  # what each condition asks of the devices, and what is proved
-    done = _run(args, simulated, chosen, judged.limits.rho)  # sample, compute, limit, hold, advance
+    done = _run(args, simulated, chosen, engine, judged.limits.rho)  # sample, compute, limit, hold, advance
     same = args.limiter is None and not scenario.ranges and args.case != "none"
     others = _alternatives(args, scenario, done, (chosen, judged.requirements, judged.limits) if same else None)
     robustness = _robustness(chosen, scenario.loop(args.case), judged)
@@ -63,7 +64,8 @@ def _parser() -> options.Parser:
     options.add_varying_delay_options(parser)
     options.add_coupling_options(parser, f"{', '.join(NAMES)}, as baselines {', '.join(layer.BASELINES)}")
     options.add_energy_budget_option(parser)
-    add("--engine", choices=ENGINES, default="mujoco", help="MuJoCo (default), or the exact solution")
+    engines = "mujoco (default), exact, or package.module:Class of your own"
+    add("--engine", default="mujoco", metavar="NAME|MODULE:CLASS", help=engines)
     steppers = "integrator of MuJoCo (default exponential, RK4 where devices rub)"
     add("--integrator", choices=tuple(INTEGRATORS), help=steppers)
     steps = "MuJoCo steps per period (default: what the plant asks)"
@@ -117,16 +119,18 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
 # The run and what it came to.
 
 
-def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tuple[float, ...] | None) -> ScenarioRun:
+def _run(
+    args: argparse.Namespace, scenario: Scenario, chosen: Chosen, engine: AnyEngine, lag: tuple[float, ...] | None
+) -> ScenarioRun:
     """Close the loop as the options say. Raises InputError for settings that cannot be."""
     net: layer.Wanted | None = None
     if args.coupling in layer.BASELINES:
         net = layer.Classic(args.coupling)
     elif args.energy_budget:
         net = layer.EnergyNet(*args.energy_budget)
-    asked = {name: getattr(args, name) for name in ("engine", "integrator", "substeps", "error", "seed")}
+    asked = {name: getattr(args, name) for name in ("integrator", "substeps", "error", "seed")}
     with render.progress("simulating") as move:
-        return run_scenario(scenario, chosen.coupling, lag, **asked, net=net, progress=move)
+        return run_scenario(scenario, chosen.coupling, lag, engine=engine, **asked, net=net, progress=move)
 
 
 def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun, own: Any) -> list[Alternative]:

@@ -20,11 +20,11 @@ from typing import Any
 
 from cli import options, render
 from cli import suite_report as reports
+from cli.checks.endurance import endurance
+from cli.checks.faults import rehearse_faults
 from controller.lti import SingularLoop
 from design.files import folder, write, write_json
 from design.result import DesignFailed
-from hw.endurance import endurance
-from hw.faults import rehearse_faults
 from sim.adversary import shortages
 from sim.checks.challenges import challenges
 from sim.checks.hard import cases, measure

@@ -210,7 +210,7 @@ def main() -> int:
     parser.add_argument("--check", action="store_true", help="run the slow commands and compare, and write nothing")
     parser.add_argument("--designs", action="store_true", help="write the designs that come with the package alone")
     parser.add_argument(
-        "pages", nargs="*", type=Path, metavar="PAGE", help="renew these alone, without what is measured"
+        "pages", nargs="*", metavar="PAGE", help="renew these alone, by name or path, without what is measured"
     )
     args = parser.parse_args()
     if args.check:
@@ -219,13 +219,18 @@ def main() -> int:
         designs()
     if args.designs:
         return 0
-    some = {page.resolve() for page in args.pages}
+    names = {page.name for page in PAGES}
+    some = {Path(page).name for page in args.pages}
+    if unknown := some - names:
+        parser.error(f"no page {', '.join(sorted(unknown))}; there are {', '.join(sorted(names))}")
     printed: dict[str, str] = {}
     with TemporaryDirectory() as place:
         folder = Path(place)
         for page in PAGES:
             text = page.read_text(encoding="utf-8")
-            if (some and page not in some) or not any(kind.search(text) for kind in (SHOWN, MEASURED, PICTURE)):
+            if (some and page.name not in some) or not any(
+                kind.search(text) for kind in (SHOWN, MEASURED, PICTURE, SOURCE)
+            ):
                 continue
             measured = [] if some else [Step("command", block[3]) for block in MEASURED.finditer(text)]
             for step in [*steps(text), *measured]:

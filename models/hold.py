@@ -79,17 +79,23 @@ def at_the_latch(plant: Plant, late: Sequence[float]) -> _Array:
     return rows
 
 
-def exponential_step(J: _Array, h: float) -> _Array:
-    """What makes s + h phi1(h J) [v; a] of [q; v; a], (nsim, 2n, 3n), for J (nsim, 2n, 2n) and a step of h seconds.
+def exponential_step(J: _Array, h: float, n: int, felt: _Array | None = None) -> _Array:
+    """What makes s + h phi1(h J) s' of [s; a], (nsim, states, states + n), for J (nsim, states, states) and a step h.
 
+    s = [q; v; the states of impedances], of n joints; s' = [v; a; 0] + felt s where the accelerations a (n,) [m/s^2]
+    are those of the bodies, to which the impedances add `felt` (nsim, states, states).
     phi1(X) = X^-1 (e^X - I) is the upper right block of exp [[X, I], [0, 0]].
     """
     nsim, states, _ = J.shape
-    n, unit = states // 2, np.tile(_units(J, h), 2)
+    unit = np.tile(_units(J, h), 2)
     generator = np.zeros((nsim, 2 * states, 2 * states))
     generator[:, :states, :states], generator[:, :states, states:] = h * J, np.eye(states)
     phi = h * _expm_in_units(generator, unit)[:, :states, states:]
-    return np.concatenate([np.broadcast_to(np.eye(states, n), (nsim, states, n)), phi + np.eye(states, k=-n)], axis=2)
+    rates = np.zeros((nsim, states, states + n))
+    rates[:, :n, n : 2 * n] = rates[:, n : 2 * n, states:] = np.eye(n)
+    if felt is not None:
+        rates[:, :, :states] += felt
+    return phi @ rates + np.eye(states, states + n)
 
 
 def expm_each(matrices: _Array) -> _Array:

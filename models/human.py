@@ -1,14 +1,14 @@
 """Humans as passive ports at the handles: chains, persons with several devices, random draws, and a user's own hand.
 
 Whatever has the two methods of `Hand` can hold a device. Its `port()` says what the handle feels: masses and
-spring-dampers, which both engines know, and if need be an impedance (A, B, C, D), which the exact engine knows.
+spring-dampers, and if need be an impedance (A, B, C, D).
 A `Port` cannot be built unless it is passive, so there is nothing else to prove.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Protocol, Self
@@ -52,6 +52,13 @@ class Impedance:
                 raise ValueError(f"impedance: {name} has the shape {getattr(self, name).shape}, expected {shape}")
         for i in np.ndindex(*many):
             _check_positive_real(*(getattr(self, name)[i] for name in "ABCD"))
+
+    def changed(self, change: Callable[[_Array], _Array]) -> Impedance:
+        """Each of A, B, C and D taken or repeated along the leading axes: as passive as it is."""
+        made = object.__new__(Impedance)
+        for name in "ABCD":
+            _freeze(made, name, change(getattr(self, name)))
+        return made
 
     @property
     def order(self) -> int:
@@ -127,8 +134,7 @@ class Port:
 
     def of(self, i: int) -> Self:
         """Port i of a stack."""
-        z = self.impedance
-        impedance = Impedance(z.A[i], z.B[i], z.C[i], z.D[i]) if z else None
+        impedance = self.impedance and self.impedance.changed(lambda part: part[i])
         one = self.mass[i], self.across, self.damping[i], self.stiffness[i]
         return type(self)(*one, impedance, self.handles, self.pull)
 
@@ -143,7 +149,7 @@ def state_space(A: Any, B: Any, C: Any, D: Any, mass: float = 0.0) -> Port:
     """The port of a hand of `mass` [kg] with the impedance C (s I - A)^-1 B + D from velocity [m/s] to force [N].
 
     A may have one eigenvalue at zero, which is the hand's static stiffness: k/s is split off as a spring. Raises
-    ValueError for what is not passive. Only the exact engine knows such a hand: MuJoCo simulates bodies.
+    ValueError for what is not passive.
     """
     A, B, C, D = (np.atleast_2d(np.asarray(part, dtype=float)) for part in (A, B, C, D))
     stiffness = 0.0
@@ -277,7 +283,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A hand as a transfer function, `mass` s + C (s I - A)^-1 B + D from velocity to force; see `state_space`.
 
-    It has no bodies: the exact engine simulates it, MuJoCo does not.
+    It has no bodies: MuJoCo's engines move its state beside those of the scene (sim.mujoco_engines).
     """
 
     A: tuple[tuple[float, ...], ...]

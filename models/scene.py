@@ -38,7 +38,7 @@ if TYPE_CHECKING:  # a third of a second: loaded where it is used
 #
 # A human is a passive port (models.human.Port). Its masses become bodies, a spring-damper that lies between one point
 # and ground belongs to a joint, any other one is a fixed tendon. An impedance (A, B, C, D) is no body: it is kept
-# among the model's custom numbers, from where `plant` takes it, and MuJoCo itself cannot simulate it.
+# among the model's custom numbers, from where `plant` takes it; engines move its state beside those of the bodies.
 
 
 _Array = NDArray[np.floating[Any]]
@@ -90,6 +90,7 @@ class Plant:
     A: _Array  # (2n + states, 2n + states)
     B: _Array  # (2n + states, outside + m)
     C: _Array  # (m, 2n + states)
+    felt: _Array | None = None  # what impedances add to A, which MuJoCo does not know; None without any
 
 
 def build(devices: Sequence[Device], humans: Sequence[Hand], persons: Sequence[Person] = ()) -> Scene:
@@ -104,7 +105,7 @@ def build(devices: Sequence[Device], humans: Sequence[Hand], persons: Sequence[P
 def plant(model: mujoco.MjModel) -> Plant:
     """The linear plant that `model` simulates: its mass, damping, stiffness and actuation matrices, no friction.
 
-    With the humans' impedances, which MuJoCo does not simulate.
+    With the humans' impedances, which MuJoCo itself leaves out.
     """
     import mujoco
 
@@ -119,11 +120,6 @@ def plant(model: mujoco.MjModel) -> Plant:
     return _plant(
         lambda matrix: inverse @ matrix, stiffness, damping, actuation(model), _motors(model), _impedances(model)
     )
-
-
-def impeded(model: mujoco.MjModel) -> bool:
-    """Whether a human of this model has an impedance (A, B, C, D), which MuJoCo leaves out."""
-    return bool(_impedances(model))
 
 
 class _Felt(NamedTuple):
@@ -141,17 +137,19 @@ def _plant(
     size = 2 * n + sum(z.order for _, z in felt)
     A, B = np.zeros((*many, size, size)), np.zeros((*many, size, forces.shape[-1]))
     A[..., :n, n : 2 * n] = np.eye(n)
-    A[..., n : 2 * n, :n] = -solved(K)
-    A[..., n : 2 * n, n : 2 * n] = -solved(D + sum(np.outer(row, row) * z.D for row, z in felt))
+    A[..., n : 2 * n, :n], A[..., n : 2 * n, n : 2 * n] = -solved(K), -solved(D)
     B[..., n : 2 * n, :] = solved(forces)
-    first = 2 * n
+    if not felt:
+        return Plant(A, B, np.eye(motors, size))
+    added, first = np.zeros_like(A), 2 * n
     for row, z in felt:
         mine = slice(first, first + z.order)
-        A[..., mine, n : 2 * n] = z.B * row
-        A[..., mine, mine] = z.A
-        A[..., n : 2 * n, mine] = -solved(row[:, None] * z.C)
+        added[..., n : 2 * n, n : 2 * n] -= solved(np.outer(row, row) * z.D)
+        added[..., mine, n : 2 * n] = z.B * row
+        added[..., mine, mine] = z.A
+        added[..., n : 2 * n, mine] = -solved(row[:, None] * z.C)
         first += z.order
-    return Plant(A, B, np.eye(motors, size))
+    return Plant(A + added, B, np.eye(motors, size), added)
 
 
 def _impedances(model: mujoco.MjModel) -> list[_Felt]:
@@ -563,14 +561,24 @@ class Variants:
 
     scene: Scene
     fields: dict[str, _Array]  # (nsim, bodies | joints | tendons)
-    impedances: tuple[_Felt, ...] = ()  # with a leading axis over the sets; MuJoCo leaves them out
+    impedances: tuple[_Felt, ...] = ()  # with a leading axis over the sets
 
     def __len__(self) -> int:
         return self.fields["body_mass"].shape[0]
 
-    def repeated(self, times: int) -> dict[str, _Array]:
-        """The fields with every row `times` times in succession."""
-        return {name: np.repeat(rows, times, axis=0) for name, rows in self.fields.items()}
+    @property
+    def states(self) -> int:
+        """Of each plant."""
+        return 2 * self.scene.model.nv + sum(z.order for _, z in self.impedances)
+
+    def repeated(self, times: int) -> Variants:
+        """Every set of humans `times` times in succession."""
+
+        def again(rows: _Array) -> _Array:
+            return np.repeat(rows, times, axis=0)
+
+        felt = tuple(_Felt(row, z.changed(again)) for row, z in self.impedances)
+        return Variants(self.scene, {name: again(rows) for name, rows in self.fields.items()}, felt)
 
     def plants(self) -> Plant:
         """All plants at once, A (nsim, 2n, 2n) and B (nsim, 2n, inputs): the same matrices as of each one's model."""

@@ -18,7 +18,7 @@ from controller.lti import Array, Lti
 from design.files import unseen
 from models.device import credible_force
 from sim.mujoco_engines import EXPONENTIAL, default_integrator
-from sim.run import Simulation, make_engine, run
+from sim.run import AnyEngine, Simulation, make_engine, run
 from sim.scenario import InputError
 from sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode
 from sim.step_choice import NEUTRAL, default_substeps, measured_hold, simulated_growth, step_radius
@@ -400,10 +400,12 @@ class CrossCheck:
     agrees: bool
 
 
-def cross_check(simulation: Simulation, trace: Trace, integrator: str | None, own_substeps: int | None) -> CrossCheck:
+def cross_check(
+    simulation: Simulation, trace: Trace, engine: AnyEngine, integrator: str | None, own_substeps: int | None
+) -> CrossCheck:
     """The run again by RK4, which shares no matrix with the exponential and the exact engine; by it, if RK4 ran.
 
-    `simulation` is what ran, with its net; integrator and substeps are None for the exact engine. Positions are
+    `simulation` is what ran, with its net; integrator and substeps are MuJoCo's, else None. Positions are
     compared as far as neither ended before its time.
     """
     other = EXPONENTIAL if integrator == "RK4" else "RK4"
@@ -412,7 +414,9 @@ def cross_check(simulation: Simulation, trace: Trace, integrator: str | None, ow
     beside = run(simulation, make_engine(simulation, "mujoco", other, substeps), ticks=trace.t.size)
     ticks, m = min(trace.t.size, beside.t.size), simulation.process.channels
     growth = simulated_growth(linear, other, substeps)
-    own = simulated_growth(linear, integrator, own_substeps) if integrator and own_substeps else exact_growth(linear)
+    own = exact_growth(linear)
+    if engine != "exact":
+        own = simulated_growth(linear, integrator, own_substeps, engine)
     apart = _apart(trace.s[:ticks, :m], beside.s[:ticks, :m])
     agrees = not disagree(own, growth) and trace.diverged == beside.diverged
     return CrossCheck(other, substeps, apart, growth, growth - own, agrees)

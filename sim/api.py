@@ -17,7 +17,7 @@ from sim.accuracy import EngineChoice, compare_engines, pick
 from sim.couplings import given, limits_of
 from sim.mujoco_engines import INTEGRATORS
 from sim.passivity_layer import EnergyNet, Plugged, Wanted, netted
-from sim.run import ENGINES, Progress, Simulation, assemble, make_engine, run
+from sim.run import ENGINES, AnyEngine, Progress, Simulation, assemble, engine_name, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
 from sim.stability import stability_of
 from sim.step_choice import MOST, settle
@@ -39,7 +39,8 @@ class ScenarioRun:
     ran: Simulation  # the same, with the net that was asked for
     period: Period | None  # of the worst switching found, where the delays switch
     choices: tuple[EngineChoice, ...]  # what was compared for the error that was asked, the cheapest first
-    integrator: str | None  # None for the exact engine, and so are the substeps
+    engine: AnyEngine
+    integrator: str | None  # of MuJoCo; None for other engines, and so are the substeps
     substeps: int | None
     remarks: list[str]  # on a number of substeps that was asked for
     trace: Trace
@@ -48,7 +49,7 @@ class ScenarioRun:
     @cached_property
     def exact(self) -> Trace | None:
         """The exact engine's trace of the same loop; None where friction makes it another one than the linear."""
-        if self.integrator is None:
+        if self.engine == "exact":
             return self.trace
         return None if self.simulation.friction else run(self.ran, "exact", ticks=self.trace.t.size)
 
@@ -58,7 +59,7 @@ def run_scenario(
     coupling: Coupling,
     lag: tuple[float, ...] | None = None,
     *,
-    engine: str = "mujoco",
+    engine: AnyEngine = "mujoco",
     integrator: str | None = None,
     substeps: int | None = None,
     error: float | None = None,
@@ -89,13 +90,13 @@ def run_scenario(
     begin = time.perf_counter()
     trace = run(ran, stepped, progress=progress)
     wall = time.perf_counter() - begin
-    return ScenarioRun(simulation, ran, period, choices, integrator, substeps, remarks, trace, wall)
+    return ScenarioRun(simulation, ran, period, choices, engine, integrator, substeps, remarks, trace, wall)
 
 
 def simulate(
     scenario: Scenario,
     coupling: Coupling | Design | None = None,
-    engine: str = "mujoco",
+    engine: AnyEngine = "mujoco",
     integrator: str | None = None,
     substeps: int | None = None,
     seed: int = 0,
@@ -105,7 +106,8 @@ def simulate(
 ) -> Trace:
     """The scenario's run, from rest, for `scenario.duration` seconds.
 
-    `coupling` None is the loop without one; `engine` is "mujoco" or "exact" (the linear loop, no Coulomb friction);
+    `coupling` None is the loop without one; `engine` is "mujoco", "exact" (the linear loop, no Coulomb friction) or
+    of your own (sim.engines.Engine), as it is or as what makes it of a sim.run.Simulation;
     `integrator` of MuJoCo, None for "exponential", or "RK4" where a device has Coulomb friction; `substeps` steps per
     period, None for what the plant asks; `seed` draws delays, periods and latencies that vary.
     Forces are limited as a guarantee covers it, where one does (`meta["limiter"]` says); elsewhere, and with
@@ -126,7 +128,8 @@ def simulate(
     """
     of_kind("scenario", scenario, Scenario, _SCENARIO)
     chosen, seed = given(coupling), whole("seed", seed, 0)
-    one_of("engine", engine, ENGINES)
+    if isinstance(engine, str) or not (callable(engine) or hasattr(engine, "start")):
+        one_of("engine", engine, ENGINES)
     if integrator is not None:
         one_of("integrator", integrator, tuple(INTEGRATORS))
     if substeps is not None:
@@ -143,7 +146,7 @@ def simulate(
     meta = {
         "scenario": scenario.name,
         "scenario_digest": scenario.digest,
-        "engine": engine,
+        "engine": engine_name(engine),
         "integrator": done.integrator,
         "substeps": done.substeps,
         "seed": seed,

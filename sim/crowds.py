@@ -296,5 +296,5 @@ def _tests(
         return exact, exact
     threads, n = validation.threads, len(held_by)
     timing = Timing(np.array([T]), np.array([late])) if late else None
-    engine = MujocoBatchEngine(held_by.scene, T, EXPONENTIAL, 1, n, threads, held_by.fields, timing)
+    engine = MujocoBatchEngine(held_by.scene, T, EXPONENTIAL, 1, n, threads, held_by, timing)
     return exact, impulse_test(process, engine, *settings, ticked, latch)

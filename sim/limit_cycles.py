@@ -307,7 +307,7 @@ def _simulate(
     scene, ticks = held_by.scene, round(plan.duration / T)
     substeps = pace(held_by.plants().A).substeps(T)
     timing = Timing(np.array([T]), np.array([held.late])) if held.late else None
-    n, processes = 2 * scene.model.nv + len(held.late or ()), [trial.process for trial in trials]
+    n, processes = held_by.states + len(held.late or ()), [trial.process for trial in trials]
     buffer = _ManyProcesses(processes, min(_BLOCK, ticks), n, scene.outside)
     starts = np.stack([trial.start for trial in trials], axis=1)
     buffer.s[0] = starts[:n]
@@ -315,7 +315,7 @@ def _simulate(
         buffer.z[0] = starts[n:]
     seen, kept, done = list(_motors_and_handles(scene)), [], 0
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
-        engine = MujocoBatchEngine(scene, T, substeps=substeps, nsim=len(trials), fields=held_by.fields, timing=timing)
+        engine = MujocoBatchEngine(scene, T, substeps=substeps, nsim=len(trials), humans=held_by, timing=timing)
         engine.start(buffer)
         while done < ticks:
             count = min(buffer.ticks, ticks - done)

@@ -6,6 +6,10 @@
 
 The exponential engine shares J with the exact one, so it checks forces and assembly, not the stepping in time: for that
 there is RK4.
+
+An impedance (A, B, C, D) that a hand has is no body. Its state and its force are part of the exponential step, which
+stays exact. Around each step of MuJoCo's own integrators lie two half steps, exact too, of what the impedance and the
+masses do to each other while positions rest (Strang's splitting): of second order in the step, and never active.
 """
 
 from __future__ import annotations
@@ -14,7 +18,7 @@ import ctypes
 import glob
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
@@ -30,8 +34,8 @@ from controller.lti import Array
 from controller.tick import FusedTicks, StepBuffer, Stretch
 from controller.timing import Timing
 from design.files import InputError
-from models.hold import Product, exponential_step, product_of
-from models.scene import Scene, Variants, impeded
+from models.hold import Product, expm_each, exponential_step, product_of
+from models.scene import Plant, Scene, Variants
 
 if TYPE_CHECKING:
     import mujoco
@@ -52,8 +56,6 @@ INTEGRATORS = {
 LEAST = 4  # steps per period of MuJoCo's own integrators
 
 _WHOLE = 1e-9  # of a step: rounding, where a number of steps is counted
-#: fields of a model that its mass, damping and stiffness matrices are made of
-_MECHANICAL = ("body_mass", "jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping")
 
 
 def default_integrator(scene: Scene) -> str:
@@ -81,11 +83,13 @@ class _Access:
     substeps: int
     ctrl: Array
     state: Array  # [q; v], (2, n) of one simulation
+    size: int  # of a state of the plant: q, v and what the impedances of hands have
     qacc: Array
     forward: Callable[[], object]
     step: Callable[[int], object]  # so many steps
     pace: Callable[[float], object]  # sets their length [s]
-    move: Callable[[float], Product] | None  # seconds -> [q; v; qacc] to [q; v] then, where steps are exponential
+    move: Callable[[float], Product] | None  # seconds -> [state; qacc] to the state then, where steps are exponential
+    kick: Callable[[float], Product] | None  # seconds -> a state to that after impedances alone have acted
 
     def put(self, buffer: StepBuffer, k: int) -> None:
         """Put the plant into the state of row k."""
@@ -94,12 +98,28 @@ class _Access:
     def ticks(self, buffer: StepBuffer, timing: Timing | None) -> Callable[[int], None]:
         """What moves tick k of the buffer, from where the plant is."""
         one = (..., 0) if self.ctrl.ndim == 1 else ...
-        states = buffer.s[:, : 2 * len(self.qacc)][one]
+        states = buffer.s[:, : self.size][one]
         rows, inputs = list(states), list(buffer.rows[:, -len(self.ctrl) :][one])
         if timing:
             return self._timed(buffer, timing, rows, inputs)
-        shaped = list(states.reshape(-1, *self.state.shape))
+        if self.kick and not self.move:
+            return self._by_both(rows, inputs)
+        shaped = list(self._shaped(states))
         return self._by_exponentials(rows, inputs, shaped) if self.move else self._by_steps(inputs, shaped)
+
+    def _shaped(self, states: Array) -> Array:
+        """A view of [q; v] of states (ticks, size, ..), as `state` is."""
+        return states[:, : 2 * len(self.qacc)].reshape(-1, *self.state.shape)
+
+    def _by_both(self, rows: list[Array], inputs: list[Array]) -> Callable[[int], None]:
+        ctrl, move_by, T = self.ctrl, self._move_by, self.T
+
+        def advance(k: int) -> None:
+            ctrl[...] = inputs[k]
+            rows[k + 1][...] = rows[k]
+            move_by(T, rows[k + 1])
+
+        return advance
 
     def _by_steps(self, inputs: list[Array], written: list[Array]) -> Callable[[int], None]:
         ctrl, state, step, count = self.ctrl, self.state, self.step, self.substeps
@@ -142,28 +162,39 @@ class _Access:
         def advance(k: int) -> None:
             self.ctrl[...] = inputs[k]
             asked, held = inputs[k][len(self.ctrl) - m :], buffer.plant_state[k][states:].reshape(forces.shape)
+            rows[k + 1][...] = rows[k]
             for seconds, waiting in kinds[which[(buffer.first + k) % len(which)]]:
                 forces[...] = asked
                 forces[waiting] = held[waiting]
-                self._move_by(seconds)
-            rows[k + 1][...] = self.state.reshape(rows[k + 1].shape)
+                self._move_by(seconds, rows[k + 1])
             if m:
                 buffer.plant_state[k + 1][states:] = asked.reshape(m, -1)
 
         return advance
 
-    def _move_by(self, seconds: float) -> None:
-        if self.move is None:
-            count = math.ceil(self.substeps * seconds / self.T - _WHOLE)
-            self.pace(seconds / count)
-            self.step(count)
+    def _move_by(self, seconds: float, row: Array) -> None:
+        """Move MuJoCo and the state `row`, which is where it stands."""
+        (view,) = self._shaped(row[None])
+        if self.move:
+            for _ in range(self.substeps):
+                self.forward()
+                self.move(seconds / self.substeps)(np.concatenate([row, self.qacc]), row)
+                self.state[...] = view
             return
-        seen = np.empty((2 * len(self.qacc), *self.qacc.shape[1:]))
-        for _ in range(self.substeps):
-            self.forward()
-            sight = np.concatenate([self.state.reshape(seen.shape), self.qacc])
-            self.move(seconds / self.substeps)(sight, seen)
-            self.state[...] = seen.reshape(self.state.shape)
+        count = max(1, math.ceil(self.substeps * seconds / self.T - _WHOLE))
+        self.pace(seconds / count)
+        if not self.kick:
+            self.step(count)
+            view[...] = self.state
+            return
+        half = self.kick(seconds / count / 2)
+        for _ in range(count):
+            half(row.copy(), row)
+            self.state[...] = view
+            self.step(1)
+            view[...] = self.state
+            half(row.copy(), row)
+        self.state[...] = view
 
 
 class MujocoEngine:
@@ -178,7 +209,8 @@ class MujocoEngine:
         self.data = mujoco.MjData(self.model)
         self._warnings = self.data.warning.number
         self.stretch: Stretch | None = None
-        moves = cache(lambda h: exponential_step(_rates(scene, None), h)[0])
+        stacked = _stacked(scene.plant)
+        moves = cache(lambda h: exponential_step(stacked.A, h, scene.model.nv, stacked.felt)[0])
         self._whole = moves if integrator == EXPONENTIAL and substeps == 1 else None
         self._timing, both, q, v = timing, (self.model, self.data), self.data.qpos, self.data.qvel
         self._access = _Access(
@@ -187,11 +219,13 @@ class MujocoEngine:
             self.data.ctrl,
             # one view of both, wherever MuJoCo has put them: one copy reads them
             as_strided(q, (2, q.size), (v.ctypes.data - q.ctypes.data, q.itemsize)),
+            len(scene.plant.A),
             self.data.qacc,
             partial(mujoco.mj_forward, *both),
             partial(mujoco.mj_step, *both),
             partial(setattr, self.model.opt, "timestep"),
             (lambda h: moves(h).dot) if integrator == EXPONENTIAL else None,
+            _kicks(stacked),
         )
         # what rubs is solved from the solution before, which nothing takes back
         self._rubs = default_integrator(scene) != EXPONENTIAL
@@ -204,7 +238,7 @@ class MujocoEngine:
         if buffer.calm and not self._timing and not (self._rubs and buffer.limited):
             if self._whole:
                 self.stretch = self._fused(buffer, self._whole(access.T))
-            elif not access.move:
+            elif not (access.move or access.kick):
                 self.stretch = self._stepped(buffer)
 
     @property
@@ -218,7 +252,7 @@ class MujocoEngine:
         fused = FusedTicks(buffer, move[:, :states], G=move[:, states:])
         ctrl, state, qacc, forward = access.ctrl, access.state, access.qacc, access.forward
         product, held, before, after, rates = fused.product, fused.held, fused.before, fused.next, fused.further
-        shaped = list(fused.states.reshape(-1, *state.shape))
+        shaped = list(access._shaped(fused.states))
 
         def stretch(ticks: int) -> None:
             for count in fused.parts(ticks):
@@ -272,26 +306,30 @@ class MujocoBatchEngine:
         substeps: int = 4,
         nsim: int = 1,
         nthread: int = 0,
-        fields: Mapping[str, Array] | None = None,
+        humans: Variants | None = None,
         timing: Timing | None = None,
     ) -> None:
-        """`fields` gives fields of the model a row per simulation, such as masses: (nsim, ...)."""
+        """With `humans` every simulation has its own, nsim of them."""
         import mujoco
         from mujoco.batch import Batch
 
         model = discretised(scene, T, integrator, substeps)
         self.batch = batch = Batch(model, nsim, nthread)
-        for name, rows in (fields or {}).items():
+        for name, rows in (humans.fields if humans else {}).items():
             batch.expand(name)[...] = rows
-        if fields:
+        if humans:
             batch.set_const()
         parts, before = mujoco.mjtState, int(mujoco.mjtState.mjSTATE_TIME)
         moved = before | int(parts.mjSTATE_QPOS) | int(parts.mjSTATE_QVEL)
         time, motion = (mujoco.mj_stateSize(model, part) for part in (before, moved))
 
+        # Runge-Kutta asks for no matrix of bodies alone
+        asked = humans and (integrator == EXPONENTIAL or humans.impedances)
+        plants = _stacked(humans.plants() if humans and asked else scene.plant)
+
         def move(h: float) -> Product:
-            moves = exponential_step(_rates(scene, fields), h)
-            return product_of(moves if fields else moves[0])
+            moves = exponential_step(plants.A, h, model.nv, plants.felt)
+            return product_of(moves if humans else moves[0])
 
         self.advance: Callable[[int], None]  # from `start` on
         self._timing = timing
@@ -300,11 +338,13 @@ class MujocoBatchEngine:
             substeps,
             batch.bind("ctrl").T,
             batch.state[:, time:motion].T,  # position and velocity lie side by side in a state row
+            plants.A.shape[-1],
             batch.bind("qacc").T,
             batch.forward,
             lambda count: batch.step(nstep=count),
             batch.expand("opt.timestep").fill if timing else float,
             cache(move) if integrator == EXPONENTIAL else None,
+            _kicks(plants),
         )
 
     def start(self, buffer: StepBuffer) -> None:
@@ -315,13 +355,25 @@ class MujocoBatchEngine:
         return bool(np.any(self.batch.warning))
 
 
-def _rates(scene: Scene, fields: Mapping[str, Array] | None) -> Array:
-    """J of s' = J s + .., (nsim or 1, 2n, 2n), from the matrices of the compiled model, or of every variant of it."""
-    if not fields:
-        return scene.plant.A[None]
-    nsim = len(next(iter(fields.values())))
-    same = {name: np.tile(getattr(scene.model, name).astype(float), (nsim, 1)) for name in _MECHANICAL}
-    return Variants(scene, {**same, **fields}).plants().A
+def _stacked(plant: Plant) -> Plant:
+    """One plant, or many, as a stack."""
+    if plant.A.ndim > 2:
+        return plant
+    return Plant(plant.A[None], plant.B[None], plant.C, None if plant.felt is None else plant.felt[None])
+
+
+def _kicks(plants: Plant) -> Callable[[float], Product] | None:
+    """Seconds to what makes the states after the impedances alone have acted; None where there are none."""
+    felt = plants.felt
+    if felt is None:
+        return None
+
+    @cache
+    def kick(h: float) -> Product:
+        step = expm_each(h * felt)
+        return product_of(step if len(step) > 1 else step[0])
+
+    return kick
 
 
 def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
@@ -335,8 +387,8 @@ def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoc
         raise ValueError(f"integrator is {integrator!r}, allowed are {', '.join(INTEGRATORS)}")
     if substeps < 1:
         raise ValueError(f"substeps is {substeps}, allowed are whole numbers from 1")
-    if impeded(scene.model):
-        raise InputError("a human has an impedance (A, B, C, D), which MuJoCo does not simulate: use the exact engine")
+    if integrator == EXPONENTIAL != default_integrator(scene) and scene.plant.felt is not None:
+        raise InputError("a human has an impedance (A, B, C, D) and a device rubs: use integrator RK4, not exponential")
     if integrator == default_integrator(scene) == EXPONENTIAL:
         return scene.model
     model = copy(scene.model)

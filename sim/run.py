@@ -28,6 +28,7 @@ from controller.lti import Array, Lti
 from controller.tick import Net, Process, StepBuffer
 from controller.timing import Timing
 from controller.walls import contact
+from design.own import called
 from models.hold import HeldPlant, hold
 from models.scene import Scene, build
 from sim.engines import Engine, ExactEngine, ExactTimedEngine
@@ -36,6 +37,7 @@ from sim.scenario import InputError, Scenario
 from sim.trace import Trace
 
 ENGINES = ("mujoco", "exact")
+AnyEngine = str | Engine | Callable[["Simulation"], Engine]  # a name, one of a user's own, or what makes it
 
 Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the hands (ticks, outside) [N]
 _Look = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
@@ -112,7 +114,7 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
 
 def run(
     simulation: Simulation,
-    engine: Engine | str = "mujoco",
+    engine: AnyEngine = "mujoco",
     outside: Outside | None = None,
     ticks: int | None = None,
     start: Array | None = None,
@@ -120,12 +122,12 @@ def run(
 ) -> Trace:
     """Close the loop and return what every tick saw.
 
-    `engine` is an engine or the name of one, with its default step; `outside`, `ticks` and the plant state `start`,
-    (states, 1), are those of the scenario and rest where they are not given. The trace ends early where numbers stop
-    being finite, the engine reports trouble, or the keyboard interrupts.
+    `engine` is an engine, its class, or the name of one, with its default step; `outside`, `ticks` and the plant state
+    `start`, (states, 1), are those of the scenario and rest where they are not given. The trace ends early where
+    numbers stop being finite, the engine reports trouble, or the keyboard interrupts.
     """
     process, scenario = simulation.process, simulation.scenario
-    engine = make_engine(simulation, engine) if isinstance(engine, str) else engine
+    engine = make_engine(simulation, engine)
     outside = outside or partial(outside_forces, scenario, simulation.scene, timing=simulation.timing)
     ticks = scenario.samples if ticks is None else ticks
     start = np.zeros((simulation.plant.A.shape[0], 1)) if start is None else start
@@ -216,6 +218,8 @@ def run_blocks(
     # a diverging run is reported, not warned about
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
         engine.start(buffer)
+        if not callable(getattr(engine, "advance", None)):
+            raise InputError(f"engine {engine_name(engine)} has no advance(k), which moves the plant by one period")
         for first in range(0, ticks, block):
             count = min(block, ticks - first)
             if not len(ahead):
@@ -269,7 +273,7 @@ def outside_forces(
 
 def make_engine(
     simulation: Simulation,
-    engine: str,
+    engine: AnyEngine,
     integrator: str | None = None,
     substeps: int | None = None,
     T: float | None = None,
@@ -277,8 +281,12 @@ def make_engine(
     """The engine of that name for one simulation, which MuJoCo advances by T seconds (default: the scenario's).
 
     Without an integrator it is the scene's default, without substeps they are 1 of the exponential one and 4 of others.
-    Raises ValueError for an unknown name, and for Coulomb friction before the exact engine.
+    A user's own is taken as it is, or made of the simulation.
+    Raises ValueError for an unknown name, for Coulomb friction before the exact engine, and for uneven ticks before an
+    engine of one's own, and for what is no engine.
     """
+    if not isinstance(engine, str):
+        return _own_engine(simulation, engine)
     if engine not in ENGINES:
         raise ValueError(f"engine is {engine!r}, allowed are {', '.join(ENGINES)}")
     if engine == "exact":
@@ -292,6 +300,25 @@ def make_engine(
     if T is not None:
         return MujocoEngine(simulation.scene, T, integrator, count)
     return MujocoEngine(simulation.scene, simulation.scenario.T, integrator, count, simulation.timing)
+
+
+def engine_name(engine: AnyEngine) -> str:
+    """How reports name it."""
+    if isinstance(engine, str):
+        return engine
+    kind: Any = engine if hasattr(engine, "__qualname__") else type(engine)
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def _own_engine(simulation: Simulation, engine: Engine | Callable[[Simulation], Engine]) -> Engine:
+    name, is_made = f"engine {engine_name(engine)}", hasattr(engine, "start") and not isinstance(engine, type)
+    made: Any = engine if is_made or not callable(engine) else called(name, engine, simulation)
+    if lacking := [part for part in ("start", "troubled") if not callable(getattr(made, part, None))]:
+        has = "expected what has start(buffer), advance(k) and troubled() (sim.engines.Engine)"
+        raise InputError(f"{name} has no {' and no '.join(lacking)}: {has}")
+    if simulation.timing and not type(made).__module__.startswith("sim."):
+        raise InputError(f"{name}: uneven ticks (period, latency) run in {' and '.join(ENGINES)}")
+    return made
 
 
 if __name__ == "__main__":

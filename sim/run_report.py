@@ -25,7 +25,7 @@ from sim.report import (
     timing_part,
     transparency_part,
 )
-from sim.run import beginnings
+from sim.run import beginnings, engine_name
 from sim.scenario import Scenario
 from sim.stability import Stability, stability_of
 
@@ -166,11 +166,11 @@ def run_report(
 
 
 def _ran(run: ScenarioRun, lam: tuple[int, ...], environment: str, seed: int, check: bool) -> Ran:
-    simulation, trace, steps = run.simulation, run.trace, (run.integrator, run.substeps)
+    simulation, trace, steps = run.simulation, run.trace, (run.engine, run.integrator, run.substeps)
     scenario, process, samples = simulation.scenario, simulation.process, trace.t.size
     duration = float(beginnings(scenario.T, simulation.timing, samples, 1)[0])
     return Ran(
-        engine="exact" if run.integrator is None else "mujoco",
+        engine=engine_name(run.engine),
         integrator=run.integrator,
         substeps=run.substeps,
         duration_s=duration,

@@ -141,7 +141,7 @@ def mujoco_loops(
     2n + m simulations for every set of humans, stepped in one batch; with `late` (m,) [s], as in `hold`, m more.
     """
     m, nsim, T = process.channels, len(variants), process.F.T
-    n = 2 * variants.scene.model.nv + (m if late else 0)
+    n = variants.states + (m if late else 0)
     timing = Timing(np.array([T]), np.array([late])) if late else None
     # within the actuators' limits, so that these do not clip
     unit = np.concatenate([np.ones(n), np.minimum(1.0, process.force_limit / 2)])
@@ -150,8 +150,8 @@ def mujoco_loops(
     basis = np.tile(np.diag(unit), (1, nsim))
     buffer.s[0], buffer.f[0] = basis[:n], basis[n:]
     with profiler_off(), quiet_warnings():
-        fields = variants.repeated(n + m)
-        engine = MujocoBatchEngine(variants.scene, T, integrator, substeps, nsim * (n + m), nthread, fields, timing)
+        each = variants.repeated(n + m)
+        engine = MujocoBatchEngine(variants.scene, T, integrator, substeps, nsim * (n + m), nthread, each, timing)
         engine.start(buffer)
         engine.advance(0)
     columns = buffer.s[1].reshape(n, nsim, n + m).transpose(1, 0, 2) / unit

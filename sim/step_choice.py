@@ -18,7 +18,7 @@ from controller.lti import Array
 from controller.tick import StepBuffer
 from models.hold import HeldPlant
 from sim.mujoco_engines import EXPONENTIAL, LEAST, default_integrator, quiet_warnings
-from sim.run import Simulation, make_engine
+from sim.run import AnyEngine, Simulation, engine_name, make_engine
 from sim.scenario import InputError
 from sim.stability import close, disagree, dominant_mode, exact_growth
 
@@ -60,17 +60,17 @@ def pace(A: Array) -> PlantSpeed:
 
 
 def settle(
-    simulation: Simulation, engine: str, integrator: str | None = None, substeps: int | None = None
+    simulation: Simulation, engine: AnyEngine, integrator: str | None = None, substeps: int | None = None
 ) -> tuple[str | None, int | None, list[str]]:
-    """(integrator, substeps, remarks) of a run for which some were asked; without any for the exact engine.
+    """(integrator, substeps, remarks) of a run for which some were asked; without any but for MuJoCo.
 
     Raises InputError where they cannot be had.
     """
-    if engine == "exact":
+    if engine != "mujoco":
         for name, asked in (("integrator", integrator), ("substeps", substeps)):
             if asked is not None:
-                raise InputError(f"--{name} with --engine exact: it takes no steps; leave it out")
-        if simulation.friction:
+                raise InputError(f"--{name} with --engine {engine_name(engine)}: it is MuJoCo's; leave it out")
+        if engine == "exact" and simulation.friction:
             raise InputError(
                 "--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco"
             )
@@ -145,7 +145,7 @@ def _instead(simulation: Simulation, integrator: str) -> str:
 
 def measured_hold(
     simulation: Simulation,
-    engine: str = "mujoco",
+    engine: AnyEngine = "mujoco",
     integrator: str | None = None,
     substeps: int | None = None,
     T: float | None = None,
@@ -170,7 +170,9 @@ def measured_hold(
     return HeldPlant(step[:, :states], step[:, states:], simulation.plant.C, period)
 
 
-def simulated_growth(simulation: Simulation, integrator: str, substeps: int) -> float:
-    """The growth rate [1/s] of the loop that MuJoCo simulates with these settings; of walls, in the worst state."""
-    held = measured_hold(simulation, "mujoco", integrator, substeps)
+def simulated_growth(
+    simulation: Simulation, integrator: str | None, substeps: int | None, engine: AnyEngine = "mujoco"
+) -> float:
+    """The growth rate [1/s] of the loop that an engine simulates with these settings; of walls, in the worst state."""
+    held = measured_hold(simulation, engine, integrator, substeps)
     return max(float(dominant_mode(close(held, F)).growth) for F in simulation.process.frozen().values())

@@ -238,7 +238,7 @@ def switched_crowd(
         exact, _ = impulse_growth(endless, moved, scene, states, ticks, nsim)
         if not mujoco:
             return Switched(exact, np.full(nsim, np.nan))
-        engine = MujocoBatchEngine(scene, scenario.T, nsim=nsim, nthread=threads, fields=held_by.fields, timing=timing)
+        engine = MujocoBatchEngine(scene, scenario.T, nsim=nsim, nthread=threads, humans=held_by, timing=timing)
         own, clipped = impulse_growth(process, engine, scene, states, ticks, nsim)
         return Switched(exact, np.where(clipped, np.nan, own))
 

@@ -38,10 +38,12 @@ def _mirror(path: str) -> set[str]:
     package, *folders = Path(path).parts[:-1]
     tests, stem = sorted(Path("tests").glob("*/test_*.py")), Path(path).stem
     own = {str(test) for test in tests if test.stem[5:] in (stem, *folders)}
+    place = r"\.".join([package, *folders])
     imported = re.compile(
-        rf"^from {package}(\.{stem} import| import .*\b{stem}\b)|^import {package}\.{stem}\b", re.MULTILINE
+        rf"^from {place}(\.{stem} import| import .*\b{stem}\b)|^import {place}\.{stem}\b", re.MULTILINE
     )
-    own = own or {str(one) for one in tests if one.parent.name == package and imported.search(one.read_text())}
+    found = [] if own else [one for one in tests if imported.search(one.read_text())]
+    own = own or {str(one) for one in found if one.parent.name == package} or set(map(str, found))
     return own or ({f"tests/{package}"} if Path("tests", package).is_dir() else set())
 
 

@@ -154,8 +154,8 @@ def test_many_hands(benchmark):
     plants = hold(held_by.plants(), scenario.T)
     batches = {
         "exact": ExactEngine(plants),
-        "exponential x 1": MujocoBatchEngine(held_by.scene, scenario.T, EXPONENTIAL, 1, nsim, 1, held_by.fields),
-        "RK4 x 4": MujocoBatchEngine(held_by.scene, scenario.T, "RK4", 4, nsim, 1, held_by.fields),
+        "exponential x 1": MujocoBatchEngine(held_by.scene, scenario.T, EXPONENTIAL, 1, nsim, 1, held_by),
+        "RK4 x 4": MujocoBatchEngine(held_by.scene, scenario.T, "RK4", 4, nsim, 1, held_by),
     }
     used, after = {name: [] for name in batches}, {}
     start = 1e-4 * np.random.default_rng(0).normal(size=(plants.A.shape[1], nsim))

@@ -12,7 +12,7 @@ from controller.coupling import CASE_I, NoCoupling
 from controller.tick import StepBuffer
 from design.conditions import this_environment
 from models.hold import hold
-from models.scene import variants
+from models.scene import Variants, variants
 from sim.adversary import attempts
 from sim.crowds import crowds
 from sim.engines import ExactEngine
@@ -86,8 +86,8 @@ def test_batched_exact_engine(benchmark, held_by):
 def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
     """The loop around the batch against the batch's own steps, alternating, on all cores."""
     simulation, ticks, short, nsim = assemble(load(), CASE_I), 160, 32, 200
-    T, fields = simulation.scenario.T, {name: rows[:nsim] for name, rows in held_by.fields.items()}
-    engine, bare = (MujocoBatchEngine(held_by.scene, T, "RK4", substeps, nsim, fields=fields) for _ in range(2))
+    T, some = simulation.scenario.T, Variants(held_by.scene, {n: rows[:nsim] for n, rows in held_by.fields.items()})
+    engine, bare = (MujocoBatchEngine(held_by.scene, T, "RK4", substeps, nsim, humans=some) for _ in range(2))
     buffer = StepBuffer(simulation.process, short, 2 * held_by.scene.model.nv, held_by.scene.outside, nsim)
     buffer.s[0] = 1e-4
     engine.start(buffer)

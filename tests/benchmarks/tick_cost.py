@@ -17,9 +17,9 @@ import sys
 import time
 from collections import defaultdict
 
+from cli.checks.faults import lively
 from hw.control import certified_couplings
 from hw.emulator import Emulator, Terminal
-from hw.faults import lively
 from hw.haptic_device import SerialDevice
 from hw.limits import ENDED, Stage
 from hw.monitor import LinkSettings

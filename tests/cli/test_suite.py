@@ -11,9 +11,9 @@ from importlib import import_module
 import pytest
 
 from cli import suite, suite_report
+from cli.checks import endurance
 from cli.options import Parser
 from cli.suite import CHECKS, Check, main
-from hw import endurance
 from sim.scenario import InputError
 
 HARD = next(check for check in CHECKS if check.name == "hard")

@@ -188,7 +188,7 @@ def test_random_hands_on_walls_come_to_rest_under_any_environment(name, humans, 
     if name == "exact":
         engine = ExactEngine(hold(sets.plants(), scenario.T))
     else:
-        engine = MujocoBatchEngine(sets.scene, scenario.T, nsim=humans, fields=sets.fields)
+        engine = MujocoBatchEngine(sets.scene, scenario.T, nsim=humans, humans=sets)
     n = sets.scene.model.nv
     start = np.zeros((2 * n, humans))
     start[n:] = np.random.default_rng(1).uniform(-0.3, 0.3, (n, humans))

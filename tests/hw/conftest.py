@@ -1,17 +1,19 @@
-"""The scenario that sessions are held with, and couplings for its links."""
+"""The scenario that sessions are held with, and couplings for its links: made once."""
 
 import pytest
 
+from cli.checks.faults import lively
 from hw.control import certified_couplings
 from sim.scenario import load as scenario_of
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def scenario():
-    return scenario_of()
+    """People who move soon after arming, at full amplitude."""
+    return lively(scenario_of())
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def rungs(scenario):
     """Couplings for links of one and two ticks."""
     return certified_couplings(scenario, "I", None, None, 1, spare=1)

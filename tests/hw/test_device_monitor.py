@@ -8,10 +8,8 @@ import pytest
 from worlds import FakePort
 
 from design.files import plain
-from hw.control import certified_couplings
 from hw.device_state import Device
 from hw.emulator import Emulator, FaultInjection, info_of, nobody
-from hw.faults import lively
 from hw.haptic_device import Driver, SerialDevice
 from hw.identify import chirp
 from hw.limits import SafetyLimits, SafetyStop, Stage
@@ -97,16 +95,6 @@ def test_a_disarmed_device_has_no_force():
     with pytest.raises(SafetyStop, match=r"is disarmed and applies \(1, 0\) steps"):
         check_state(state(0, (1, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
     check_state(state(0, (0, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
-
-
-@pytest.fixture(scope="module")
-def scenario():
-    return lively(scenario_of())
-
-
-@pytest.fixture(scope="module")
-def rungs(scenario):
-    return certified_couplings(scenario, "I", None, None, 1, spare=0)
 
 
 def test_a_session_stops_where_a_disarmed_device_pushes(scenario, rungs):

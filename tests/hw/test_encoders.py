@@ -7,28 +7,15 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from hw.control import certified_couplings
 from hw.emulator import Emulator, FaultInjection, nobody
-from hw.faults import lively
 from hw.limits import SafetyLimits, SafetyStop, Stage
 from hw.monitor import EncoderMonitor, EncoderTest, LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import Session
 from sim.scenario import InputError
-from sim.scenario import load as scenario_of
 
 T = 1.2e-3
 STEP = 4e-4  # [N]
-
-
-@pytest.fixture(scope="module")
-def scenario():
-    return lively(scenario_of())
-
-
-@pytest.fixture(scope="module")
-def rungs(scenario):
-    return certified_couplings(scenario, "I", None, None, 1, spare=0)
 
 
 def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step=None, **settings):

@@ -9,11 +9,9 @@ from types import SimpleNamespace
 import pytest
 
 from cli import bridge
-from hw.control import certified_couplings
-from hw.faults import CASES, lively, rehearse_case
+from cli.checks.faults import CASES, rehearse_case
 from hw.monitor import LinkSettings
 from hw.transport import SerialPort, _no_collections
-from sim.scenario import load
 
 PAGE = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")
 TABLE = re.search(r"^\| fault \| ends in .*\n\|[-|]+\n((?:\|.*\n)+)", PAGE, flags=re.MULTILINE)[1]
@@ -30,18 +28,12 @@ CALLED = {
 IN_WORDS = ("no FORCE arrives; cable pulled", "10 % of answers late")  # causes that the page tells in its own words
 
 
-@pytest.fixture(scope="module")
-def made():
-    scenario = lively(load())
-    return scenario, certified_couplings(scenario, "I", None, None, 1, spare=1)
-
-
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
-def test_the_table_of_faults_shows_what_the_rehearsal_gives(row, made):
+def test_the_table_of_faults_shows_what_the_rehearsal_gives(row, scenario, rungs):
     fault, ends, cause, zero = row
     shown = [re.search(r"[\d.]+", part)[0] for part in zero.split(";")]
     names = CALLED.get(fault, (fault,))
-    outcomes = [rehearse_case(next(c for c in CASES if c.name == name), *made)[1] for name in names]
+    outcomes = [rehearse_case(next(c for c in CASES if c.name == name), scenario, rungs)[1] for name in names]
     times = [f"{outcome.zero_force_ms:.1f}" for outcome in outcomes]
     assert times == (shown if len(shown) == len(times) else shown * len(times))
     for outcome in outcomes:
@@ -50,9 +42,11 @@ def test_the_table_of_faults_shows_what_the_rehearsal_gives(row, made):
         assert cause in outcomes[0].cause
 
 
-def test_a_dead_encoder_or_channel_is_found_as_soon_as_the_page_says(made):
+def test_a_dead_encoder_or_channel_is_found_as_soon_as_the_page_says(scenario, rungs):
     names = ("encoder dies", "encoder 2 dies", "a channel of encoder 1 dies", "a channel of encoder 2 dies")
-    times = [rehearse_case(next(c for c in CASES if c.name == name), *made)[1].zero_force_ms for name in names]
+    times = [
+        rehearse_case(next(c for c in CASES if c.name == name), scenario, rungs)[1].zero_force_ms for name in names
+    ]
     assert f"forces are zero {min(times):.1f} to {max(times):.1f} ms after an encoder died" in PAGE
 
 

@@ -26,7 +26,7 @@ from cli import emulator as emulator_command
 from cli.options import Parser
 from cli.session_cli import add_link_options, check_link
 from controller.delay import VaryingDelay
-from hw.control import certified_coupling, certified_couplings
+from hw.control import certified_coupling
 from hw.haptic_device import SerialDevice
 from hw.limits import ENDED, SafetyLimits, Stage
 from hw.monitor import LinkSettings
@@ -34,7 +34,6 @@ from hw.recording import IncidentLog
 from hw.session import Session
 from hw.transport import Live, SerialPort
 from sim.scenario import InputError
-from sim.scenario import load as scenario_of
 
 pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
 ROOT = Path(__file__).parent.parent.parent
@@ -72,16 +71,6 @@ def emulator():
     emulator = EmulatorProcess(f"--pace={PACE}")
     yield emulator
     assert emulator.end()["phase"] in AT_REST
-
-
-@pytest.fixture(scope="module")
-def scenario():
-    return scenario_of()
-
-
-@pytest.fixture(scope="module")
-def rungs(scenario):
-    return certified_couplings(scenario, "I", None, None, 1, spare=0)
 
 
 def run(emulator, scenario, plan, glance=lambda session: None, pace=PACE):

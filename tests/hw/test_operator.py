@@ -2,25 +2,11 @@
 
 import pytest
 
-from hw.control import certified_couplings
 from hw.emulator import Emulator, FaultInjection
-from hw.faults import lively
 from hw.limits import SafetyLimits, Stage
 from hw.monitor import LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import Operator, Session
-from sim.scenario import load as scenario_of
-
-
-@pytest.fixture(scope="module")
-def scenario():
-    return lively(scenario_of())
-
-
-@pytest.fixture(scope="module")
-def rungs(scenario):
-    """Couplings for links of one and two ticks."""
-    return certified_couplings(scenario, "I", None, None, 1, spare=1)
 
 
 def rehearsal_of(scenario, rungs, operator, *faults):

@@ -16,9 +16,7 @@ from worlds import FakePort
 from cli import bridge, replay
 from cli.bridge import _parser
 from cli.session_cli import limits_from, touched
-from hw.control import certified_couplings
 from hw.emulator import Emulator, FaultInjection
-from hw.faults import lively
 from hw.haptic_device import Driver, SerialDevice
 from hw.limits import SafetyLimits, Stage
 from hw.monitor import LinkSettings
@@ -27,19 +25,8 @@ from hw.rehearsal import Rehearsal
 from hw.session import Operator, Session, session_for
 from hw.transport import Preflight, preflight
 from sim.scenario import InputError
-from sim.scenario import load as scenario_of
 
 ROOT = Path(__file__).parent.parent.parent
-
-
-@pytest.fixture(scope="module")
-def scenario():
-    return lively(scenario_of())
-
-
-@pytest.fixture(scope="module")
-def rungs(scenario):
-    return certified_couplings(scenario, "I", None, None, 1, spare=0)
 
 
 def rehearsal_of(scenario, rungs, operator):

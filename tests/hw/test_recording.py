@@ -16,7 +16,6 @@ from design.certificate import assess
 from design.files import plain
 from hw.control import CertifiedCoupling, certified_coupling, fill
 from hw.emulator import Emulator
-from hw.faults import lively
 from hw.limits import SafetyLimits, Stage, Units
 from hw.recording import Recorder, digest, load, outcome, recipes_of, replay, result_of, save, save_npz, steady_ticks
 from hw.rehearsal import Rehearsal
@@ -24,6 +23,7 @@ from hw.session import Session
 from sim.couplings import choose, limits_of
 from sim.run import assemble, run
 from sim.scenario import InputError
+from sim.scenario import load as scenario_of
 from sim.stability import close, dominant_mode
 from sim.trace import Trace
 
@@ -37,7 +37,7 @@ def test_missing_samples_are_filled_by_a_straight_line():
 def trace(scenario, rungs, tmp_path_factory):
     """A session over a line that loses STATEs, as files."""
     recorder = Recorder(2)
-    rehearsal = rehearsal_of(lively(scenario), rungs, "up:drop=0.05@0.3", recorder=recorder)
+    rehearsal = rehearsal_of(scenario, rungs, "up:drop=0.05@0.3", recorder=recorder)
     session = rehearsal.run_until_armed(1.0)
     session.stop("enough", session.now)
     rehearsal.run(2.5)
@@ -65,7 +65,7 @@ def test_a_replay_is_identical_bit_by_bit(trace):
 
 def test_a_session_armed_twice_is_replayed_with_both_couplings(scenario, rungs, tmp_path):
     recorder = Recorder(2)
-    rehearsal = rehearsal_of(lively(scenario), rungs, "down:jitter=0.0007@0.45", recorder=recorder)
+    rehearsal = rehearsal_of(scenario, rungs, "down:jitter=0.0007@0.45", recorder=recorder)
     session = rehearsal.run_until_armed(1.2)
     assert session.stage == Stage.DISARMED
     session.arm(session.now)
@@ -226,7 +226,7 @@ def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
         cuts.append(session.counters.clipped + session.counters.slowed)
 
     session.record = record
-    Rehearsal(session, Emulator(lively(scenario)), lambda ages: rungs).run_until_armed(1.2)
+    Rehearsal(session, Emulator(scenario), lambda ages: rungs).run_until_armed(1.2)
     ((first, stop),) = steady_ticks(recorder, session.units.force_step, session.limits.cap)
     assert (recorder.link()["gain"][first:] == 1.0).all()
     full = np.diff(cuts, prepend=0)[first:]
@@ -245,6 +245,7 @@ def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, 
     """From the file alone: the exact engine's eigenvalue without coupling, to 2e-3 1/s (a rounded force is no linear
     one), and with the certified one nothing that oscillates. On the ticks of full gain, before the cap is met.
     """
+    scenario = scenario_of()  # people who begin slowly
     made = certified_coupling(scenario, "I", None, None, 1) if settles else None
     if made is None:
         chosen = choose(scenario, "I", name, None)

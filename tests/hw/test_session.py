@@ -9,11 +9,11 @@ from sessions import AT_REST, FAST, rehearsal_of, session_with
 from worlds import FakePort
 
 from cli import bridge
+from cli.checks.faults import CASES, Fault, at, person, rehearse_case
 from design.coupling_file import Stored
 from design.coupling_file import save as save_coupling
 from hw.control import LinearController, certified_coupling, certified_couplings, link_delay
 from hw.emulator import Emulator, FaultInjection
-from hw.faults import CASES, Fault, at, lively, person, rehearse_case
 from hw.haptic_device import Driver, SerialDevice
 from hw.limits import SafetyLimits, SafetyStop, Stage
 from hw.monitor import Ages, LinkSettings
@@ -45,8 +45,8 @@ def test_a_session_whose_device_is_deaf_to_stop_has_not_finished(scenario, rungs
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_every_fault_ends_where_it_must(case, scenario, rungs):
-    """Stage, cause, time to zero force, counters, no force above the cap, no second arming: hw.faults says which."""
-    assert rehearse_case(case, lively(scenario), rungs)[1].wrong == ()
+    """Stage, cause, time to zero force, counters, no force above the cap, no second arming."""
+    assert rehearse_case(case, scenario, rungs)[1].wrong == ()
 
 
 def test_there_are_enough_faults():
@@ -56,8 +56,8 @@ def test_there_are_enough_faults():
 
 def test_faults_that_do_not_stop_leave_the_forces_alone(scenario, rungs):
     """A frame that comes twice, on either side, changes no force."""
-    plain = rehearsal_of(lively(scenario), rungs)
-    twice = rehearsal_of(lively(scenario), rungs, "duplicate=0.5@0.3")
+    plain = rehearsal_of(scenario, rungs)
+    twice = rehearsal_of(scenario, rungs, "duplicate=0.5@0.3")
     for rehearsal in (plain, twice):
         rehearsal.run_until_armed(0.8)
     assert twice.session.counters.duplicates > 50
@@ -108,7 +108,7 @@ def test_a_device_that_arms_by_itself_is_stopped(scenario, rungs):
 
 
 def test_without_arming_no_force_is_ever_asked_for(scenario, rungs):
-    rehearsal = rehearsal_of(lively(scenario), rungs, arm=False)
+    rehearsal = rehearsal_of(scenario, rungs, arm=False)
     rehearsal.emulator.plant.begin()  # the person moves all the same
     sent = []
     receive = rehearsal.emulator.receive
@@ -254,7 +254,7 @@ def test_nothing_uncertified_is_loaded(scenario, rungs):
 def test_a_softer_coupling_takes_over_once_a_person_arms_it(scenario, rungs):
     """10 % late answers: ramp-out, the coupling for one tick more, disarmed; only arm() brings the forces back."""
     faults = (FaultInjection.parse("down:jitter=0.0007@0.45"),)
-    rehearsal = Rehearsal(session_with(lively(scenario)), Emulator(lively(scenario)), lambda ages: rungs, faults)
+    rehearsal = Rehearsal(session_with(scenario), Emulator(scenario), lambda ages: rungs, faults)
     session = rehearsal.run_until_armed(1.2)
     assert session.stage == Stage.DISARMED
     assert session.program is rungs[1]
@@ -302,7 +302,7 @@ def test_a_coupling_from_a_file_has_one_too(scenario, optimal_rungs, tmp_path):
 def test_the_spring_damper_follows_the_optimal_coupling(scenario, optimal_rungs, tmp_path):
     """Late answers, a ramp to zero, the reserve armed by a person; and the trace of both replays bit by bit."""
     recorder = Recorder(2)
-    rehearsal = rehearsal_of(lively(scenario), optimal_rungs, "down:jitter=0.0007@0.45", recorder=recorder)
+    rehearsal = rehearsal_of(scenario, optimal_rungs, "down:jitter=0.0007@0.45", recorder=recorder)
     session = rehearsal.run_until_armed(1.2)
     assert (session.stage, session.program) == (Stage.DISARMED, optimal_rungs[1])
     session.arm(session.now)
@@ -358,7 +358,7 @@ def test_forces_at_the_cap_are_limited_under_the_guarantee_and_replay(scenario, 
     recorder = Recorder(2)
     session = Session(scenario, SafetyLimits((0.3, 0.2)), FAST)
     session.record = recorder
-    Rehearsal(session, Emulator(lively(scenario)), lambda ages: rungs).run_until_armed(2.0)
+    Rehearsal(session, Emulator(scenario), lambda ages: rungs).run_until_armed(2.0)
     report = outcome("I", session, recorder, 0)
     assert report.program["limiter"]["words"].startswith("proved, also while forces are limited to 0.3, 0.2 N")
     asked = np.abs(recorder.link()["asked"])

@@ -2,7 +2,6 @@
 
 import ast
 import re
-import tokenize
 from functools import cache
 from pathlib import Path
 
@@ -48,7 +47,7 @@ def _tree(path: Path) -> ast.Module:
 
 @cache
 def imported(path: Path) -> set[str]:
-    """Every module that a file imports, at its head or later; names of modules in full."""
+    """Every module that a file imports, at its head, later or by a string; names of modules in full."""
     names = set()
     for top in _tree(path).body:
         for node in () if is_door(top) else ast.walk(top):
@@ -59,6 +58,10 @@ def imported(path: Path) -> set[str]:
                 inside = {f"{node.module}.{alias.name}" for alias in node.names}
                 modules = {name for name in inside if file_of(name)}
                 names |= modules or {node.module or ""}
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+                names |= {
+                    arg.value for arg in node.args if isinstance(arg, ast.Constant) and isinstance(arg.value, str)
+                }
     return names
 
 
@@ -138,8 +141,9 @@ def test_folders_have_no_circle():
 
 def test_the_check_sees_forbidden_arrows_and_circles(tmp_path):
     wrong = tmp_path / "wrong.py"
-    wrong.write_text("import numpy\nfrom sim.run import run\nif __name__ == '__main__':\n    import cli.run\n")
-    assert imported(wrong) == {"numpy", "sim.run"}
+    door = "if __name__ == '__main__':\n    import cli.run\n"
+    wrong.write_text(f"import numpy\nfrom sim.run import run\nimport_module('hw.session')\n{door}")
+    assert imported(wrong) == {"numpy", "sim.run", "hw.session"}
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}}) == ["a", "b", "c", "a"]
     assert circle({"a": {"b"}, "b": {"c"}}) is None
 
@@ -159,24 +163,46 @@ def test_replaced_fields_exist():
 
 
 def prose(path: Path) -> str:
-    """Comments and docstrings."""
-    with path.open("rb") as file:
-        tokens = list(tokenize.tokenize(file.readline))
-    said = [t for t in tokens if t.type in (tokenize.COMMENT, tokenize.STRING)]
-    return "\n".join(t.string for t in said if t.string.startswith(("#", '"""')))
+    """Comments and docstrings of Python, all of any other file but what pages show as a file or as output."""
+    if path.suffix != ".py":
+        return re.sub(r"^```(?:toml|console|text)\n.*?^```", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
+    return "\n".join(re.findall(r'#.*|"""(?:.|\n)*?"""', path.read_text()))
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_what_a_docstring_names_is_there(path):
-    """A file of ours by its path, or a name by its module."""
-    text = prose(path)
-    for name in re.findall(rf"\b(?:{'|'.join((*WORLDS, 'docs', 'tests', 'examples'))})/[\w/]+\.\w+", text):
-        assert (ROOT / name).exists(), f"{name} is named, and does not exist"
-    for world, module, name in re.findall(
-        rf"(?<!from )\b({'|'.join(WORLDS)})\.(?!py\b|step\b)([a-z_]+)(?:\.(\w+))?", text
-    ):
-        file, front = ROOT / world / f"{module}.py", ROOT / world / "__init__.py"
-        if not file.exists():
-            assert (ROOT / world / module).is_dir() or re.search(rf"\b{module}\b", front.read_text()), (world, module)
-        elif name:
-            assert re.search(rf"\b{name}\b", file.read_text()), f"{world}.{module} has no {name}"
+PLACES = (*WORLDS, "docs", "tests", "examples")
+#: whatever speaks of our files; the changelog tells of those that are gone
+SPEAKING = [
+    path
+    for place in PLACES
+    for kind in ("py", "md", "h", "ino", "toml", "xml", "c")
+    for path in ROOT.glob(f"{place}/**/*.{kind}")
+]
+SPEAKING += [
+    ROOT / n for n in ("README.md", "CONTRIBUTING.md", "NOTATION.md", "Makefile", "pyproject.toml", "constraints.txt")
+]
+SPEAKING += [ROOT / n for n in (".pre-commit-config.yaml", ".github/workflows/ci.yml", ".ci/run")]
+#: what a reader makes after a page's example, and a word of Linux
+YOURS = {"half_stiff", "h.py", "performance"}
+
+
+def test_what_is_named_is_there():
+    """In comments, docstrings, headers and pages: files of ours, names by their module, words in backticks on pages."""
+    names = {path.name for place in PLACES for path in ROOT.glob(f"{place}/**/*.*")} | YOURS
+    words = {word for path in SPEAKING if path.suffix != ".md" for word in re.findall(r"\w+", path.read_text())} | YOURS
+    wrong = []
+    for path in SPEAKING:
+        text, place = prose(path), path.relative_to(ROOT)
+        said = re.findall(rf"(?<![\w/.])(?:{'|'.join(PLACES)})/[a-z_/]+\.[a-z]+\b", text)
+        gone = [name for name in said if not (ROOT / name).exists() and not (ROOT / "tests" / name).exists()]
+        gone += {*re.findall(r"(?<![\w/.<-])[a-z_]+\.(?:py|h|ino)\b(?!>)", text)} - names
+        for world, module, name in re.findall(
+            rf"(?<!from )(?<![\w/.])({'|'.join(WORLDS)})\.(?!py\b|step\b)([a-z_]+)(?:\.(\w+))?", text
+        ):
+            file, front = ROOT / world / f"{module}.py", ROOT / world / "__init__.py"
+            within = [name] if file.exists() else [] if (ROOT / world / module).is_dir() else [module]
+            known = (file if file.exists() else front).read_text()
+            gone += [f"{world}.{module}" for one in within if one not in YOURS and not re.search(rf"\b{one}\b", known)]
+        if path.suffix == ".md":
+            gone += {*re.findall(r"`([a-z]{4}\w*)(?:\([^`]*)?`", text)} - words
+        wrong += [f"{place}: {name}" for name in gone]
+    assert not wrong

@@ -16,7 +16,7 @@ from scipy.linalg import expm
 from controller.coupling import CASE_I, NoCoupling
 from controller.tick import Process, StepBuffer
 from models.device import CompliantDevice
-from models.hold import expm_each, hold
+from models.hold import expm_each, exponential_step, hold
 from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
 from sim import mujoco_engines
@@ -200,7 +200,7 @@ def test_many_hands_are_each_their_own_scene(substeps):
     held_by = variants(SCENARIO.device, crowd)
     loop = assemble(SCENARIO, CASE_I)
     start = 1e-3 * np.random.default_rng(1).normal(size=(8, 5))
-    batch = MujocoBatchEngine(held_by.scene, SCENARIO.T, EXPONENTIAL, substeps, 5, fields=held_by.fields)
+    batch = MujocoBatchEngine(held_by.scene, SCENARIO.T, EXPONENTIAL, substeps, 5, humans=held_by)
     together = knocked(loop, batch, 300, start).s
     for i in range(5):
         own = assemble(SCENARIO.replace(human=crowd.humans(i)), CASE_I)
@@ -324,12 +324,12 @@ def test_a_wrong_verdict_is_shown_and_never_chosen():
 def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
     """The exponential engine with a J that is off by one part in a thousand; RK4 knows no J."""
     loop = assemble(SCENARIO.replace(duration=0.5), CASE_I)
-    sound = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), EXPONENTIAL, 1)
+    sound = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), "mujoco", EXPONENTIAL, 1)
     assert (sound.integrator, sound.substeps, sound.agrees) == ("RK4", 4, True)
     assert sound.position_relative_rms < 1e-6  # of RK4 x 4 here
     assert abs(sound.growth_rate_difference_per_s) < 1e-3
-    monkeypatch.setattr(mujoco_engines, "_rates", lambda scene, fields: 1.001 * scene.plant.A[None])
-    wrong = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), EXPONENTIAL, 1)
+    monkeypatch.setattr(mujoco_engines, "exponential_step", lambda J, *rest: exponential_step(1.001 * J, *rest))
+    wrong = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), "mujoco", EXPONENTIAL, 1)
     assert wrong.position_relative_rms > 30 * sound.position_relative_rms
     assert abs(wrong.growth_rate_difference_per_s) > 1e-3
 

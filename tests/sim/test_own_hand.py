@@ -3,12 +3,14 @@
 import json
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 import pytest
 
 from cli.run import main
 from cli.validate import main as validate_command
 from controller.coupling import CASE_I, NoCoupling
+from controller.timing import Periods
 from design import design_coupling
 from models.hold import hold
 from models.human import Human, Link, Person, Port, state_space
@@ -16,7 +18,7 @@ from models.scene import variants
 from sim import load, simulate, validate
 from sim.adversary import search_population
 from sim.crowds import Validation
-from sim.run import assemble
+from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, load_humans
 from sim.stability import close, dominant_mode
 
@@ -82,7 +84,7 @@ def test_both_engines_simulate_it_and_agree():
 
 
 def test_its_matrices_give_the_run_that_its_bodies_give():
-    """No body, but the same hand: only the exact engine, and the same trace to rounding."""
+    """No body, but the same hand: the same trace to rounding."""
     bodies, space = (simulate(held_by(hand, hand), CASE_I, engine="exact") for hand in (Muscle(), MuscleBySpace()))
     # the sum of 1250 ticks' rounding
     assert rms(space.x, bodies.x) < 1e-9
@@ -101,12 +103,39 @@ def test_the_tissue_s_mass_goes_to_nothing():
     assert off[0] / off[1] == pytest.approx(2.0, abs=0.1)
 
 
-def test_mujoco_refuses_what_it_cannot_simulate_in_one_line():
-    message = r"an impedance \(A, B, C, D\), which MuJoCo does not simulate: use the exact engine"
-    with pytest.raises(InputError, match=message):
-        simulate(held_by(Light(), Muscle()), CASE_I)
-    with pytest.raises(InputError, match=message):
-        validate(held_by(Light(), Muscle()).replace(population=Muscles(Light)), CASE_I, humans=4, duration=0)
+def test_an_impedance_runs_in_mujoco_exactly_by_exponentials_and_to_second_order_by_runge_kutta():
+    simulation = assemble(held_by(Light(), MuscleBySpace()), CASE_I)
+    exact = run(simulation, "exact")
+    assert rms(run(simulation).s, exact.s) < 1e-10  # rounding
+    coarse, fine = (rms(run(simulation, make_engine(simulation, "mujoco", "RK4", n)).x, exact.x) for n in (4, 8))
+    assert coarse < 1e-5
+    assert np.log2(coarse / fine) == pytest.approx(2.0, abs=0.1)
+
+
+def test_an_impedance_runs_in_uneven_ticks_with_forces_that_latch_late():
+    uneven = {"period": Periods(1e-3, 1.2e-3), "latency": ((1e-4, 5e-4), (0.0, 3e-4)), "duration": 0.3}
+    simulation = assemble(held_by(Light(), MuscleBySpace()).replace(**uneven), CASE_I)
+    exact = run(simulation, "exact")
+    for integrator, least in (("exponential", 1e-10), ("RK4", 1e-5)):
+        assert rms(run(simulation, make_engine(simulation, "mujoco", integrator)).x, exact.x) < least
+
+
+def test_where_devices_rub_runge_kutta_moves_an_impedance():
+    rubbing = held_by(Light(), Light())
+    devices = tuple(msgspec.structs.replace(device, friction=0.2) for device in rubbing.device)
+    simulation = assemble(rubbing.replace(device=devices), CASE_I)
+    with pytest.raises(InputError, match=r"a human has an impedance .* and a device rubs: use integrator RK4"):
+        make_engine(simulation, "mujoco", "exponential")
+    coarse, fine = (run(simulation, make_engine(simulation, "mujoco", "RK4", n)).x for n in (4, 16))
+    assert rms(coarse, fine) < 1e-4  # of first order where a device sticks
+
+
+def test_a_population_of_impedances_is_validated_in_both_engines():
+    found = validate(held_by(Light(), Light()).replace(population=Muscles(Light)), None, humans=20, duration=0.3)
+    assert 0 < (found.exact > 0).sum() < 20
+    assert not found.disagreements.any()
+    np.testing.assert_allclose(found.mujoco, found.exact, atol=2e-2, rtol=1e-3)
+    np.testing.assert_allclose(found.trace, found.exact, atol=2e-2, rtol=1e-3)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from cli.checks.faults import person
 from hw.control import certified_couplings
 from hw.emulator import Emulator
-from hw.faults import person
 from hw.limits import Stage
 from hw.monitor import LinkSettings
 from hw.rehearsal import Rehearsal
