@@ -163,7 +163,7 @@ def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: De
         whole = check_ranges(loop, design.coupling, args.seed, samples, move, searched, held)
     limits = coverage.Limits(None, "as asked")
     if args.limiter is not False:
-        limits = coverage.covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
+        limits = coverage.covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None, held)
     return Judged.of(args.coupling, design.coupling, loop, requirements, whole, limits, scenario)
 
 

@@ -12,6 +12,7 @@ and a stored float stands for its shortest decimal, the one that a person wrote:
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -292,7 +293,7 @@ class Lti(ReadOnly):
             except SingularLoop:  # of a part, perhaps not of the whole
                 pass
         R = np.swapaxes(_solve(np.swapaxes(_identity(self) - self.A, -1, -2), np.swapaxes(self.C, -1, -2)), -1, -2)
-        return self.D + _times(R, self.B), R
+        return self.D + times(R, self.B), R
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in ("A", "B", "C", "D", "T")}
@@ -324,22 +325,22 @@ class Lti(ReadOnly):
     def __matmul__(self, other: Lti | Array) -> Lti:
         B, D = self.B, self.D
         if not isinstance(other, Lti):
-            whole = Lti(self.A, _times(B, other), self.C, _times(D, other), self.T)
-            return _made(whole, lambda: (_times(self._rest[0], other), self._rest[1]))
+            whole = Lti(self.A, times(B, other), self.C, times(D, other), self.T)
+            return _made(whole, lambda: (times(self._rest[0], other), self._rest[1]))
         T = _common_period(self, other)
         zero = np.zeros((other.order, self.order), dtype=int)
-        A = _block([[other.A, zero], [_times(B, other.C), self.A]])
-        C = _block([[_times(D, other.C), self.C]])
-        whole = Lti(A, _block([[other.B], [_times(B, other.D)]]), C, _times(D, other.D), T)
+        A = _block([[other.A, zero], [times(B, other.C), self.A]])
+        C = _block([[times(D, other.C), self.C]])
+        whole = Lti(A, _block([[other.B], [times(B, other.D)]]), C, times(D, other.D), T)
 
         def rest() -> tuple[Array, Array]:
             (own, R), (static, S) = self._rest, other._rest
-            return _times(own, static), _block([[_times(own, S), R]])
+            return times(own, static), _block([[times(own, S), R]])
 
         return _made(whole, rest)
 
     def __rmatmul__(self, matrix: Array) -> Lti:
-        return Lti(self.A, self.B, _times(matrix, self.C), _times(matrix, self.D), self.T)
+        return Lti(self.A, self.B, times(matrix, self.C), times(matrix, self.D), self.T)
 
     def __add__(self, other: Lti | Array) -> Lti:
         if not isinstance(other, Lti):
@@ -375,27 +376,27 @@ class Lti(ReadOnly):
         Raises SingularLoop where I + D_G D_H cannot be inverted.
         """
         T = _common_period(self, other)
-        S = inverse(_eye(self.outputs, T) + _times(self.D, other.D))
+        S = inverse(_eye(self.outputs, T) + times(self.D, other.D))
         # y = S (C x - D_G C_H h + D_G u), and the feedback block is driven by y
-        y_u = _times(S, self.D)
-        y_x = _block([[_times(S, self.C), -_times(y_u, other.C)]])
-        u_x = _block([[np.zeros((self.inputs, self.order), dtype=int), -other.C]]) - _times(other.D, y_x)
-        u_u = _eye(self.inputs, T) - _times(other.D, y_u)
-        A = _block_diagonal([self.A, other.A]) + _block([[_times(self.B, u_x)], [_times(other.B, y_x)]])
-        whole = Lti(A, _block([[_times(self.B, u_u)], [_times(other.B, y_u)]]), y_x, y_u, T)
+        y_u = times(S, self.D)
+        y_x = _block([[times(S, self.C), -times(y_u, other.C)]])
+        u_x = _block([[np.zeros((self.inputs, self.order), dtype=int), -other.C]]) - times(other.D, y_x)
+        u_u = _eye(self.inputs, T) - times(other.D, y_u)
+        A = _block_diagonal([self.A, other.A]) + _block([[times(self.B, u_x)], [times(other.B, y_x)]])
+        whole = Lti(A, _block([[times(self.B, u_u)], [times(other.B, y_u)]]), y_x, y_u, T)
 
         def rest() -> tuple[Array, Array]:
             (own, R), (static, Q) = self._rest, other._rest
-            closed = inverse(_eye(self.outputs, T) + _times(own, static))
-            return _times(closed, own), _times(closed, _block([[R, -_times(own, Q)]]))
+            closed = inverse(_eye(self.outputs, T) + times(own, static))
+            return times(closed, own), times(closed, _block([[R, -times(own, Q)]]))
 
         return _made(whole, rest)
 
     def inverse(self) -> Lti:
         """G^-1, where D has an inverse. Raises SingularLoop where it has none."""
         D = inverse(self.D)
-        B, C = _times(self.B, D), _times(D, self.C)
-        return Lti(self.A - _times(B, self.C), B, -C, D, self.T)
+        B, C = times(self.B, D), times(D, self.C)
+        return Lti(self.A - times(B, self.C), B, -C, D, self.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -581,7 +582,8 @@ _ZERO, _ONE = Fraction(0), Fraction(1)
 def _exact(value: Any) -> Any:
     """A copy as Fractions."""
     array = np.asarray(value, dtype=object)
-    if isinstance(value, np.ndarray) and not value.flags.writeable and all(type(v) is Fraction for v in value.ravel()):
+    known = isinstance(value, np.ndarray) and value.dtype == object and not value.flags.writeable
+    if known and all(type(v) is Fraction for v in value.ravel()):
         return value
     out = np.empty(array.shape, dtype=object)
     out.ravel()[:] = [v if type(v) is Fraction else _ZERO if v == 0 else rational(v) for v in array.ravel()]
@@ -606,24 +608,40 @@ def inverse(M: Array) -> Array:
     return np.linalg.inv(M)
 
 
-def _times(left: Array, right: Array) -> Array:
-    """left @ right; of Fractions only the entries that are not zero are multiplied, since next to all are."""
+def times(left: Array, right: Array) -> Array:
+    """left @ right; of Fractions only the entries that are not zero are multiplied, since next to all are.
+
+    Rows of the left one and columns of the right one become integers over a common denominator each, so that a sum
+    needs no common divisors but one at its end.
+    """
     if left.ndim != 2 or right.ndim != 2 or object not in (left.dtype, right.dtype):
         return left @ right
     if left.shape[1] != right.shape[0]:
         raise ValueError(f"shapes {left.shape} and {right.shape} do not fit")
-    rows = [[(j, v) for j, v in enumerate(row) if v] for row in right.tolist()]
+    (lines, own), (columns, below) = _cleared(left), _cleared(right.T)
+    rows = [[(j, column[k]) for j, column in enumerate(columns) if column[k]] for k in range(right.shape[0])]
     result = np.full((left.shape[0], right.shape[1]), _ZERO, dtype=object)
-    for i, row in enumerate(left.tolist()):
+    for i, line in enumerate(lines):
         on_time()
-        total: dict[int, Any] = {}
-        for factor, entries in zip(row, rows, strict=True):
+        total = [0] * right.shape[1]
+        for factor, entries in zip(line, rows, strict=True):
             if factor:
                 for j, v in entries:
-                    total[j] = total.get(j, _ZERO) + factor * v
-        for j, v in total.items():
-            result[i, j] = v
+                    total[j] += factor * v
+        for j, v in enumerate(total):
+            if v:
+                result[i, j] = Fraction(v, own[i] * below[j])
     return result
+
+
+def _cleared(M: Array) -> tuple[list[list[int]], list[int]]:
+    """Every row as integers, and the common denominator of each."""
+    common = [math.lcm(*(v.denominator for v in row if v)) for row in M.tolist()]
+    whole = [
+        [v.numerator * (den // v.denominator) if v else 0 for v in row]
+        for row, den in zip(M.tolist(), common, strict=True)
+    ]
+    return whole, common
 
 
 def _solve(M: Array, right: Array) -> Array:

@@ -258,6 +258,7 @@ LARGEST = 300  # states of a model that a proof is tried for: 0.1 s at 50, 0.5 s
 _MOST_BITS = 4000  # of the common denominator of a stored P, a power of two of some hundred bits when we made it
 _STORED_BITS = 44  # of each entry of P, relative to its diagonal
 _UNIT = 2.0**-53  # of double precision
+_SAMPLES = 400  # frequencies at which states are looked at, about
 _LONG = 80  # states from which on one solution of the Riccati equation has not been enough
 
 
@@ -380,9 +381,10 @@ def _scaled(G: Lti) -> tuple[Lti, Array]:
 
 
 def _states(G: Lti) -> NDArray[np.complex128]:
-    """(zI - A)^-1 B on a pole-dense grid of the circle, shape (k, n, m)."""
+    """(zI - A)^-1 B on a grid of the circle that knows the poles, shape (k, n, m): for the size of things."""
     n, m = G.B.shape
-    return Lti(G.A, G.B, np.eye(n), np.zeros((n, m)), G.T).at(on_circle(frequencies(G)))
+    w = frequencies(G, points=100)
+    return Lti(G.A, G.B, np.eye(n), np.zeros((n, m)), G.T).at(on_circle(w[:: 1 + w.size // _SAMPLES]))
 
 
 def _least_eigenvalue(G: Lti) -> tuple[float, float]:

@@ -212,9 +212,9 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
         settled = settled + 1 if value.max() <= top + 1e-13 * abs(top) else 0
         if value.max() > top:
             top, where = float(value.max()), float(w[np.argmax(value)])
-        if settled == 2:
-            break
         bracket = bracket[0][reach >= top], bracket[1][reach >= top]
+        if settled == 2 or not bracket[0].size:
+            break
     return top, where
 
 

@@ -111,7 +111,8 @@ def limits_of(
         return Limits(None, "limiter: limited forces are proved for constant delays")
     loop = scenario.loop("I")  # the reference does not matter
     coupling, proof = chosen.coupling, chosen.limiter
-    return covered_limits(loop, coupling, requirements or assess(loop, coupling, chosen.phi, chosen.known), proof)
+    requirements = requirements or assess(loop, coupling, chosen.phi, chosen.known)
+    return covered_limits(loop, coupling, requirements, proof, chosen.known)
 
 
 def read_coupling(path: str | Path) -> Stored:
