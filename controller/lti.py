@@ -106,7 +106,7 @@ class ReadOnly:
         self.__dict__.update(state)
 
 
-_ROWS, _POINTS = 32, 1024  # of a response at once: what stays in the processor's cache
+_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # of a response at once: what stays in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +210,8 @@ class Lti(ReadOnly):
             A, B, C, D = (getattr(self, name)[..., None, :, :] for name in "ABCD")
             return C @ np.linalg.solve(z[..., None, None] * one - A, B + 0j) + D
         points = z.ravel()
-        parts = [self._resolved(points[i : i + _POINTS]) for i in range(0, max(points.size, 1), _POINTS)]
+        step = min(_POINTS, max(_CELLS // max(self.inner_order * self.inputs, 1), 64))
+        parts = [self._resolved(points[i : i + step]) for i in range(0, max(points.size, 1), step)]
         G = np.concatenate(parts, axis=2) + self.D[:, :, None]
         return np.moveaxis(G, -1, 0).reshape(*z.shape, self.outputs, self.inputs)
 
