@@ -15,12 +15,12 @@ from rich.table import Table
 from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.loop import DelayRange, Loop
-from controller.older import AUDITS, with_older
 from design.audit import LONGEST_DELAY, Audit, ConditionAudit, Help, audit
 from design.certificate import check_ranges
-from design.coverage import ranges_rows
+from design.coverage import Switching
 from design.designs import KINDS
 from design.files import unseen
+from design.guarantees import EncoderSteps
 from design.result import CONDITIONS, listed
 from models.device import CATALOGUE, listed_device
 from sim.couplings import check_stored, fitted, read_coupling
@@ -43,7 +43,7 @@ class _Report:
     device: dict[str, Any] | None
     gains: str | None  # the source of a device's gains
     audit: Audit = unseen("beside")
-    encoder: dict[str, Any] | None = unseen()
+    encoder: EncoderSteps | None = unseen()
     notes: tuple[str, ...] = unseen()
     wall_s: float = unseen()
 
@@ -81,8 +81,8 @@ def main(argv: list[str]) -> int:
         notes,
         time.perf_counter() - begin,
     )
-    render.publish(args, with_older(render.plain(report), AUDITS), _tables(found), _remarks(report), out)
-    return options.exit_code(found.certified and (found.switching is None or found.switching["certified"]))
+    render.publish(args, report, _tables(found), _remarks(report), out)
+    return options.exit_code(found.certified and (found.switching is None or found.switching.requirement.certified))
 
 
 def _parser() -> options.Parser:
@@ -115,7 +115,7 @@ def _with_device(args: argparse.Namespace) -> argparse.Namespace:
     if args.delta is None:
         if device.damping is None:
             raise InputError(f"--device {name}: nobody publishes its damping: give --delta, as measured by hw.identify")
-        found["delta"] = (device.damping.least,)
+        found["delta"] = (device.damping.value,)
     gained = args.coupling or args.case == "none" or (args.K and args.B)
     if device.stiffness and device.framework_damping and not gained:
         found["source"] = f"K and B: {device.stiffness.source}; T: the 1 kHz that haptic loops customarily run at"
@@ -139,8 +139,7 @@ def _list_devices(args: argparse.Namespace) -> int:
     def cell(fact: dict[str, Any] | None, scale: float) -> str:
         if fact is None:
             return "unknown"
-        value: float = fact["value"] if "value" in fact else fact["least"]
-        return f"{value * scale:g}[{numbered[fact['source']]}]"
+        return f"{fact['value'] * scale:g}[{numbered[fact['source']]}]"
 
     heads = ("device", "damping N s/m", "mass g", "force N", "encoder um", "friction N", "CHAI3D N/m")
     rows = [(name, *(cell(part[field], scale) for field, scale in _UNITS.items())) for name, part in parts.items()]
@@ -177,10 +176,7 @@ def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Co
 
 
 def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
-    """The range of --varying-delay, or of the scenario, around the constant theta that the other conditions are about.
-
-    Raises InputError.
-    """
+    """The range of --varying-delay, or that of the scenario; it must contain theta. Raises InputError."""
     if args.varying_delay is None:
         return loop.varying_delay
     span = options.delay_range(args.varying_delay, loop.channels, LONGEST_DELAY)
@@ -200,25 +196,25 @@ def _tables(found: Audit) -> list[Table]:
         table.add_row(name, *map(cell, parts))
     if not found.ranges:
         return [table]
-    return [table, render.facts("the ranges around the environment", ranges_rows(found.ranges), left=True)]
+    return [table, render.facts("the ranges around the environment", found.ranges.rows(), left=True)]
 
 
 def _verdict(found: Audit) -> str:
-    coupling, promise = found.coupling, found.promise
+    coupling, guarantee = found.coupling, found.guarantee
     gains = f" K {listed(coupling.K)} N/m, B {listed(coupling.B or ())} N s/m" if coupling.K else ""
-    verdict = f"[green]certified[/] for {promise}" if found.certified else "[red]not certified[/]"
-    if promise and not found.certified:
-        verdict += f" for the ranges, only for {promise}"
+    verdict = f"[green]certified[/] for {guarantee}" if found.certified else "[red]not certified[/]"
+    if guarantee and not found.certified:
+        verdict += f" for the ranges, only for {guarantee}"
     return f"{coupling.kind}{gains}: {verdict}"
 
 
-def _percent(error: float | None, sign: str) -> str:
-    """A relative error, rounded down so that what is printed is tolerated."""
-    return render.optional(error and math.floor(1e4 * error) / 100, sign + "{:.2f} %")
+def _percent(error: float | None) -> str:
+    """A relative error in percent, rounded down, so that the printed one is tolerated."""
+    return render.optional(error and math.floor(1e4 * error) / 100, "{:.2f} %")
 
 
 def _stiffest(K: Sequence[float | None]) -> str:
-    """To five digits, rounded down so that what is printed is certified."""
+    """Stiffnesses to five digits, rounded down, so that the printed ones are certified."""
     if None in K:
         return "-"
     units = ((k, 10.0 ** (math.floor(math.log10(k)) - 4)) for k in K if k is not None)
@@ -227,13 +223,13 @@ def _stiffest(K: Sequence[float | None]) -> str:
 
 #: name of a row -> what stands in it, given what one condition says
 _ROWS: dict[str, Callable[[ConditionAudit], str]] = {
-    "needs damping": lambda c: f"{render.needs(c.certificate)}: {render.certified(c.certificate | {'proof': None})}",
-    "margin": lambda c: render.optional(c.certificate["margin"], "{:.5g}"),
-    "binds at": lambda c: render.optional(c.certificate["binding_frequency_hz"], "{:.5g} Hz"),
+    "needs damping": lambda c: f"{render.needs(c.requirement)}: {render.certified(c.requirement, proof=False)}",
+    "margin": lambda c: render.optional(c.requirement.margin, "{:.5g}"),
+    "binds at": lambda c: render.optional(c.requirement.frequency_hz, "{:.5g} Hz"),
     "stiffest K here": lambda c: _stiffest(c.stiffest.K),
-    "delta error": lambda c: _percent(c.sensitivity.delta_error, "-"),
-    "T error": lambda c: _percent(c.sensitivity.T_error, "+"),
-    "spare samples": lambda c: render.optional(c.sensitivity.extra_samples, "{:.5g}"),
+    "delta may be less by": lambda c: _percent(c.sensitivity.delta_error),
+    "T may be longer by": lambda c: _percent(c.sensitivity.T_error),
+    "delay may be longer by": lambda c: render.optional(c.sensitivity.extra_samples, "{:.5g} samples"),
 }
 
 
@@ -242,9 +238,9 @@ def _remarks(report: _Report) -> Iterator[str]:
     yield from (f"{note}." for note in report.notes)
     for condition in CONDITIONS:
         part = found.conditions[condition]
-        sensitivity = part.sensitivity.reason if part.certificate["certified"] else None
+        sensitivity = part.sensitivity.reason if part.requirement.certified else None
         reasons = {
-            "": part.certificate.get("reason"),
+            "": part.requirement.reason,
             ", stiffest K": part.stiffest.reason,
             ", sensitivity": sensitivity,
         }
@@ -254,12 +250,12 @@ def _remarks(report: _Report) -> Iterator[str]:
     if found.switching:
         yield from _switching_remarks(found.switching)
     if part := report.encoder:
-        yield f"{part['words'][0].upper()}{part['words'][1:]}."
+        yield f"{part.words[0].upper()}{part.words[1:]}."
     yield found.not_covered
 
 
 def _proposed(helps: Sequence[Help]) -> Iterator[str]:
-    """Changes that were certified, the one that leaves most damping over first."""
+    """Changes that certify the coupling; the one that needs the least damping comes first."""
     enough = sorted((each for each in helps if each.certified), key=lambda each: max(each.required_damping))
     if not enough:
         yield "What helps: no single change of delay, damper or period was found to; a design finds other gains."
@@ -268,14 +264,14 @@ def _proposed(helps: Sequence[Help]) -> Iterator[str]:
         yield f"What helps: {each.change} ({needs})."
 
 
-def _switching_remarks(part: dict[str, Any]) -> Iterator[str]:
-    span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
-    yield f"Any switching of the delays ({span} samples) needs {render.needs(part)}: {render.certified(part)}."
-    if "playout" not in part:
-        yield f"any switching: {part['reason']}."
+def _switching_remarks(found: Switching) -> Iterator[str]:
+    needs, buffered = found.requirement, found.playout
+    span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(found.lo, found.hi, strict=True))
+    yield f"Any switching of the delays ({span} samples) needs {render.needs(needs)}: {render.certified(needs)}."
+    if buffered is None:
+        yield f"any switching: {needs.reason}."
         return
-    buffered = part["playout"]
-    enough = "certified" if buffered["certified"] else "not certified"
-    needs = f"{listed(buffered['required_damping'])} N s/m: {enough}"
-    yield f"A playout buffer to the constant {listed(part['hi'])} needs {needs}."
-    yield part["not_covered"]
+    enough = "certified" if buffered.certified else "not certified"
+    asked = listed(buffered.required_damping)
+    yield f"A playout buffer to the constant {listed(found.hi)} needs {asked} N s/m: {enough}."
+    yield found.not_covered or ""

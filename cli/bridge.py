@@ -11,14 +11,15 @@ import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from rich.console import Console
 
 from cli import options, render, session_cli
 from design.files import plain, write_json
-from design.guarantees import CAVEATS, LATE
+from design.guarantees import CAVEATS
+from design.lmi import LATE
+from design.result import listed
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages
@@ -54,13 +55,13 @@ def main(argv: list[str]) -> int:
         met, link = timed(scenario, ages, args.quantile, 1e6 * args.guard, at_once)
         asked = args.case, args.coupling, args.condition
         programs = certified_couplings(met, *asked, link, limiter=args.limiter)
-        print_certificate(ages, link, programs, session.limits.cap, render.console(args))
+        _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         return programs
 
     live = session_cli.hold_session(args, session, plan, seconds, out)
     report = outcome(args.case, session, recorder, live.dropped, args.pace)
     try:  # first, for a disk may be full
-        print_session(report, render.console(args))
+        _print_session(report, render.console(args))
     except OSError:
         if signal.SIGHUP not in live.signals:
             raise
@@ -94,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def print_certificate(
+def _print_certificate(
     ages: Ages, link: int, programs: Sequence[CertifiedCoupling], caps: Sequence[float], console: Console
 ) -> None:
     """What was measured, and what is certified for it: printed before anything is armed."""
@@ -106,24 +107,26 @@ def print_certificate(
     console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)
     heads = ("coupling", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee")
     title = "certified for the delay measured, and softer in reserve"
-    console.print(render.grid(title, heads, [_certified(program.part(caps)) for program in programs], left=range(6)))
+    console.print(render.grid(title, heads, [_certified(program, caps) for program in programs], left=range(6)))
     for program in programs:
-        for remark in (program.limits.words(caps), *program.remarks()):
+        for remark in (program.limits.within(caps).words, *program.remarks()):
             console.print(f"[dim]·[/] theta = {list(program.scenario.theta)}: {remark}", highlight=False)
     if len(programs) == 1:
         console.print("no reserve: nothing softer is certified, so late answers end the session")
 
 
-def _certified(part: dict[str, Any]) -> tuple[str, ...]:
+def _certified(program: CertifiedCoupling, caps: Sequence[float]) -> tuple[str, ...]:
     """A row: the coupling, and the first condition that certifies it."""
-    coupling = part["coupling"]
-    found = next(c for c in (part["certificate"], *part["certificates"].values()) if c["certified"])
+    part = program.figures(caps)
+    coupling, asked = part.coupling, (part.certificate, *(part.certificates or {}).values())
+    found = next(need for need in asked if need and need.certified)
+    assert coupling
     return (
-        f"{coupling['kind']}, theta = {', '.join(map(str, part['theta']))}",
-        *(_list(coupling[name]) for name in "KB"),
-        f"{_list(found['required_damping'])} ({found['condition']}, {found['proof']})",
-        _list(found["available_damping"]),
-        part["promise"],
+        f"{coupling.kind}, theta = {', '.join(map(str, program.scenario.theta))}",
+        *("-" if gains is None else listed(gains, 5) for gains in (coupling.K, coupling.B)),
+        f"{listed(found.required, 5)} ({found.condition}, {found.proof})",
+        listed(found.available, 5),
+        part.guarantee or "none",
     )
 
 
@@ -135,7 +138,7 @@ def _link(link: int, scenario: Scenario) -> str:
 
 
 def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
-    """How long ticks are, and what one longer than the certificate counts with may cost."""
+    """How long ticks are, and how much energy a tick longer than the certified one may give."""
     least, most = (f"{1e-3 * side(ages.ticks, default=1e6 * scenario.T):.4g}" for side in (min, max))
     span = least if least == most else f"{least} to {most}"
     longest = 1e3 * (scenario.T_max or scenario.T)
@@ -146,7 +149,7 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
     )
 
 
-def print_session(report: SessionReport, console: Console) -> None:
+def _print_session(report: SessionReport, console: Console) -> None:
     """The log, then what the link did."""
     cells = {"after": "{r.t_s:.3f} s", "stage": lambda r: _colour(r.stage), "cause": "{r.cause}"}
     console.print(render.columns(f"case {report.case} · {report.scenario}", cells, report.session.log, left=(1, 2)))
@@ -162,10 +165,6 @@ def print_session(report: SessionReport, console: Console) -> None:
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link.counters.items() if n)
     console.print(f"counted: {counted or 'nothing'}")
     console.print(f"[dim]·[/] {CAVEATS}")
-
-
-def _list(values: Sequence[float | None] | None) -> str:
-    return "-" if values is None else ", ".join("inf" if v is None else f"{v:.5g}" for v in values)
 
 
 def _colour(stage: str) -> str:

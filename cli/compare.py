@@ -11,7 +11,6 @@ import argparse
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -23,10 +22,11 @@ from controller.lti import Array
 from design import compare
 from design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
 from design.program import Options
-from design.result import CONDITIONS, DesignFailed
+from design.result import CONDITIONS, Chosen, DesignFailed, finite
+from design.robustness import Robustness
 from sim import baselines
-from sim.compare_report import ComparedCoupling, Comparison
-from sim.couplings import NAMES, Chosen, choose
+from sim.compare_report import ComparedCoupling, Comparison, ConditionCurve, Here, Limits
+from sim.couplings import NAMES, choose
 from sim.scenario import InputError, Scenario
 
 _MOST = 6  # curves that can be told apart in one panel
@@ -74,6 +74,12 @@ def _parser() -> options.Parser:
     optimal = parser.add_argument_group("the optimal coupling of --over")
     add_optimal_options(optimal)
     options.add_output_options(parser, picture=True)
+    plain = "without --over, --ladder and --baselines"
+    parser.only(plain, lambda args: not (args.over or args.ladder or args.baselines), "coupling", "condition")
+    parser.only("without --ladder, which has no picture", lambda args: not args.ladder, "no_plot")
+    parser.only("with --baselines", lambda args: args.baselines, "limiter")
+    optimal = ("objective", "band_hz", "high_gain", "seconds")
+    parser.only("with --over", lambda args: args.over, "points", "keep", "beside", *optimal)
     return parser
 
 
@@ -81,31 +87,15 @@ def _beside(text: str) -> tuple[str, ...]:
     return {"none": (), "both": tuple(CONDITIONS)}[text] if text in ("none", "both") else (options.condition(text),)
 
 
-#: options -> the modes that take them
-_MODES = {
-    "coupling": ("",),
-    "condition": ("",),
-    "no_plot": ("", "--over", "--baselines"),
-    "limiter": ("--baselines",),
-    **dict.fromkeys(("points", "keep", "beside", "objective", "band_hz", "high_gain", "seconds"), ("--over",)),
-}
-
-
 def _check_mode(args: argparse.Namespace, parser: options.Parser) -> None:
-    """Raises InputError where an option is given that this comparison would have to ignore."""
+    """Raises InputError where two comparisons are asked for, or a case that this one does not have."""
     asked = [f"--{name}" for name in ("over", "ladder", "baselines") if getattr(args, name)]
     if len(asked) > 1:
         raise InputError(f"{' with '.join(asked)}: give one of them")
-    mode = "".join(asked)
     if args.ladder and args.case != parser.get_default("case"):
         raise InputError(f"--ladder shows both cases: leave out --case {args.case}")
-    if mode and args.case == "none":
+    if asked and args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
-    for name, modes in _MODES.items():
-        if mode not in modes and getattr(args, name) != parser.get_default(name):
-            where = [f"for {modes[0]}"] * bool(modes[0]) + [f"not for {mode}"] * bool(mode)
-            option = {"limiter": "no-limiter"}.get(name, name.removesuffix("_hz").replace("_", "-"))
-            raise InputError(f"--{option} is {', '.join(where)}")
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -181,28 +171,27 @@ def _guarantees(report: Comparison) -> Table:
         "at 10 %": lambda c: _robust(c.robustness, scale),
         "any-env.": lambda c: _needs(c.conditions["any-environment"], scale),
         "at Hz ": lambda c: _binds(c.conditions["any-environment"]),
-        "sup dB": lambda c: render.optional(c.transparency["relative_mismatch_db"], "{:.2f}", "-inf"),
-        "rms dB": lambda c: render.optional(c.transparency["rms_mismatch_db"], "{:.2f}", "-inf"),
+        "sup dB": lambda c: render.optional(finite(c.transparency.mismatch_db), "{:.2f}", "-inf"),
+        "rms dB": lambda c: render.optional(finite(c.transparency.rms_mismatch_db), "{:.2f}", "-inf"),
     }
     return render.columns(title, cells, report.couplings)
 
 
-def _binds(part: dict[str, Any]) -> str:
-    return render.optional(part["binding_frequency_hz"], "{:.4g}")
+def _binds(part: ConditionCurve) -> str:
+    return render.optional(part.requirement.frequency_hz, "{:.4g}")
 
 
-def _needs(part: dict[str, Any], scale: float) -> str:
+def _needs(part: ConditionCurve, scale: float) -> str:
     """The worst device's figure, green where it is certified."""
-    need = "infinite" if np.isinf(part["ratio"]) else f"{scale * part['ratio']:.5g}"
-    return f"[{'green' if part['certified'] else 'red'}]{need}[/]"
+    need = "infinite" if np.isinf(part.ratio) else f"{scale * part.ratio:.5g}"
+    return f"[{'green' if part.requirement.certified else 'red'}]{need}[/]"
 
 
-def _robust(part: dict[str, Any] | None, scale: float = 1.0) -> str:
-    """The need at the worst stiffness or mass within ten percent."""
+def _robust(part: Robustness | None, scale: float = 1.0) -> str:
+    """The damping that is needed at the worst stiffness or mass within ten percent."""
     if part is None:
         return "-"
-    need = part["required_over_available"]
-    return "infinite" if need is None else f"{scale * need:.4g}"
+    return f"{scale * part.required_over_available:.4g}"
 
 
 def _feel(report: Comparison) -> Table:
@@ -219,7 +208,7 @@ def _feel(report: Comparison) -> Table:
 
 
 def _list(values: Iterable[float]) -> str:
-    """'1, 2', or '1' where all are equal."""
+    """The values with commas between them; a single one where all are equal."""
     shown = [format(v, ".0f" if abs(v) >= 1000 else ".3g") for v in values]
     return shown[0] if len(set(shown)) == 1 else ", ".join(shown)
 
@@ -276,27 +265,12 @@ _LADDER: dict[str, str | Callable[[LadderRow], str]] = {
 # The classics beside ours.
 
 
-@dataclass(frozen=True)
-class _Baselines:
-    """The classics and our couplings on the same runs."""
-
-    scenario: str
-    case: str
-    seed: int
-    rows: Sequence[baselines.Rival]
-    wall_s: float
-    interrupted: bool
-    hands: int = baselines.PAIRS
-    hands_s: float = baselines.SECONDS
-    start_m_s: float = baselines.SLOW
-
-
 def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
     with render.progress("comparing") as move:
         all_of_them = baselines.rivals(scenario, args.case, move, args.limiter)
         out, begin = options.out_folder(args, "compare"), time.perf_counter()
         rows, interrupted = options.until_interrupted(all_of_them)
-    report = _Baselines(scenario.name, args.case, args.seed, rows, time.perf_counter() - begin, interrupted)
+    report = baselines.Baselines(scenario.name, args.case, args.seed, rows, time.perf_counter() - begin, interrupted)
     files = render.pictures(args, report, out, {"baselines.png": lambda plots: plots.plot_baselines} if rows else {})
     shown = [render.columns(f"on the same runs · {scenario.title(args.case)}", _RIVALS, rows, left=(0, 7))]
     lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
@@ -323,37 +297,20 @@ _RIVALS: dict[str, str | Callable[[baselines.Rival], str]] = {
 # The limits of any coupling along an axis.
 
 
-@dataclass(frozen=True)
-class _Limits:
-    """How good a coupling can be."""
-
-    scenario: str
-    seed: int
-    case: str
-    objective: str
-    delays_kept_in: str
-    wish: Options
-    here: dict[str, Any]
-    sweeps: dict[str, compare.Sweep]
-    gains: list[str]
-    wall_s: float
-    interrupted: bool
-
-
 def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     loop = scenario.loop(args.case)
     if min(loop.delta) <= 0:
         raise InputError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
     with options.refused(args=args):
-        wish = Options(**asked_of(args, "optimal"))
-    plan, out = _plan(args, loop, wish), options.out_folder(args, "compare")
+        asked = Options(**asked_of(args, "optimal"))
+    plan, out = _plan(args, loop, asked), options.out_folder(args, "compare")
     begin = time.perf_counter()
     with render.progress("designing") as move:
         sweeps, interrupted = compare.limits(plan, args.beside, move)
-    here = {"delta": loop.delta, "theta": loop.theta, "psi": loop.psi, "T_s": loop.T}
-    about = scenario.name, args.seed, args.case, wish.objective, args.keep, wish, here
-    wall, gains = time.perf_counter() - begin, compare.gains(plan, sweeps, loop, wish)
-    report = _Limits(*about, sweeps, gains, wall, interrupted)
+    here = Here(loop.delta, loop.theta, loop.psi, loop.T)
+    about = scenario.name, args.seed, args.case, asked.objective, args.keep, asked, here
+    wall, gains = time.perf_counter() - begin, compare.gains(plan, sweeps, loop, asked)
+    report = Limits(*about, sweeps, gains, wall, interrupted)
     points = [(name, row) for name, sweep in sweeps.items() for row in sweep.curves["optimal"]]
     files = render.pictures(args, report, out, {"limits.png": lambda plots: plots.plot_limits} if points else {})
     names = " and by ".join(args.beside)
@@ -364,7 +321,7 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     return options.exit_code(any(row.rms_mismatch_db is not None for _, row in points), interrupted)
 
 
-def _plan(args: argparse.Namespace, loop: Loop, wish: Options) -> dict[str, list[Point]]:
+def _plan(args: argparse.Namespace, loop: Loop, asked: Options) -> dict[str, list[Point]]:
     """The points of every sweep that is asked for. Raises InputError."""
     plan = {}
     for part in args.over.split(","):
@@ -377,11 +334,11 @@ def _plan(args: argparse.Namespace, loop: Loop, wish: Options) -> dict[str, list
         ends = (options.numbers(f"--over {name}", end, float, 1)[0] for end in (low, high))
         span = (next(ends), next(ends)) if given else None
         with options.refused(f"--over {part}: "):
-            plan[name] = points_along(name, loop, wish, args.points, span, args.keep)
+            plan[name] = points_along(name, loop, asked, args.points, span, args.keep)
     return plan
 
 
-def _limit_table(report: _Limits, name: str, beside: Sequence[str]) -> Table:
+def _limit_table(report: Limits, name: str, beside: Sequence[str]) -> Table:
     sweep, designs = report.sweeps[name], ("optimal", *beside)
     rows = []
     for i, row in enumerate(sweep.curves["optimal"]):
@@ -404,7 +361,7 @@ def _error(limit: Limit | None, objective: str) -> str:
 
 
 def _proofs(limits: dict[str, Limit | None]) -> str:
-    """Rational where every design of a row is proved exactly, else which are only sampled."""
+    """'rational' where every design of a row is proved exactly, else the names of those that are only sampled."""
     found = {name: limit.proof for name, limit in limits.items() if limit and limit.proof}
     sampled = [name for name, proof in found.items() if proof != "rational"]
     if not found:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import msgspec
@@ -16,18 +15,17 @@ from controller.loop import Loop
 from design import coverage
 from design.api import Filed, proved, store
 from design.audit import LONGEST_DELAY
-from design.bound import bound_part
+from design.bound import BoundBeside
 from design.certificate import SAMPLES, assess, check_ranges
-from design.designs import KINDS, design_by_kind, usual_condition
+from design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
 from design.guarantees import ANY
-from design.optimal import Optimal, robustness_parts
+from design.optimal import Nearby, Optimal
 from design.program import DEFAULT, OBJECTIVES, Options
-from design.result import Design, listed
+from design.result import Design, Requirement, finite, listed
 from design.robustness import ranges_around
-from design.transparency import BAND_HZ, transparency
-from sim import report as parts
+from design.transparency import BAND_HZ, Transparency, transparency
 from sim.judged import Judged
 from sim.scenario import InputError, Scenario
 
@@ -42,14 +40,15 @@ def main(argv: list[str]) -> int:
     scenario = options.scenario_from(args)
     loop = _loop(args, scenario)
     if args.samples is not None and loop.ranges is None:
-        raise InputError("--samples without ranges: give --ranges, or a scenario with [ranges]")
+        raise InputError("--samples is only with ranges: give --ranges, or a scenario with [ranges]")
     design = _design(args, loop)
     judged = _judged(args, scenario, loop, design)
-    stored = store(loop, design, out, judged.whole, judged.limits.certificate)
+    stored = store(loop, design, out, judged.whole, judged.limiter.certificate)
     report = _reported(args, loop, design, judged, stored)
     render.publish(args, report, _tables(scenario, report))
-    holds = report.certificate["certified"] and (judged.promise == ANY or not judged.whole or judged.proved)
-    return options.exit_code(holds and (report.switching or report.certificate)["certified"])
+    holds = report.certificate.certified and (judged.guarantee == ANY or not judged.whole or judged.proved)
+    switching = report.switching.requirement if report.switching else report.certificate
+    return options.exit_code(holds and switching.certified)
 
 
 def _parser() -> options.Parser:
@@ -57,7 +56,8 @@ def _parser() -> options.Parser:
     parser = options.Parser("design", "Design a coupling, prove its certificate and store both.", example)
     options.add_loop_options(parser)
     kind = parser.add_mutually_exclusive_group()
-    kind.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
+    kinds = f"{', '.join(KINDS)}, or package.module:function of your own (default spring-damper)"
+    kind.add_argument("--coupling", metavar="NAME", default="spring-damper", help=kinds)
     best = "the coupling of the least transparency error: --coupling optimal"
     kind.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
     around = "certify for every stiffness and mass this much more or less, as [ranges] of a scenario does"
@@ -109,7 +109,8 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
         with options.refused(f"--ranges {args.ranges:g}: "):
             loop = msgspec.structs.replace(loop, ranges=ranges_around(loop.network, args.ranges))
             loop.members()
-    args.condition = args.condition or usual_condition(loop, args.coupling)
+    if args.coupling in KINDS:
+        args.condition = args.condition or usual_condition(loop, args.coupling)
     if args.varying_delay is not None:
         if not _for_switching(args):
             raise InputError("--varying-delay is for --coupling optimal or --condition this-environment")
@@ -123,15 +124,15 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 
 def _for_switching(args: argparse.Namespace) -> bool:
     """Whether this design can be made for delays that vary; any other is only judged under them."""
-    condition = args.condition or KINDS[args.coupling].conditions[0]
-    return args.coupling in ("spring-damper", "optimal") and condition == "this-environment"
+    kind = kind_of(args.coupling)
+    return "switching" in kind.options and (args.condition or kind.conditions[0]) == "this-environment"
 
 
 def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
-    """What is asked of a design, in its own words. Raises InputError for options of another coupling."""
+    """The options of a design by the names of its arguments. Raises InputError for options of another coupling."""
     known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
     given = {name: value for name in known if options.given(value := getattr(args, name, None))}
-    if kind == "spring-damper" and args.limiter is not None:
+    if kind_of(kind).limited and args.limiter is not None:
         given["limiter"] = args.limiter
     for name in given:
         taking = [other for other, design in KINDS.items() if name in design.options]
@@ -142,7 +143,7 @@ def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 
 def _design(args: argparse.Namespace, loop: Loop) -> Design:
-    """Raises InputError for a request that contradicts itself, DesignFailed where there is no such coupling."""
+    """Design and prove. Raises InputError for options that contradict each other, DesignFailed without a coupling."""
     asked = asked_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
         asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
@@ -164,57 +165,51 @@ def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: De
     limits = coverage.Limits(None, "as asked")
     if args.limiter is not False:
         limits = coverage.covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None, held)
-    return Judged.of(args.coupling, design.coupling, loop, requirements, whole, limits, scenario)
+    limits = limits.within([device.force_limit for device in scenario.device])
+    return Judged.of(args.coupling, design.coupling, loop, requirements, whole, limits)
 
 
 def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judged, stored: Filed) -> _Report:
-    figures = transparency(loop.F(design.coupling), loop.E(), loop.lam, args.band_hz or BAND_HZ)
-    return _Report(
-        args.case,
-        args.seed,
-        design.objective,
-        design.wall_s,
-        judged.certificates[design.condition],
-        coverage.price(loop, design, args.coupling, asked_of(args, args.coupling)) if judged.whole else None,
-        judged.coupling,
-        judged.certificates,
-        loop.varying_delay and coverage.switching_part(loop, design.coupling),
-        judged.ranges,
-        judged.promise,
-        judged.limiter,
-        stored.switching["promise"] if stored.switching and stored.switching["proof"] else None,
-        design.figure,
-        parts.transparency_part(figures),
-        *_worth(args, loop, design),
-        design.sdps,
-        stored,
-    )
-
-
-def _worth(args: argparse.Namespace, loop: Loop, design: Design) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """What a wrong model of the environment costs, and what only an optimal coupling is reported with."""
-    best = design if isinstance(design, Optimal) else None
+    band, best, nearby = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None, Nearby()
+    switching = coverage.Switching.of(loop, design.coupling) if loop.varying_delay else None
     with render.progress("working out robustness and its price, and the bound"):
-        robust = {"robustness": None}
         if design.condition == "this-environment":
-            asked = Options(**asked_of(args, "optimal")) if best else DEFAULT
-            robust = robustness_parts(loop, design.coupling, asked)
-        limit = best and bound_part(loop, best, best.figures.rms_mismatch_db, args.band_hz or BAND_HZ)
-    if best is None:
-        return robust, None
-    return robust, {"bound": limit, "rendered_stiffness": best.g, "ladder": best.ladder}
+            nearby = Nearby.of(loop, design.coupling, Options(**asked_of(args, "optimal")) if best else DEFAULT)
+        limit = best and BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band)
+    return _Report(
+        case=args.case,
+        seed=args.seed,
+        objective=design.objective,
+        objective_name=design.figure,
+        wall_s=design.wall_s,
+        certificate=judged.certificates[design.condition],
+        price=coverage.price(loop, design, args.coupling, asked_of(args, args.coupling)) if judged.whole else None,
+        judged=judged,
+        switching=switching,
+        delays=stored.switching.guarantee if stored.switching and stored.switching.proof else None,
+        transparency=transparency(loop.F(design.coupling), loop.E(), loop.lam, band),
+        nearby=nearby,
+        best=best and _Best(limit, best.g, best.ladder),
+        sdps=design.sdps,
+        stored=stored,
+    )
 
 
 # ----------------------------------------------------------------------------------------------------
 # The report as tables.
 
 
-def _coupling_rows(coupling: dict[str, Any]) -> render.Rows:
-    end = f"{STIFFEST:g} N/m is where the search ends, no optimum of its own"
-    yield "K [N/m]", coupling["K"] and listed(coupling["K"])
-    yield "", end if max(coupling["K"] or [0]) > 0.999 * STIFFEST else None
-    yield "B [N s/m]", coupling["K"] and listed(coupling["B"])
-    yield "stiffness, static [N/m]", coupling.get("stiffness") and listed(coupling["stiffness"])
+def _judged_rows(judged: Judged) -> render.Rows:
+    coupling, end = judged.coupling, f"{STIFFEST:g} N/m is where the search ends, no optimum of its own"
+    if coupling.K and coupling.B:
+        yield "K [N/m]", listed(coupling.K)
+        yield "", end if max(coupling.K) > 0.999 * STIFFEST else None
+        yield "B [N s/m]", listed(coupling.B)
+    yield "stiffness, static [N/m]", listed(coupling.stiffness) if coupling.stiffness else None
+    yield from render.certificate_rows(judged.requirements, proof=False)
+    yield from judged.ranges.rows() if judged.ranges else ()
+    yield "guarantee", judged.guarantee or "none"
+    yield "guarantee, forces", judged.limiter.words
 
 
 #: what a design minimised or maximised -> in words
@@ -226,29 +221,35 @@ _OBJECTIVE_WORDS = {
 }
 
 
-def _best_rows(part: dict[str, Any]) -> render.Rows:
-    """Rows that only an optimal coupling has."""
-    limit = part["bound"]
-    climbed = ", ".join(f"{rung.mismatch_db:.2f}" for rung in part["ladder"])
-    bounded = "no linear coupling can be better than {rms_mismatch_db:.2f} dB rms: {gap_db:.2f} dB left"
-    yield "bound", limit.get("reason") or bounded.format(**limit)
-    yield "rendered stiffness", render.optional(part["rendered_stiffness"], "{:.3f} of the environment's")
-    yield "ladder [dB]", climbed or None
+@dataclass(frozen=True)
+class _Best:
+    """What only an optimal coupling is reported with."""
+
+    bound: BoundBeside | None
+    rendered_stiffness: float
+    ladder: Sequence[Any]
+
+    def rows(self) -> render.Rows:
+        if limit := self.bound:
+            bounded = f"no linear coupling can be better than {limit.rms_mismatch_db or 0:.2f} dB rms"
+            yield "bound", limit.reason or f"{bounded}: {limit.gap_db:.2f} dB left"
+        yield "rendered stiffness", f"{self.rendered_stiffness:.3f} of the environment's"
+        yield "ladder [dB]", ", ".join(f"{rung.mismatch_db:.2f}" for rung in self.ladder) or None
 
 
-def _switching_words(proof: dict[str, Any]) -> str:
-    span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(proof["lo"], proof["hi"], strict=True))
-    word = "certified" if proof["certified"] else "not certified"
-    return f"{span} samples: needs {listed(proof['required_damping'])}: {word} (proof: {proof['proof']})"
+def _switching_words(proof: coverage.Switching) -> str:
+    span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(proof.lo, proof.hi, strict=True))
+    needs = f"needs {render.needs(proof.requirement)}: {render.certified(proof.requirement, proof=False)}"
+    return f"{span} samples: {needs} (proof: {proof.requirement.proof})"
 
 
 def _stored_rows(stored: Filed) -> render.Rows:
     delays = stored.switching
     yield "stored", f"{stored.file} (proof: {stored.proof or stored.reason})"
-    yield "", f"for constant delays only: {delays['reason']}" if delays and not delays["proof"] else None
+    yield "", f"for constant delays only: {delays.reason}" if delays and not delays.proof else None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Report:
     """The design; parts that it does not have are null."""
 
@@ -256,19 +257,15 @@ class _Report:
     seed: int
     objective: float
     wall_s: float
-    certificate: dict[str, Any]
-    price: list[dict[str, Any]] | None
-    coupling: dict[str, Any] = render.several(_coupling_rows)
-    certificates: dict[str, Any] = render.several(partial(render.certificate_rows, proof=False))
-    switching: dict[str, Any] | None = render.figure("damping, any switching", _switching_words)
-    ranges: dict[str, Any] | None = render.several(coverage.ranges_rows)
-    promise: str | None = render.figure("guarantee", absent="none")
-    limiter: dict[str, Any] = render.figure("guarantee, forces", "{[words]}")
+    certificate: Requirement
+    price: list[coverage.OverRanges] | None
+    judged: Judged = render.several(_judged_rows, "beside")
+    switching: coverage.Switching | None = render.figure("damping, any switching", _switching_words)
     delays: str | None = render.figure("guarantee, delays", json="table")
     objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
-    transparency: dict[str, Any] = render.figure("transparency error", render.transparency_error)
-    robust: dict[str, Any] = render.several(render.robustness_rows, "beside")
-    best: dict[str, Any] | None = render.several(_best_rows, "beside")
+    transparency: Transparency = render.figure("transparency error", render.transparency_error)
+    nearby: Nearby = render.several(render.robustness_rows, "beside")
+    best: _Best | None = render.several(_Best.rows, "beside")
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
     stored: Filed = render.several(_stored_rows)
 
@@ -278,25 +275,29 @@ class _Report:
 
 
 def _tables(scenario: Scenario, report: _Report) -> list[Table]:
-    title = f"{scenario.title(report.case)}: {report.coupling['kind']} for {report.certificate['condition']}"
+    title = f"{scenario.title(report.case)}: {report.judged.coupling.kind} for {report.certificate.condition}"
     rows = [render.channel_row(scenario.environment.contacts), *render.rows_of(report)]
     shown = [render.facts(title, rows)]
     if report.price:
-        shown.append(_over_the_ranges(report.price))
+        title = "in the nominal environment / at the worst vertex"
+        shown.append(render.columns(title, _OVER_RANGES, report.price, left=range(5)))
     return shown
 
 
-def _over_the_ranges(rows: list[dict[str, Any]]) -> Table:
-    """Each figure in the nominal environment, and the worst of the ranges."""
+def _both(name: str, form: str) -> Callable[[coverage.OverRanges], str]:
+    """A figure in the nominal environment, and the worst of the ranges."""
 
-    def both(name: str, form: str) -> Callable[[dict[str, Any]], str]:
-        return lambda row: " / ".join(render.optional(value, form) for value in row[name].values())
+    def cell(row: coverage.OverRanges) -> str:
+        found: coverage.NominalWorst = getattr(row, name)
+        return " / ".join(render.optional(finite(value), form) for value in (found.nominal, found.worst))
 
-    cells: dict[str, str | Callable[[dict[str, Any]], str]] = {
-        "coupling": "{r[coupling]}",
-        "needs of its damping": both("required_over_available", "{:.4f}"),
-        "vertices violated": "{r[violated]}",
-        "rms error": lambda row: both("rms_mismatch_db", "{:.2f}")(row) + " dB",
-        "largest error": lambda row: both("relative_mismatch_db", "{:.2f}")(row) + " dB",
-    }
-    return render.columns("in the nominal environment / at the worst vertex", cells, rows, left=range(5))
+    return cell
+
+
+_OVER_RANGES: dict[str, str | Callable[[coverage.OverRanges], str]] = {
+    "coupling": "{r.coupling}",
+    "needs of its damping": _both("required_over_available", "{:.4f}"),
+    "vertices violated": "{r.violated}",
+    "rms error": lambda row: _both("rms_mismatch_db", "{:.2f}")(row) + " dB",
+    "largest error": lambda row: _both("relative_mismatch_db", "{:.2f}")(row) + " dB",
+}

@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 
 from cli import render
-from design.coverage import ranges_rows
+from design.result import Chosen
 from sim import judged
-from sim.couplings import Chosen
 from sim.judged import Judged
 from sim.scenario import Scenario
 
@@ -21,6 +20,6 @@ def judge(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, met: Sce
 
 def rows(part: Judged) -> render.Rows:
     """What a table says first."""
-    yield from render.certificate_rows(part.certificates, 5)
-    yield from ranges_rows(part.ranges) if part.ranges else ()
-    yield "guarantee", f"holds for {part.promise}" if part.promise else "none"
+    yield from render.certificate_rows(part.requirements, 5)
+    yield from part.ranges.rows() if part.ranges else ()
+    yield "guarantee", f"holds for {part.guarantee}" if part.guarantee else "none"

@@ -8,12 +8,13 @@ text is None is left out.
 from __future__ import annotations
 
 import argparse
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, field, fields
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rich.console import Console
 from rich.errors import MarkupError
@@ -22,9 +23,13 @@ from rich.table import Table
 from rich.text import Text
 
 from controller.loop import Loop
-from controller.older import REPORTS, with_older
 from design.files import nobody_reads, plain, printable, write_json
-from design.result import CONDITIONS, DesignFailed, listed
+from design.result import DesignFailed, Requirement, listed
+
+if TYPE_CHECKING:  # the reports' parts, which no command without them loads
+    from design.optimal import Nearby
+    from design.transparency import Transparency
+    from sim.report import UnevenTicks, VaryingDelays
 
 # ----------------------------------------------------------------------------------------------------
 # The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
@@ -38,10 +43,10 @@ _OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # what opens
 
 
 class Screen(Console):
-    """A console whose tables lose nothing: words may break, numbers do not; what is too wide runs over the edge."""
+    """A console that cuts nothing off: words may be broken, numbers are not; a table may be wider than the terminal."""
 
     def print(self, *objects: Any, **how: Any) -> None:
-        """As rich's, at the least width from the terminal's at which no table loses a character."""
+        """Print as rich does, but widen until no table loses a character."""
         own = self._width
         self._width = max([self.width, *(self._needed(one) for one in objects if isinstance(one, Table))])
         try:
@@ -60,7 +65,7 @@ class Screen(Console):
         return super().render_str(text, **how)
 
     def on_broken_pipe(self) -> None:  # rich itself would leave with 1, our "it does not hold"
-        """A reader that has seen enough (`| head -1`) changes neither the work nor its exit code."""
+        """Go on without output where its reader has gone (`| head -1`); the exit code stays the same."""
         self.quiet = True
         nobody_reads()
 
@@ -135,9 +140,9 @@ def publish(
 ) -> None:
     """Keep a report as report.json in the folder, print tables and lines, and write what --json asks for.
 
-    `files` are those written before; the report names them and its own. A part stands there by its older name, too.
+    `files` are those written before; the report names them and its own.
     """
-    outcome = with_older(plain(report), REPORTS)
+    outcome = plain(report)
     if folder:
         kept = folder / "report.json"
         outcome["files"] = [*map(str, files), str(kept)]
@@ -159,8 +164,7 @@ def pictures(args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping
         return []
     from sim import plots
 
-    outcome = plain(report)
-    return [drawing(plots)(outcome, folder / file) for file, drawing in drawn.items()]
+    return [drawing(plots)(report, folder / file) for file, drawing in drawn.items()]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -171,9 +175,9 @@ Rows = Iterable[tuple[str, str | None]]
 _Form = str | Callable[[Any], str | None]
 
 
-def facts(title: str, rows: Rows, heads: Sequence[str] = (), left: bool = False) -> Table:
+def facts(title: str, rows: Rows, left: bool = False) -> Table:
     """A table of names and texts; a text of None is left out."""
-    table = Table(*heads, title=title, title_justify="left" if left else "center", show_header=bool(heads))
+    table = Table(title=title, title_justify="left" if left else "center", show_header=False)
     for name, text in rows:
         if text is not None:
             table.add_row(name, text)
@@ -181,7 +185,7 @@ def facts(title: str, rows: Rows, heads: Sequence[str] = (), left: bool = False)
 
 
 def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (0,)) -> Table:
-    """A table of figures, to the right but for the columns `left`."""
+    """A table of figures, aligned to the right except in the columns `left`."""
     table, rows = Table(title=title), list(rows)
     short = all(len(row[0]) <= _SHORT_NAME for row in rows)
     for i, head in enumerate(heads):
@@ -195,19 +199,26 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
 def columns(title: str, cells: Mapping[str, _Form], records: Iterable[Any], left: Sequence[int] = (0,)) -> Table:
     """A table of records: under each head a format of the record `r`, or what a function says of it.
 
-    A head that stands there twice has a blank behind it once.
+    Two columns of the same head: one of the keys has a blank at its end.
     """
     rows = [[str(form(r)) if callable(form) else form.format(r=r) for form in cells.values()] for r in records]
     return grid(title, [head.strip() for head in cells], rows, left)
 
 
-def figure(name: str, form: _Form = "{}", default: Any = MISSING, json: str = "key", absent: str | None = None) -> Any:
+def figure(
+    name: str,
+    form: _Form = "{}",
+    default: Any = MISSING,
+    json: str = "key",
+    absent: str | None = None,
+    older: str | None = None,
+) -> Any:
     """A field that a report's table shows under this name, in this format: of the value, and of the whole report `r`.
 
     None is shown as `absent`, or not at all. In JSON it is a `key`, a key only where it is `given`, keys `beside` the
-    report's own, or in the `table` alone.
+    report's own, or in the `table` alone; `older` is the name that the key had before.
     """
-    return field(default=default, metadata={"name": name, "form": form, "json": json, "absent": absent})
+    return field(default=default, metadata={"name": name, "form": form, "json": json, "absent": absent, "older": older})
 
 
 def several(rows: Callable[[Any], Rows], json: str = "key") -> Any:
@@ -236,29 +247,27 @@ def rows_of(report: Any) -> Rows:
 # Phrases that several reports share.
 
 
-def certified(part: Mapping[str, Any]) -> str:
-    """Whether it is, and whether that is proved in exact arithmetic."""
-    if not part["certified"]:
+def certified(need: Requirement, proof: bool = True) -> str:
+    """Whether the condition holds; with `proof` also whether that is proved in exact arithmetic."""
+    if not need.certified:
         return "[red]not certified[/]"
-    return "[green]certified[/]" + (", proved exactly" if part["proof"] == "rational" else "")
+    return "[green]certified[/]" + (", proved exactly" if proof and need.proof == "rational" else "")
 
 
-def needs(part: Mapping[str, Any], digits: int = 6) -> str:
+def needs(need: Requirement, digits: int = 6) -> str:
     """Required of available damping."""
-    required, available = (listed(part[f"{which}_damping"], digits) for which in ("required", "available"))
-    return f"{required} of {available} N s/m"
+    return f"{listed(need.required, digits)} of {listed(need.available, digits)} N s/m"
 
 
-def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> Rows:
-    """What each condition needs, and whether that is proved exactly, where no other row says it."""
-    for name, part in certificates.items():
-        if name in CONDITIONS:
-            word = certified(part) if proof else certified(part | {"proof": None})
-            yield f"damping, {name}", f"needs {needs(part, digits)}: {word}"
+def certificate_rows(requirements: Mapping[str, Requirement], digits: int = 6, proof: bool = True) -> Rows:
+    """The damping that each condition needs; with `proof` also whether it is proved in exact arithmetic."""
+    for name, need in requirements.items():
+        asks = f"needs {needs(need, digits)}" if math.isfinite(need.ratio) else "no damping is enough"
+        yield f"damping, {name}", f"{asks}: {certified(need, proof)}"
 
 
 def channel_row(contacts: Sequence[str]) -> tuple[str, str | None]:
-    """Which contact each number of a list in the table belongs to, where there are several."""
+    """The names of the contacts, in the order of the numbers of every list; None for a single one."""
     return "channels", ", ".join(contacts) if len(contacts) > 1 else None
 
 
@@ -267,21 +276,19 @@ def optional(value: float | None, form: str, absent: str = "-") -> str:
     return absent if value is None else form.format(value)
 
 
-def transparency_error(part: Mapping[str, Any]) -> str:
+def transparency_error(figures: Transparency) -> str:
     """The mismatch M relative to the reference, in decibels."""
-    sup, rms = (optional(part[f"{which}_mismatch_db"], "{:.2f} dB", "zero") for which in ("relative", "rms"))
-    return f"{sup} at most, {rms} rms (0 dB: as wrong as no force)"
+    shown = (f"{db:.2f} dB" if math.isfinite(db) else "zero" for db in (figures.mismatch_db, figures.rms_mismatch_db))
+    return "{} at most, {} rms (0 dB: as wrong as no force)".format(*shown)
 
 
-def robustness_rows(outcome: Mapping[str, Any]) -> Rows:
+def robustness_rows(nearby: Nearby) -> Rows:
     """What a wrong model of the environment costs, and what a design that allows for it would."""
-    there, price = outcome.get("robustness"), outcome.get("designed_for_it")
-    if there is None:
-        return []
-    need = optional(there["required_over_available"], "{:.3f}", "infinite")
-    words = f"{need} of the damping is needed at {there['where']}, the worst within {there['percent']:g} %"
-    costs = price and f"{price['price_db']:.2f} dB worse over a small basis (--ranges)"
-    return [("robustness", words), ("designed for that", costs)]
+    if there := nearby.robustness:
+        words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
+        yield "robustness", f"{words}, the worst within {there.percent:g} %"
+    if price := nearby.designed_for_it:
+        yield "designed for that", f"{price.price_db:.2f} dB worse over a small basis (--ranges)"
 
 
 def verdict(word: str | None) -> str:
@@ -289,32 +296,33 @@ def verdict(word: str | None) -> str:
     return {"stable": "[green]stable[/]", "unstable": "[red]unstable[/]"}.get(word or "", "not decided")
 
 
-def timing_row(part: Mapping[str, Any] | None) -> tuple[str, str | None]:
+def timing_row(part: UnevenTicks | None) -> tuple[str, str | None]:
     """Periods and latencies of a run or of a validation that are not even."""
     if part is None:
         return "ticks", None
-    period, words = part["period_s"], []
-    if period["least"] < period["largest"]:
-        how = "recorded" if part["recorded"] else "drawn"
-        words.append(f"{1e3 * period['least']:.4g} to {1e3 * period['largest']:.4g} ms long, {how}")
-    if part["latency_s"]:
-        spans = (f"{1e3 * a:.4g} to {1e3 * b:.4g}" if a < b else f"{1e3 * a:.4g}" for a, b in part["latency_s"])
+    period, words = part.period_s, []
+    if period.least < period.largest:
+        how = "recorded" if part.recorded else "drawn"
+        words.append(f"{1e3 * period.least:.4g} to {1e3 * period.largest:.4g} ms long, {how}")
+    if part.latency_s:
+        spans = (f"{1e3 * a:.4g} to {1e3 * b:.4g}" if a < b else f"{1e3 * a:.4g}" for a, b in part.latency_s)
         words.append(f"forces latch {', '.join(dict.fromkeys(spans))} ms later")
     return "ticks", "; ".join(words)
 
 
-def delay_rows(part: Mapping[str, Any]) -> Rows:
+def delay_rows(part: VaryingDelays) -> Rows:
     """Delays that vary, of a run or of a validation."""
-    spans = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
-    played = ", played out at the largest" if part["playout"] else ""
-    lost = f", {100 * part['loss']:g} % lost" if part["loss"] else ""
-    yield "varying delay", f"{spans} samples, {part['pattern']}{played}{lost}"
-    if age := part.get("age"):
-        met = zip(age["least"], age["largest"], age["mean"], strict=True)
-        yield "age of the forces", "; ".join(f"{a} to {b}, mean {c:.2f}" for a, b, c in met) + " samples"
-    if period := part.get("period"):
-        growth = f"{period['growth_rate_per_s']:+.4f} 1/s with a period of {period['ticks']} ticks"
-        yield "worst switching found", f"{growth}: {verdict(period['verdict'])}"
-    if proof := part.get("switching"):
-        yield "damping, any switching", f"needs {needs(proof, 5)}: {certified(proof)}"
-    yield "these delays covered", "[green]yes[/]" if part["covered"] else "[yellow]no[/]"
+    span, met, proof = part.span, part.met, part.certified.switching
+    ranges = ", ".join(f"{lo} to {hi}" for lo, hi in zip(span.lo, span.hi, strict=True))
+    played = ", played out at the largest" if span.playout else ""
+    lost = f", {100 * span.loss:g} % lost" if span.loss else ""
+    yield "varying delay", f"{ranges} samples, {span.pattern}{played}{lost}"
+    if met and (age := met.age):
+        each = zip(age.least, age.largest, age.mean, strict=True)
+        yield "age of the forces", "; ".join(f"{a} to {b}, mean {c:.2f}" for a, b, c in each) + " samples"
+    if met and (period := met.period):
+        growth = f"{period.growth_rate_per_s:+.4f} 1/s with a period of {period.ticks} ticks"
+        yield "worst switching found", f"{growth}: {verdict(period.verdict)}"
+    if proof:
+        yield "damping, any switching", f"needs {needs(proof.requirement, 5)}: {certified(proof.requirement)}"
+    yield "these delays covered", "[green]yes[/]" if part.certified.covered else "[yellow]no[/]"

@@ -15,14 +15,14 @@ from controller.environment import GROUND
 from controller.loop import Loop
 from design.files import write
 from design.guarantees import ANY
-from design.optimal import robustness_parts
-from design.result import CONDITIONS, finite, listed
+from design.optimal import Nearby
+from design.result import CONDITIONS, Chosen, finite, listed
 from design.transparency import BAND_HZ
 from sim import accuracy
 from sim import passivity_layer as layer
 from sim.alternatives import Alternative, alternatives
 from sim.api import ScenarioRun, run_scenario
-from sim.couplings import NAMES, Chosen, choose
+from sim.couplings import NAMES, choose
 from sim.judged import Judged
 from sim.mujoco_engines import INTEGRATORS
 from sim.run import ENGINES, AnyEngine
@@ -42,12 +42,12 @@ def main(argv: list[str]) -> int:
     environment, simulated = _environment(args, scenario)
     chosen = _chosen(args, scenario)  # V, Q or R
     judged = judge(args, scenario, chosen, simulated)  # what each condition asks of the devices, and what is proved
-    done = _run(args, simulated, chosen, engine, judged.limits.rho)  # sample, compute, limit, hold, advance
+    done = _run(args, simulated, chosen, engine, judged.limiter.rho)  # sample, compute, limit, hold, advance
     same = args.limiter is None and not scenario.ranges and args.case != "none"
-    others = _alternatives(args, scenario, done, (chosen, judged.requirements, judged.limits) if same else None)
-    robustness = _robustness(chosen, scenario.loop(args.case), judged)
+    others = _alternatives(args, scenario, done, (chosen, judged.requirements, judged.limiter) if same else None)
+    nearby = _nearby(chosen, scenario.loop(args.case), judged)
     asked = {"seed": args.seed, "band_hz": args.band_hz or BAND_HZ, "check": args.cross_check}
-    report = run_report(scenario, args.case, chosen, judged, done, environment, others, robustness, **asked)
+    report = run_report(scenario, args.case, chosen, judged, done, environment, others, nearby, **asked)
     files = _save(args, out, done, report)
     if args.side_by_side:
         files.append(_side_by_side(others, out / "couplings.png", scenario.environment.contacts))
@@ -88,7 +88,7 @@ def _parser() -> options.Parser:
 
 
 def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
-    """The coupling; with a baseline there is none, and the note says whose that is. Raises InputError."""
+    """The coupling that was asked for. A baseline has none, and a note names its authors. Raises InputError."""
     if args.coupling not in layer.BASELINES:
         with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
             return choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
@@ -107,7 +107,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Scenario]:
-    """Which environment is simulated, and the scenario with that one, known exactly. Raises InputError."""
+    """The name of the environment that is simulated, and the scenario with it in place of ranges. Raises InputError."""
     members = scenario.loop(args.case).members()
     if not 0 <= args.vertex < len(members):
         why = f"allowed are 0 to {len(members) - 1}" if scenario.ranges else "but the scenario has no ranges ([ranges])"
@@ -134,7 +134,7 @@ def _run(
 
 
 def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun, own: Any) -> list[Alternative]:
-    """What other couplings come to in the scenario's own environment. Raises InputError for a picture of nothing."""
+    """The run repeated with other couplings. Raises InputError where --side-by-side would have nothing to draw."""
     skipped = args.no_alternatives or run.trace.interrupted or args.vertex > 0
     with render.progress("other couplings") as move:
         made = [] if skipped else alternatives(scenario, args.case, move, own)
@@ -156,20 +156,20 @@ def _side_by_side(others: list[Alternative], path: Path, names: tuple[str, ...])
 
 def _panel_title(other: Alternative) -> str:
     kind = ", spring-damper" if other.coupling == "spring-damper" else ""
-    guarantee = f"guarantee: {other.promise}" if other.promise else "no guarantee"
+    guarantee = f"guarantee: {other.guarantee}" if other.guarantee else "no guarantee"
     felt = f"grows: {render.optional(other.growth_rate_per_s, '{:+.2f} 1/s')}"
     if other.force_error_percent is not None:
         felt = f"force error {other.force_error_percent:.2g} %"
     return f"{'no coupling' if other.coupling == 'none' else other.name + kind}\n{felt}; {guarantee}"
 
 
-def _robustness(chosen: Chosen, loop: Loop, judged: Judged) -> dict[str, Any]:
-    """What a wrong model of the environment costs a guarantee for this environment alone."""
-    alone = chosen.condition == "this-environment" and judged.certificates[chosen.condition]["certified"]
-    if not alone or judged.promise == ANY:
-        return {"robustness": None, "designed_for_it": None}
+def _nearby(chosen: Chosen, loop: Loop, judged: Judged) -> Nearby:
+    """The damping needed where the environment is not as modelled; empty where no guarantee depends on that."""
+    alone = chosen.condition == "this-environment" and judged.certificates[chosen.condition].certified
+    if not alone or judged.guarantee == ANY:
+        return Nearby()
     with render.progress("working out robustness and its price"):
-        return robustness_parts(loop, chosen.coupling)
+        return Nearby.of(loop, chosen.coupling)
 
 
 def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
@@ -193,8 +193,8 @@ def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunRepo
 
 def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
     """Walls between a contact and ground, (channel, place, name), and in which ticks any wall was touched, (N,)."""
-    contact, network = run.simulation.process.contact, run.simulation.scenario.environment
-    if not network.walls or contact is None:
+    law, network = run.simulation.process.law, run.simulation.scenario.environment
+    if not network.walls:
         return [], None
     found = []
     for number, wall in enumerate(network.walls, start=1):
@@ -204,19 +204,19 @@ def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
         if second == GROUND and first in network.contacts:
             name = f"wall {number}, {1e3 * wall.gap:g} mm from {first} at rest"
             found.append((network.contacts.index(first), sign * wall.gap, name))
-    return found, (contact.depths(run.trace.z)[:, : len(network.walls)] > 0).any(axis=1)
+    return found, (law.depths(run.trace.z) > 0).any(axis=1)
 
 
 def _title(what: str, report: RunReport) -> str:
-    """Of the picture."""
-    stability, kind = report.stability, report.judged.coupling["kind"]
+    """The title of the picture."""
+    stability, kind = report.stability, report.judged.coupling.kind
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
-    if kind != "none" and report.judged.promise:
-        coupling += f" for {report.judged.promise}"
+    if kind != "none" and report.judged.guarantee:
+        coupling += f" for {report.judged.guarantee}"
     rate, hertz = stability.exact_growth_rate_per_s, stability.exact_frequency_hz
     growth = f"grows by {rate:.3f} 1/s at {hertz:.1f} Hz" if rate > 0 else f"slowest motion decays by {-rate:.3f} 1/s"
     if report.varying_delay and report.switched:
-        growth = f"{report.varying_delay['pattern']} delays, {stability.verdict}"
+        growth = f"{report.varying_delay.span.pattern} delays, {stability.verdict}"
     return f"{what.removesuffix(', no coupling').removesuffix(', case none')}, {coupling}: {growth}"
 
 
@@ -225,8 +225,8 @@ def _title(what: str, report: RunReport) -> str:
 
 
 def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
-    title = f"{scenario.title(report.case)}: coupling {report.judged.coupling['kind']}"
-    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(report)], ("", ""))]
+    title = f"{scenario.title(report.case)}: coupling {report.judged.coupling.kind}"
+    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(report)])]
     if report.run.engines:
         shown.append(_speed_against_error(report.run, report.run.engines))
     if report.alternatives:
@@ -238,24 +238,24 @@ def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
 
 
 def _rows(report: RunReport) -> render.Rows:
-    """Of its table."""
+    """The rows of the table."""
     coupling, stability, run, ratio = (
         report.judged.coupling,
         report.stability,
         report.run,
-        report.transparency["dc_ratio"],
+        finite(report.transparency.dc_ratio),
     )
     how = "switching" if report.switched else "simulated trace"
     if run.timing and "impulse" in (stability.reason or ""):
         how = "uneven ticks"
     measured = render.optional(stability.growth_rate_per_s, "{:+.4f} 1/s")
-    if coupling["K"]:
-        yield "coupling K / B", f"{listed(coupling['K'], 5)} N/m / {listed(coupling['B'], 5)} N s/m"
-    if coupling.get("stiffness"):
-        yield "coupling, static", f"{listed(coupling['stiffness'], 5)} N/m"
+    if coupling.K and coupling.B:
+        yield "coupling K / B", f"{listed(coupling.K, 5)} N/m / {listed(coupling.B, 5)} N s/m"
+    if coupling.stiffness:
+        yield "coupling, static", f"{listed(coupling.stiffness, 5)} N/m"
     yield from judged_rows(report.judged)
     yield "transparency error", render.transparency_error(report.transparency)
-    yield from render.robustness_rows(report.robustness)
+    yield from render.robustness_rows(report.nearby)
     apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
     yield "force error", f"{apart}, before the force limits" if apart else f"- ({report.ideal_force.reason})"
     yield "rendered stiffness", f"{100 * ratio:.1f} %" if ratio else "-"
@@ -270,7 +270,7 @@ def _rows(report: RunReport) -> render.Rows:
             name = f"wall{'s' * (len(state.touching) > 1)} {', '.join(map(str, state.touching))}"
             yield f"growth, {name if state.touching else 'no wall'} touching", _growth(state)
     yield "simulated in", run.environment if report.judged.ranges else None
-    yield "force limits", report.judged.limiter["words"]
+    yield "force limits", report.judged.limiter.words
     yield "limited ticks", f"{stability.clipped_ticks} of {run.samples}"
     yield "speed", _speed(run)
     size = render.optional(report.error.position_max_m, "{:.1e} m at most")
@@ -297,8 +297,8 @@ def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> 
 
 
 def _beside(report: RunReport) -> Any:
-    """The price of each guarantee; the run's own coupling is marked where it is one of them."""
-    own = report.judged.coupling["kind"], report.certificate["condition"]
+    """A table of other couplings; the one of this run is marked."""
+    own = report.judged.coupling.kind, report.certificate.condition
     cells = []
     for other in report.alternatives:
         if other.reason:
@@ -309,7 +309,7 @@ def _beside(report: RunReport) -> Any:
         grows = other.growth_rate_per_s is None or other.growth_rate_per_s > MARGINAL
         error = "grows" if grows else render.optional(other.force_error_percent, "{:.3g} %")
         felt = _share(other.dc_ratio, "-")
-        cells.append((other.name + "*" * same, *needs, other.promise or "none", felt, error))
+        cells.append((other.name + "*" * same, *needs, other.guarantee or "none", felt, error))
     heads = ("coupling", "this-env.", "any-env.", "guarantee", "stiffness", "error")
     marked = " (*: this run)" if any(cell[0].endswith("*") for cell in cells) else ""
     title = f"the same devices with other couplings{marked}: required damping\nin % of theirs"

@@ -17,24 +17,26 @@ from design.certificate import RangesCheck
 from design.conditions import this_environment
 from design.files import unseen
 from design.guarantees import ANY
+from design.result import Chosen
 from models.human import Human, Population
-from sim import report, verdicts
+from sim import verdicts
 from sim.adversary import Worst, search, search_population
-from sim.couplings import NAMES, Chosen, choose
+from sim.couplings import NAMES, choose
 from sim.crowds import ENGINES, MIXED, Findings, Validation
 from sim.judged import Judged
+from sim.report import DelaySpan, UnevenTicks, VaryingDelays
 from sim.run import assemble
 from sim.scenario import InputError, Scenario, require_linear, save_humans
 from sim.shards import Table, validate, validate_on_cluster
 from sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
-from sim.switching import certified_part
+from sim.switching import DelaysCovered
 
 _ENVIRONMENTS = ("nominal", "ranges", "box")  # the last is the older name of the second
 _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
 
 def main(argv: list[str]) -> int:
-    """Meet random humans. 0: the claims hold, 1: not, 3: workers were lost, 130: interrupted."""
+    """Test random humans. 0: what is claimed holds, 1: it does not, 3: workers were lost, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
     with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
@@ -48,8 +50,11 @@ def main(argv: list[str]) -> int:
     report = _reported(args, chosen, judged, question, findings, wall, searched)
     files = _save(args, out, question, findings, searched.worst, chosen.kind)
     title = f"{scenario.title(args.case)}: coupling {chosen.kind}"
-    lines = [*([f"Delays that vary: {report.switching.met['covers']}."] if report.switching else []), *report.remarks]
-    render.publish(args, report, [render.facts(title, render.rows_of(report), ("", ""))], lines, out, files)
+    lines = [
+        *([f"Delays that vary: {report.switching.met.certified.covers}."] if report.switching else []),
+        *report.remarks,
+    ]
+    render.publish(args, report, [render.facts(title, render.rows_of(report))], lines, out, files)
     if report.unfinished and not report.interrupted:
         return options.UNFINISHED
     return options.exit_code(bool(report.holds), report.interrupted)
@@ -81,6 +86,7 @@ def _parser() -> options.Parser:
     met = "nominal (default), or ranges: in turn all vertices of the scenario's ranges and as many others inside"
     add("--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
     options.add_output_options(parser, picture=True)
+    parser.only("with --adversary", lambda args: args.adversary, "generations")
     return parser
 
 
@@ -90,8 +96,6 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     require_linear(scenario, "sim.validate", walls=True)
     if args.dask is not None and args.shards > 1:
         raise InputError(f"--shards {args.shards} with --dask: the cluster decides who does what, give one of them")
-    if args.generations is not None and not args.adversary:
-        raise InputError("--generations without --adversary: it is how long that searches")
     if not (args.duration == 0 or 4 * scenario.T <= args.duration <= 1e5):
         allowed = f"allowed are 0 and {4 * scenario.T:g} to 100000 s"
         raise InputError(f"--duration is {args.duration:g}, {allowed}")
@@ -99,9 +103,9 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environments(args: argparse.Namespace, whole: RangesCheck | None) -> tuple[Member, ...]:
-    """Vertices and as many others of the ranges, the worst that was found first; none where all meet the nominal one.
+    """The vertices of the ranges, and as many other points of them, the worst one found first. Raises InputError.
 
-    Raises InputError.
+    Without --environments ranges there are none: every loop has the nominal environment.
     """
     if args.environments == "nominal":
         return ()
@@ -112,10 +116,10 @@ def _environments(args: argparse.Namespace, whole: RangesCheck | None) -> tuple[
 
 
 def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, judged: Judged) -> Validation:
-    """What is asked of whom. Raises InputError."""
+    """The loop, the humans that are to hold it, and the engines that decide. Raises InputError."""
     links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
     work, met = (args.humans, links, args.engine, args.duration), _environments(args, judged.whole)
-    return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=judged.limits.rho)
+    return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=judged.limiter.rho)
 
 
 def _findings(args: argparse.Namespace, question: Validation, table: Table) -> tuple[Findings, float]:
@@ -131,7 +135,7 @@ def _findings(args: argparse.Namespace, question: Validation, table: Table) -> t
 
 @dataclass(frozen=True)
 class _Searched:
-    """What the adversary found; None where it was not asked, or the keyboard ended its search."""
+    """What the adversary found; None where none was asked for, or where Ctrl-C ended its search."""
 
     worst: Worst | None = None
     drawn: Worst | None = None  # the worst that the scenario's own population draws
@@ -140,7 +144,7 @@ class _Searched:
 
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, judged: Judged) -> _Searched:
-    """The worst humans, in the environment that asks most; what was found before Ctrl-C is kept."""
+    """The worst humans, in the environment that needs the most damping; what was found before Ctrl-C is kept."""
     scenario, ratio = question.scenario, judged.requirements["this-environment"].ratio
     if question.environments and judged.whole:
         member, requirement = judged.whole.worst_found
@@ -149,7 +153,7 @@ def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, ju
     try:
         for seek in (search, search_population)[: 1 if isinstance(scenario.population, Population) else 2]:
             with render.progress("searching the worst human") as move:
-                frozen = assemble(scenario, chosen.coupling).process.frozen().values()
+                frozen = assemble(scenario, chosen.coupling).process.law.frozen().values()
                 F = max(frozen, key=lambda F: this_environment(F, scenario.delta).ratio)  # the state that asks most
                 found.append(seek(scenario, F, args.seed, args.generations or 150, progress=move))
     except KeyboardInterrupt:
@@ -206,7 +210,7 @@ class _Own:
 
 @dataclass(frozen=True, kw_only=True)
 class _Report:
-    """What a validation found; parts are null, or left out, where there is none of them."""
+    """What a validation found; a part that does not exist is null or left out."""
 
     case: str
     scenario: str
@@ -225,11 +229,15 @@ class _Report:
         "MuJoCo's growth rates", "within {:.1e} 1/s of the exact ones"
     )
     traces: verdicts.Traces | None = render.several(verdicts.Traces.rows)
-    judged: Judged = render.figure("force limits", "{.limiter[words]}", json="beside")
+    judged: Judged = render.figure("force limits", "{.limiter.words}", json="beside")
     settled: str | None = render.figure("handles come to rest", json="table")
     energy_audit: verdicts.EnergyAudit | None = render.figure("energy audit W >= 0", json="given")
-    switching: verdicts.Growing | None = render.several(lambda g: [*render.delay_rows(g.met), g.row("delays")], "given")
-    timing: verdicts.Growing | None = render.several(lambda g: [render.timing_row(g.met), g.row("ticks")], "given")
+    switching: verdicts.Growing[VaryingDelays] | None = render.several(
+        lambda grow: [*render.delay_rows(grow.met), grow.row("delays")], "given"
+    )
+    timing: verdicts.Growing[UnevenTicks] | None = render.several(
+        lambda grow: [render.timing_row(grow.met), grow.row("ticks")], "given"
+    )
     adversary: verdicts.Attacked | None = render.figure("adversary", json="given")
     adversary_population: verdicts.Attacked | None = render.figure("adversary, own population", json="given")
     certified: bool = render.figure("certified", lambda yes: "yes" if yes else "no")
@@ -246,15 +254,15 @@ class _Report:
 
 def _varying(
     question: Validation, chosen: Chosen, findings: Findings, certified: bool
-) -> tuple[verdicts.Growing | None, verdicts.Growing | None]:
+) -> tuple[verdicts.Growing[VaryingDelays] | None, verdicts.Growing[UnevenTicks] | None]:
     """How many hands grow while delays vary, and while ticks do; None where they do not vary."""
     scenario, switching, timing = question.scenario, None, None
     if scenario.varying_delay:
-        covered = report.delay_range_part(scenario.varying_delay) | certified_part(scenario, chosen, certified)
-        switching = verdicts.Growing.of(findings, covered)
-    if scenario.uneven:
-        met = report.timing_part(scenario.timing(question.seed, max(1, question.ticks)), scenario) or {}
-        timing = verdicts.Growing.of(findings, met | {"covered": certified})
+        covered = DelaysCovered.of(scenario, chosen, certified)
+        met = VaryingDelays(DelaySpan.of(scenario.varying_delay), None, covered)
+        switching = verdicts.Growing.of(findings, met, covered.covered)
+    if scenario.uneven and (ticks := scenario.timing(question.seed, max(1, question.ticks))):
+        timing = verdicts.Growing.of(findings, UnevenTicks.of(ticks, scenario), certified)
     return switching, timing
 
 
@@ -269,7 +277,7 @@ def _reported(
 ) -> _Report:
     """Everything that was found, and whether all of it holds."""
     scenario, any_done = question.scenario, bool(findings.index.size)
-    guarantee = judged.promise
+    guarantee = judged.guarantee
     certified = guarantee is not None and (not question.environments or guarantee == ANY or judged.proved)
     mode = worst_mode(assemble(scenario, chosen.coupling))
     own = _Own(args.human or scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from math import inf, isfinite
 from pathlib import Path
-from typing import Any
 
 from cli import options, render
+from design.coverage import Limits
 from design.files import unseen, write_json
-from design.result import CONDITIONS, certificate_part
+from design.result import CONDITIONS, Requirement
 from sim.scenario import InputError, require_even_ticks
 from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, PreparedLoop, Script, first_loop, parse_script
 from sim.view.film import Picture, check_film, painter, save_film
@@ -58,7 +58,7 @@ def main(argv: list[str]) -> int:
 
 @dataclass(frozen=True)
 class _Event:
-    """What was changed when, and what could be said of the loop that came of it."""
+    """A change of the loop: when it was made, and the verdicts on the loop after it."""
 
     t_s: float
     event: str
@@ -67,20 +67,18 @@ class _Event:
     psi: tuple[int, ...]
     exact_growth_rate_per_s: float  # null in JSON where there is none
     exact_frequency_hz: float
-    certificates: dict[str, Any]
-    promise: str | None
-    limiter: dict[str, Any]
+    certificates: Mapping[str, Requirement]
+    guarantee: str | None = unseen(older="promise")
+    limiter: Limits = unseen()
 
     @classmethod
     def of(cls, t: float, what: str, prepared: PreparedLoop) -> _Event:
         scenario, mode = prepared.scenario, prepared.mode
         loop = prepared.label, scenario.theta, scenario.psi, float(mode.growth), float(mode.frequency_hz)
-        certificates = {name: certificate_part(need) for name, need in prepared.requirements.items()}
-        limiter = prepared.limits.part([device.force_limit for device in scenario.device])
-        return cls(t, what, *loop, certificates, prepared.guarantee, limiter)
+        return cls(t, what, *loop, prepared.requirements, prepared.guarantee, prepared.limits)
 
     def line(self) -> str:
-        held = [name for name in CONDITIONS if self.certificates[name]["certified"]]
+        held = [name for name in CONDITIONS if self.certificates[name].certified]
         growth = f"{self.exact_growth_rate_per_s:+.3g} 1/s at {self.exact_frequency_hz:.1f} Hz"
         grows = growth if isfinite(self.exact_growth_rate_per_s) else "no growth"
         proved = f"certified ({', '.join(held)})" if held else "NOT certified"
@@ -157,6 +155,7 @@ def _parser() -> options.Parser:
     add("--fps", type=options.whole(1, 100), default=10, metavar="N", help=rate)
     drawn = "by OpenGL, or flat without it (default: by what works)"
     add("--draw", choices=_DRAWN, default="auto", help=drawn)
+    parser.only("with --video", lambda args: args.video, "fps", "draw")
     return parser
 
 
@@ -172,7 +171,7 @@ def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
 
 
 def _label(args: argparse.Namespace) -> str:
-    """How the user calls the coupling of --coupling. Raises InputError."""
+    """The name of the first coupling, as the window shows it. Raises InputError."""
     name = args.coupling
     if args.case == "none":
         if name not in (None, "none"):
@@ -188,12 +187,12 @@ def _label(args: argparse.Namespace) -> str:
 
 
 def _names() -> list[str]:
-    """The couplings as the other commands call them, and as the window does."""
+    """The names of couplings in other commands, and those in the window."""
     return list(dict.fromkeys([*LABELS, *COUPLINGS]))
 
 
 def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
-    """The session against a clock of its own: the same film every time. Interrupted, it is as long as it got."""
+    """Film the session by its own clock, so that the film is the same every time; after Ctrl-C it is shorter."""
     seconds = args.duration or (session.script_ends + _AFTER)
     count, interrupted = round(seconds * args.fps) + 1, False
     simulation = session.prepared.simulation

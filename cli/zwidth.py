@@ -6,24 +6,21 @@ options -> CouplingSweep or EnvironmentSweep: whose K and B -> Grid -> Map -> fi
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import msgspec
-import numpy as np
 
 from cli import options, render
 from cli.judged import judge
 from controller.lti import Array
-from controller.older import with_older
-from design.result import CONDITIONS
+from design.result import CONDITIONS, Chosen, Requirement
 from sim import zwidth
-from sim.couplings import NAMES, Chosen, choose
+from sim.couplings import NAMES, choose
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from sim.scenario import InputError, Scenario, require_constant_delay
 from sim.trace import SUSTAINED
-from sim.zwidth_report import MapReport, save_csv
+from sim.zwidth_report import FixedCoupling, MapReport, Shown, save_csv
 
 _EXAMPLE = """python -m sim.zwidth --theta 1 --grid 30
   python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0
@@ -41,12 +38,14 @@ def main(argv: list[str]) -> int:
     require_constant_delay(scenario, "sim.zwidth")
     if scenario.period is not None:
         raise InputError("period: a map simulates even periods; give T_max alone, which its certificates are for")
-    _check_case(args)
+    if args.case == "none":
+        instead = "use --case I, or --coupling none for a map over environments"
+        raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
     chosen = _chosen(args, scenario)
-    sweep, fixed = _sweep(args, scenario, chosen), {"axes": "coupling", "coupling": None}
+    sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
-        fixed = _fixed(args, scenario, chosen)
-        sweep = replace(sweep, lag=fixed["limiter"]["rho"])
+        fixed = FixedCoupling.of(judge(args, scenario, chosen), scenario.loop(args.case).network, chosen.notes)
+        sweep = replace(sweep, lag=fixed.limiter.rho)
     marks = tuple(args.mark)
     grid = zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, marks)
     plan, out = _plan(args, sweep), options.out_folder(args, "zwidth")
@@ -62,7 +61,7 @@ def main(argv: list[str]) -> int:
     if not args.no_plot:
         from sim.map_plot import plot_zwidth
 
-        files.append(plot_zwidth(drawn, render.plain(report), out / "zwidth.png"))
+        files.append(plot_zwidth(drawn, report, out / "zwidth.png"))
     title = f"{_span(grid.K)} N/m, B {_span(grid.B)} N s/m, {report.cells} couplings"
     table = render.facts(f"K {title}", _rows(report), left=True)
     render.publish(args, report, [table], [*_marked(report), *_remarks(report)], out, files)
@@ -90,6 +89,13 @@ def _parser() -> options.Parser:
     of_map.add_argument("--humans", type=options.whole(1, 100_000), default=200, metavar="N", help=humans)
     _add_points(parser.add_argument_group("the points simulated in MuJoCo, and what they have beside the linear loop"))
     options.add_output_options(parser, picture=True)
+    simulated = ("trials", "duration", "start", "press", "threshold", "quantisation", "saturation", "friction")
+    parser.only("about simulated points: --points 0 has none", lambda args: args.points, *simulated)
+    parser.only("about simulated points with --rigid: --points 0 has none", lambda a: a.points or not a.rigid, "wall")
+    parser.only("with --saturation: motors without limits clip nothing", lambda args: args.saturation, "limiter")
+    parser.only("with --coupling: nothing else is designed", lambda args: args.coupling, "condition")
+    gains = "for a map of spring-dampers: with --coupling the axes are the environment's"
+    parser.only(gains, lambda args: args.coupling is None, "rigid", "wall", "velocity_filter")
     return parser
 
 
@@ -121,24 +127,8 @@ def _mark(text: str) -> tuple[float, float]:
     return K, B
 
 
-def _check_case(args: argparse.Namespace) -> None:
-    """Whether the options ask for a map of one kind. Raises InputError."""
-    if args.limiter is False and not args.saturation:
-        raise InputError("--no-limiter without --saturation: motors without limits clip nothing")
-    if args.case == "none":
-        instead = "use --case I, or --coupling none for a map over environments"
-        raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
-    if args.coupling is None and args.condition:
-        why = "without --coupling nothing is designed, and both are drawn"
-        raise InputError(f"--condition {args.condition}: {why}")
-    for name in ("rigid", "wall", "velocity_filter"):
-        if args.coupling is not None and getattr(args, name):
-            what = "is about a map of spring-dampers; with --coupling the axes are the environment's"
-            raise InputError(f"--{name.replace('_', '-')} with --coupling {args.coupling}: it {what}")
-
-
 def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
-    """The coupling that stays as it is over the whole map, or None where the axes are the coupling's own gains."""
+    """The coupling of a map over environments; None where the axes are the gains of the coupling."""
     if args.coupling is None:
         return None
     with render.designing() as heard:
@@ -146,7 +136,7 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
 
 
 def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) -> zwidth.Sweep:
-    """The loop whose couplings, or environments behind the coupling chosen, the map is of. Raises InputError."""
+    """What varies over the map: the couplings of a loop, or the environments behind one coupling. Raises InputError."""
     devices, loop = scenario.device, scenario.loop("I")
     if args.rigid:
         devices, loop = devices[:1], options.rigid_loop(args, scenario)
@@ -158,24 +148,6 @@ def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) 
             loop = loop.at(zwidth.one_sided(scenario.environment))
         wall, clip = args.rigid and args.wall, args.limiter is False
         return zwidth.CouplingSweep(devices, scenario.population, loop, args.velocity_filter, wall, clip)
-
-
-def _fixed(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> dict[str, Any]:
-    """The fixed coupling and what is guaranteed of it where it was designed, in the scenario's own environment."""
-    judged, springs = judge(args, scenario, chosen), zwidth.contact_springs(scenario.loop(args.case).network)
-    designed_for = {
-        "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
-        "certificates": judged.certificates,
-        "promise": judged.promise,
-        "ranges": judged.ranges,
-    }
-    return {
-        "axes": "environment",
-        "coupling": judged.coupling,
-        "designed_for": with_older(designed_for, {"set": "ranges"}),
-        "limiter": judged.limiter,
-        "remarks": list(chosen.notes),
-    }
 
 
 def _plan(args: argparse.Namespace, sweep: zwidth.Sweep) -> Plan:
@@ -194,8 +166,8 @@ def _plan(args: argparse.Namespace, sweep: zwidth.Sweep) -> Plan:
 
 def _rows(report: MapReport) -> render.Rows:
     crowd, simulation = report.population, report.simulation
-    if report.fixed["axes"] == "environment":
-        yield from _designed_rows(report.fixed, simulation.effects["force_limit_n"])
+    if report.fixed:
+        yield from _designed_rows(report.fixed, simulation.effects.force_limit_n is not None)
     for name in report.conditions:
         error = (report.error or {}).get(name)
         near = f"; edge within {100 * error.edge_relative_in_K:.2g} % of the condition's own sweep" if error else ""
@@ -213,28 +185,28 @@ def _share(count: int, report: MapReport) -> str:
     return f"{100 * count / report.cells:.1f} % of the map"
 
 
-def _designed_rows(fixed: Mapping[str, Any], limited: list[float] | None) -> render.Rows:
+def _designed_rows(fixed: FixedCoupling, limited: bool) -> render.Rows:
     """The fixed coupling in the environment that it was designed for."""
-    designed = fixed["designed_for"]
-    each = (f"{' - '.join(s['between'])} {s['K']:g} N/m, {s['B']:g} N s/m" for s in designed["contact_springs"])
-    asked = [(name, designed["certificates"][name]) for name in CONDITIONS]
+    there = fixed.designed_for
+    asked = [(name, there.certificates[name]) for name in CONDITIONS]
     needs = "; ".join(
-        f"{name} needs {100 / part['margin']:.4g} % of the damping ({part['proof']})"
-        for name, part in asked
-        if part["margin"]
+        f"{name} needs {100 / need.margin:.4g} % of the damping ({need.proof})" for name, need in asked if need.margin
     )
-    yield "coupling", f"{fixed['coupling']['kind']}, fixed"
-    yield "designed for", ", ".join(each)
-    yield "there", f"guarantee: {designed['promise'] or 'none'}; {needs or 'no damping is enough'}"
-    yield "force limits there", fixed["limiter"]["words"] if limited else None
+    yield "coupling", f"{fixed.coupling.kind}, fixed"
+    yield (
+        "designed for",
+        ", ".join(f"{' - '.join(s.between)} {s.K:g} N/m, {s.B:g} N s/m" for s in there.contact_springs),
+    )
+    yield "there", f"guarantee: {there.guarantee or 'none'}; {needs or 'no damping is enough'}"
+    yield "force limits there", fixed.limiter.words if limited else None
 
 
-def _effects(effects: Mapping[str, Any]) -> str:
+def _effects(effects: Shown) -> str:
     on = {
-        "quantisation": any(effects["encoder_step_m"]),
-        "friction": any(effects["friction_n"]),
-        "saturation": effects["force_limit_n"] is not None,
-        "one-sided contact": effects["one_sided"],
+        "quantisation": any(effects.encoder_step_m),
+        "friction": any(effects.friction_n),
+        "saturation": effects.force_limit_n is not None,
+        "one-sided contact": effects.one_sided,
     }
     names = [name for name, present in on.items() if present]
     return f" with {', '.join(names)}" if names else ", linear loop"
@@ -243,28 +215,27 @@ def _effects(effects: Mapping[str, Any]) -> str:
 def _marked(report: MapReport) -> Iterator[str]:
     """A line for every coupling that was asked about."""
     for mark in report.marks or ():
-        stiffest = mark["stiffest_K_at_this_B"]
+        stiffest = mark.stiffest_K_at_this_B
         ends = ", ".join(f"{name} {_limit(K)}" for name, K in stiffest.items())
-        needs = ", ".join(f"{name} {_needs(mark[name])}" for name in stiffest if name != "population")
-        met = f"{mark['unstable_humans']} of {report.population.humans} humans make it unstable"
-        yield f"K {mark['K']:g}, B {mark['B']:g}: {needs}; {met}; stiffest at this B: {ends}"
+        needs = ", ".join(f"{name} {_needs(mark.requirements[name])}" for name in stiffest if name != "population")
+        met = f"{mark.unstable_humans} of {report.population.humans} humans make it unstable"
+        yield f"K {mark.K:g}, B {mark.B:g}: {needs}; {met}; stiffest at this B: {ends}"
 
 
 def _limit(K: float | str | None) -> str:
     return "none" if K is None else K if isinstance(K, str) else f"{K:.5g} N/m"
 
 
-def _needs(part: Mapping[str, Any]) -> str:
-    """Of the worst channel."""
-    required = max(np.inf if d is None else d for d in part["required_damping"])
-    least = min(part["available_damping"])
-    return f"needs {required:.6g} of {least:.6g} N s/m ({render.certified({**part, 'proof': None})})"
+def _needs(need: Requirement) -> str:
+    """The damping that the worst channel needs."""
+    worst, least = max(need.required), min(need.available)
+    return f"needs {worst:.6g} of {least:.6g} N s/m ({render.certified(need, proof=False)})"
 
 
 def _remarks(report: MapReport) -> Iterator[str]:
     simulation = report.simulation
-    if report.fixed["axes"] == "environment":
-        yield from report.fixed["remarks"]
+    if report.fixed:
+        yield from report.fixed.remarks
         yield _about(report.conditions)
     for name in report.conditions:
         ratio = report.ratios[name]

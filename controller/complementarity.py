@@ -95,7 +95,9 @@ class BoxProblem(_Problem):
         if self._separate:
             f = np.minimum(np.maximum(q, lower), upper)
             return np.divide(q - f, self._diagonal, out=np.zeros_like(q), where=q != f), f
-        v = self._listed(q) if self._candidates else self._pivoted(q)
+        if self._candidates:
+            return self._listed(q)
+        v = self._pivoted(q)
         f = np.where(v > 0, upper, np.where(v < 0, lower, q - self.M @ v))
         return v, np.minimum(np.maximum(f, lower), upper)
 
@@ -115,38 +117,48 @@ class BoxProblem(_Problem):
         return regular
 
     @cached_property
-    def _candidates(self) -> list[tuple[Array, Array, Array]]:
-        """(signs, bounds, q - bounds to v) of every set of active limits; none where there are too many."""
-        n = len(self.M)
+    def _candidates(self) -> tuple[Array, ...]:
+        """Of every set of active limits, of c: its signs, [v; f] by q and by one, and how far from wrong it is by both.
+
+        Shapes (c, n, 1), (c, 2n, n), (c, 2n, 1), (c 2n, n), (c 2n, 1); none where there are too many sets. A limit's
+        sign must be that of its v, and what is free must be within both limits.
+        """
+        n, diagonal, one = len(self.M), self._diagonal[:, 0], np.eye(len(self.M))
         kinds = [
             [0.0, *[1.0] * bool(np.isfinite(b)), *[-1.0] * bool(np.isfinite(a))]
             for a, b in zip(self.lower, self.upper, strict=True)
         ]
         if np.prod([len(kind) for kind in kinds]) > _MOST_CANDIDATES:
-            return []
-        scale, found = np.sqrt(np.maximum(np.abs(np.diag(self.M)), 1e-300)), []
+            return ()
+        scale, found = np.sqrt(np.maximum(np.abs(diagonal), 1e-300)), []
         for signs in map(np.array, itertools.product(*kinds)):
             active = np.flatnonzero(signs)
             chosen = np.ix_(active, active)
             if np.linalg.det((self.M / scale / scale[:, None])[chosen]) > _LEAST_MINOR:
-                inverse = np.zeros((n, n))
-                inverse[chosen] = np.linalg.inv(self.M[chosen])
+                v, free = np.zeros((n, n)), signs == 0
+                v[chosen] = np.linalg.inv(self.M[chosen])
                 bounds = np.where(signs > 0, self.upper, np.where(signs < 0, self.lower, 0.0))
-                found.append((signs[:, None], bounds[:, None], inverse))
-        return found
+                f = np.where(free[:, None], one - self.M @ v, 0.0)  # q - M v, and exactly the limit where it acts
+                v_one, f_one = -v @ bounds, np.where(free, self.M @ v @ bounds, bounds)
+                pushed, pushed_one = (signs * diagonal)[:, None] * v, signs * diagonal * v_one
+                below, above = np.where(free[:, None], -f, pushed), np.where(free[:, None], f, pushed)
+                room_below = np.where(free, self.upper - f_one, pushed_one)
+                room_above = np.where(free, f_one - self.lower, pushed_one)
+                solved = np.vstack([v, f]), np.append(v_one, f_one)[:, None]
+                room = np.vstack([below, above]), np.append(room_below, room_above)[:, None]
+                found.append((signs[:, None], *solved, *room))
+        signs, by_q, by_one, room, room_one = map(np.stack, zip(*found, strict=True))
+        return signs, by_q, by_one, room.reshape(-1, n), room_one.reshape(-1, 1)
 
-    def _listed(self, q: Array) -> Array:
-        """v of the set that is least violated: rounding leaves the right one some 1e-16 short, every other more."""
-        lower, upper = self.lower[:, None], self.upper[:, None]
-        best, least = np.zeros_like(q), np.full(q.shape[1], -np.inf)
-        for signs, bounds, inverse in self._candidates:
-            v = inverse @ (q - bounds)
-            f = q - self.M @ v
-            room = np.where(signs == 0, np.minimum(upper - f, f - lower), signs * v * self._diagonal).min(axis=0)
-            better = room > least
-            best = np.where(better, np.where(signs * v > 0, v, 0.0), best)
-            least = np.where(better, room, least)
-        return best
+    def _listed(self, q: Array) -> tuple[Array, Array]:
+        """(v, f) of the set that is least wrong: rounding leaves the right one some 1e-16 short, every other more."""
+        signs, by_q, by_one, room, room_one = self._candidates
+        n, k = q.shape
+        best = (room @ q + room_one).reshape(len(signs), 2 * n, k).min(axis=1).argmax(axis=0)
+        both = (np.matmul(by_q[best], q.T[:, :, None]) + by_one[best])[:, :, 0].T
+        v, f = both[:n], both[n:]
+        v[v * signs[best, :, 0].T <= 0] = 0.0
+        return v, np.minimum(np.maximum(f, self.lower[:, None]), self.upper[:, None])
 
     def _pivoted(self, q: Array) -> Array:
         """v by switching limits on and off, all that are wrong at once and, should that go round, the first only.

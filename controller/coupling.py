@@ -55,6 +55,14 @@ class Coupling(ABC):
         """The same gains, or coefficients, with another period T [s]."""
         return self
 
+    def scaled(self, stiffness: float = 1.0, damping: float = 1.0) -> Coupling:
+        """The same with all K and all B, where it has such gains, times as much."""
+        return self
+
+    def in_series(self, T: Number) -> Lti | None:
+        """A block with the poles that it adds to those of the environment, where it feeds nothing back."""
+        return None
+
     def figures(self, T: float) -> dict[str, Any]:
         """Figures for a report: the order of V, Q or R, and the gains where it has gains."""
         V = self.compliance(T)
@@ -128,6 +136,9 @@ class SpringDamper(ReadOnly, Coupling):
 
     def figures(self, T: float) -> dict[str, Any]:
         return {"K": self.K.tolist(), "B": self.B.tolist()} | super().figures(T)
+
+    def scaled(self, stiffness: float = 1.0, damping: float = 1.0) -> SpringDamper:
+        return replace(self, K=stiffness * self.K, B=damping * self.B)
 
     def sampled(self, z: Complex, T: float) -> Sampled:
         """V at z (n, k) or (1, k), for gains (n, m) or (m,)."""
@@ -370,6 +381,9 @@ class ForceFilter(ReadOnly, Coupling):
     def filter(self, T: Number) -> Lti:
         """R(z), in the arithmetic of T."""
         return _realised(self.poles, self.pairs, self.R, T)
+
+    def in_series(self, T: Number) -> Lti:
+        return ForceFilter(self.poles, self.pairs, np.append(np.zeros(len(self.R) - 1), 1.0)[:, None, None]).filter(T)
 
     def figures(self, T: float) -> dict[str, Any]:
         return {"order": self.filter(T).order}

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.lti import Array, Complex, Lti, Number, Sampled, inverse, numbers, rational, times
+from controller.lti import Array, Complex, Lti, Number, Sampled, as_like, inverse, numbers, rational, times
 
 GROUND = "ground"
 
 
 #: largest amounts, far from where arithmetic ends and beyond what anybody renders
 MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
+MOST_WALLS = 6
 _MOST_NODES, _MOST_PARTS = 200, 2000  # a mass is two states, and a proof has at most a few hundred
 
 
@@ -40,20 +41,21 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     between: tuple[str, str]
     stiffness: float  # [N/m]
     damping: float = 0.0  # [N s/m]
+    inertance: float | msgspec.UnsetType = msgspec.UNSET  # [kg] of an inerter beside them
 
     def __post_init__(self) -> None:
-        for name, unit in (("stiffness", "N/m"), ("damping", "N s/m")):
-            _check_amount(f"{name} between {' and '.join(self.between)}", getattr(self, name), unit)
+        for name, unit in (("stiffness", "N/m"), ("damping", "N s/m"), ("inertance", "kg")):
+            _check_amount(f"{name} between {' and '.join(self.between)}", getattr(self, name) or 0.0, unit)
         if self.between[0] == self.between[1]:
             raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
 
     def amounts(self, number: Callable[[float], Any]) -> tuple[Any, Any, Any]:
-        """Mass [kg], damping [N s/m] and stiffness [N/m] between the ends: what another linear element overrides."""
-        return number(0.0), number(self.damping), number(self.stiffness)
+        """Mass [kg], damping [N s/m] and stiffness [N/m] between the ends."""
+        return number(self.inertance or 0.0), number(self.damping), number(self.stiffness)
 
 
 class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A one-sided spring-damper: it pushes the first node back once it is `gap` beyond the second; see walls.py."""
+    """A one-sided spring-damper: it pushes the first node back once it is `gap` beyond the second; see law.py."""
 
     between: tuple[str, str]
     stiffness: float  # [N/m]
@@ -76,6 +78,73 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return numbers(self.stiffness, T) + 2 * numbers(self.damping, T) / T
 
 
+def parts_of(element: Any) -> list[Spring | Wall]:
+    """What an element of one's own is made of. Raises ValueError for what is none.
+
+    Nodes that it names beside its ends are its own. What is not linear is made of springs and walls: a hardening
+    spring is a spring with walls beside it, which begin to push beyond their gaps.
+    """
+    made = element.parts() if callable(getattr(element, "parts", None)) else None
+    parts = list(made) if isinstance(made, list | tuple) else []
+    if not parts or not all(type(part) in (Spring, Wall) for part in parts):
+        what = f"parts() is {made!r}" if made is not None else f"it is {element!r}"
+        raise ValueError(
+            f"element {type(element).__name__}: {what}, expected a class whose parts() is a list of Spring and Wall"
+        )
+    return parts
+
+
+class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """E(z) = C (z I - A)^-1 B + D by its numbers, contact displacements [m] to forces [N], which hold at one period T.
+
+    Passive by a sweep of frequencies: He [(1 - z) E(z)] >= 0, with E(1) symmetric and nonnegative; ValueError else.
+    """
+
+    A: tuple[tuple[float, ...], ...]
+    B: tuple[tuple[float, ...], ...]
+    C: tuple[tuple[float, ...], ...]
+    D: tuple[tuple[float, ...], ...]
+    T: float  # [s]
+
+    @classmethod
+    def of(cls, E: Lti) -> Block:
+        """The block of an E(z) over floats."""
+        A, B, C, D = (tuple(map(tuple, part.tolist())) for part in (E.A, E.B, E.C, E.D))
+        return cls(A, B, C, D, E.T)
+
+    def __post_init__(self) -> None:
+        E = self.at(self.T)
+        if E.inputs != E.outputs:
+            raise ValueError(f"block: it has {E.inputs} inputs and {E.outputs} outputs, expected as many")
+        poles = np.linalg.eigvals(E.A) if E.order else np.zeros(0)
+        if not np.abs(poles).max(initial=0.0) < 1:
+            raise ValueError("block: not passive, A has an eigenvalue on or outside the unit circle")
+        near = np.outer(np.abs(np.angle(poles)), 1 + np.linspace(-0.1, 0.1, 41)).ravel()
+        w = np.concatenate([[1e-9], np.geomspace(1e-6, np.pi, 2000), near[(near > 0) & (near < np.pi)]])
+        z = np.exp(1j * w)
+        flow = (1 - z)[:, None, None] * E.at(z[None])[0]  # E z/(z-1) times |z-1|^2
+        least = np.linalg.eigvalsh(flow + flow.conj().swapaxes(1, 2))[:, 0] / 2
+        worst = int(np.argmin(least / np.abs(flow).max(axis=(1, 2)).clip(1e-300)))
+        if least[worst] < -1e-9 * np.abs(flow[worst]).max():
+            raise ValueError(
+                f"block: not passive, its force feeds power in at {w[worst] / (2 * np.pi * self.T):.3g} Hz"
+            )
+        still = E.at(np.ones((1, 1), dtype=complex))[0, 0].real
+        rounding = 1e-9 * np.abs(still).max()
+        if np.abs(still - still.T).max() > rounding or np.linalg.eigvalsh(still).min() < -rounding:
+            raise ValueError("block: not passive, its static stiffness E(1) is not symmetric and nonnegative")
+
+    def at(self, T: Number) -> Lti:
+        """E(z) in the arithmetic of T. Raises ValueError for another period."""
+        if float(T) != self.T:
+            raise ValueError(f"block: its numbers are for T = {self.T:g} s, the loop has {float(T):g} s")
+        D = np.array(self.D, dtype=float).reshape(len(self.D), -1)
+        n, (outputs, inputs) = len(self.A), D.shape
+        shapes = {"A": (n, n), "B": (n, inputs), "C": (outputs, n)}
+        A, B, C = (np.array(getattr(self, name), dtype=float).reshape(shape) for name, shape in shapes.items())
+        return Lti(numbers(A, T), numbers(B, T), numbers(C, T), numbers(D, T), T)
+
+
 class Environment:
     """What a loop asks of its environment. Your own class has `contacts` and `E(T)`."""
 
@@ -83,6 +152,7 @@ class Environment:
     contacts: Any  # tuple[str, ...], one a channel
     walls: tuple[Wall, ...] = ()
     here: Any = "this environment"  # str: how a guarantee names it
+    one_period = False  # whether it is known for one T only
 
     def check(self, psi: Sequence[int], T: float) -> None:
         """Raises ValueError where no loop with this environment makes sense."""
@@ -146,9 +216,19 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
     contacts: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
     springs: tuple[Spring, ...] = ()
     masses: dict[str, float] = {}  # [kg], by node; nodes that are not named have none
-    walls: Annotated[tuple[Wall, ...], msgspec.Meta(max_length=6)] = ()  # 2^6 contact states
+    walls: Annotated[tuple[Wall, ...], msgspec.Meta(max_length=MOST_WALLS)] = ()  # 2^6 contact states
+    block: Block | None = None  # beside all these, of E(z) what is known by its numbers alone
+    elements: tuple[Any, ...] = ()  # of one's own: their parts are put among springs and walls
 
     def __post_init__(self) -> None:
+        for part in [part for element in self.elements for part in parts_of(element)]:
+            name = "springs" if isinstance(part, Spring) else "walls"
+            msgspec.structs.force_setattr(self, name, (*getattr(self, name), part))
+        msgspec.structs.force_setattr(self, "elements", ())
+        if len(self.walls) > MOST_WALLS:
+            raise ValueError(f"the network has {len(self.walls)} walls, allowed are {MOST_WALLS}")
+        if self.block and len(self.block.D) != len(self.contacts):
+            raise ValueError(f"block has {len(self.block.D)} channels, expected {len(self.contacts)}, as contacts")
         if len(set(self.contacts)) < len(self.contacts) or GROUND in self.contacts:
             raise ValueError(f"contacts must be different names other than {GROUND!r}, got {list(self.contacts)}")
         nodes = self.nodes()
@@ -160,12 +240,16 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
             if name not in nodes:
                 raise ValueError(f"masses names {name!r}, which no spring reaches; nodes: {', '.join(nodes)}")
         held = {node for part in (*self.springs, *self.walls) for node in part.between} | set(self.masses)
-        loose = [n for n in self.contacts if n not in held]
+        loose = [n for n in self.contacts if n not in held and not self.block]
         if loose:
             raise ValueError(f"contact {loose[0]!r} has neither spring nor mass nor wall, so it can render no force")
 
     def check(self, psi: Sequence[int], T: float) -> None:
         environment(self, T)
+
+    @property
+    def one_period(self) -> bool:
+        return self.block is not None
 
     def E(self, T: Number) -> Lti:
         return environment(held(self), T)
@@ -205,6 +289,33 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         return rows
 
 
+#: mass [kg], damping [N s/m] and stiffness [N/m], (..., nodes, nodes) each, as Network.matrices gives them
+Matrices = tuple[Array, Array, Array]
+
+
+class Networks(Environment):
+    """Networks with the same nodes, the contacts first, by their matrices: a stack where these have axes."""
+
+    def __init__(self, contacts: tuple[str, ...], matrices: Matrices) -> None:
+        self.contacts, self.matrices = contacts, matrices
+
+    def E(self, T: Number) -> Lti:
+        return Lti(*_realise(self.matrices, len(self.contacts), T), T)
+
+    def sampled(self, z: Complex, T: float) -> Sampled:
+        """E at z (n, k) from the dynamic stiffness itself, Z_cc - Z_ci Z_ii^-1 Z_ic at s = (z-1)/(Tz)."""
+        M, D, K = (part[..., None, :, :] for part in self.matrices)
+        s = ((z - 1) / (T * z))[..., None, None]
+        Z = M * s**2 + D * s + K
+        cc, ci, ic, ii = (Z[(..., *quarter)] for quarter in _quarters(len(self.contacts)))
+        inner = ic / ii if ii.shape[-1] == 1 else np.linalg.solve(ii, ic)
+        return Sampled(z, cc - ci @ inner, T)
+
+    def sent_at(self, coupling: Coupling, psi: Sequence[int], z: Complex, T: float) -> Sampled:
+        E = self.sampled(z, T)
+        return coupling.around(as_like(E, delay(psi, T)) @ E)
+
+
 #: Figure 4 as we read it: contact 1 -(K1, B1)- M -(K2, B2)- contact 2, the mass free.
 FIGURE_4 = Network(
     contacts=("contact 1", "contact 2"),
@@ -225,33 +336,19 @@ def environment(network: Network, T: Number) -> Lti:
     if an internal node is held by nothing.
     """
     adrift = _adrift(network, network.springs)
-    return Lti(*_realise(_solvable(network, T), len(network.contacts), T, adrift=adrift), T)
-
-
-#: mass [kg], damping [N s/m] and stiffness [N/m], (..., nodes, nodes) each, as Network.matrices gives them
-Matrices = tuple[Array, Array, Array]
-
-
-def environment_of(matrices: Matrices, contacts: int, T: Number) -> Lti:
-    """E(z) of the networks with these matrices, whose first nodes are the contacts: a stack where they have axes."""
-    return Lti(*_realise(matrices, contacts, T), T)
-
-
-def sampled_environment(matrices: Matrices, contacts: int, z: Complex, T: float) -> Sampled:
-    """The same at z (n, k) from the dynamic stiffness itself, Z_cc - Z_ci Z_ii^-1 Z_ic at s = (z-1)/(Tz)."""
-    M, D, K = (part[..., None, :, :] for part in matrices)
-    s = ((z - 1) / (T * z))[..., None, None]
-    Z = M * s**2 + D * s + K
-    cc, ci, ic, ii = (Z[(..., *quarter)] for quarter in _quarters(contacts))
-    inner = ic / ii if ii.shape[-1] == 1 else np.linalg.solve(ii, ic)
-    return Sampled(z, cc - ci @ inner, T)
+    E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, adrift=adrift), T)
+    return E + network.block.at(T) if network.block else E
 
 
 def walled_environment(network: Network, T: Number) -> Lti:
     """[x; p] -> [f; y]: as `environment`, wall forces p [N] put in and displacements y [m] across walls out."""
     across = network.across(network.walls)
     adrift = _adrift(network, (*network.springs, *network.walls))
-    return Lti(*_realise(_solvable(network, T), len(network.contacts), T, across, adrift), T)
+    E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, across, adrift), T)
+    if not network.block:
+        return E
+    w = len(network.walls)
+    return E + Lti.diag(network.block.at(T), Lti.constant(np.zeros((w, w)), T))
 
 
 def _adrift(network: Network, springs: Sequence[Spring | Wall]) -> list[list[int]]:
@@ -304,7 +401,7 @@ def _realise(
     outputs, these displacements. The places of internal nodes in a group of `adrift` are kept relatively to its first.
     The arithmetic is that of the entries.
     """
-    (Mcc, _, _, Mii), (Dcc, Dci, Dic, Dii), (Kcc, Kci, Kic, Kii) = (
+    (Mcc, Mci, Mic, Mii), (Dcc, Dci, Dic, Dii), (Kcc, Kci, Kic, Kii) = (
         [part[(..., *quarter)] for quarter in _quarters(c)] for part in matrices
     )
     solve = inverse(Mii / T + Dii + T * Kii)
@@ -318,11 +415,15 @@ def _realise(
         q_old[group[0]] = 0
     vx = (x - x_old) / T
     push = times(Mii / T, v_old) - times(Kii, q_old) - times(Dic, vx) - times(Kic, x)
+    if joined := (Mci != 0).any():
+        push = push - times(Mic, vx - vx_old) / T
     if across is not None:
         push = push - across[:, c:].T @ p
     v = times(solve, push)
     q = q_old + T * v
     force = times(Mcc, vx - vx_old) / T + times(Dcc, vx) + times(Kcc, x) + times(Dci, v) + times(Kci, q)
+    if joined:
+        force = force + times(Mci, v - v_old) / T
     if across is not None:
         force = np.vstack([force + across[:, :c].T @ p, across[:, :c] @ x + across[:, c:] @ q])
 
@@ -356,17 +457,3 @@ def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
     walls = zip(network.walls, touching, strict=True)
     springs = (Spring(w.between, on * w.stiffness, on * w.damping) for w, on in walls)
     return msgspec.structs.replace(network, springs=(*network.springs, *springs), walls=())
-
-
-def walled_force_map(network: Network, coupling: Coupling, theta: Sequence[int], psi: Sequence[int], T: Number) -> Lti:
-    """[x; p] to [f; y]: displacements and wall forces [N] to what the devices feel and the ways into the walls [m].
-
-    Psi and Theta delay what the devices feel of the walls. Raises SingularLoop, and ValueError for a coupling that
-    walls cannot stand behind.
-    """
-    w = len(network.walls)
-
-    def late(steps: Sequence[int]) -> Lti:
-        return Lti.diag(delay(steps, T), Lti.constant(np.eye(w), T))
-
-    return late(theta) @ coupling.around(late(psi) @ walled_environment(network, T), further=w)

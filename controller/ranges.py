@@ -147,6 +147,8 @@ class _Part:
 
 
 def _parts(network: Network, ranges: Ranges) -> list[_Part]:
+    if network.block:
+        raise ValueError("ranges and environment.block: ranges are of springs, dampers and masses")
     if not (ranges.springs or ranges.masses):
         raise ValueError("ranges are empty: give springs or masses whose parameters have ranges")
     named = [frozenset(one.between) for one in ranges.springs]
@@ -166,6 +168,8 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
         if node not in (*network.nodes(), GROUND):
             raise ValueError(f"{field}: there is no node {node!r}; nodes: {', '.join(network.nodes())}, ground")
     found = [spring for spring in network.springs if set(spring.between) == {a, b}]
+    if any(spring.inertance for spring in found):
+        raise ValueError(f"{field}: the spring there has an inertance, and ranges are of stiffness and damping")
     if len(found) > 1:
         raise ValueError(f"{field}: the environment has {len(found)} springs there, expected one")
     nothing = Spring((a, b), 0.0, 0.0)

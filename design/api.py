@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Literal, TypedDict, Unpack
 
 import msgspec
 
@@ -16,8 +16,9 @@ from design.arguments import known, of_kind, one_of, shown
 from design.certificate import RangesCheck, assess, check_ranges, lag, prove, prove_limiter, switching_requirement
 from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save, sealed
 from design.designs import KINDS, design_by_kind, usual_condition
+from design.files import unseen
 from design.guarantees import HERE, guarantee_of, switching_guarantee
-from design.result import Condition, Design, NotProved, Requirement
+from design.result import ConditionName, Design, NotProved, Requirement
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 _Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
@@ -43,7 +44,7 @@ class DesignOptions(TypedDict, total=False):
 
 
 def design_coupling(
-    loop: Loop, kind: _Kind = "spring-damper", condition: Condition | None = None, **options: Unpack[DesignOptions]
+    loop: Loop, kind: _Kind = "spring-damper", condition: ConditionName | None = None, **options: Unpack[DesignOptions]
 ) -> Design:
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
@@ -65,7 +66,7 @@ def design_coupling(
 
 
 #: kinds and conditions that are quick to try in the place of something else; of the optimal coupling the first rung
-_QUICK: tuple[tuple[_Kind, Condition, DesignOptions], ...] = (
+_QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
     ("optimal", "this-environment", {"seconds": 0.0}),
     ("spring-damper", "this-environment", {}),
     ("spring-damper", "any-environment", {}),
@@ -110,7 +111,7 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[st
     """
     of_kind("loop", loop, Loop, _LOOP)
     phi = coupling.phi if isinstance(coupling, Design) else None
-    alone = _fitting(loop, coupling)
+    alone = fitting(loop, coupling)
     requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi))
     if whole := check_ranges(loop, alone, samples=0):
         _, worst = whole.worst if whole.proved else whole.worst_found
@@ -145,7 +146,16 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
     Raises TypeError and ValueError as `certify` does.
     """
     of_kind("loop", loop, Loop, _LOOP)
-    return transparency(loop.F(_fitting(loop, coupling)), loop.E(), loop.lam, band_hz)
+    return transparency(loop.F(fitting(loop, coupling)), loop.E(), loop.lam, band_hz)
+
+
+@dataclass(frozen=True)
+class _SwitchingFiled:
+    """The guarantee for delays that vary, with its proof or why there is none."""
+
+    guarantee: str = unseen(older="promise")
+    proof: str | None = unseen()
+    reason: str | None = unseen()
 
 
 @dataclass(frozen=True)
@@ -155,7 +165,7 @@ class Filed:
     file: Path
     proof: str | None
     reason: str | None
-    switching: dict[str, Any] | None  # the guarantee for delays that vary, by its older name, with its proof
+    switching: _SwitchingFiled | None
     limited_forces: bool
 
 
@@ -191,7 +201,7 @@ def store(
     if loop.varying_delay:
         proof = certificate.proof if certificate else None
         words = f"{switching_guarantee(loop.varying_delay)}, in {HERE}"
-        switching = {"promise": words, "proof": proof, "reason": reason}
+        switching = _SwitchingFiled(words, proof, reason)
         if certificate is None:
             loop = loop.switching(None)
             certificate, reason = _proved(loop, design, limiter)
@@ -229,7 +239,7 @@ def bare(coupling: Coupling | Design, expected: str = COUPLING) -> Coupling:
     return found
 
 
-def _fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:
+def fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:
     """The coupling alone. Raises ValueError where it is one of another number of channels."""
     alone = bare(coupling)
     Stored.of(loop, alone)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from typing import Any, TypeVar, cast, get_args
@@ -19,13 +19,15 @@ from controller.coupling import (
 from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
 from controller.lti import TooLong
-from design.certificate import RangesCheck, any_environment_of
+from controller.older import CONDITIONS, with_older
+from design.certificate import RangesCheck, named
 from design.conditions import any_environment
-from design.coverage import ranges_part, switching_part
+from design.coverage import RangesFigures, Switching
+from design.files import unseen
 from design.frequency import sweeping, too_long
-from design.guarantees import ANY, CAVEATS, LATE, guarantee_of
-from design.multipliers import this_environment_of
-from design.result import Condition, Requirement, certificate_part, listed, refusal
+from design.guarantees import ANY, CAVEATS, guarantee_of
+from design.lmi import LATE
+from design.result import ConditionName, Requirement, listed, refusal
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling in its loop, judged by either condition.
@@ -35,18 +37,17 @@ from design.result import Condition, Requirement, certificate_part, listed, refu
 LONGEST_DELAY = 100
 
 
-def requirement(loop: Loop, coupling: Coupling, condition: Condition) -> Requirement:
+def requirement(loop: Loop, coupling: Coupling, condition: ConditionName) -> Requirement:
     """The damping that the condition asks of the devices."""
-    ask = this_environment_of if condition == "this-environment" else any_environment_of
     try:
-        return ask(loop, coupling)
+        return named(condition).required(loop, coupling)
     except TooLong:
         raise
     except ValueError as error:  # no solution of the algebraic loop
         return refusal(condition, loop.delta, str(error))
 
 
-def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any) -> Requirement:
+def _varied(loop: Loop, coupling: Coupling, condition: ConditionName, **changes: Any) -> Requirement:
     """The same with some of the loop's fields changed; a loop that cannot be is refused."""
     try:
         return requirement(msgspec.structs.replace(loop, **changes), coupling, condition)
@@ -56,7 +57,7 @@ def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any
         return refusal(condition, loop.delta, str(error))
 
 
-def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -> Requirement:
+def _at_period(loop: Loop, coupling: Coupling, condition: ConditionName, T: float) -> Requirement:
     """The same with the gains, or coefficients, and the delays in samples at another T [s]."""
     longest = loop.T_max and loop.T_max * (T / loop.T)  # periods vary in proportion
     return _varied(loop, coupling.at_period(T), condition, T=T, T_max=longest)
@@ -89,15 +90,12 @@ _EDGE = 1e-7  # relative accuracy of an edge
 _NOT_CERTIFIED = "not certified: there is nothing to lose"
 
 
-_GIVEN: dict[str, Any] = {"json": "given"}  # a key only where there is something to say
-
-
 @dataclass(frozen=True)
 class _Stiffest:
     """The largest certified stiffness of each channel beside its B [N/m]; None where the reason says why."""
 
     K: tuple[float | None, ...]
-    reason: str | None = field(default=None, metadata=_GIVEN)
+    reason: str | None = unseen("given", None)
 
 
 @dataclass(frozen=True)
@@ -112,21 +110,22 @@ class _Sensitivity:
     largest_T_s: float | None = None  # gains and delays in samples kept
     T_error: float | None = None
     extra_samples: int | None = None  # of delay, on all channels at once
-    reason: str | None = field(default=None, metadata=_GIVEN)
+    reason: str | None = unseen("given", None)
 
 
-def stiffest(loop: Loop, coupling: Coupling, condition: Condition) -> _Stiffest:
+def stiffest(loop: Loop, coupling: Coupling, condition: ConditionName) -> _Stiffest:
     """any-environment: channel by channel; this-environment: the largest common scale of all K."""
     unknown = (None,) * loop.channels
-    if not isinstance(coupling, SpringDamper):
+    gains = coupling.figures(loop.T)
+    if "K" not in gains:
         return _Stiffest(unknown, "only a spring-damper has a K")
     if condition == "any-environment":
-        return _stiffest_for_any_environment(loop, coupling)
-    K, B = coupling.K, coupling.B
+        return _stiffest_for_any_environment(loop, gains["B"])
+    K = np.array(gains["K"])
 
     @cache
     def ratio(scale: float) -> float:
-        return requirement(loop, SpringDamper(scale * K, B), condition).ratio
+        return requirement(loop, coupling.scaled(stiffness=scale), condition).ratio
 
     scale = _STIFFEST / K.max()
     if ratio(scale) < 1:
@@ -139,14 +138,14 @@ def stiffest(loop: Loop, coupling: Coupling, condition: Condition) -> _Stiffest:
     return _Stiffest(unknown, "no scale of K is certified beside this B")
 
 
-def _stiffest_for_any_environment(loop: Loop, coupling: SpringDamper) -> _Stiffest:
+def _stiffest_for_any_environment(loop: Loop, dampers: Sequence[float]) -> _Stiffest:
     """Between 0 and 2 (delta - B)/T, the bound where z^-n = -1; the set of gains is convex and contains K -> 0."""
     if any(loop.psi):
         return _Stiffest((None,) * loop.channels, "with psi >= 1 each K needs a multiplier of its own: not searched")
     if loop.latency:
         return _Stiffest((None,) * loop.channels, LATE)
     stiffest, reasons = [], []
-    for B, theta, delta in zip(coupling.B.tolist(), loop.theta, loop.delta, strict=True):
+    for B, theta, delta in zip(dampers, loop.theta, loop.delta, strict=True):
         if delta <= B:
             stiffest.append(None)
             reasons.append(f"B = {B:g} N s/m alone uses up delta = {delta:g} N s/m")
@@ -168,10 +167,12 @@ def sensitivity(loop: Loop, coupling: Coupling, needs: Requirement) -> _Sensitiv
         return _Sensitivity(reason=_NOT_CERTIFIED)
     if needs.condition == "any-environment" and any(loop.psi):
         return _of_delta(needs, "with psi >= 1 every T and delay needs a multiplier of its own: not searched")
-    largest = _largest_period(loop, coupling, needs.condition)
+    fixed = loop.environment.one_period
+    largest = None if fixed else _largest_period(loop, coupling, needs.condition)
     extra = _extra_samples(loop, coupling, needs.condition)
+    tried = "environment.block is of one T" if fixed else f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s"
     reasons = [
-        f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s" if largest is None else "",
+        tried if largest is None else "",
         f"certified with {MOST_EXTRA_SAMPLES} samples more, the most that were tried" if extra is None else "",
     ]
     error = None if largest is None else largest / loop.T - 1
@@ -186,7 +187,7 @@ def _of_delta(needs: Requirement, reason: str | None) -> _Sensitivity:
     return _Sensitivity(needs.required, 1 - needs.ratio, reason=reason)
 
 
-def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> float | None:
+def _largest_period(loop: Loop, coupling: Coupling, condition: ConditionName) -> float | None:
     @cache
     def ratio(T: float) -> float:
         return _at_period(loop, coupling, condition, T).ratio
@@ -200,7 +201,7 @@ def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> flo
     return None
 
 
-def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int | None:
+def _extra_samples(loop: Loop, coupling: Coupling, condition: ConditionName) -> int | None:
     for extra in range(1, MOST_EXTRA_SAMPLES + 1):
         later = tuple(n + extra for n in loop.theta)
         if not _varied(loop, coupling, condition, theta=later).certified:
@@ -247,11 +248,11 @@ def remedies(loop: Loop, coupling: Coupling, needs: Requirement) -> list[_Remedy
     if needs.certified or (condition == "any-environment" and any(loop.psi)):
         return []
     found = [_fewer_samples(loop, coupling, condition, name) for name in ("theta", "psi")]
-    if isinstance(coupling, SpringDamper) and coupling.B.any():
+    if any(B := coupling.figures(loop.T).get("B", ())):
         found.append(
             _smaller(
-                lambda x: requirement(loop, SpringDamper(coupling.K, x * coupling.B), condition),
-                lambda x: f"smaller B: {listed((x * coupling.B).tolist(), 5)} N s/m",
+                lambda x: requirement(loop, coupling.scaled(damping=x), condition),
+                lambda x: f"smaller B: {listed([x * b for b in B], 5)} N s/m",
             )
         )
     found.append(
@@ -264,7 +265,7 @@ def remedies(loop: Loop, coupling: Coupling, needs: Requirement) -> list[_Remedy
     return [r for r in found if r and (r.requirement.certified or r.requirement.ratio < least)]
 
 
-def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
+def _fewer_samples(loop: Loop, coupling: Coupling, condition: ConditionName, name: str) -> _Remedy | None:
     """One sample less at a time, on every channel that has one; the reference is none later than the loop."""
     steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):
@@ -316,9 +317,9 @@ class _Loop:
 class ConditionAudit:
     """What one condition says, and how far the coupling is from its edge."""
 
-    certificate: dict[str, Any] = field(metadata={"json": "beside"})
-    stiffest: _Stiffest
-    sensitivity: _Sensitivity
+    requirement: Requirement = unseen("beside")
+    stiffest: _Stiffest = unseen()
+    sensitivity: _Sensitivity = unseen()
 
 
 @dataclass(frozen=True)
@@ -337,12 +338,12 @@ class Audit:
 
     coupling: _Coupling
     loop: _Loop
-    conditions: dict[str, ConditionAudit] = field(metadata={"json": "beside"})
-    switching: dict[str, Any] | None
-    ranges: dict[str, Any] | None
-    certified: bool
-    promise: str | None  # the guarantee, by its older name
-    helps: list[Help]
+    conditions: dict[str, ConditionAudit] = unseen("beside")  # also under the names that they had before
+    switching: Switching | None = unseen(older="jitter-proof")
+    ranges: RangesFigures | None = unseen(older="set")
+    certified: bool = unseen()
+    guarantee: str | None = unseen(older="promise")
+    helps: list[Help] = unseen()
     not_covered: str = CAVEATS
 
 
@@ -356,7 +357,7 @@ def audit(
     """
     loop = loop.at(loop.environment).switching(None)
     check_loop(loop)
-    requirements = {name: requirement(loop, coupling, name) for name in reversed(get_args(Condition))}
+    requirements = {name: requirement(loop, coupling, name) for name in reversed(get_args(ConditionName))}
     here = requirements["this-environment"].certified
     proved = bool(whole and whole.proved)
     guaranteed = guarantee_of(requirements, loop, proved)
@@ -364,9 +365,9 @@ def audit(
     return Audit(
         _Coupling(coupling.kind, figures.get("K"), figures.get("B")),
         _Loop(loop.T, loop.T_max, loop.latency, loop.theta, loop.psi, loop.delta, rigid),
-        {name: _judged(loop, coupling, needs) for name, needs in requirements.items()},
-        _switching_part(loop, coupling, switching) if switching else None,
-        whole and ranges_part(whole),
+        with_older({name: _judged(loop, coupling, needs) for name, needs in requirements.items()}, CONDITIONS),
+        _switching(loop, coupling, switching) if switching else None,
+        whole and RangesFigures.of(whole),
         here and (whole is None or proved or guaranteed == ANY),
         guaranteed,
         _helps(loop, coupling, requirements["any-environment" if here else "this-environment"]),
@@ -394,7 +395,7 @@ def _in_time(loop: Loop, coupling: Coupling, search: Callable[[], _Found], witho
 def _judged(loop: Loop, coupling: Coupling, needs: Requirement) -> ConditionAudit:
     unknown = (None,) * loop.channels
     return ConditionAudit(
-        certificate_part(needs),
+        needs,
         _in_time(
             loop, coupling, lambda: stiffest(loop, coupling, needs.condition), lambda why: _Stiffest(unknown, why)
         ),
@@ -402,10 +403,10 @@ def _judged(loop: Loop, coupling: Coupling, needs: Requirement) -> ConditionAudi
     )
 
 
-def _switching_part(loop: Loop, coupling: Coupling, span: DelayRange) -> dict[str, Any]:
+def _switching(loop: Loop, coupling: Coupling, span: DelayRange) -> Switching:
     """Of an environment with walls, while all of them touch."""
     touching = msgspec.structs.replace(loop.at(loop.environment.frozen()[-1]), latency=None).switching(span)
-    return switching_part(touching, coupling)
+    return Switching.of(touching, coupling)
 
 
 def _helps(loop: Loop, coupling: Coupling, needs: Requirement) -> list[Help]:

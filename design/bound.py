@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
@@ -28,6 +27,7 @@ from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti
 from design.barrier import Block, Program, centre, packed, towards
+from design.files import unseen
 from design.frequency import frequencies, hermitian, on_circle
 from design.result import Design
 from design.transparency import BAND_HZ, decibels
@@ -147,7 +147,7 @@ class _Dual:
         slope = np.concatenate([*slopes, packed(hermitian(self.further(w)))], axis=1)
         return Block(np.zeros((w.size, m * m)), np.ascontiguousarray(np.swapaxes(slope, 1, 2)))
 
-    def lacking(self, x: Array, w: Array, parts: Complex, further: Complex) -> Array:
+    def lacking(self, x: Array, parts: Complex, further: Complex) -> Array:
         """By how much D is not positive, (k,)."""
         m = self.loop.channels
         h, C = np.split(x, [m * m * len(self.target)])
@@ -187,7 +187,7 @@ class _Dual:
                     break
                 t *= _STEEPER
             x = scipy.linalg.solve_triangular(U, y)
-            lacking = self.lacking(x, swept, *parts)
+            lacking = self.lacking(x, *parts)
             charge = self.loop.channels * max(0.0, float(lacking.max()))
             value = nothing - program.value(y) - charge
             found = max(found, value)
@@ -281,14 +281,21 @@ def _worst(lacking: Array, w: Array) -> Array:
     return w[local[np.argsort(lacking[local])[-_MOST_ADDED:]]]
 
 
-def bound_part(loop: Loop, best: Design, reached_db: float, band_hz: tuple[float, float]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class BoundBeside:
     """What no linear coupling can be better than, and by how much the best one is worse; or why there is no bound."""
-    part: dict[str, Any] = {"rms_mismatch_db": None}
-    if loop.channels > MOST:
-        return part | {"reason": NO_BOUND}
-    if best.objective == 0:
-        return part | {"reason": "the mismatch is zero: there is nothing to bound"}
-    least = bound(loop, band_hz)
-    if not least.rms:
-        return part | {"reason": "the bound is zero: nothing is known to be lost"}
-    return {"rms_mismatch_db": least.rms_db, "gap_db": reached_db - least.rms_db}
+
+    rms_mismatch_db: float | None = None
+    gap_db: float | None = unseen("given", None)
+    reason: str | None = unseen("given", None)
+
+    @classmethod
+    def of(cls, loop: Loop, best: Design, reached_db: float, band_hz: tuple[float, float]) -> BoundBeside:
+        if loop.channels > MOST:
+            return cls(reason=NO_BOUND)
+        if best.objective == 0:
+            return cls(reason="the mismatch is zero: there is nothing to bound")
+        least = bound(loop, band_hz)
+        if not least.rms:
+            return cls(reason="the bound is zero: nothing is known to be lost")
+        return cls(least.rms_db, reached_db - least.rms_db)

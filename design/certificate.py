@@ -17,14 +17,13 @@ import scipy
 from controller.coupling import (
     Coupling,
 )
-from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti, SingularLoop, TooLong, rational, within
 from controller.ranges import Member, inside, number_of_vertices
 from design import conditions, multipliers
+from design.conditions import Condition
 from design.coupling_file import (
     Certificate,
-    Guarantee,
     LimiterCertificate,
     Stored,
     SwitchingProof,
@@ -32,11 +31,19 @@ from design.coupling_file import (
     own_fields,
     sealed,
 )
-from design.environments import Progress, Searched, in_each, search_ranges, worst
-from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
+from design.environments import (
+    THIS_ENVIRONMENT,
+    Progress,
+    Searched,
+    in_each,
+    search_ranges,
+    worst,
+)
+from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, require_size, rows_of, too_large
 from design.frequency import frequencies, on_circle, rounding
-from design.guarantees import LATE, no_compliance, switching_guarantee
-from design.result import Condition, NotProved, Requirement, refusal
+from design.guarantees import switching_guarantee
+from design.lmi import ANY_ENVIRONMENT
+from design.result import NotProved, Requirement, refusal
 
 # ----------------------------------------------------------------------------------------------------
 # An exact proof that no switching of the delays within a loop's range is dangerous: made, stored, proved again.
@@ -152,7 +159,7 @@ def prove_limiter(
     loop: Loop, coupling: Coupling, beta: float = multipliers.BETA, c: multipliers.Lags | None = None
 ) -> LimiterCertificate:
     """An exact proof with the multiplier `c` or the best one. Raises NotProved with the reason."""
-    _require_limits(loop, coupling, "this-environment")
+    _require_limits(loop, coupling, THIS_ENVIRONMENT)
     found = multipliers.limiter_requirement(loop, coupling, beta, c)
     requirement = found.requirement
     if not requirement.certified:
@@ -167,12 +174,11 @@ def _limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: mult
     """The exact block that must be strictly positive real. Raises NotProved."""
     try:
         G = loop.sent(coupling, exact=True)
-        _require_size(G.order + 2 * loop.channels + sum(max(n, len(row)) for n, row in zip(loop.theta, c, strict=True)))
+        require_size(G.order + 2 * loop.channels + sum(max(n, len(row)) for n, row in zip(loop.theta, c, strict=True)))
         demand = multipliers.limiter_demand(G, loop.theta, loop.delta, rho, c, loop.T_max)
     except (SingularLoop, ValueError) as error:
         raise NotProved(f"limiter: {error}") from None
-    _require_static("F(1)", demand.static["F(1)"])
-    return demand.gain + demand.free
+    return _block(demand)
 
 
 def check_limiter(
@@ -209,28 +215,16 @@ def switching_requirement(loop: Loop, coupling: Coupling) -> multipliers.Switchi
 # ----------------------------------------------------------------------------------------------------
 # Certificates of couplings: proved once, stored, and proved again from the file alone without a solver.
 #
-# this-environment: F(1) is exactly symmetric and positive semidefinite, and with F(z) = F(1) + (z - 1) R(z) the block
-#     R + Delta_D/T - F(1)/2
-# is strictly positive real (design.exact). On |z| = 1 the Hermitian part of F(1)/(z - 1) is -F(1)/2, so
-# He[F/(z-1)] > -Delta_D/T there; the same certificate shows that F is stable.
+# The blocks are those of the condition (design.conditions, design.environments), over the rationals: what is static
+# is exactly symmetric, and positive semidefinite where it must be, and each block at the available damping is
+# strictly positive real (design.exact). Then F, or V-hat, is stable, too. Of any-environment with psi = 0 the
+# environment is passive because every parameter of the network is non-negative (the Network type refuses others), so
+# Phi = 0 satisfies Lemma 4, whatever the environment. A multiplier that the blocks need is stored with them.
 #
-# this-environment, forces that latch late, or walls: the blocks of latency_demand and walls_demand, the
-# latter with the multipliers g of its walls, stored too.
-#
-# any-environment, psi = 0: with H = V - Theta-hat (11), (12), V-hat = (1 - 1/z) H/T, H(1) is exactly symmetric, and
-# with H(z) = H(1) + (z - 1) R(z) the block
-#     H(1)/2 - R
-# is strictly positive real. Then He V-hat = |1 - 1/z|^2 He[H(1)/2 - R]/T >= Delta_V V-hat* V-hat for a small
-# Delta_V > 0, as V-hat carries the same factor: V-hat is stable and output strictly passive. The environment is
-# passive because every parameter of the network is non-negative (the Network type refuses others), so
-# Phi = 0 satisfies Lemma 4, whatever the environment.
-#
-# With ranges around the environment the same is proved for the environment (P) and for every vertex (P1, P2, ..);
-# nothing is proved of the environments in between, or of one that changes.
+# With ranges around the environment this-environment is proved for the environment (P) and for every vertex
+# (P1, P2, ..); nothing is proved of the environments in between, or of one that changes.
 #
 # A loop whose delays may switch within a range carries a second proof, of any switching.
-#
-# any-environment, psi >= 1: a multiplier Phi, stored too, and two blocks (delayed_blocks); it is of this environment.
 
 
 @dataclass(frozen=True)
@@ -245,50 +239,52 @@ class Verdict:
 def prove(
     loop: Loop,
     coupling: Coupling,
-    condition: Condition,
+    condition: str | Condition,
     phi: Sequence[float] | None = None,
     limiter: LimiterCertificate | None = None,
     swept: Requirement | None = None,
 ) -> Certificate:
-    """A certificate with an exact proof of the condition; `phi` [N s/m] is Theorem 4's multiplier where psi >= 1.
+    """A certificate with an exact proof of the condition, one of your own or that of a name.
+
+    `phi` [N s/m] is Theorem 4's multiplier where psi >= 1.
 
     With `limiter`, which `prove_limiter` gives of this loop, also of forces that are limited, under this-environment;
     under any-environment without delay in the environment rho is 0 and the certificate is the same. `swept` is what
     `required_damping` gives, of a caller who has just asked. Raises NotProved with the reason.
     """
-    _require_limits(loop, coupling, condition)
-    if condition == "this-environment" and loop.environment.walls:
-        phi = multipliers.walls_of(loop, coupling).g
-    multiplier = None if phi is None else [rational(float(p)) for p in phi]
-    requirement = swept or required_damping(loop, coupling, condition, multiplier)
+    asked = named(condition)
+    _require_limits(loop, coupling, asked)
+    given = asked.multiplier(loop, coupling, phi)
+    multiplier = None if given is None else [rational(float(p)) for p in given]
+    requirement = swept or required_damping(loop, coupling, asked, multiplier)
     if not requirement.certified:
-        place = f"P{worst(in_each(loop, coupling, loop.members()))}" if loop.ranges else "P"
-        raise NotProved(f"{_place_certificate(loop, condition, place)}{requirement.shortfall}", requirement)
+        place = f"P{worst(in_each(loop, coupling, loop.members()))}" if len(asked.members(loop)) > 1 else "P"
+        raise NotProved(f"{_place(loop, asked, place)}{requirement.shortfall}", requirement)
     if reason := _another_system(loop, coupling):
         raise NotProved(reason, requirement)
     proof: dict[str, Matrix] = {}
-    for name, real in _blocks(loop, coupling, condition, multiplier).items():
-        _require_size(real.order, requirement)
+    for name, real in _blocks(loop, coupling, asked, multiplier).items():
+        require_size(real.order, requirement)
         P, reason = find_storage(real)
         if P is None:
-            asked = f"the sweep asks {requirement.ratio:.9f} of the available damping"
-            raise NotProved(f"{_place_certificate(loop, condition, name)}{reason}; {asked}", requirement)
+            share = f"the sweep asks {requirement.ratio:.9f} of the available damping"
+            raise NotProved(f"{_place(loop, asked, name)}{reason}; {share}", requirement)
         proof[name] = P
     if multiplier is not None:
-        proof[_multiplier_name(loop, condition)] = Matrix.of([multiplier])
+        proof[str(asked.multiplier_name(loop))] = Matrix.of([multiplier])
     return sealed(
         Certificate(
-            condition=condition,
+            condition=asked.name,
             required=requirement.required,
             available=loop.delta,
             margin=_margin(requirement),
-            guarantee=_guarantee(loop, condition),
+            guarantee=asked.guarantee(loop),
             proof="rational",
             matrices={name: rows_of(M) for name, M in proof.items()},
             scenario=digest(loop, coupling.form()),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
             switching=_switching(loop, coupling, requirement),
-            limiter=msgspec.UNSET if limiter is None or condition == "any-environment" else limiter,
+            limiter=msgspec.UNSET if limiter is None or asked is ANY_ENVIRONMENT else limiter,
         )
     )
 
@@ -301,7 +297,7 @@ _MOST_COST = 8  # environments of ranges, each as many as LARGEST states are
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
     """Raises NotProved, in a moment, where a sweep or a proof would take minutes."""
     late = sum(loop.delays.hi) + sum(loop.psi)
-    _require_size(late)
+    require_size(late)
     for value in _coefficients(msgspec.to_builtins((loop, coupling.form()), enc_hook=own_fields)):
         if rational(value).denominator.bit_length() > _MOST_BITS:
             raise NotProved(f"the coefficient {value:g} has too many digits for exact arithmetic")
@@ -309,9 +305,9 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
         states = loop.sent(coupling).order
     except SingularLoop:
         return  # the sweep says where
-    states += sum(loop.theta) if condition == "this-environment" else 0
-    _require_size(states)
-    members = len(loop.members()) if condition == "this-environment" else 1
+    states += 0 if condition is ANY_ENVIRONMENT else sum(loop.theta)
+    require_size(states)
+    members = len(condition.members(loop)) or 1
     if members * states**3 > _MOST_COST * LARGEST**3:
         raise NotProved(f"a proof in {members} environments over {states} states each takes long")
 
@@ -360,8 +356,11 @@ def _switching(loop: Loop, coupling: Coupling, requirement: Requirement) -> Swit
     return proof
 
 
-def verify(stored: Stored) -> Verdict:
-    """Prove the stored certificate again: its bookkeeping, its figures, then its matrices in exact arithmetic."""
+def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
+    """Prove the stored certificate again: its bookkeeping, its figures, then its matrices in exact arithmetic.
+
+    `condition` is the certificate's own, where its name is not one of design.result.CONDITIONS.
+    """
     certificate, loop = stored.certificate, stored.loop
     if certificate is None:
         return Verdict(False, "the file carries no certificate")
@@ -369,143 +368,85 @@ def verify(stored: Stored) -> Verdict:
         return Verdict(False, "scenario digest differs: the loop or the coupling was changed after it was certified")
     if sealed(certificate).seal != certificate.seal:
         return Verdict(False, "seal differs: the certificate was changed after it was made")
+    if condition and condition.name != certificate.condition:
+        return Verdict(False, f"the certificate is of {certificate.condition!r}, not of {condition.name!r}")
     coupling = stored.built()
     try:
+        asked = condition or named(certificate.condition)
         with _in_time():
-            reason = _refuted_claims(loop, coupling, certificate) or _refuted_proof(loop, coupling, certificate)
-    except NotProved as refusal:
-        reason = str(refusal)
+            reason = _refuted_claims(loop, coupling, asked, certificate)
+            reason = reason or _refuted_proof(loop, coupling, asked, certificate)
+    except ValueError as refused:  # NotProved, or a condition of somebody's own
+        reason = str(refused)
     return Verdict(reason is None, reason)
 
 
+_NAMED: dict[str, Condition] = {each.name: each for each in (THIS_ENVIRONMENT, ANY_ENVIRONMENT)}
+
+
+def named(condition: str | Condition) -> Condition:
+    """The condition of that name; one that comes itself is itself. Raises ValueError for an unknown name."""
+    if not isinstance(condition, str):
+        return condition
+    if condition not in _NAMED:
+        raise ValueError(f"condition is {condition!r}, allowed are {', '.join(_NAMED)}, or a Condition of your own")
+    return _NAMED[condition]
+
+
 def required_damping(
-    loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[Fraction] | None = None
+    loop: Loop, coupling: Coupling, condition: str | Condition, multiplier: Sequence[Any] | None = None
 ) -> Requirement:
-    """The damping that the condition asks, from a refined sweep; this-environment: the most over all members.
+    """The damping that the condition asks, the same share of each device's, from a refined sweep.
 
-    Raises NotProved where it is undefined: any-environment with psi >= 1 needs the multiplier phi.
+    this-environment: the most over all members. A loop that has no solution is refused.
     """
-    if loop.environment.walls:
-        if condition == "this-environment":
-            return multipliers.walls_of(loop, coupling, phi).requirement
-        if any(loop.psi):
-            raise NotProved(
-                "with delay in the environment the multiplier of any-environment is of a linear one: no walls"
-            )
-    if condition == "this-environment":
-        requirements = in_each(loop, coupling, loop.members())
-        return requirements[worst(requirements)]
-    if loop.latency:
-        return refusal("any-environment", loop.delta, LATE)
-    V = coupling.compliance(loop.T)
-    if V is None:
-        return refusal("any-environment", loop.delta, no_compliance(coupling))
-    if not any(loop.psi):
-        return conditions.any_environment(V, loop.theta, loop.delta, loop.T_max)
-    if phi is None or len(phi) != len(loop.delta):
-        raise NotProved("any-environment with psi >= 1 needs a multiplier Phi, one entry per channel")
-    values = np.array([float(p) for p in phi])
-    return conditions.any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, values, loop.T_max)
-
-
-def _walls_block(loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Lti:
-    """The block of this-environment with walls, after the exact tests at z = 1. Raises NotProved."""
+    asked = named(condition)
     try:
-        G = loop.walled(coupling, exact=True)
-        _require_size(G.order)
-        slopes = [wall.slope(G.T) for wall in loop.environment.walls]
-        demand = multipliers.walls_demand(G, loop.delta, slopes, g, None, loop.T_max)
+        found = asked.required(loop, coupling, multiplier)
     except SingularLoop as error:
-        raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
-    for name, value in demand.static.items():
-        _require_symmetric(name, value)
-        if name in demand.semidefinite:
-            _require_static(name, value)
-    return demand.gain + demand.free
+        return refusal(asked.name, loop.delta, str(error))
+    return replace(found, required=tuple(found.ratio * d for d in found.available))
 
 
-def _guarantee(loop: Loop, condition: Condition) -> Guarantee:
-    if condition == "any-environment":
-        return "this environment" if any(loop.psi) else "any passive environment"
-    # proved at every vertex; whether it is kept between them is searched by check_ranges and design.check
-    return "these ranges" if loop.ranges else "this environment"
-
-
-def _place_certificate(loop: Loop, condition: Condition, matrix: str) -> str:
-    """Which member of the ranges the matrix P, P1, P2, .. is about, as the beginning of a message."""
-    if loop.ranges is None or condition == "any-environment":
-        return ""
-    return f"{loop.members()[int(matrix[1:] or 0)].name}: "
-
-
-def _blocks(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[Fraction] | None) -> dict[str, Lti]:
+def _blocks(loop: Loop, coupling: Coupling, condition: Condition, multiplier: Any) -> dict[str, Lti]:
     """The exact blocks to be strictly positive real, by the name of the matrix that proves it. Raises NotProved."""
-    if condition == "this-environment" and loop.environment.walls:
-        assert phi is not None  # prove has found it, or the file holds it
-        return {"P": _walls_block(loop, coupling, phi)}
-    if condition == "this-environment":
-        loops = [loop.at(member.network) for member in loop.members()]
-        return {f"P{i or ''}": _this_environment(each, coupling) for i, each in enumerate(loops)}
-    T = rational(loop.T)
-    V = coupling.compliance(T)
-    assert V is not None  # required_damping has refused the rest
-    _require_size(V.order + sum(loop.theta))
     try:
-        if not any(loop.psi):
-            demand = conditions.any_environment_demand(V, loop.theta, loop.delta, loop.T_max)
-            _require_symmetric("H(1)", demand.static["V(1)"])
-            return {"P": demand.gain + demand.free}
-        assert phi is not None
-        E1, passive = conditions.delayed_environment_block(delay(loop.psi, T) @ loop.E(exact=True), phi)
-        H1, excess = conditions.delayed_coupling_block(
-            V, loop.theta, phi, [rational(d) for d in loop.delta], loop.T_max
-        )
-    except (SingularLoop, ValueError) as error:
-        raise NotProved(str(error)) from None
-    _require_static("E(1)", E1)
-    _require_symmetric("H(1)", H1)
-    return {"P": excess, "P_E": passive}
-
-
-def _this_environment(loop: Loop, coupling: Coupling) -> Lti:
-    """The block of this-environment, after the exact test at z = 1. Raises NotProved."""
-    try:
-        F = loop.F(coupling, exact=True)
-        _require_size(F.order)
-        demand = conditions.this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
+        demands = condition.exact_demands(loop, coupling, multiplier)
+    except NotProved:
+        raise
     except SingularLoop as error:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
-    _require_static("F(1)", demand.static["F(1)"])
+    except ValueError as error:
+        raise NotProved(str(error)) from None
+    return {name: _block(demand) for name, demand in demands.items()}
+
+
+def _block(demand: conditions.Demand[Lti]) -> Lti:
+    """The block of a demand at the devices' damping, after the exact tests of what is static. Raises NotProved."""
+    for name, value in demand.static.items():
+        if not (value == value.T).all():
+            raise NotProved(f"{name} is not exactly symmetric")
+        if name in demand.semidefinite and not (outcome := definiteness(Matrix.of(value))).semidefinite:
+            raise NotProved(f"{name} is not positive semidefinite: {outcome}")
     return demand.gain + demand.free
 
 
-def _require_size(states: int, requirement: Requirement | None = None) -> None:
-    if reason := too_large(states):
-        raise NotProved(reason, requirement)
+def _place(loop: Loop, condition: Condition, matrix: str) -> str:
+    """Which member of the ranges the matrix P, P1, P2, .. is about, as the beginning of a message."""
+    members = condition.members(loop)
+    return f"{members[int(matrix[1:] or 0)].name}: " if len(members) > 1 else ""
 
 
-def _require_symmetric(name: str, value: Array) -> None:
-    if not (value == value.T).all():
-        raise NotProved(f"{name} is not exactly symmetric")
-
-
-def _require_static(name: str, value: Array) -> None:
-    _require_symmetric(name, value)
-    outcome = definiteness(Matrix.of(value))
-    if not outcome.semidefinite:
-        raise NotProved(f"{name} is not positive semidefinite: {outcome}")
-
-
-def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) -> str | None:
+def _refuted_claims(loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate) -> str | None:
     """Why the figures on file do not follow from the loop and the coupling, or None."""
     if certificate.proof != "rational":
         return f"the certificate is {certificate.proof}: it carries no exact proof"
-    if certificate.guarantee != _guarantee(loop, certificate.condition):
+    if certificate.guarantee != condition.guarantee(loop):
         return f"{certificate.condition} does not guarantee {certificate.guarantee!r}"
     if certificate.available != loop.delta:
         return f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}"
-    _require_limits(loop, coupling, certificate.condition)
-    requirement = required_damping(loop, coupling, certificate.condition, _multiplier(loop, certificate))
+    _require_limits(loop, coupling, condition)
+    requirement = required_damping(loop, coupling, condition, _multiplier(loop, coupling, condition, certificate))
     if reason := _other_figures(certificate, requirement):
         return reason
     if not requirement.certified:
@@ -513,39 +454,34 @@ def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) ->
     return _another_system(loop, coupling)
 
 
-def _refuted_proof(loop: Loop, coupling: Coupling, certificate: Certificate) -> str | None:
+def _refuted_proof(loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate) -> str | None:
     """Why the matrices prove nothing, or None if they prove the condition."""
-    phi, name = _multiplier(loop, certificate), _multiplier_name(loop, certificate.condition)
-    if name == multipliers.WALL_MULTIPLIER and phi is None:
-        return f"no multiplier {name} of the walls is on file"
-    blocks = _blocks(loop, coupling, certificate.condition, phi)
-    expected = {*blocks, *([name] if "P_E" in blocks or name == multipliers.WALL_MULTIPLIER else [])}
+    blocks = _blocks(loop, coupling, condition, _multiplier(loop, coupling, condition, certificate))
+    expected = {*blocks, *filter(None, [condition.multiplier_name(loop)])}
     if set(certificate.matrices) != expected:
         found = ", ".join(certificate.matrices) or "none"
         return f"matrices are {found}, expected {', '.join(sorted(expected))}"
     for name, real in blocks.items():
         if reason := refuted_rows(name, real, certificate.matrices[name]):
-            return f"{_place_certificate(loop, certificate.condition, name)}{reason}"
+            return f"{_place(loop, condition, name)}{reason}"
     if certificate.limiter is not msgspec.UNSET:
-        if certificate.condition != "this-environment":
-            return "limiter: any-environment needs no proof of its own, and one is on file"
+        if condition is not THIS_ENVIRONMENT:
+            return f"limiter: {condition.name} needs no proof of its own, and one is on file"
         check_limiter(loop, coupling, certificate.limiter)
     return refuted(loop, coupling, certificate.switching)
 
 
-def _multiplier_name(loop: Loop, condition: Condition) -> str:
-    """Its name among the matrices: Phi of any-environment with psi >= 1, or g of walls under this-environment."""
-    return multipliers.WALL_MULTIPLIER if condition == "this-environment" and loop.environment.walls else "Phi"
-
-
-def _multiplier(loop: Loop, certificate: Certificate) -> list[Fraction] | None:
-    """The stored multiplier, or None. Raises NotProved where it is no row of rationals."""
-    name = _multiplier_name(loop, certificate.condition)
-    rows = certificate.matrices.get(name)
-    if rows is None:
+def _multiplier(
+    loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate
+) -> Sequence[Fraction] | None:
+    """The stored multiplier, or None for a condition without. Raises NotProved where it is no row of rationals."""
+    name = condition.multiplier_name(loop)
+    if name is None:
         return None
+    if name not in certificate.matrices:
+        raise NotProved(f"no multiplier {name} is on file")
     try:
-        return [Fraction(value) for value in rows[0]]
+        return [Fraction(value) for value in certificate.matrices[name][0]]
     except (IndexError, ValueError, ZeroDivisionError):
         raise NotProved(f"{name} is no row of rational numbers") from None
 
@@ -555,12 +491,12 @@ def assess(
 ) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
-    this-environment is about the nominal environment alone (design.coverage.ranges_part asks for the rest of its
-    ranges) and the constant theta (sim.switching.certified_part asks for the rest of its range). What `known`, a
+    this-environment is about the nominal environment alone (design.coverage.RangesFigures asks for the rest of its
+    ranges) and the constant theta (sim.switching.DelaysCovered asks for the rest of its range). What `known`, a
     certificate just made, proves is not proved again; without `more` nothing else is proved beside it.
     """
     loop = loop.at(loop.environment).switching(None)
-    asked = any_environment_of(loop, coupling, phi), multipliers.this_environment_of(loop, coupling)
+    asked = ANY_ENVIRONMENT.required(loop, coupling, phi), THIS_ENVIRONMENT.required(loop, coupling)
     proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
 
     def judged(each: Requirement) -> Requirement:
@@ -570,31 +506,6 @@ def assess(
 
     with within(_LONGEST):  # both proofs together
         return {each.condition: judged(each) for each in asked}
-
-
-def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:
-    """What any-environment requires; walls are covered without delay in the environment, and refused with it."""
-    if loop.latency:
-        return refusal("any-environment", loop.delta, LATE)
-    if loop.environment.walls and any(loop.psi):
-        reason = "with delay in the environment its multiplier is of a linear one: no walls"
-        return refusal("any-environment", loop.delta, reason)
-    if (channels := coupling.channels(loop.T)) and not any(loop.psi):
-        return conditions.any_environment_per_channel(channels, loop.theta, loop.delta, loop.T_max)
-    V = coupling.compliance(loop.T)
-    if V is None:
-        return refusal("any-environment", loop.delta, no_compliance(coupling))
-    if not any(loop.psi):
-        return conditions.any_environment(V, loop.theta, loop.delta, loop.T_max)
-    if phi is None:
-        from design.lmi import least_phi  # only an environment with delay inside needs the solver
-
-        try:
-            phi = least_phi(loop)
-        except ValueError as error:
-            return refusal("any-environment", loop.delta, str(error))
-    assert phi is not None  # psi >= 1 has a multiplier or none is possible
-    return conditions.any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi, loop.T_max)
 
 
 def _proved(loop: Loop, coupling: Coupling, requirement: Requirement, phi: Array | None = None) -> Requirement:
@@ -689,6 +600,6 @@ def check_ranges(
 
 
 def violated_between(place: Member, ratio: float) -> str:
-    """Why a coupling that is proved at every vertex has no guarantee for the ranges."""
+    """The reason why ranges are not guaranteed although every vertex is proved: a point between them violates."""
     needs = f"{ratio:.4f} of the damping is needed" if np.isfinite(ratio) else "no damping is enough"
     return f"proved at the vertices, but violated between them: {needs} at {place.name}"

@@ -19,13 +19,14 @@ from controller.loop import Loop
 from controller.lti import Array, Lti
 from design import conditions
 from design.bound import MOST, NO_BOUND, bound
-from design.certificate import any_environment_of, prove
+from design.certificate import prove
 from design.coupling_file import digest
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
+from design.lmi import ANY_ENVIRONMENT
 from design.program import LADDER, Options
-from design.result import Condition, Design, DesignFailed, NotProved, Requirement, finite
-from design.robustness import robustness_part
+from design.result import ConditionName, Design, DesignFailed, NotProved, Requirement, finite
+from design.robustness import Robustness, robustness_nearby
 from design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------
@@ -71,7 +72,7 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Demands:
     phi = _multiplier(loop, coupling) if phi is None and any(loop.psi) else phi
     requirements = {
         "this-environment": conditions.this_environment(F, loop.delta, loop.T_max, loop.latency),
-        "any-environment": any_environment_of(loop, coupling, phi),
+        "any-environment": ANY_ENVIRONMENT.required(loop, coupling, phi),
     }
     demands: dict[str, Response | None] = dict.fromkeys(requirements)
     if np.isfinite(requirements["this-environment"].ratio):
@@ -139,7 +140,7 @@ def _multiplier(loop: Loop, coupling: Coupling) -> Array | None:
     try:
         return least_phi(loop)
     except ValueError:
-        return None  # any_environment_of says why
+        return None  # the condition says why
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -248,12 +249,12 @@ def optimum(point: Point) -> Limit:
     return measured(point, "optimal", None, vars(point.options))
 
 
-def spring_damper(condition: Condition) -> _Designer:
+def spring_damper(condition: ConditionName) -> _Designer:
     """The designed spring-damper of a point."""
     return lambda point: measured(point, "spring-damper", condition, {})
 
 
-def measured(point: Point, kind: str, condition: Condition | None, options: dict[str, Any]) -> Limit:
+def measured(point: Point, kind: str, condition: ConditionName | None, options: dict[str, Any]) -> Limit:
     """One design and its figures, from the coupling alone; a request without a solution gives its reason."""
     loop, begin = point.loop, time.perf_counter()
     names = ("states", "rms_mismatch_db", "relative_mismatch_db", "required_damping", "dc_ratio")
@@ -319,7 +320,7 @@ class Sweep:
 
 
 def limits(
-    plan: Mapping[str, Sequence[Point]], beside: Sequence[Condition], progress: _Progress
+    plan: Mapping[str, Sequence[Point]], beside: Sequence[ConditionName], progress: _Progress
 ) -> tuple[dict[str, Sweep], bool]:
     """The optimum at every point of a plan, beside it the spring-dampers by these conditions; what an interruption
     leaves, and whether there was one.
@@ -389,7 +390,7 @@ class _Entry:
 
     name: str
     kind: str
-    condition: Condition = "this-environment"
+    condition: ConditionName = "this-environment"
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -410,7 +411,7 @@ class LadderRow:
     wall_s: float  # of the design, with its check
     proof_s: float
     reason: str | None = None
-    robustness: dict[str, Any] | None = None  # the worst need within ten percent of every spring and mass
+    robustness: Robustness | None = None  # the worst need within ten percent of every spring and mass
 
 
 SHORT = (
@@ -467,7 +468,7 @@ def ladder_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:
     mismatch = finite(decibels(figures.relative_mismatch)), finite(decibels(figures.rms_mismatch))
     proof_s, certified = time.perf_counter() - begin, requirement.certified
     place = _name(entry, case), case, required, certified, entry.condition
-    return LadderRow(*place, *mismatch, proof, wall, proof_s, reason, robustness_part(loop, coupling))
+    return LadderRow(*place, *mismatch, proof, wall, proof_s, reason, robustness_nearby(loop, coupling))
 
 
 def _bound_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:
@@ -530,7 +531,7 @@ def _figure(limit: Limit, objective: str) -> float | None:
 
 
 def printed_decibels(value: float) -> str:
-    """In case I a loop that needs no coupling reaches minus infinity, of which a solver finds some -60 to -120 dB."""
+    """A mismatch in dB; one below the accuracy of a solver, where minus infinity is exact, is printed as such."""
     return f"below {_EXACT_DB:g} dB" if value < _EXACT_DB else f"{value:.2f} dB"
 
 

@@ -6,11 +6,11 @@ G/(z - 1) into G(1)/(z - 1), whose Hermitian part on the circle is -G(1)/2, and 
 same expression is evaluated in floating point (a sweep: the required damping), over Fractions (an exact proof), over
 stacks and over sampled responses (maps and designs). docs/theory.md derives them.
 
-this-environment   He[F/(z-1)] > -Delta_D/T,  F stable,  F(1) symmetric positive semidefinite
-any-environment    Lemma 4 of the paper for Psi = I and any passive environment under backward Euler:
-                   He[(z-1) V/(Tz)] >= diag((1 - cos n_i w) / (2 delta_i)),   n_i = theta_i + 1
-latency            this-environment for forces that latch a fraction of a sample after the tick, anew at every tick
+this-environment   `this_environment_demand`; of forces that latch a fraction of a sample late `latency_demand`
+any-environment    Lemma 4 of the paper for any passive environment under backward Euler: `v_hat`,
+                   `any_environment_demand`, and where the environment holds delay `delayed_coupling_demand`
 
+design/environments.py and lmi.py have the two as a `Condition` of a loop and a coupling: which form applies.
 design/multipliers.py has those of this-environment that weigh an error with a multiplier: walls that make and break
 contact, delays that switch, forces that leave through the limiter of controller.limiter.
 
@@ -19,6 +19,7 @@ The period may vary from tick to tick, up to T_max, in all of them: `even_dampin
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -27,7 +28,9 @@ from typing import Any, Generic
 import numpy as np
 import scipy  # its parts load when they are used
 
+from controller.coupling import Coupling
 from controller.delay import delay, moving_sum
+from controller.loop import Loop
 from controller.lti import (
     Array,
     Block,
@@ -42,6 +45,7 @@ from controller.lti import (
     numbers,
     vstack,
 )
+from controller.ranges import Member
 from design.frequency import (
     Response,
     frequencies,
@@ -54,7 +58,7 @@ from design.frequency import (
     supremum,
     too_long,
 )
-from design.result import Requirement, from_ratio, refusal
+from design.result import Guarantee, Requirement, from_ratio, refusal
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,30 +125,43 @@ def latency_demand(F: Block, delta: Sequence[Any], latency: Latency, T_max: floa
     return Demand(R - E1 / 2, constant_like(F, np.diag(gain)), {"F(1)": E1[..., len(late) :, len(late) :]}, ("F(1)",))
 
 
+def theta_hat(theta: Sequence[int], damping: Any, T: Number) -> Lti:
+    """Theta-hat (12), diag(T/(2 damping_i)) (1 + 1/z + ... + z^-theta_i): what delays take of damping (m,) [N s/m]."""
+    return np.diag(T / (2 * damping)) @ moving_sum(theta, T)
+
+
+def v_hat(H: Block) -> tuple[Array, Block]:
+    """H(1), symmetric, and H(1)/2 - (H - H(1))/(z - 1), which has the Hermitian part of T V-hat/|1 - 1/z|^2.
+
+    V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) carries the compliance V and what the delays add. It vanishes at
+    z = 1, where nothing can be strict, so it is divided by |1 - 1/z|^2: (1 - 1/z) becomes 1/(1 - z), whose pole has
+    the Hermitian part 1/2. It is linear in H, so V and Theta-hat may come one by one. design.lmi.v_hat_ports states it
+    in the paper's ports, for realisations whose quotient is known, as a test compares.
+    """
+    H1, R = H.split_at_one()
+    return H1, H1 / 2 - R
+
+
 def any_environment_demand(
     V: Block, theta: Sequence[int], delta: Sequence[Any], T_max: float | None = None
 ) -> Demand[Block]:
-    """Theorem 4 without psi.
+    """Theorem 4 without psi: He V-hat >= 0, whose Theta-hat is that of the damping s Delta_D; times s.
 
-    He[(1 - 1/z) V/T] >= diag(|1 - z^-n_i|^2 / (4 s delta_i)), n = theta + 1, divided by |1 - 1/z|^2 and times s.
-
-    With Theta-hat = diag(T/(2 delta_i) (1 + 1/z + ... + z^-theta_i)) (12) and H = V - Theta-hat/s, which (11) makes
-    V-hat of, the block is H(1)/2 - (H - H(1))/(z - 1) for either part.
+    He[(1 - 1/z) V/T] >= diag(|1 - z^-n_i|^2 / (4 s delta_i)), n = theta + 1.
     """
-    window = np.diag(V.T / (2 * even_damping(delta, V.T, T_max))) @ as_like(V, moving_sum(theta, V.T))
-    (V1, R), (W1, S) = V.split_at_one(), window.split_at_one()
-    return Demand(S - W1 / 2, V1 / 2 - R, {"V(1)": V1})
+    (V1, gain) = v_hat(V)
+    _, taken = v_hat(as_like(V, theta_hat(theta, even_damping(delta, V.T, T_max), V.T)))
+    return Demand(-taken, gain, {"V(1)": V1})
 
 
-def delayed_environment_block(delayed: Lti, phi: Sequence[Any]) -> tuple[Array, Lti]:
-    """E(1), and E-hat + Phi without its pole, which must be positive real; `delayed` is Psi E.
+def delayed_environment_demand(delayed: Lti, phi: Sequence[Any]) -> Demand[Lti]:
+    """E-hat + Phi without its pole must be positive real; `delayed` is Psi E.
 
     E-hat = T z/(z-1) Psi E = T E(1) z/(z-1) + T z R(z), and the Hermitian part of z/(z-1) on the circle is 1/2:
     T (z R + E(1)/2) + Phi. Delay makes the environment lose passivity; Phi (14) covers the loss.
     """
-    E1, R = delayed.split_at_one()
-    T, passive = delayed.T, Lti(R.A, R.B, R.C @ R.A, R.C @ R.B + E1 / 2, delayed.T)
-    return E1, T * passive + np.diag(numbers(phi, T))
+    T, E1 = delayed.T, delayed.dc()
+    return Demand(T * regular_part(delayed), Lti.constant(np.diag(numbers(phi, T)), T), {"E(1)": E1}, ("E(1)",))
 
 
 #: Delta_V^-1 stays this much, relatively, below the limit of (14), which is strict.
@@ -153,25 +170,25 @@ _STRICT = Fraction(1, 10**9)
 _UNLIMITED = 10**6
 
 
-def delayed_coupling_block(
-    V: Lti, theta: Sequence[int], phi: Sequence[Any], delta: Any, T_max: float | None = None
-) -> tuple[Array, Lti]:
-    """H(1), which must be symmetric, and the block that carries the excess of V-hat, exactly, for the multiplier phi.
+def delayed_coupling_demand(
+    V: Lti, theta: Sequence[int], phi: Sequence[Any], delta: Sequence[Any], T_max: float | None = None
+) -> Demand[Lti]:
+    """The excess of V-hat, exactly, for the multiplier phi and the damping itself.
 
-    V-hat must be Delta_V-OSP with Delta_V^-1 = S < Phi^-1 - Delta_D^-1 (14). With H = V - Theta-hat = H(1) + (z-1) R,
-    divided by |1 - 1/z|^2: T He[H(1)/2 - R] > H* S^-1 H, by a Schur complement the Hermitian part of
-    [[T (H(1)/2 - R), 0], [2 H, S]]. Raises ValueError for a phi that is not a multiplier.
+    V-hat must be Delta_V-OSP with Delta_V^-1 = S < Phi^-1 - Delta_D^-1 (14). Divided by |1 - 1/z|^2, as `v_hat` is,
+    T He v_hat(H) > H* S^-1 H: by a Schur complement the Hermitian part of [[T v_hat(H), 0], [2 H, S]]. Raises
+    ValueError for a phi that is not a multiplier.
     """
-    T = V.T
+    T, m = V.T, len(delta)
     damping = even_damping(delta, T, T_max)
-    if len(phi) != len(delta) or not all(0 <= p < d for p, d in zip(phi, damping, strict=True)):
+    if len(phi) != m or not all(0 <= p < d for p, d in zip(phi, damping, strict=True)):
         raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
-    H = V - np.diag(T / (2 * damping)) @ moving_sum(theta, T)
-    H1, R = H.split_at_one()
+    H = V - theta_hat(theta, damping, T)
+    H1, regular = v_hat(H)
     excess = [(1 / p - 1 / d) * (1 - _STRICT) if p else _UNLIMITED / d for p, d in zip(phi, damping, strict=True)]
-    m = len(delta)
-    right = np.vstack([np.zeros((m, m), dtype=object), np.diag(numbers(excess, T))])
-    return H1, hstack(vstack(T * (H1 / 2 - R), 2 * H), Lti.constant(right, T))
+    zero = np.zeros((2 * m, m), dtype=object)
+    free = hstack(vstack(T * regular, 2 * H), Lti.constant(zero, T))
+    return Demand(free, Lti.constant(np.diag([0] * m + excess), T), {"H(1)": H1})
 
 
 _CELLS = 2**19  # entries of a response that are looked at together
@@ -227,6 +244,81 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
     return needed
 
 
+class Condition(ABC):
+    """What must hold of a coupling in a loop, as a block. One of your own is a class with a name and `demand`.
+
+    `design.certificate` proves and verifies it as it does those that it knows by name.
+    """
+
+    name: str  # in requirements, certificates and reports
+
+    @abstractmethod
+    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
+        """The block of this coupling in this loop, over Fractions where `exact`. Raises SingularLoop."""
+
+    def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
+        """The damping that it asks of the devices, from a refined sweep. Raises SingularLoop."""
+        demand = self.demand(loop, coupling)
+        return least_damping(self.name, demand.free, lambda: demand, loop.delta)
+
+    def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
+        """What is to be proved over the rationals, by the name of the matrix that proves it. Raises NotProved."""
+        return {"P": self.demand(loop, coupling, exact=True)}
+
+    def multiplier(self, loop: Loop, coupling: Coupling, given: Sequence[float] | None) -> Sequence[float] | None:
+        """The numbers that the block needs beside the coupling: those given or the best found. Raises NotProved."""
+        return None
+
+    def multiplier_name(self, loop: Loop) -> str | None:
+        """What a file calls them; None for a condition without any."""
+        return None
+
+    def members(self, loop: Loop) -> tuple[Member, ...]:
+        """The environments in which it is proved one by one; P, P1, P2, .. are of these."""
+        return ()
+
+    def guarantee(self, loop: Loop) -> Guarantee:
+        """For which environments it holds."""
+        return "this environment"
+
+
+def least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], delta: Sequence[float]) -> Requirement:
+    """The damping that a demand asks of devices with `delta` [N s/m], by a refined sweep.
+
+    `system` is the block whose poles it has, and whose size says what is rounding.
+    """
+    available = tuple(delta)
+
+    def refused(reason: str) -> Requirement:
+        return refusal(name, available, reason)
+
+    if min(available) == 0:
+        return refused("a device guarantees no damping, so no coupling is safe for every passive human")
+    if reason := too_long(system):
+        return refused(reason)
+    radius = float(np.abs(system.poles()).max(initial=0.0))
+    if radius >= 1:
+        return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
+    try:
+        asked = demand()
+    except SingularLoop as error:  # a radius that rounding has kept below one
+        return refused(f"the force map is singular in floating point: {error}")
+    end = system.at(-1.0)
+    for matrix, value in asked.static.items():
+        skew, least = _static_errors(value, system.D, end)
+        slack = _STATIC
+        if max(skew, -least) > slack:  # of a map that is nothing but rounding
+            size = max(float(np.abs(part).max()) for part in (value, system.D, end))
+            allowed = min(rounding(system, on_circle(frequencies(system))), _STATIC * min(available) / system.T)
+            slack = max(slack, allowed / max(size, 1e-12))
+        if skew > slack:
+            return refused(f"the static stiffness {matrix} is not symmetric: a slow closed path could extract energy")
+        if least < -slack and matrix in asked.semidefinite:
+            return refused(f"the static stiffness {matrix} has a negative direction: it pushes outwards")
+    ratio, w = supremum(lambda w: least_scale(asked, w), np.concatenate([[0.0], frequencies(system)]))
+    return from_ratio(name, max(ratio, 0.0), available, w / (2 * np.pi * system.T))
+
+
 def this_environment(
     F: Lti, delta: Sequence[float], T_max: float | None = None, latency: Latency | None = None
 ) -> Requirement:
@@ -235,34 +327,9 @@ def this_environment(
     For periods up to T_max [s] (T without it), and forces that latch late by `latency` (m,) [s] (at the tick without).
     """
     available = dampings(delta, F.inputs)
-
-    def refused(reason: str) -> Requirement:
-        return refusal("this-environment", available, reason)
-
-    if min(available) == 0:
-        return refused("a device guarantees no damping, so no coupling is safe for every passive human")
-    if reason := too_long(F):
-        return refused(reason)
-    radius = float(np.abs(F.poles()).max(initial=0.0))
-    if radius >= 1:
-        return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
-    try:
-        demand = this_environment_demand(F, available, T_max, latency)
-    except SingularLoop as error:  # a radius that rounding has kept below one
-        return refused(f"the force map is singular in floating point: {error}")
-    F1, end = F.dc(), F.at(-1.0)
-    skew, least = _static_errors(F1, F.D, end)
-    slack = _STATIC
-    if max(skew, -least) > slack:  # of a map that is nothing but rounding
-        size = max(float(np.abs(part).max()) for part in (F1, F.D, end))
-        allowed = min(rounding(F, on_circle(frequencies(F))), _STATIC * min(available) / F.T)
-        slack = max(slack, allowed / max(size, 1e-12))
-    if skew > slack:
-        return refused("the static stiffness F(1) is not symmetric: a slow closed path could extract energy")
-    if least < -slack:
-        return refused("the static stiffness F(1) has a negative direction: it pushes outwards")
-    ratio, w = supremum(lambda w: least_scale(demand, w), np.concatenate([[0.0], frequencies(F)]))
-    return from_ratio("this-environment", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
+    return least_damping(
+        "this-environment", F, lambda: this_environment_demand(F, available, T_max, latency), available
+    )
 
 
 _W_ZERO = 1e-10  # [rad/sample] stands for F(1) of many, whose real part is even: sampled, a network may be 0/0 there
@@ -423,8 +490,8 @@ def any_environment_delayed(
 ) -> Requirement:
     """Theorem 4 for the coupling V with the diagonal multiplier phi (N,) [N s/m]; phi = 0 is `any_environment`.
 
-    The ratio s is the least for which s Delta_D satisfies, at every frequency and divided by |1 - 1/z|^2,
-    He[H/(1-z)] >= H* Delta_V H with H = V - Theta-hat/s and Delta_V = Phi + Phi (s Delta_D - Phi)^-1 Phi.
+    The ratio s is the least for which s Delta_D satisfies, at every frequency, He v_hat(H) >= H* Delta_V H with
+    H = V - Theta-hat/s and Delta_V = Phi + Phi (s Delta_D - Phi)^-1 Phi.
     """
     available = dampings(delta, V.inputs)
 
@@ -466,15 +533,14 @@ def delayed_demand(V: Lti, theta: Sequence[int], delta: Array, phi: Array) -> Re
 
 
 def _delayed_response(V: Block, theta: Sequence[int]) -> Block:
-    """[(V(1)/2 - R)/T; V/T; 1 + 1/z + ... + z^-theta], what `_delayed_scale` needs of V = V(1) + (z-1) R."""
-    V1, R = V.split_at_one()
-    return vstack((V1 / 2 - R) * (1 / V.T), V * (1 / V.T), as_like(V, moving_sum(theta, V.T)))
+    """[v_hat(V)/T; V/T; 1 + 1/z + ... + z^-theta], what `_delayed_scale` needs."""
+    return vstack(v_hat(V)[1] * (1 / V.T), V * (1 / V.T), as_like(V, moving_sum(theta, V.T)))
 
 
 def _delayed_scale(response: Complex, delta: Array, phi: Array) -> Array:
     """The least s of `any_environment_delayed`, (...,), from `_delayed_response` (..., 3m, m); inf: none is enough.
 
-    With S = He (V(1)/2 - R)/T - V* Phi V/T^2 and N = (1 + ... + z^-theta)/2 - Phi V/T the inequality is S > 0 and
+    With S = He v_hat(V)/T - V* Phi V/T^2 and N = (1 + ... + z^-theta)/2 - Phi V/T the inequality is S > 0 and
     s Delta_D >= Phi + N S^-1 N*: two Schur complements of a matrix that is affine in s.
     """
     passivity, VT, window = np.split(response, 3, axis=-2)

@@ -20,7 +20,7 @@ from controller.environment import Network
 from controller.loop import Loop
 from controller.older import CONDITIONS, GUARANTEES, named_first, named_today
 from design.files import InputError, counted, read, write
-from design.result import Condition
+from design.result import Guarantee
 
 _Rows = tuple[tuple[float, ...], ...]
 
@@ -28,8 +28,6 @@ _Rows = tuple[tuple[float, ...], ...]
 _Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
 
 
-#: for which environments a certificate holds
-Guarantee = Literal["any passive environment", "these ranges", "this environment"]
 _OLDER = CONDITIONS | GUARANTEES
 
 
@@ -59,7 +57,7 @@ class LimiterCertificate(Strict, frozen=True):
 class Certificate(Strict, frozen=True):
     """The claim about a coupling in its loop, and its proof."""
 
-    condition: Condition
+    condition: str  # of design.result.CONDITIONS, or the name of one's own
     required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
     available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
     margin: float  # available / required

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.environment import environment
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
 from design.conditions import this_environment
 from design.coupling_file import Certificate, LimiterCertificate
-from design.designs import design_by_kind
+from design.designs import KINDS, design_by_kind
 from design.environments import SEARCH, Searched, worst
+from design.files import unseen
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
-from design.result import Design, DesignFailed, NotProved, Requirement, certificate_part, finite
+from design.result import Design, DesignFailed, NotProved, Requirement
 from design.transparency import decibels, transparency
 
 _OWN_PROOF = "by a proof of its own, for this environment"
@@ -32,13 +33,20 @@ class Limits:
     requirement: Requirement | None = None  # by the condition `limiter`, where it was asked
     c: tuple[tuple[float, ...], ...] = ()  # its multiplier
     certificate: LimiterCertificate | None = None  # its proof
+    force_limit: tuple[float, ...] = ()  # (m,) [N]
 
-    def words(self, force_limit: Sequence[float]) -> str:
-        """In one line, for forces limited to so many N."""
-        amounts = [f"{f:.4g}" for f in force_limit]
+    def within(self, force_limit: Sequence[float]) -> Limits:
+        """The same, of forces limited to so many N."""
+        return replace(self, force_limit=tuple(force_limit))
+
+    @property
+    def words(self) -> str:
+        """In one line."""
+        amounts = [f"{f:.4g}" for f in self.force_limit]
         limit = f"{', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N"
         if self.rho is None:
-            return f"clipped at {limit}: a guarantee holds while forces stay below ({self.reason})"
+            why = self.reason.removeprefix("limiter: ")
+            return f"clipped at {limit}: a guarantee holds while forces stay below ({why})"
         if not self.proved:
             return f"certified, also while forces are limited to {limit} ({self.reason})"
         return f"proved, also while forces are limited to {limit}"
@@ -48,16 +56,10 @@ class Limits:
         """In exact arithmetic."""
         return self.rho is not None and (self.requirement is None or self.requirement.proof == "rational")
 
-    def part(self, force_limit: Sequence[float]) -> dict[str, Any]:
-        """As plain data."""
-        return {
-            "rho": None if self.rho is None else list(self.rho),
-            "force_limit": [finite(f) for f in force_limit],
-            "reason": self.reason,
-            "words": self.words(force_limit),
-            "certificate": self.requirement and certificate_part(self.requirement),
-            "c": self.c,
-        }
+    def part(self) -> dict[str, Any]:
+        """As JSON has it."""
+        shown = {"rho": self.rho, "force_limit": self.force_limit, "reason": self.reason, "words": self.words}
+        return shown | {"certificate": self.requirement, "c": self.c}
 
 
 def covered_limits(
@@ -107,39 +109,86 @@ _NOT_COVERED = (
 )
 
 
-def switching_part(loop: Loop, coupling: Coupling) -> dict[str, Any]:
-    """What any switching within the loop's range asks, and what a playout buffer to the constant delay hi would need.
+@dataclass(frozen=True)
+class _Playout:
+    """What the constant delay hi asks, which a playout buffer makes."""
 
-    Only the requirement where there is none: its reason says why.
-    """
-    found, span = switching_requirement(loop, coupling), loop.delays
-    part = certificate_part(found.requirement) | {"lo": list(span.lo), "hi": list(span.hi)}
-    if found.requirement.reason:
-        return part
-    G = loop.sent(coupling)
-    buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available, loop.T_max)
-    return part | {
-        "alpha": [finite(a) for a in found.alpha],
-        "playout": {
-            "theta": list(span.hi),
-            "required_damping": [finite(d) for d in buffered.required],
-            "certified": buffered.certified,
-        },
-        "not_covered": _NOT_COVERED,
-    }
+    theta: tuple[int, ...]
+    required_damping: tuple[float, ...]
+    certified: bool
+
+
+@dataclass(frozen=True)
+class Switching:
+    """What any switching within a loop's range of delays asks; only the requirement where its reason says why."""
+
+    requirement: Requirement = unseen("beside")
+    lo: tuple[int, ...] = unseen()
+    hi: tuple[int, ...] = unseen()
+    alpha: tuple[float, ...] | None = unseen("given", None)
+    playout: _Playout | None = unseen("given", None)
+    not_covered: str | None = unseen("given", None)
+
+    @classmethod
+    def of(cls, loop: Loop, coupling: Coupling) -> Switching:
+        found, span = switching_requirement(loop, coupling), loop.delays
+        if found.requirement.reason:
+            return cls(found.requirement, span.lo, span.hi)
+        G = loop.sent(coupling)
+        buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available, loop.T_max)
+        playout = _Playout(span.hi, buffered.required, buffered.certified)
+        return cls(found.requirement, span.lo, span.hi, tuple(found.alpha), playout, _NOT_COVERED)
 
 
 # ----------------------------------------------------------------------------------------------------
 # What a guarantee for ranges of parameters costs: the robust coupling beside the one made for the nominal one.
 
 
-def price(loop: Loop, design: Design, kind: str, asked: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """A design over the ranges; an optimal one beside the one for the nominal environment alone, `asked` the same.
+@dataclass(frozen=True)
+class NominalWorst:
+    """A figure in the nominal environment, and the worst of the ranges."""
 
-    SI units; null for a mismatch of zero, or where no damping is enough.
-    """
+    nominal: float
+    worst: float
+
+
+@dataclass(frozen=True)
+class OverRanges:
+    """What a coupling asks and costs over ranges; the mismatch is null in JSON where it is zero."""
+
+    coupling: str
+    violated: int  # vertices
+    required_over_available: NominalWorst
+    rms_mismatch_db: NominalWorst
+    relative_mismatch_db: NominalWorst
+    worst: str  # where the rms mismatch is largest
+
+    @classmethod
+    def of(cls, name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -> OverRanges:
+        """Members that no device feels have no mismatch."""
+        ratios, figures = [], {}
+        for member in members:
+            here = loop.at(member.network)
+            E, F = here.E(), here.F(coupling)
+            ratios.append(this_environment(F, loop.delta, loop.T_max, loop.latency).ratio)
+            if E.D.any():
+                figures[member.name] = transparency(F, E, loop.lam)
+        nominal, worst = figures[members[0].name], max(figures, key=lambda member: figures[member].rms_mismatch)
+        largest = max(f.relative_mismatch for f in figures.values())
+        return cls(
+            name,
+            sum(ratio >= 1 for ratio in ratios),
+            NominalWorst(ratios[0], max(ratios)),
+            NominalWorst(nominal.rms_mismatch_db, figures[worst].rms_mismatch_db),
+            NominalWorst(nominal.mismatch_db, decibels(largest)),
+            worst,
+        )
+
+
+def price(loop: Loop, design: Design, kind: str, asked: Mapping[str, Any]) -> list[OverRanges]:
+    """A design over the ranges; one made for all of them beside that for the nominal environment, `asked` the same."""
     couplings = {kind: design.coupling}
-    if kind == "optimal":
+    if KINDS[kind].model:
         couplings = {"whole ranges": design.coupling}
         try:
             alone = design_by_kind(loop.at(loop.environment), kind, None, **asked)
@@ -147,35 +196,7 @@ def price(loop: Loop, design: Design, kind: str, asked: Mapping[str, Any]) -> li
         except DesignFailed:  # ranges are given another basis by default
             pass
     members = loop.members()
-    return [_cost(name, loop, coupling, members) for name, coupling in couplings.items()]
-
-
-def _cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -> dict[str, Any]:
-    """Required damping and mismatch in the nominal environment and at the worst member.
-
-    Members that no device feels have no mismatch.
-    """
-    ratios, figures = [], {}
-    for member in members:
-        E = environment(member.network, loop.T)
-        F = force_map(E, coupling, loop.theta, loop.psi)
-        ratios.append(this_environment(F, loop.delta, loop.T_max, loop.latency).ratio)
-        if E.D.any():
-            figures[member.name] = transparency(F, E, loop.lam)
-    nominal, worst = figures[members[0].name], max(figures, key=lambda member: figures[member].rms_mismatch)
-    largest = max(f.relative_mismatch for f in figures.values())
-
-    def pair(first: float, second: float) -> dict[str, float | None]:
-        return {"nominal": finite(first), "worst": finite(second)}
-
-    return {
-        "coupling": name,
-        "violated": sum(ratio >= 1 for ratio in ratios),
-        "required_over_available": pair(ratios[0], max(ratios)),
-        "rms_mismatch_db": pair(decibels(nominal.rms_mismatch), decibels(figures[worst].rms_mismatch)),
-        "relative_mismatch_db": pair(decibels(nominal.relative_mismatch), decibels(largest)),
-        "worst": worst,
-    }
+    return [OverRanges.of(name, loop, coupling, members) for name, coupling in couplings.items()]
 
 
 _WHAT_IS_PROVED = (
@@ -184,77 +205,97 @@ _WHAT_IS_PROVED = (
 )
 
 
-def ranges_part(check: RangesCheck) -> dict[str, Any]:
-    """The check as plain data; SI units, null where no damping is enough."""
-    member, requirement = check.worst
-    part: dict[str, Any] = {
-        "vertices": len(check.members) - 1,
-        "all_vertices": check.vertices,
-        "vertices_certified": sum(r.certified for r in check.at_members[1:]),
-        "required_damping": [finite(d) for d in requirement.required],
-        "available_damping": list(requirement.available),
-        "worst": member.name,
-        "proof": "rational" if check.certificate else "sampled",
-        "certified": check.proved,
-        "search": search_part(check.searched),
-        "inside": _inside_part(check),
-        "what": _WHAT_IS_PROVED,
-    }
-    return part | ({"reason": check.reason} if check.reason else {})
-
-
-def search_part(searched: Searched) -> dict[str, Any]:
+@dataclass(frozen=True)
+class SearchFigures:
     """What the search between the vertices has found: evidence, no proof."""
-    worst = searched.worst[0]
-    return {
-        "how": SEARCH,
-        "environments": searched.tried,
-        "worst_ratio": finite(worst.ratio),
-        "worst": worst.member.name,
-        "violated": not worst.ratio < 1,
-        "ended_by_clock": searched.ended,
-    }
+
+    environments: int
+    worst_ratio: float
+    worst: str
+    violated: bool
+    ended_by_clock: bool
+    how: str = SEARCH
+
+    @classmethod
+    def of(cls, searched: Searched) -> SearchFigures:
+        worst = searched.worst[0]
+        return cls(searched.tried, worst.ratio, worst.member.name, not worst.ratio < 1, searched.ended)
+
+    def __str__(self) -> str:
+        found = "[red]violated[/]" if self.violated else "no violation found"
+        ratio = f"worst ratio {self.worst_ratio:.4f}" if math.isfinite(self.worst_ratio) else _NEVER
+        ended = ", until its time was over" if self.ended_by_clock else ""
+        return f"searched, not proved: {found}, {ratio} in {self.environments} points{ended}, at {self.worst}"
 
 
-def search_words(part: dict[str, Any]) -> str:
-    """The result of the search between the vertices, in one line."""
-    found = "[red]violated[/]" if part["violated"] else "no violation found"
-    ratio = "no damping is enough" if part["worst_ratio"] is None else f"worst ratio {part['worst_ratio']:.4f}"
-    ended = ", until its time was over" if part["ended_by_clock"] else ""
-    return f"searched, not proved: {found}, {ratio} in {part['environments']} points{ended}, at {part['worst']}"
+@dataclass(frozen=True)
+class _Inside:
+    """What was found in environments drawn from inside: evidence, no proof."""
+
+    samples: int
+    certified: int
+    seed: int
+    worst_ratio: float | None
+    worst: str | None
+
+    @classmethod
+    def of(cls, check: RangesCheck) -> _Inside:
+        if not check.samples:
+            return cls(0, 0, check.seed, None, None)
+        i, good = worst(check.at_samples), sum(r.certified for r in check.at_samples)
+        return cls(len(check.samples), good, check.seed, check.at_samples[i].ratio, check.samples[i].name)
 
 
-def _inside_part(check: RangesCheck) -> dict[str, Any]:
-    """What was found in the environments drawn from inside: evidence, no proof."""
-    if not check.samples:
-        return {"samples": 0, "certified": 0, "seed": check.seed, "worst_ratio": None, "worst": None}
-    i = worst(check.at_samples)
-    return {
-        "samples": len(check.samples),
-        "certified": sum(r.certified for r in check.at_samples),
-        "seed": check.seed,
-        "worst_ratio": finite(check.at_samples[i].ratio),
-        "worst": check.samples[i].name,
-    }
+_NEVER = "no damping is enough"
 
 
-def ranges_rows(part: dict[str, Any]) -> list[tuple[str, str]]:
-    """The part of a report as rows of a table."""
-    ratios = [d / a for d, a in zip(part["required_damping"], part["available_damping"], strict=True) if d is not None]
-    most = f"{max(ratios):.4f} of the damping" if ratios else "no damping is enough"
-    exact = part["proof"] == "rational"
-    proof = "[green]proved exactly[/] at all" if exact else f"[red]not proved[/]: {part['reason']}"
-    found, count, every = part["inside"], part["vertices"], part["all_vertices"]
-    of = f", of all {every}: any three parameters have all their ends among them" if every > count + 1 else ""
-    rows = [
-        ("ranges, vertices", f"{part['vertices_certified']} of {count} certified, {proof}{of}"),
-        ("ranges, worst vertex", f"{most}, at {part['worst']}"),
-        ("ranges, between", search_words(part["search"])),
-    ]
-    if found["samples"]:
-        ratio = "no damping is enough" if found["worst_ratio"] is None else f"at most {found['worst_ratio']:.4f}"
-        inside = f"{found['certified']} of {found['samples']} random samples certified, {ratio} of the damping"
-        rows.append(("ranges, inside", inside))
-    if exact and not part["certified"]:
-        rows.append(("ranges", f"[red]not guaranteed[/]: {part['reason']}"))
-    return rows
+@dataclass(frozen=True)
+class RangesFigures:
+    """A check over ranges, as a report shows it."""
+
+    vertices: int
+    all_vertices: int
+    vertices_certified: int
+    required_damping: tuple[float, ...]  # (m,) [N s/m] at the worst vertex
+    available_damping: tuple[float, ...]
+    worst: str
+    proof: str
+    certified: bool
+    search: SearchFigures
+    inside: _Inside
+    reason: str | None = unseen("given")
+    what: str = _WHAT_IS_PROVED
+
+    @classmethod
+    def of(cls, check: RangesCheck) -> RangesFigures:
+        member, requirement = check.worst
+        return cls(
+            len(check.members) - 1,
+            check.vertices,
+            sum(r.certified for r in check.at_members[1:]),
+            requirement.required,
+            requirement.available,
+            member.name,
+            "rational" if check.certificate else "sampled",
+            check.proved,
+            SearchFigures.of(check.searched),
+            _Inside.of(check),
+            check.reason or None,
+        )
+
+    def rows(self) -> Iterator[tuple[str, str]]:
+        """Of a table."""
+        ratio = max(d / a for d, a in zip(self.required_damping, self.available_damping, strict=True))
+        most = f"{ratio:.4f} of the damping" if math.isfinite(ratio) else _NEVER
+        exact, found, count, every = self.proof == "rational", self.inside, self.vertices, self.all_vertices
+        proof = "[green]all proved exactly[/]" if exact else f"[red]not proved[/]: {self.reason}"
+        of = f", of all {every}: any three parameters have all their ends among them" if every > count + 1 else ""
+        yield "ranges, vertices", f"{self.vertices_certified} of {count} certified, {proof}{of}"
+        yield "ranges, worst vertex", f"{most}, at {self.worst}"
+        yield "ranges, between", str(self.search)
+        if found.worst_ratio is not None:
+            most = f"at most {found.worst_ratio:.4f}" if math.isfinite(found.worst_ratio) else _NEVER
+            inside = f"{found.certified} of {found.samples} random samples certified, {most} of the damping"
+            yield "ranges, inside", inside
+        if exact and not self.certified:
+            yield "ranges", f"[red]not guaranteed[/]: {self.reason}"

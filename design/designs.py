@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import msgspec
 
 from controller.loop import Loop
-from design.guarantees import LATE
-from design.multipliers import this_environment_of
+from design.environments import THIS_ENVIRONMENT
+from design.lmi import LATE
+from design.own import called, named
 from design.result import Design, DesignFailed
 
 
@@ -24,6 +25,8 @@ class Kind(NamedTuple):
     function: str  # from a loop to a Design
     takes: tuple[str, ...] = ()  # besides the loop and its options: condition, progress
     options: tuple[str, ...] = ()  # in words of design.api.DesignOptions
+    model: bool = False  # of the environment, in the coupling: made for late forces and whole ranges, not for walls
+    limited: bool = False  # made for limited forces, too, unless it is asked not to be
 
 
 KINDS = {
@@ -33,6 +36,7 @@ KINDS = {
         "design_with",
         ("condition",),
         ("switching", "limiter", "band_hz"),
+        limited=True,
     ),
     "moving-average": Kind(("any-environment",), "design.spring_damper", "moving_average"),
     "ccl": Kind(("any-environment",), "design.fixed_order", "design", options=("order", "method", "diagonal")),
@@ -42,8 +46,17 @@ KINDS = {
         "design_with",
         ("progress",),
         ("objective", "band_hz", "high_gain", "limiter", "seconds", "switching"),
+        model=True,
     ),
 }
+
+
+_OWN = Kind(("this-environment", "any-environment"), "", "")  # a function of a user's own, which takes a loop alone
+
+
+def kind_of(name: str) -> Kind:
+    """The kind of that name, or that of a user's own functions."""
+    return KINDS.get(name, _OWN)
 
 
 def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
@@ -53,7 +66,8 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     that vary. Other kinds for their own condition.
     """
     less = loop.environment.walls or loop.ranges or loop.varying_delay
-    return "any-environment" if less and "any-environment" in KINDS[kind].conditions else KINDS[kind].conditions[0]
+    conditions = kind_of(kind).conditions
+    return "any-environment" if less and "any-environment" in conditions else conditions[0]
 
 
 def design_by_kind(
@@ -71,23 +85,35 @@ def design_by_kind(
     Raises ValueError for a kind or condition that does not exist, Infeasible or DesignFailed (design.result) where
     there is nothing to return.
     """
+    if kind not in KINDS and ":" in kind:
+        found = own_coupling(kind, loop)
+        if not isinstance(found, Design):
+            raise ValueError(f"coupling {kind} is {found!r} for this loop, expected a design.result.Design")
+        if condition not in (None, found.condition):
+            raise ValueError(f"condition is {condition!r}, but {kind} is designed for {found.condition}")
+        return found
     if kind not in KINDS:
-        raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)}")
+        raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)} and package.module:function")
     condition = condition or usual_condition(loop, kind)
     chosen = KINDS[kind]
     if condition not in chosen.conditions:
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(chosen.conditions)}")
-    if kind == "optimal" and loop.environment.walls:
-        raise ValueError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
+    if chosen.model and loop.environment.walls:
+        raise ValueError(f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls")
     own = (("condition", condition), ("progress", progress))
     further = {name: value for name, value in own if name in chosen.takes}
     made = partial(getattr(import_module(chosen.module), chosen.function), **further, **options)
 
-    if condition == "any-environment" and loop.latency and kind != "optimal":
+    if condition == "any-environment" and loop.latency:
         raise ValueError(f"latency: {LATE}, or design for this-environment")
-    if kind == "optimal" or condition == "any-environment" or not (loop.latency or loop.environment.walls):
+    if chosen.model or condition == "any-environment" or not (loop.latency or loop.environment.walls):
         return made(loop)
     return _with_less_damping(loop, made)
+
+
+def own_coupling(name: str, loop: Loop) -> Any:
+    """What a user's own function, named as `package.module:function`, makes of a loop. Raises InputError."""
+    return called(f"--coupling {name}", named("--coupling", name), loop)
 
 
 #: A design for forces that latch late, or for walls, leaves at most this share of the damping, and is sought so often.
@@ -103,7 +129,7 @@ def _with_less_damping(loop: Loop, made: Callable[[Loop], Design]) -> Design:
     for _ in range(_MOST_ROUNDS):
         part = msgspec.structs.replace(loop, latency=None, delta=tuple(share * d for d in loop.delta))
         found = made(part)
-        needs = this_environment_of(loop, found.coupling)
+        needs = THIS_ENVIRONMENT.required(loop.at(loop.environment), found.coupling)
         if needs.certified:
             best = replace(found, requirement=needs)
             if needs.ratio > 1 - _UNUSED:

@@ -1,22 +1,88 @@
-"""What a coupling asks in each environment of ranges, and the one that asks the most: a search, no proof."""
+"""What the conditions that have names ask of a coupling: in this environment, its walls and ranges, and in any other.
+
+And the environment of ranges in which a coupling asks the most: a search, no proof.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from itertools import product
+from typing import Any
 
 import numpy as np
 
-from controller.coupling import Coupling, ForceFilter
+from controller.coupling import Coupling
 from controller.delay import delay
 from controller.loop import Loop
-from controller.lti import Array, Sampled, SingularLoop
+from controller.lti import Array, Block, Lti, Sampled, SingularLoop, TooLong, constant_like, numbers, vstack
 from controller.ranges import Member, Region, regions
-from design.conditions import least_multiple, least_scale, this_environment, this_environment_demand
-from design.frequency import MOST_SECONDS, frequencies, hermitian, on_circle, supremum
-from design.result import Requirement, refusal
+from design.conditions import (
+    Condition,
+    Demand,
+    dampings,
+    even_damping,
+    least_multiple,
+    least_scale,
+    this_environment,
+    this_environment_demand,
+)
+from design.exact import require_size
+from design.frequency import MOST_SECONDS, frequencies, hermitian, on_circle, supremum, sweeping, too_long
+from design.result import Guarantee, NotProved, Requirement, from_ratio, refusal
+
+
+class ThisEnvironment(Condition):
+    """Safe in the environment of the loop: around its walls, whether they touch or not, and at all of its members."""
+
+    name = "this-environment"
+
+    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
+        F = loop.F(coupling, exact)
+        if exact:
+            require_size(F.order)
+        return this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
+
+    def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
+        """The most that any member asks."""
+        if loop.environment.walls:
+            try:
+                return walls_of(loop, coupling, multiplier).requirement
+            except NotProved as error:
+                return refusal(self.name, loop.delta, str(error))
+        if loop.ranges is None:
+            return this_environment(loop.F(coupling), loop.delta, loop.T_max, loop.latency)
+        requirements = in_each(loop, coupling, loop.members())
+        return requirements[worst(requirements)]
+
+    def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
+        if loop.environment.walls:
+            return {"P": self._walls(loop, coupling, multiplier)}
+        loops = [loop.at(member.network) for member in self.members(loop)]
+        return {f"P{i or ''}": self.demand(each, coupling, exact=True) for i, each in enumerate(loops)}
+
+    def _walls(self, loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Demand[Lti]:
+        G = loop.walled(coupling, exact=True)
+        require_size(G.order)
+        return walls_demand(G, loop.delta, [wall.slope(G.T) for wall in loop.environment.walls], g, None, loop.T_max)
+
+    def multiplier(self, loop: Loop, coupling: Coupling, given: Sequence[float] | None) -> Sequence[float] | None:
+        return walls_of(loop, coupling).g if loop.environment.walls else None
+
+    def multiplier_name(self, loop: Loop) -> str | None:
+        return _WALL_MULTIPLIER if loop.environment.walls else None
+
+    def members(self, loop: Loop) -> tuple[Member, ...]:
+        return loop.members()
+
+    def guarantee(self, loop: Loop) -> Guarantee:
+        # proved at every vertex; whether it is kept between them is searched by check_ranges and design.check
+        return "these ranges" if loop.ranges else "this environment"
+
+
+THIS_ENVIRONMENT = ThisEnvironment()
 
 
 def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
@@ -35,6 +101,157 @@ def _required(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
     except SingularLoop as error:
         return refusal("this-environment", loop.delta, str(error))
     return this_environment(F, loop.delta, loop.T_max, loop.latency)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Walls that make and break contact: this-environment with a multiplier for each.
+
+
+def walls_demand(
+    G: Block,
+    delta: Sequence[Any],
+    slopes: Sequence[Any],
+    g: Any,
+    lam: Sequence[Any] | None = None,
+    T_max: float | None = None,
+) -> Demand[Block]:
+    """this-environment for walls of any stiffness and damping with k + 2 b/T up to `slopes` (w,) [N/m], and any gap.
+
+    G takes [x; p] to [f; y], displacements (m,) and wall forces to the forces of the devices and the ways into the
+    walls, [[F, J], [H, Y]]. With a multiplier g >= 0 and a weight lam > 0 for each wall (1 if not given) and
+    M = g (z-1) - 1 the block is, on (dx, dp),
+        [[F, J], [-lam M H, -lam M Y]]/(z-1) + diag(s Delta_D/T, lam g/slopes),
+    whose static part must be symmetric, J(1) = H(1)' lam and lam Y(1) = Y(1)' lam, with F(1) >= 0 >= lam Y(1).
+    """
+    T, m, w = G.T, len(delta), len(slopes)
+    gains, one = numbers(g, T), numbers(np.eye(m + w), T)
+    weights = numbers([1] * w if lam is None else lam, T)
+    weigh = np.diag(np.concatenate([numbers([1] * m, T), weights]))
+    S1, R = (weigh @ G).split_at_one()
+    steep = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
+    limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(slopes, T)])
+    free = np.hstack([one, -steep]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
+    damping = np.concatenate([even_damping(delta, T, T_max) / T, numbers([0] * w, T)])
+    F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
+    static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
+    return Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
+
+
+# this-environment with walls: the best multiplier. The least s is convex in g, because the block is affine in both.
+
+
+#: Where the multiplier of a wall is looked for [samples], and the digits that are kept of it.
+_LEAST_G, _MOST_G, _G_DIGITS = 1e-3, 1e3, 4
+
+
+@dataclass(frozen=True)
+class _WallsProof:
+    """What walls that make and break contact ask of the devices."""
+
+    requirement: Requirement  # condition "this-environment"
+    g: tuple[float, ...]  # (w,) the multiplier that shows it
+
+
+def walls_proof(
+    G: Lti,
+    delta: Sequence[float],
+    slopes: Sequence[float],
+    g: Sequence[float] | None = None,
+    T_max: float | None = None,
+) -> _WallsProof:
+    """The damping that `walls_demand` asks with the best multiplier found, or with g (w,) where it is given.
+
+    G takes [x; p] to [f; y] while no wall touches.
+    """
+    m, w = len(delta), len(slopes)
+    available = dampings(delta, m)
+
+    def refused(reason: str) -> _WallsProof:
+        return _WallsProof(refusal("this-environment", available, reason), tuple(g or (1.0,) * w))
+
+    if min(available) == 0:
+        return refused("a device guarantees no damping, so no coupling is safe for every passive human")
+    if reason := too_long(G):
+        return refused(reason)
+    radius = float(np.abs(G.poles()).max(initial=0.0))
+    if radius >= 1:
+        return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
+    S1 = G.dc()
+    # rounding, relative to what each channel and wall is elsewhere
+    own = np.abs([np.diag(S1), np.diag(G.D), np.diag(G.at(-1.0))]).max(axis=0)
+    if (np.abs(S1 - S1.T) > 1e-9 * np.sqrt(np.outer(own, own))).any():
+        return refused("the static map of devices and walls is not symmetric: a slow closed path could extract energy")
+    for name, part, size in (("F(1)", S1[:m, :m], own[:m]), ("-Y(1)", -S1[m:, m:], own[m:])):
+        if np.linalg.eigvalsh((part + part.T) / 2).min() < -1e-9 * size.max():
+            return refused(f"{name} has a negative direction: it pushes outwards")
+    grid = np.concatenate([[0.0], frequencies(G)])
+    z = on_circle(frequencies(G, points=100))
+    sampled = Sampled(z[None], G.at(z)[None], G.T)
+
+    def needed(values: Array) -> float:
+        demand = walls_demand(sampled, available, slopes, values, None, T_max)
+        return float(least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G)).max())
+
+    found = _best_g(needed, w) if g is None else np.asarray(g, dtype=float)
+    demand = walls_demand(G, available, slopes, found, None, T_max)
+    ratio, at = supremum(lambda w: least_scale(demand, w), grid)
+    if np.isinf(ratio):
+        return refused("no multiplier was found with which the walls are covered, whatever the damping")
+    return _WallsProof(
+        from_ratio("this-environment", max(ratio, 0.0), available, at / (2 * np.pi * G.T)), tuple(found.tolist())
+    )
+
+
+def _best_g(needed: Callable[[Array], float], walls: int) -> Array:
+    """g (walls,) with about the least `needed`: one for all of them, then one by one, each by a search in log g."""
+    from scipy.optimize import minimize_scalar  # slow to load, and seldom needed
+
+    g = np.ones(walls)
+    turns = [np.ones(walls, dtype=bool), *(np.eye(walls, dtype=bool) if walls > 1 else ())]
+
+    def moved(which: Array, value: float) -> Array:
+        return np.where(which, value, g)
+
+    for which in turns:
+        grid = np.geomspace(_LEAST_G, _MOST_G, 13)
+        values = [needed(moved(which, value)) for value in grid]
+        best = int(np.argmin(values))
+        ends = np.log(grid[max(best - 1, 0)]), np.log(grid[min(best + 1, grid.size - 1)])
+        finer = minimize_scalar(
+            lambda x, which=which: min(needed(moved(which, np.exp(x))), 1e300),
+            bounds=ends,
+            method="bounded",
+            options={"xatol": 1e-2},
+        )
+        g = moved(which, float(np.exp(finer.x)) if finer.fun < values[best] else float(grid[best]))
+    return np.array([float(f"{value:.{_G_DIGITS}g}") for value in g])
+
+
+#: What a certificate calls the multipliers of walls that make and break contact, one each.
+_WALL_MULTIPLIER = "g"
+
+
+def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None) -> _WallsProof:
+    """What this-environment asks where walls make and break contact, with the multipliers g (w,) or the best found.
+
+    Raises NotProved for walls that nothing is proved of.
+    """
+    walls = loop.environment.walls
+    if loop.ranges:
+        raise NotProved("walls and ranges: walls are proved in one environment")
+    try:
+        G = loop.walled(coupling)
+    except (SingularLoop, ValueError) as error:
+        raise NotProved(str(error)) from None
+    slopes = [float(wall.slope(loop.T)) for wall in walls]
+    values = None if g is None else [float(value) for value in g]
+    if values is not None and (len(values) != len(walls) or min(values) < 0):
+        raise NotProved(f"{_WALL_MULTIPLIER} is {values}, expected a number >= 0 for each of {len(walls)} walls")
+    try:
+        with sweeping():
+            return walls_proof(G, loop.delta, slopes, values, loop.T_max)
+    except TooLong as error:
+        raise NotProved(str(error)) from None
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -197,15 +414,13 @@ def search_ranges(
 def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
     """The damping that this-environment requires over the available damping, by a refined sweep of a stable coupling.
 
-    With `thin` by every so-manieth frequency of its grid alone. Of a force filter the responses of environment and
-    filter are multiplied: the poles of their series are defective and cost digits, and time.
+    With `thin` by every so-manieth frequency of its grid alone. Of one in series, a force filter, the responses of
+    environment and filter are multiplied: the poles of their series are defective and cost digits, and time.
     """
-    if not isinstance(coupling, ForceFilter):
-        return (
-            _thinly(loop, coupling, thin) if thin > 1 else _required(loop, coupling, Member("", loop.environment)).ratio
-        )
-    E, one = loop.E(), np.append(np.zeros(len(coupling.R) - 1), 1.0)[:, None, None]
-    chain = ForceFilter(coupling.poles, coupling.pairs, one).filter(loop.T)  # a block with all of its poles
+    if (chain := coupling.in_series(loop.T)) is None:
+        nominal = Member("", loop.environment)
+        return _thinly(loop, coupling, thin) if thin > 1 else _required(loop, coupling, nominal).ratio
+    E = loop.E()
     late, delayed = delay(loop.theta, loop.T), delay(loop.psi, loop.T) @ E
 
     def needed(w: Array) -> Array:

@@ -12,7 +12,6 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from controller.complementarity import GROUNDED, PIVOT_ROUNDING
-from controller.coupling import SpringDamperForm
 from controller.delay import delay
 from controller.limiter import Limiter
 from controller.loop import Loop
@@ -112,7 +111,7 @@ def _limited_block(
     loop, rho = stored.loop, lag(stored.loop, stored.certificate)
     if rho is None:
         raise NothingToExport("its certificate covers no limited forces: design it anew, or leave out --force-limit")
-    limiter = Limiter(loop.sent(stored.built()), tuple(theta), np.array(force_limit), np.array(rho))
+    limiter = Limiter(loop.sent(stored.built()), theta, limit=force_limit, rho=rho)
     about = (
         "f: the whole discrete process with its limiter; the devices get -f, held for T. Forces never exceed "
         f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead, and the certificate holds there.",
@@ -607,10 +606,10 @@ def with_origin(block: ExportedBlock, file: str, stored: Stored, verdict: Verdic
 
 
 def _gains(stored: Stored) -> str:
-    coupling = stored.coupling
-    if isinstance(coupling, SpringDamperForm):
-        return f"spring-damper, K = {listed(coupling.K)} N/m, B = {listed(coupling.B)} N s/m"
-    return f"coupling of kind {coupling.__struct_config__.tag}"
+    coupling = stored.built()
+    if "K" in (gains := coupling.figures(stored.loop.T)):
+        return f"{coupling.kind}, K = {listed(gains['K'])} N/m, B = {listed(gains['B'])} N s/m"
+    return f"coupling of kind {stored.coupling.__struct_config__.tag}"
 
 
 def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:

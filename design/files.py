@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from zipfile import ZipFile, ZipInfo
 
+import msgspec
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
@@ -311,15 +312,21 @@ def _fill(file: BinaryIO, content: Callable[[BinaryIO], None] | bytes | str) -> 
         file.write(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
 
 
-def unseen(json: str = "key", default: Any = MISSING) -> Any:
-    """A field of a report that no table shows; in JSON as `figure` in cli/render.py has it, or `no` key."""
-    return field(default=default, metadata={"json": json})
+def unseen(json: str = "key", default: Any = MISSING, older: str | None = None) -> Any:
+    """A field of a report that no table shows; in JSON as `figure` in cli/render.py has it, or `no` key.
+
+    `older` is the name that the key had before: the value stands under both.
+    """
+    return field(default=default, metadata={"json": json, "older": older})
 
 
 def plain(report: Any) -> Any:
-    """A report as JSON takes it: dataclasses by their fields, null for what is infinite or no number."""
+    """A report as JSON takes it: dataclasses by `part()` or their fields, null for what is infinite or no number."""
     if is_dataclass(report) and not isinstance(report, type):
-        return _part(report)
+        own = getattr(report, "part", None)
+        return plain(own()) if own else _part(report)
+    if isinstance(report, msgspec.Struct):
+        return plain(msgspec.to_builtins(report))
     if isinstance(report, Mapping):
         return {name: plain(value) for name, value in report.items()}
     if isinstance(report, np.ndarray | np.generic):
@@ -338,7 +345,8 @@ def _part(report: Any) -> dict[str, Any]:
         if how == "beside":
             part |= plain(value) or {}
         elif how == "key" or (how == "given" and value is not None):
-            part[one.name.removesuffix("_")] = plain(value)  # from_, for Python has its own `from`
+            key = one.name.removesuffix("_")  # from_, for Python has its own `from`
+            part |= dict.fromkeys((key, one.metadata.get("older") or key), plain(value))
     return part
 
 

@@ -30,8 +30,8 @@ from design.result import Design, DesignFailed, Requirement
 # ----------------------------------------------------------------------------------------------------
 # State-space couplings of fixed order, in a realisation where both conditions are affine.
 #
-# V = V1 + (F - F z)(zI - A)^-1 B: the output is V1 u + F x - F x+. Its static compliance is V1, and the quotient that
-# the remedied (2) needs is y2 = F x + V1/2 u (design.lmi.v_hat_regular). With F held fixed, V, y2 and the loop (22)
+# V = V1 + (F - F z)(zI - A)^-1 B: the output is V1 u + F x - F x+. Its static compliance is V1, and what
+# the remedied (2) needs, v_hat(V), is F x + V1/2 u (design.conditions). With F held fixed, V, y2 and the loop (22)
 # are all affine in (A, B, V1). That loses nothing where F has full row rank: any such F is reached by a change of
 # state.
 
@@ -62,7 +62,6 @@ class FixedOrder:
         masks = masks if diagonal else [np.ones_like(mask) for mask in masks]
         self._free = [np.nonzero(mask) for mask in (*masks[:2], np.triu(masks[2]))]
         self.plant = _plant(shaping)
-        self.window = lmi.theta_hat(self.loop.theta)
 
     @property
     def unknowns(self) -> int:
@@ -103,13 +102,10 @@ class FixedOrder:
     def ports(self, p: Array) -> lmi.Ports:
         """The remedied V-hat: supply y2'u - y1'y1, y1 = Sigma^-1/2 H u, with no y1 rows where Sigma is infinite."""
         A, B, V1 = self.matrices(p)
-        V, G = self.unit_coupling(p), self.window
-        quotient = -G.quotient_at_one().C
+        G = lmi.v_hat_ports(self.unit_coupling(p), self.loop.theta, Lti(A, B, self.F, V1 / 2, 1.0))
         paid = np.isfinite(self.sigma)
         weight = 1 / np.sqrt(self.sigma[paid])[:, None]
-        C1, D1 = np.hstack([V.C, -G.C])[paid] * weight, (V.D - G.D)[paid] * weight
-        C2, D2 = np.hstack([self.F, -quotient]), (V1 - G.dc()) / 2
-        return lmi.Ports(block_diag(A, G.A), np.vstack([B, G.B]), C2, D2, C1, D1)
+        return G._replace(C1=G.C1[paid] * weight, D1=G.D1[paid] * weight)
 
     def weighted_loop(self, p: Array) -> tuple[Array, Array, Array, Array]:
         """A, B, C, D of W1 L W2: the plant with V closed between its output u and its input v."""
@@ -403,30 +399,26 @@ class FixedPoles:
         self.sdps += 1
         return self._coupling(poles, x[:gains]), float(np.sqrt(x[-1]))
 
-    def _unit(self, poles: Sequence[Sequence[float]], gains: Array) -> tuple[Lti, Array, Array]:
-        """V in units T = 1 and usable damping = I, with F and V1 of design.fixed_order.realisation's realisation."""
+    def _unit(self, poles: Sequence[Sequence[float]], gains: Array) -> Lti:
+        """V in units T = 1 and usable damping = I."""
         N = len(poles)
         V1, f = np.diag(gains[:N]), np.split(gains[N:], np.cumsum([len(a) for a in poles])[:-1])
         A = np.diag(np.concatenate(poles))
         B = np.asarray(block_diag(*(np.sqrt(1 - np.square(a))[:, None] for a in poles)))
         F = np.asarray(block_diag(*(row[None, :] for row in f)))
-        return Lti(A, B, F - F @ A, V1 - F @ B, 1.0), F, V1
+        return Lti(A, B, F - F @ A, V1 - F @ B, 1.0)
 
     def _coupling(self, poles: Sequence[Sequence[float]], gains: Array) -> Lti:
-        V, root, T = self._unit(poles, gains)[0], 1 / np.sqrt(self.shaping.usable), self.loop.T
+        V, root, T = self._unit(poles, gains), 1 / np.sqrt(self.shaping.usable), self.loop.T
         return Lti(V.A, V.B * root, T * root[:, None] * V.C, T * root[:, None] * V.D * root, T)
 
     def _passivity(self, poles: Sequence[Sequence[float]], gains: Array, P: Array) -> Array:
         """The remedied (2) with the excess term by a Schur complement, so that it is linear in (gains, P)."""
-        V, F, V1 = self._unit(poles, gains)
-        G = lmi.theta_hat(self.loop.theta)
-        C2 = np.hstack([F, G.quotient_at_one().C])
-        C1, D1 = np.hstack([V.C, -G.C]), V.D - G.D
-        ports = lmi.Ports(block_diag(V.A, G.A), np.vstack([V.B, G.B]), C2, (V1 - G.dc()) / 2, C1, D1)
-        zero = np.zeros_like(D1)
-        plain = lmi.lemma1(ports, P, zero, zero)
+        G = lmi.v_hat_ports(self._unit(poles, gains), self.loop.theta)
+        zero = np.zeros_like(G.D1)
+        plain = lmi.lemma1(G, P, zero, zero)
         paid = np.isfinite(self.sigma)
-        excess = np.hstack([C1, D1])[paid] / np.sqrt(self.sigma[paid])[:, None]
+        excess = np.hstack([G.C1, G.D1])[paid] / np.sqrt(self.sigma[paid])[:, None]
         return lmi.symmetric([[plain, excess.T], [excess, np.eye(excess.shape[0])]])
 
     def _cuts(self, poles: Sequence[Sequence[float]], unknowns: Sequence[int]) -> Inequality:
@@ -489,7 +481,7 @@ class _Search:
         self.gains = start or self._structured()
 
     def requirement(self, V: Lti) -> Requirement:
-        return spring_damper.any_environment_with(self.loop, V, self.phi)
+        return lmi.ANY_ENVIRONMENT.required(self.loop, Compliance(V), self.phi)
 
     def run(self, method: str, most_sdps: int) -> Lti:
         """The coupling found, certified."""

@@ -14,9 +14,9 @@ import numpy as np
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.lti import Array, Sampled
-from design.conditions import even_damping, this_environment
+from design.conditions import even_damping, this_environment, this_environment_demand
 from design.frequency import frequencies, hermitian, on_circle
 from design.lmi import RESERVE, Complex
 from design.multipliers import (
@@ -60,7 +60,10 @@ def polynomials(theta: int, w: Array) -> tuple[Array, Array]:
 
 
 class SampledLoop:
-    """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta), shape (2N,)."""
+    """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta, ..).
+
+    The gains are the first 2N entries; behind them are the unknowns of a condition's multiplier, where it has some.
+    """
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.loop, self.E = loop, loop.E()
@@ -68,7 +71,8 @@ class SampledLoop:
         low, high = (per_hz * f for f in band_hz)
         self.band = frequencies(self.E, low=low, high=min(high, np.pi), points=80)
         self.conditions = frequencies(self.E, low=1e-3, points=80)
-        self.loop_in_band, self.loop_at_conditions = self._responses(self.band), self._responses(self.conditions)
+        self.loop_in_band = self._responses(self.band)
+        self.loop_at_conditions, self.of_one = self._responses(self.conditions), self._of_one()
         E = self.E.at(on_circle(self.band))
         self.size2 = (np.abs(E) ** 2).sum(axis=(1, 2))
         self.target = delay(loop.lam, loop.T).at(on_circle(self.band)) @ E
@@ -78,8 +82,11 @@ class SampledLoop:
         self._known: dict[int, tuple[_Responses, Array, tuple[Complex, Array, Complex, Complex]]] = {}
 
     def coupling(self, x: Array) -> SpringDamper:
-        log_k, b = np.split(x, 2)
+        log_k, b = np.split(self._gains(x), 2)
         return SpringDamper(np.exp(log_k), np.maximum(b, 0.0) * self.delta)
+
+    def _gains(self, x: Array) -> Array:
+        return x[: 2 * self.loop.channels]
 
     def point(self, coupling: SpringDamper) -> Array:
         return np.concatenate([np.log(coupling.K), coupling.B / self.delta])
@@ -91,11 +98,18 @@ class SampledLoop:
     def add(self, w: float) -> None:
         """Impose the condition at the frequency w [rad/sample] too."""
         self.conditions = np.append(self.conditions, w)
-        self.loop_at_conditions = self._responses(self.conditions)
+        self.loop_at_conditions, self.of_one = self._responses(self.conditions), self._of_one()
 
     def multiplier(self, x: Array) -> Lags | None:
         """The limiter's multiplier c in x, where the condition has one."""
         return None
+
+    def _of_one(self) -> Complex:
+        """The block of this-environment without its damping where F is 1, (k,): it is proportional to F."""
+        F = Sampled(
+            on_circle(self.conditions)[None], np.ones((1, self.conditions.size, 1, 1), dtype=np.complex128), self.loop.T
+        )
+        return this_environment_demand(F, [1.0]).free.G[0, :, 0, 0]
 
     def _responses(self, w: Array) -> _Responses:
         """(z-1)/(Tz), Psi E and Theta at exp(jw)."""
@@ -105,7 +119,7 @@ class SampledLoop:
 
     def force(self, x: Array, responses: _Responses) -> Complex:
         """F = Theta G (G + Psi E)^-1 Psi E with G = V^-1, (k, N, N)."""
-        by, b, _, right = self._solved(x, responses)
+        by, b, _, right = self._solved(self._gains(x), responses)
         g = by[0] + by[1] * b
         return np.diagonal(responses[2], axis1=1, axis2=2)[:, :, None] * g[:, :, None] * right
 
@@ -132,8 +146,8 @@ class SampledLoop:
 
     def square_mismatch_slope(self, x: Array) -> Array:
         """Its gradient by x; the unknowns behind the gains do not move it."""
-        gains, (_, E, theta) = x[: 2 * self.loop.channels], self.loop_in_band
-        by, _, S, right = self._solved(gains, self.loop_in_band)
+        _, E, theta = self.loop_in_band
+        by, _, S, right = self._solved(self._gains(x), self.loop_in_band)
         M, log_w = self.force(x, self.loop_in_band) - self.target, np.log(self.band)
         back = right @ M.conj().swapaxes(1, 2) @ theta @ E
         moved = 2 * (np.einsum("kij,kji->ki", back, S) * by).real
@@ -156,7 +170,7 @@ class SampledLoop:
         by, _, S, right = self._solved(x, self.loop_at_conditions)
         v = self._least(x)[1][:, :, None]
         into = (v.conj().swapaxes(1, 2) @ theta @ E @ S)[:, 0]
-        turned = into * (right @ v)[:, :, 0] / (on_circle(self.conditions) - 1)[:, None]
+        turned = into * (right @ v)[:, :, 0] * self.of_one[:, None]
         slope = np.concatenate([*(turned * by).real], axis=1)
         if not any(self.loop.psi):
             return slope
@@ -179,12 +193,12 @@ class SampledLoop:
 
     def _block(self, x: Array) -> Complex:
         """What must be positive definite with the damping, at each sampled frequency, Hermitian."""
-        return hermitian(self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None])
+        return hermitian(self.force(x, self.loop_at_conditions) * self.of_one[:, None, None])
 
     def stability(self, x: Array) -> float:
         """By how much more than CLOSEST_POLE the poles keep away from the circle."""
-        F = force_map(self.E, self.coupling(x), self.loop.theta, self.loop.psi)
-        return float(1 - _CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
+        poles = self.loop.F(self.coupling(x)).poles()
+        return float(1 - _CLOSEST_POLE - np.abs(poles).max(initial=0.0))
 
     def search(self, x: Array, most: int) -> OptimizeResult:
         """The local optimum from x, by so many steps."""
@@ -223,9 +237,6 @@ class SwitchingLoop(SampledLoop):
         self.active = np.flatnonzero(self.h)
         super().__init__(loop)
 
-    def coupling(self, x: Array) -> SpringDamper:
-        return super().coupling(self._gains(x))
-
     def point(self, coupling: SpringDamper) -> Array:
         """The gains with their best multiplier."""
         loop = self.loop
@@ -237,9 +248,6 @@ class SwitchingLoop(SampledLoop):
     def judged(self, x: Array) -> Requirement:
         sent = self.loop.sent(self.coupling(x))
         return switching_sweep(sent, *self.range, self.loop.delta, T_max=self.loop.T_max).requirement
-
-    def force(self, x: Array, responses: _Responses) -> Complex:
-        return super().force(self._gains(x), responses)
 
     def room(self, x: Array) -> Array:
         """1 - SAMPLED_RESERVE less the damping ratio at each sampled frequency, with the multiplier in x."""
@@ -257,9 +265,6 @@ class SwitchingLoop(SampledLoop):
     def search(self, x: Array, most: int) -> OptimizeResult:
         return self.minimised(x, most, [(np.log(_MULTIPLIERS[0]), np.log(_MULTIPLIERS[1]))] * self.active.size)
 
-    def _gains(self, x: Array) -> Array:
-        return x[: 2 * self.loop.channels]
-
 
 # ----------------------------------------------------------------------------------------------------
 # Spring-damper gains that are safe also while forces are limited: the same search with the limiter's block
@@ -274,9 +279,6 @@ class LimiterLoop(SampledLoop):
         self._undelayed: tuple[_Responses, _Responses] | None = None
         super().__init__(loop, band_hz)
 
-    def coupling(self, x: Array) -> SpringDamper:
-        return super().coupling(self._gains(x))
-
     def point(self, coupling: SpringDamper) -> Array:
         """The gains with a usual multiplier."""
         return np.append(super().point(coupling), np.full(self.loop.channels, _FIRST_WEIGHT))
@@ -284,9 +286,6 @@ class LimiterLoop(SampledLoop):
     def judged(self, x: Array) -> Requirement:
         loop, sent, c = self.loop, self.loop.sent(self.coupling(x)), self._weights(x).tolist()
         return limiter_proof(sent, loop.theta, loop.delta, self.rho, c, T_max=loop.T_max).requirement
-
-    def force(self, x: Array, responses: _Responses) -> Complex:
-        return super().force(self._gains(x), responses)
 
     def room(self, x: Array) -> Array:
         """The least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency."""
@@ -298,7 +297,7 @@ class LimiterLoop(SampledLoop):
         loop, (_, E, theta), v = self.loop, self.loop_at_conditions, self._least(x)[1]
         (by, _, S, right), z = self._solved(self._gains(x), self._now()), on_circle(self.conditions)[:, None]
         first, second = np.split(v, 2, axis=1)
-        N, late = self._lines(x), np.diagonal(theta, axis1=1, axis2=2) / (z - 1)
+        N, late = self._lines(x), np.diagonal(theta, axis1=1, axis2=2) * self.of_one[:, None]
         into = np.einsum("ki,kij->kj", first.conj() * late + second.conj() * N, E @ S)
         turned = into * np.einsum("kij,kj->ki", right, first)
         steps = np.einsum("kij,kj->ki", self.force(x, self._now()), first) - (1 - 1 / z) * np.array(self.rho) * second
@@ -337,7 +336,7 @@ class LimiterLoop(SampledLoop):
         z, theta = on_circle(self.conditions)[:, None], np.diagonal(self.loop_at_conditions[2], axis1=1, axis2=2)
         G, N, one = self.force(x, self._now()), self._lines(x), np.eye(self.loop.channels)
         damping, rho = (1 - _SAMPLED_RESERVE) * self.delta / self.loop.T, np.array(self.rho)
-        first = hermitian((theta / (z - 1))[:, :, None] * G) + damping * one
+        first = hermitian((theta * self.of_one[:, None])[:, :, None] * G) + damping * one
         across = damping - np.conj(rho * theta / z) / 2
         return first, N[:, :, None] * G / 2 + across[:, :, None] * one, damping - (N * (1 - 1 / z)).real * rho
 
@@ -350,9 +349,6 @@ class LimiterLoop(SampledLoop):
     def _weights(self, x: Array) -> Array:
         """c, a row of one lag per channel."""
         return np.maximum(x[2 * self.loop.channels :, None], 0.0)
-
-    def _gains(self, x: Array) -> Array:
-        return x[: 2 * self.loop.channels]
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from controller.coupling import Coupling
 from controller.loop import DelayRange, Loop
 from design.conditions import encoder_friction
-from design.result import Requirement, finite
+from design.result import Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # What may be said of a coupling: required against available damping, for which environments, and what is left out.
@@ -56,26 +56,33 @@ def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_rang
     return loop.environment.here
 
 
-def encoder_part(
-    loop: Loop, coupling: Coupling, steps: Sequence[float], friction: Sequence[float]
-) -> dict[str, Any] | None:
-    """Whether declared Coulomb friction (m,) [N] pays for encoder steps (m,) [m]; None where encoders are ideal."""
-    if not any(steps):
-        return None
-    widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
-    part: dict[str, Any] = {"encoder_step": list(steps), "friction": list(friction)}
-    if loop.environment.walls:
-        words = f"encoder steps of {widths} um: with walls nothing is proved of them"
-        return part | {"friction_needed": None, "covered": False, "words": words}
-    needed = encoder_friction(loop.F(coupling), steps)
-    covered = bool((needed <= np.asarray(friction)).all())
-    has = ", ".join(f"{f:.4g}" for f in friction)
-    enough = (
-        f"friction of {', '.join(f'{f:.4g}' for f in needed)} N is enough for {widths} um, the devices declare {has} N"
-    )
-    verdict = "are covered while forces stay below the limits" if covered else "are not covered"
-    words = f"encoder steps {verdict}: {enough}"
-    return part | {"friction_needed": [finite(f) for f in needed], "covered": covered, "words": words}
+@dataclass(frozen=True)
+class EncoderSteps:
+    """Whether declared Coulomb friction pays for encoder steps."""
+
+    encoder_step: tuple[float, ...]  # (m,) [m]
+    friction: tuple[float, ...]  # (m,) [N]
+    friction_needed: tuple[float, ...] | None  # (m,) [N]; None before walls, where nothing is proved
+    covered: bool
+    words: str
+
+    @classmethod
+    def of(
+        cls, loop: Loop, coupling: Coupling, steps: Sequence[float], friction: Sequence[float]
+    ) -> EncoderSteps | None:
+        """None where encoders are ideal."""
+        if not any(steps):
+            return None
+        widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
+        given = tuple(steps), tuple(friction)
+        if loop.environment.walls:
+            return cls(*given, None, False, f"encoder steps of {widths} um: with walls nothing is proved of them")
+        needed = encoder_friction(loop.F(coupling), steps)
+        covered = bool((needed <= np.asarray(friction)).all())
+        amounts, has = (", ".join(f"{f:.4g}" for f in some) for some in (needed, friction))
+        verdict = "are covered while forces stay below the limits" if covered else "are not covered"
+        enough = f"friction of {amounts} N is enough for {widths} um, the devices declare {has} N"
+        return cls(*given, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -85,14 +92,3 @@ def encoder_part(
 def making_covered(loop: Loop) -> bool:
     """Whether this-environment covers walls that make and break contact: in one environment, not over ranges."""
     return bool(loop.environment.walls) and not loop.ranges
-
-
-#: Why any-environment says nothing of forces that latch between ticks.
-LATE = "a latency of a fraction of a sample is derived for this environment only: count it as a whole sample of theta"
-
-
-def no_compliance(coupling: Coupling) -> str:
-    """Why Theorem 4 does not apply to a coupling that has no V(z) of its own."""
-    if coupling.holds_model:
-        return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
-    return "without a coupling there is nothing that Theorem 4 could use"

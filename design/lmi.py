@@ -8,7 +8,7 @@ Two transfer matrices of the paper can never satisfy the strict inequalities pri
       Remedy: the Hermitian part of E(1) z/(z-1) on |z| = 1 is the constant E(1)/2, so what is left, E-hat less
       its pole plus E(1)/2, carries the same condition and is stable (`e_hat_regular`).
   V-hat = (1 - 1/z)(V - Theta-hat) vanishes at z = 1, where (2) asks 0 > 0.
-      Remedy: divide by |1 - 1/z|^2 (`v_hat_regular`).
+      Remedy: divide by |1 - 1/z|^2 (`v_hat_ports`).
 """
 
 from __future__ import annotations
@@ -20,13 +20,16 @@ import numpy as np
 import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
+from controller.coupling import Coupling
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from design.conditions import even_damping, regular_part, uncovered
+from design import conditions
+from design.conditions import Condition, Demand, even_damping, regular_part, uncovered, v_hat
 from design.cone import ConeProgram, Inequality
+from design.exact import require_size
 from design.frequency import frequencies, hermitian, on_circle, supremum
-from design.result import DesignFailed, Infeasible
+from design.result import DesignFailed, Guarantee, Infeasible, NotProved, Requirement, refusal
 
 #: Designs ask for (1 - RESERVE) of the available damping, so that they are certified as stored.
 RESERVE = 1e-4
@@ -219,7 +222,7 @@ def gain_block(
 
 
 # ----------------------------------------------------------------------------------------------------
-# The least multiplier Phi of Theorem 4 for an environment with delay inside (psi >= 1), by (17).
+# Theorem 4, and the least multiplier Phi of an environment with delay inside (psi >= 1), by (17).
 
 
 #: Phi is enlarged by this, relatively, so that a sweep confirms what a solver found to its own tolerance.
@@ -279,6 +282,95 @@ def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
         f"Theorem 4 admits no coupling: with psi = {psi} the environment alone uses up {required} N s/m of device "
         f"damping and delta is {tuple(delta.tolist())}"
     )
+
+
+#: Why any-environment says nothing of forces that latch between ticks.
+LATE = "a latency of a fraction of a sample is derived for this environment only: count it as a whole sample of theta"
+
+
+class AnyEnvironment(Condition):
+    """Theorem 4 of the paper: safe around every passive environment; with psi >= 1 around this one.
+
+    Its multiplier is then Phi (m,) [N s/m]. Walls are covered without delay in the environment, and refused with it.
+    """
+
+    name = "any-environment"
+
+    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
+        V = coupling.compliance(loop.period(exact))
+        assert V is not None  # where it is None, `required` refuses
+        if exact:
+            require_size(V.order + sum(loop.theta))
+        return conditions.any_environment_demand(V, loop.theta, loop.delta, loop.T_max)
+
+    def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
+        """The least Phi, None where none is needed; and why it says nothing of the loop, whatever the coupling."""
+        if (reason := self._refused(loop)) or not any(loop.psi):
+            return None, reason
+        try:
+            return least_phi(loop), None
+        except ValueError as error:
+            return None, " ".join(str(error).split())
+
+    def _refused(self, loop: Loop) -> str | None:
+        if loop.environment.walls and any(loop.psi):
+            return "with delay in the environment its multiplier is of a linear one: no walls"
+        return LATE if loop.latency else None
+
+    def _without(self, coupling: Coupling) -> str:
+        """Why it says nothing of a coupling that has no V(z)."""
+        if coupling.holds_model:
+            return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
+        return "without a coupling there is nothing that Theorem 4 could use"
+
+    def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
+        """Without a multiplier it takes the least one, where it needs one."""
+        reason, V = self._refused(loop), coupling.compliance(loop.T)
+        if reason or V is None:
+            return refusal(self.name, loop.delta, reason or self._without(coupling))
+        if not any(loop.psi):
+            if channels := coupling.channels(loop.T):
+                return conditions.any_environment_per_channel(channels, loop.theta, loop.delta, loop.T_max)
+            return conditions.any_environment(V, loop.theta, loop.delta, loop.T_max)
+        if multiplier is None:
+            multiplier, reason = self.least_multiplier(loop)
+        if multiplier is None:
+            return refusal(self.name, loop.delta, str(reason))
+        phi = np.array([float(p) for p in multiplier])
+        return conditions.any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi, loop.T_max)
+
+    def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
+        if not any(loop.psi):
+            return super().exact_demands(loop, coupling)
+        T = loop.period(exact=True)
+        V = coupling.compliance(T)
+        assert V is not None
+        require_size(V.order + sum(loop.theta))
+        delayed = delay(loop.psi, T) @ loop.E(exact=True)
+        return {
+            "P": conditions.delayed_coupling_demand(V, loop.theta, multiplier, loop.delta, loop.T_max),
+            "P_E": conditions.delayed_environment_demand(delayed, multiplier),
+        }
+
+    def multiplier(self, loop: Loop, coupling: Coupling, given: Sequence[float] | None) -> Sequence[float] | None:
+        if not any(loop.psi) or self._refused(loop) or coupling.compliance(loop.T) is None:
+            return None
+        if given is None or len(given) != loop.channels:
+            raise NotProved("any-environment with psi >= 1 needs a multiplier Phi, one entry per channel")
+        return given
+
+    def multiplier_name(self, loop: Loop) -> str | None:
+        return "Phi" if any(loop.psi) else None
+
+    def guarantee(self, loop: Loop) -> Guarantee:
+        return "this environment" if any(loop.psi) else "any passive environment"
+
+
+ANY_ENVIRONMENT = AnyEnvironment()
+
+
+# ----------------------------------------------------------------------------------------------------
+# The paper's lemmas.
 
 
 _Matrix = Any  # Array or cvxpy expression, (rows, columns)
@@ -353,25 +445,20 @@ def e_hat_regular(E: Lti, psi: Sequence[int]) -> Lti:
     return regular_part(delay(psi, E.T) @ E)
 
 
-def theta_hat(theta: Sequence[int], T: float = 1.0) -> Lti:
-    """(12) in these units: blockdiag(1 + 1/z + ... + z^-theta_i) / 2."""
-    return Lti.diag(*(_window(n, T) for n in theta))
+def theta_hat(theta: Sequence[int]) -> Lti:
+    """(12) in these units."""
+    return conditions.theta_hat(theta, np.ones(len(theta)), 1.0)
 
 
-def v_hat_regular(V: Lti, theta: Sequence[int]) -> Ports:
-    """V-hat divided by |1 - 1/z|^2: with H = V - Theta-hat, y1 = H u and y2 = (H(1)/2 - (H - H(1))/(z-1)) u.
+def v_hat_ports(V: Lti, theta: Sequence[int], regular: Lti | None = None) -> Ports:
+    """V-hat without its zero at z = 1: y1 = H u with H = V - Theta-hat, and y2 = v_hat(H) u of design.conditions.
 
-    He[(1 - 1/z) H]/|1 - 1/z|^2 = He[H/(1 - z)], and 1/(1-z) has the Hermitian part 1/2 on the circle: V-hat is
-    Delta-OSP iff He y2/u >= (y1/u)* Delta (y1/u). V(1) must be symmetric. One state per channel fewer than (16).
+    V-hat is Delta-OSP iff He y2/u >= (y1/u)* Delta (y1/u); V(1) must be symmetric. One state per channel fewer than
+    (16). `regular` is v_hat(V) with the states of V, where a realisation has it without solving for it.
     """
-    return _shifted_ports(V - theta_hat(theta, V.T))
-
-
-def _shifted_ports(H: Lti) -> Ports:
-    """The two outputs of `v_hat_regular` for a given stable H."""
-    quotient = H.quotient_at_one()
-    static = H.dc()
-    return Ports(H.A, H.B, -quotient.C, (static + static.T) / 4, H.C, H.D)
+    G = theta_hat(theta)
+    H, y2 = V - G, (regular or v_hat(V)[1]) - v_hat(G)[1]
+    return Ports(H.A, H.B, y2.C, (y2.D + y2.D.T) / 2, H.C, H.D)
 
 
 def symmetric(rows: list[list[_Matrix]]) -> _Matrix:
@@ -386,9 +473,3 @@ def symmetric(rows: list[list[_Matrix]]) -> _Matrix:
 
         M = cp.bmat(kept)
     return (M + M.T) / 2
-
-
-def _window(n: int, T: float) -> Lti:
-    chain = delay([n], T)
-    ones = np.ones((1, chain.order))
-    return Lti(chain.A, chain.B, ones / 2, np.array([[0.5]]), T)

@@ -22,7 +22,6 @@ from controller.lti import (
     Complex,
     Lti,
     Number,
-    Sampled,
     SingularLoop,
     TooLong,
     as_like,
@@ -33,41 +32,11 @@ from controller.lti import (
     vstack,
 )
 from design import conditions, cone
-from design.frequency import frequencies, hermitian, on_circle, peaks, supremum, sweeping, too_long
-from design.result import DesignFailed, NotProved, Requirement, from_ratio, refusal
+from design.frequency import frequencies, hermitian, on_circle, peaks, supremum, sweeping
+from design.result import DesignFailed, Requirement, from_ratio, refusal
 
 #: c_ij >= 0 of the limiter's multiplier: for every channel i a weight per lag j = 1, 2, ..; none is zero
 Lags = Sequence[Sequence[Any]]
-
-
-def walls_demand(
-    G: Block,
-    delta: Sequence[Any],
-    slopes: Sequence[Any],
-    g: Any,
-    lam: Sequence[Any] | None = None,
-    T_max: float | None = None,
-) -> conditions.Demand[Block]:
-    """this-environment for walls of any stiffness and damping with k + 2 b/T up to `slopes` (w,) [N/m], and any gap.
-
-    G takes [x; p] to [f; y], displacements (m,) and wall forces to the forces of the devices and the ways into the
-    walls, [[F, J], [H, Y]]. With a multiplier g >= 0 and a weight lam > 0 for each wall (1 if not given) and
-    M = g (z-1) - 1 the block is, on (dx, dp),
-        [[F, J], [-lam M H, -lam M Y]]/(z-1) + diag(s Delta_D/T, lam g/slopes),
-    whose static part must be symmetric, J(1) = H(1)' lam and lam Y(1) = Y(1)' lam, with F(1) >= 0 >= lam Y(1).
-    """
-    T, m, w = G.T, len(delta), len(slopes)
-    gains, one = numbers(g, T), numbers(np.eye(m + w), T)
-    weights = numbers([1] * w if lam is None else lam, T)
-    weigh = np.diag(np.concatenate([numbers([1] * m, T), weights]))
-    S1, R = (weigh @ G).split_at_one()
-    steep = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
-    limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(slopes, T)])
-    free = np.hstack([one, -steep]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
-    damping = np.concatenate([conditions.even_damping(delta, T, T_max) / T, numbers([0] * w, T)])
-    F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
-    static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
-    return conditions.Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
 
 
 def switching_block(
@@ -78,7 +47,7 @@ def switching_block(
     alpha: Any,
     T_max: float | None = None,
 ) -> tuple[Block, Array]:
-    """[[F/(z-1) + Delta_D/T - diag(alpha)/2, 0], [2 h G, 2 diag(alpha)]], which must be positive real; and F(1).
+    """[[this-environment - diag(alpha)/2, 0], [2 h G, 2 diag(alpha)]], which must be positive real; and F(1).
 
     F = Theta_nom G with Theta_nom = (z^-lo + z^-hi)/2 and 2 h = hi - lo; G are the forces as they leave,
     alpha (m,) [N/m] is a multiplier, positive where the delay varies. Channels whose delay does not vary have no row
@@ -96,8 +65,9 @@ def switching_block(
     )
     both: Any = as_like(G, vstack(half, spread)) @ G
     m = len(lo)
-    F1, R = both.rows(slice(None, m)).split_at_one()
-    upper = R - F1 / 2 + np.diag(conditions.even_damping(delta, T, T_max) / T - a / 2)
+    linear = conditions.this_environment_demand(both.rows(slice(None, m)), delta, T_max)
+    F1 = linear.static["F(1)"]
+    upper = linear.free + np.diag(conditions.even_damping(delta, T, T_max) / T - a / 2)
     if not varying:
         return upper, F1
     lower = np.zeros((m + len(varying), len(varying)), dtype=object)
@@ -141,96 +111,6 @@ def _delay_and_weights(theta: int, c: Sequence[Any], T: Number) -> Lti:
     weights = [-sum([numbers(c[j - 1], T) * (j - k) for j in lags if j > k], int(k <= theta)) for k in range(size)]
     first, second = taps(late, T), taps(weights, T)
     return Lti(first.A, first.B, np.vstack([first.C, second.C]), np.vstack([first.D, second.D]), T)
-
-
-# this-environment with walls: the best multiplier. The least s is convex in g, because the block is affine in both.
-
-
-#: Where the multiplier of a wall is looked for [samples], and the digits that are kept of it.
-_LEAST_G, _MOST_G, _G_DIGITS = 1e-3, 1e3, 4
-
-
-@dataclass(frozen=True)
-class _WallsProof:
-    """What walls that make and break contact ask of the devices."""
-
-    requirement: Requirement  # condition "this-environment"
-    g: tuple[float, ...]  # (w,) the multiplier that shows it
-
-
-def walls_proof(
-    G: Lti,
-    delta: Sequence[float],
-    slopes: Sequence[float],
-    g: Sequence[float] | None = None,
-    T_max: float | None = None,
-) -> _WallsProof:
-    """The damping that `walls_demand` asks with the best multiplier found, or with g (w,) where it is given.
-
-    G takes [x; p] to [f; y] while no wall touches.
-    """
-    m, w = len(delta), len(slopes)
-    available = conditions.dampings(delta, m)
-
-    def refused(reason: str) -> _WallsProof:
-        return _WallsProof(refusal("this-environment", available, reason), tuple(g or (1.0,) * w))
-
-    if min(available) == 0:
-        return refused("a device guarantees no damping, so no coupling is safe for every passive human")
-    if reason := too_long(G):
-        return refused(reason)
-    radius = float(np.abs(G.poles()).max(initial=0.0))
-    if radius >= 1:
-        return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
-    S1 = G.dc()
-    # rounding, relative to what each channel and wall is elsewhere
-    own = np.abs([np.diag(S1), np.diag(G.D), np.diag(G.at(-1.0))]).max(axis=0)
-    if (np.abs(S1 - S1.T) > 1e-9 * np.sqrt(np.outer(own, own))).any():
-        return refused("the static map of devices and walls is not symmetric: a slow closed path could extract energy")
-    for name, part, size in (("F(1)", S1[:m, :m], own[:m]), ("-Y(1)", -S1[m:, m:], own[m:])):
-        if np.linalg.eigvalsh((part + part.T) / 2).min() < -1e-9 * size.max():
-            return refused(f"{name} has a negative direction: it pushes outwards")
-    grid = np.concatenate([[0.0], frequencies(G)])
-    z = on_circle(frequencies(G, points=100))
-    sampled = Sampled(z[None], G.at(z)[None], G.T)
-
-    def needed(values: Array) -> float:
-        demand = walls_demand(sampled, available, slopes, values, None, T_max)
-        return float(conditions.least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G)).max())
-
-    found = _best_g(needed, w) if g is None else np.asarray(g, dtype=float)
-    demand = walls_demand(G, available, slopes, found, None, T_max)
-    ratio, at = supremum(lambda w: conditions.least_scale(demand, w), grid)
-    if np.isinf(ratio):
-        return refused("no multiplier was found with which the walls are covered, whatever the damping")
-    return _WallsProof(
-        from_ratio("this-environment", max(ratio, 0.0), available, at / (2 * np.pi * G.T)), tuple(found.tolist())
-    )
-
-
-def _best_g(needed: Callable[[Array], float], walls: int) -> Array:
-    """g (walls,) with about the least `needed`: one for all of them, then one by one, each by a search in log g."""
-    from scipy.optimize import minimize_scalar  # slow to load, and seldom needed
-
-    g = np.ones(walls)
-    turns = [np.ones(walls, dtype=bool), *(np.eye(walls, dtype=bool) if walls > 1 else ())]
-
-    def moved(which: Array, value: float) -> Array:
-        return np.where(which, value, g)
-
-    for which in turns:
-        grid = np.geomspace(_LEAST_G, _MOST_G, 13)
-        values = [needed(moved(which, value)) for value in grid]
-        best = int(np.argmin(values))
-        ends = np.log(grid[max(best - 1, 0)]), np.log(grid[min(best + 1, grid.size - 1)])
-        finer = minimize_scalar(
-            lambda x, which=which: min(needed(moved(which, np.exp(x))), 1e300),
-            bounds=ends,
-            method="bounded",
-            options={"xatol": 1e-2},
-        )
-        g = moved(which, float(np.exp(finer.x)) if finer.fun < values[best] else float(grid[best]))
-    return np.array([float(f"{value:.{_G_DIGITS}g}") for value in g])
 
 
 # delays that switch within [lo, hi]: the best multiplier
@@ -303,8 +183,8 @@ _Found = tuple[Array, float, float, float]  # a, s(a), where it binds [rad/sampl
 class _Search:
     """s(a) = sup over w of the largest eigenvalue of N + diag(a)/2 + Y* diag(1/2a) Y, over the channels that vary.
 
-    A Schur complement of `switching_block`, scaled by W = diag(sqrt(T/delta)): N = -W He[F/(z-1)] W,
-    F = Theta_nom G, Y = h W G W.
+    A Schur complement of `switching_block`, scaled by W = diag(sqrt(T/delta)): N = -W He[free] W with
+    this-environment's block of F = Theta_nom G, Y = h W G W.
     """
 
     def __init__(self, G: Lti, lo: Sequence[int], hi: Sequence[int], delta: Array) -> None:
@@ -483,7 +363,7 @@ class _LimiterSearch:
     def requirement(self, ratio: float, w: float) -> Requirement:
         T = self._loop[0].T
         if np.isinf(ratio):
-            reason = f"no proof found with the limiter, for {w / (2 * np.pi * T):.4g} Hz"
+            reason = "no limiter is proved for this coupling"
             return refusal("limiter", self._delta, reason)
         return from_ratio("limiter", max(ratio, 0.0), self._delta, w / (2 * np.pi * T))
 
@@ -597,40 +477,3 @@ def limiter_requirement(loop: Loop, coupling: Coupling, beta: float = BETA, c: L
     except (SingularLoop, TooLong) as error:
         reason = str(error)
     return _LimiterProof(refusal("limiter", loop.delta, reason), rho, ((),) * loop.channels, math.inf)
-
-
-#: What a certificate calls the multipliers of walls that make and break contact, one each.
-WALL_MULTIPLIER = "g"
-
-
-def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None) -> _WallsProof:
-    """What this-environment asks where walls make and break contact, with the multipliers g (w,) or the best found.
-
-    Raises NotProved for walls that nothing is proved of.
-    """
-    walls = loop.environment.walls
-    if loop.ranges:
-        raise NotProved("walls and ranges: walls are proved in one environment")
-    try:
-        G = loop.walled(coupling)
-    except (SingularLoop, ValueError) as error:
-        raise NotProved(str(error)) from None
-    slopes = [float(wall.slope(loop.T)) for wall in walls]
-    values = None if g is None else [float(value) for value in g]
-    if values is not None and (len(values) != len(walls) or min(values) < 0):
-        raise NotProved(f"{WALL_MULTIPLIER} is {values}, expected a number >= 0 for each of {len(walls)} walls")
-    try:
-        with sweeping():
-            return walls_proof(G, loop.delta, slopes, values, loop.T_max)
-    except TooLong as error:
-        raise NotProved(str(error)) from None
-
-
-def this_environment_of(loop: Loop, coupling: Coupling) -> Requirement:
-    """What this-environment asks of the environment itself, its walls making and breaking contact."""
-    if loop.environment.walls:
-        try:
-            return walls_of(loop, coupling).requirement
-        except NotProved as error:
-            return refusal("this-environment", loop.delta, str(error))
-    return conditions.this_environment(loop.F(coupling), loop.delta, loop.T_max, loop.latency)

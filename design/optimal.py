@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,8 @@ from design.conditions import this_environment as requirement_of
 from design.coupling_file import Certificate, LimiterCertificate
 from design.environments import Searched, in_each, ratio_in, search_ranges, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
-from design.result import Design, DesignFailed, NotProved, finite
-from design.robustness import at, robustness, robustness_part, vertices
+from design.result import Design, DesignFailed, NotProved
+from design.robustness import Robustness, at, robustness, robustness_nearby, vertices
 from design.spring_damper import design as design_spring_damper
 from design.transparency import Transparency, decibels, transparency
 
@@ -387,7 +387,7 @@ def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
 
 
 @dataclass(frozen=True)
-class _Spread:
+class Spread:
     """The price of keeping the condition over `vertices`, too: two designs over one small basis."""
 
     mismatch_db: float  # of the design for the vertices, in the nominal environment
@@ -396,23 +396,29 @@ class _Spread:
     worst: float  # times the damping that there is, over the vertices
 
 
-def spread(loop: Loop, options: program.Options = program.DEFAULT, percent: float = 10.0) -> _Spread | None:
+def spread(loop: Loop, options: program.Options = program.DEFAULT, percent: float = 10.0) -> Spread | None:
     """The design for `vertices` beside the nominal one, by sweeps: a price, not a coupling to run. None without one."""
     try:
         alone, wide = _compromise(loop, list(vertices(loop.network, percent).values()), options)
     except DesignFailed:
         return None
     mismatch, before = (decibels(getattr(one.figures, _MINIMISED[options.objective])) for one in (wide, alone))
-    return _Spread(mismatch, mismatch - before, wide.g, robustness(loop, wide.coupling, percent).worst)
+    return Spread(mismatch, mismatch - before, wide.g, robustness(loop, wide.coupling, percent).required_over_available)
 
 
-def robustness_parts(loop: Loop, coupling: Coupling, options: program.Options = program.DEFAULT) -> dict[str, Any]:
-    """A report's `robustness` of a coupling for this environment, and what a design for that range would cost.
+@dataclass(frozen=True)
+class Nearby:
+    """What a coupling for this environment needs in one that is 10 % off, and what a design for that would cost."""
 
-    The latter is null with walls, with ranges, for a coupling that is no force filter, and for more than _FEW devices,
-    where it takes far longer than the design.
-    """
-    alone = isinstance(coupling, ForceFilter) and not (loop.ranges or loop.environment.walls)
-    price = spread(loop, options) if alone and loop.channels <= _FEW else None
-    parts = price and {name: finite(value) for name, value in asdict(price).items()}
-    return {"robustness": robustness_part(loop, coupling), "designed_for_it": parts}
+    robustness: Robustness | None = None
+    designed_for_it: Spread | None = None
+
+    @classmethod
+    def of(cls, loop: Loop, coupling: Coupling, options: program.Options = program.DEFAULT) -> Nearby:
+        """Without the design before walls, with ranges, for a coupling that is no force filter, and for more than _FEW
+        devices, where it takes far longer than the coupling's own.
+        """
+        known = loop.ranges or loop.environment.walls or loop.environment.one_period
+        alone = isinstance(coupling, ForceFilter) and not known
+        price = spread(loop, options) if alone and loop.channels <= _FEW else None
+        return cls(robustness_nearby(loop, coupling), price)

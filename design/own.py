@@ -48,7 +48,8 @@ def called(what: str, make: Callable[..., _Made], *given: Any, **named: Any) -> 
     except Exception as error:
         if isinstance(error, InputError) or place_of(error):
             raise
-        raise InputError(f"{what}: {type(error).__name__}: {error}") from error
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        raise InputError(f"{what}: {kind}{error}") from error
 
 
 def holds_own_code(path: str) -> None:

@@ -10,18 +10,21 @@ from typing import Any, Generic, Literal, TypeVar
 import numpy as np
 
 from controller.coupling import Coupling
+from controller.loop import DelayRange
 from controller.lti import Array
 
-Condition = Literal["this-environment", "any-environment"]
+ConditionName = Literal["this-environment", "any-environment"]
+#: for which environments a certificate holds
+Guarantee = Literal["any passive environment", "these ranges", "this environment"]
 
 #: the conditions in the order of tables, each with the environments for which it holds
-CONDITIONS: dict[Condition, str] = {
+CONDITIONS: dict[ConditionName, str] = {
     "this-environment": "this environment",
     "any-environment": "any passive environment",
 }
 
 
-C = TypeVar("C", bound=str)  # a Condition, "switching" or "limiter"
+C = TypeVar("C", bound=str)  # a ConditionName, "switching" or "limiter"
 
 
 # How much damping a condition asks: sweeps, without a solver.
@@ -48,6 +51,24 @@ class Requirement(Generic[C]):
     def certified(self) -> bool:
         return self.ratio < 1
 
+    def part(self) -> dict[str, Any]:
+        """As JSON has it; `reason` only where there is one."""
+        part = {
+            "condition": self.condition,
+            "required_damping": self.required,
+            "available_damping": self.available,
+            "margin": self.margin,
+            "binding_frequency_hz": self.frequency_hz,
+            "certified": self.certified,
+            "proof": self.proof,
+        }
+        return part | ({"reason": self.reason} if self.reason else {})
+
+    @property
+    def margin(self) -> float | None:
+        """Available over required damping; None where none or infinitely much is required."""
+        return finite(1 / self.ratio) if self.ratio > 0 else None
+
     @property
     def shortfall(self) -> str:
         """Why it is not certified."""
@@ -68,20 +89,6 @@ def refusal(condition: C, available: tuple[float, ...], reason: str) -> Requirem
 def finite(value: float) -> float | None:
     """JSON knows neither infinity nor not-a-number."""
     return float(value) if math.isfinite(value) else None
-
-
-def certificate_part(requirement: Requirement) -> dict[str, Any]:
-    """Required against available damping."""
-    part = {
-        "condition": requirement.condition,
-        "required_damping": [finite(b) for b in requirement.required],
-        "available_damping": list(requirement.available),
-        "margin": finite(1 / requirement.ratio) if requirement.ratio > 0 else None,
-        "binding_frequency_hz": requirement.frequency_hz,
-        "certified": requirement.certified,
-        "proof": requirement.proof,
-    }
-    return part | ({"reason": requirement.reason} if requirement.reason else {})
 
 
 class NotProved(ValueError):
@@ -113,7 +120,7 @@ class Infeasible(DesignFailed):
 
 
 def listed(values: Iterable[float | None], digits: int = 6) -> str:
-    """1.37, 0.5 with so many significant digits; None stands for infinity in plain data."""
+    """1.37, 0.5 with so many significant digits; None, as JSON has infinity, is inf."""
     return ", ".join("inf" if v is None else f"{v:.{digits}g}" for v in values)
 
 
@@ -122,17 +129,27 @@ def listed(values: Iterable[float | None], digits: int = 6) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Design:
-    """A coupling, what it was designed for and what was verified from the coupling alone."""
+class Chosen:
+    """A coupling, the condition that it was made for or is judged by, and how it came about."""
 
     coupling: Coupling
-    condition: Condition
+    condition: str
+    kind: str = field(kw_only=True, default="given")
+    phi: Array | None = field(kw_only=True, default=None)  # (m,) multiplier Phi_E [N s/m] of Theorem 4, if it needs one
+    certificate: Any = field(kw_only=True, default=None)  # the file's Certificate, where it was proved in this process
+    limiter: Any = field(kw_only=True, default=None)  # LimiterCertificate: what it comes with for limited forces
+    switching: DelayRange | None = field(kw_only=True, default=None)  # its file proves any switching within it
+    notes: tuple[str, ...] = field(kw_only=True, default=())  # what a reader should know of its origin
+
+
+@dataclass(frozen=True, eq=False)
+class Design(Chosen):
+    """A coupling, what it was designed for and what was verified from the coupling alone."""
+
     figure: str  # what was minimised: "loop-norm" (23), "rms" (mismatch), "stiffness" (maximised)
     objective: float  # its value, of the coupling as returned
     requirement: Requirement  # by `condition`, on a refined sweep
     sdps: int = 0  # convex problems solved (local searches count their runs)
     wall_s: float = 0.0
-    phi: Array | None = None  # (N,) multiplier Phi_E [N s/m] of Theorem 4, None where the environment has none
-    certificate: Any = field(kw_only=True, default=None)  # the file's Certificate, where the design has proved it
     c: Sequence[Sequence[float]] | None = field(kw_only=True, default=None)  # of the limiter, where its search is long
     hurried: bool = field(kw_only=True, default=False)  # its clock ended it: more time may find a better

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,7 +13,6 @@ from controller.environment import Network
 from controller.loop import Loop
 from controller.ranges import Ranges, UncertainSpring
 from design.environments import ratio_in
-from design.result import finite
 
 #: Of more environments than _FEW every _THIN-th frequency is looked at; only those that ask for the most there, or for
 #: next to it, are swept whole.
@@ -22,23 +20,13 @@ _FEW, _THIN, _NEAR = 12, 12, 0.03
 
 
 @dataclass(frozen=True)
-class _Robustness:
+class Robustness:
     """What a coupling needs where the environment is not quite the one that it was designed for."""
 
     percent: float
-    worst: float  # times the damping that there is
+    required_over_available: float  # of the damping, at the worst
     where: str  # which parameter, and which way
-    kept: bool  # whether it is certified there
-
-    def part(self) -> dict[str, Any]:
-        """As plain data."""
-        worst = finite(self.worst)
-        return {
-            "percent": self.percent,
-            "required_over_available": worst,
-            "where": self.where,
-            "certified": self.kept,
-        }
+    certified: bool  # there
 
 
 def at(loop: Loop, network: Network) -> Loop:
@@ -70,16 +58,14 @@ def vertices(network: Network, percent: float = 10.0) -> dict[str, Network]:
     return found
 
 
-def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> _Robustness:
+def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> Robustness:
     """The worst need of a coupling over `vertices`, by the refined sweep.
 
     Of many a thinned sweep comes first, and only those that come near the worst are refined.
     """
-    loops = {
-        name: at(loop, one) for name, one in {"nominal": loop.environment, **vertices(loop.network, percent)}.items()
-    }
-    order = list(loops)
-    rough = dict.fromkeys(loops, np.inf)
+    networks = {"nominal": loop.environment, **vertices(loop.network, percent)}
+    loops = {name: at(loop, one) for name, one in networks.items()}
+    order, rough = list(loops), dict.fromkeys(loops, np.inf)
     if len(loops) > _FEW:
         rough = {name: ratio_in(each, coupling, _THIN) for name, each in loops.items()}
         order.sort(key=lambda name: -rough[name])
@@ -90,14 +76,14 @@ def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> _Robust
         ratio = ratio_in(loops[name], coupling)
         if ratio > worst:
             worst, where = ratio, name
-    return _Robustness(percent, worst, where, worst < 1)
+    return Robustness(percent, worst, where, worst < 1)
 
 
-def robustness_part(loop: Loop, coupling: Coupling) -> dict[str, Any] | None:
-    """The worst need within ten percent as plain data; None with walls, and for an environment that is no network."""
-    if loop.environment.walls or not isinstance(loop.environment, Network):
+def robustness_nearby(loop: Loop, coupling: Coupling) -> Robustness | None:
+    """The worst need within ten percent; None with walls, and for what is not all springs and masses."""
+    if loop.environment.walls or not isinstance(loop.environment, Network) or loop.environment.block:
         return None
-    return robustness(loop, coupling).part()
+    return robustness(loop, coupling)
 
 
 def ranges_around(network: Network, percent: float) -> Ranges:

@@ -17,11 +17,11 @@ import numpy as np
 from controller.coupling import MovingAverage, SpringDamper
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from design.conditions import any_environment, any_environment_delayed, even_damping, this_environment
+from design.conditions import even_damping, this_environment
 from design.cone import ConeProgram, Inequality
 from design.frequency import peaks, too_long
 from design.gain_search import FEW, LimiterLoop, SampledLoop, SwitchingLoop, least_rms, likeliest_first, polynomials
-from design.lmi import RESERVE, Shaping, gain_block, least_phi, usable
+from design.lmi import ANY_ENVIRONMENT, RESERVE, Shaping, gain_block, least_phi, usable
 from design.multipliers import (
     limiter_refusal,
 )
@@ -267,7 +267,9 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
     if loop.channels > FEW:
         norm, _ = shaping.norm(coupling.compliance(loop.T))
     requirement = _verified(loop, coupling, phi)
-    return Design(coupling, "any-environment", "loop-norm", norm, requirement, sdps, time.perf_counter() - started, phi)
+    return Design(
+        coupling, "any-environment", "loop-norm", norm, requirement, sdps, time.perf_counter() - started, phi=phi
+    )
 
 
 def _short(coupling: SpringDamper) -> SpringDamper:
@@ -347,7 +349,7 @@ def stiffest(loop: Loop) -> Design:
     requirement = _verified(loop, coupling, phi)
     total = float(coupling.K.sum())
     return Design(
-        coupling, "any-environment", "stiffness", total, requirement, sdps, time.perf_counter() - started, phi
+        coupling, "any-environment", "stiffness", total, requirement, sdps, time.perf_counter() - started, phi=phi
     )
 
 
@@ -363,23 +365,18 @@ def moving_average(loop: Loop) -> Design:
     coupling = MovingAverage(weight, terms.tolist(), RESERVE / (1 - RESERVE) * terms**2 * weight)
     requirement = _verified(loop, coupling, phi)
     total = float(coupling.stiffness.sum())
-    return Design(coupling, "any-environment", "stiffness", total, requirement, 0, time.perf_counter() - started, phi)
+    return Design(
+        coupling, "any-environment", "stiffness", total, requirement, 0, time.perf_counter() - started, phi=phi
+    )
 
 
 def _verified(loop: Loop, coupling: SpringDamper | MovingAverage, phi: Array | None) -> Requirement:
     """Theorem 4's requirement from the coupling alone; raises DesignFailed unless it is certified."""
-    requirement = any_environment_with(loop, coupling.compliance(loop.T), phi)
+    requirement = ANY_ENVIRONMENT.required(loop, coupling, phi)
     if not requirement.certified:
         why = requirement.reason or f"it requires {max(requirement.required):.6g} N s/m"
         raise DesignFailed(None, (), f"the designed coupling is not certified by any_environment: {why}")
     return requirement
-
-
-def any_environment_with(loop: Loop, V: Lti, phi: Array | None) -> Requirement:
-    """Theorem 4's requirement of V with the multiplier phi (m,) [N s/m], None without delay in the environment."""
-    if phi is None:
-        return any_environment(V, loop.theta, loop.delta, loop.T_max)
-    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi, loop.T_max)
 
 
 def excess_limits(loop: Loop, phi: Array | None) -> Array:

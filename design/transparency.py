@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +38,27 @@ class Transparency:
     def rms_mismatch_db(self) -> float:
         """`rms_mismatch` in decibels."""
         return decibels(self.rms_mismatch)
+
+    @property
+    def reason(self) -> str | None:
+        """Why a figure is infinite in decibels."""
+        if self.relative_mismatch == 0:
+            return "the devices see the reference exactly: the mismatch is zero, minus infinity in dB"
+        if math.isinf(self.tau):
+            return "tau (25) divides by inf sigma_min(E), which is 0: some motion costs no static force"
+        return None
+
+    def part(self) -> dict[str, Any]:
+        """As JSON has it: the mismatch in decibels, `reason` only where there is one."""
+        part = {
+            "tau_db": decibels(self.tau),
+            "relative_mismatch_db": self.mismatch_db,
+            "rms_mismatch_db": self.rms_mismatch_db,
+            "dc_ratio": self.dc_ratio,
+            "high_frequency_gain": self.high_frequency_gain,
+            "band_hz": self.band_hz,
+        }
+        return part | ({"reason": self.reason} if self.reason else {})
 
 
 def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> Transparency:

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from operator import sub
 from typing import Any, NamedTuple, Protocol
 
@@ -19,14 +20,14 @@ import numpy as np
 
 from controller.budget import EPS, EnergyBudget
 from controller.coupling import Coupling
-from controller.environment import environment
-from controller.limiter import Limiter, limited
-from controller.loop import force_map
-from controller.lti import Array, Lti
+from controller.law import Law
+from controller.loop import Loop
+from controller.lti import Array
 from design.certificate import assess
 from design.coverage import Limits
+from design.files import unseen
 from design.guarantees import guarantee_of
-from design.result import Design, DesignFailed, Requirement, certificate_part
+from design.result import Chosen, Design, DesignFailed, Requirement
 from hw import monitor
 from hw.limits import (
     Gain,
@@ -41,8 +42,8 @@ from hw.limits import (
     shape,
 )
 from hw.protocol import MAX_THETA, Config, State
-from sim.couplings import Chosen, choose, given, limits_of
-from sim.report import coupling_part
+from sim.couplings import choose, given, limits_of
+from sim.report import CouplingFigures
 from sim.scenario import InputError, Scenario
 
 _SPEED_SECONDS = 0.01  # over which a speed is taken: one count of the coarsest encoder is 0.03 m/s
@@ -54,65 +55,36 @@ class Controller(Protocol):
 
     T: float  # [s]
 
-    def step(self, x: Sequence[float]) -> Sequence[float]:
-        """Forces fed back (m,) [N] for the displacements x (m,) [m]."""
-        ...
+    def step(self, x: Sequence[float]) -> Sequence[float]: ...  # (m,) [N] fed back for the displacements x (m,) [m]
 
 
-class LinearController:
-    """[f; z+] = [C D; A B] [z; x], from rest."""
+class HostController:
+    """A law at work, tick by tick and from rest."""
 
-    def __init__(self, F: Lti) -> None:
-        self.F, self.T = F, F.T
+    def __init__(self, law: Law) -> None:
+        F = law.open
         n, m = F.order, F.inputs
-        self._product = np.ascontiguousarray(np.block([[F.A, F.B], [F.C, F.D]]))
-        self._input, self._output = np.zeros(n + m), np.zeros(n + F.outputs)
-        self._order = n
+        before, after = np.zeros((n + m, 1)), np.zeros((n + m, 1))
+        self.F, self.T = F, F.T
+        self._state, self._x, self._f, self._next = before[:n], before[n:, 0], after[:m, 0], after[m:]
+        self._tick = partial(law.transition(), before, after)
 
     def step(self, x: Sequence[float]) -> list[float]:
         """Forces (m,) [N] for the displacements x (m,) [m]; the state moves on by one tick."""
-        n = self._order
-        self._input[n:] = x
-        np.dot(self._product, self._input, out=self._output)
-        self._input[:n] = self._output[:n]
-        return self._output[n:].tolist()
-
-
-class _LimitedController:
-    """The loop whose forces leave through a limiter, from rest."""
-
-    def __init__(self, limiter: Limiter) -> None:
-        F = limiter.open
-        self.limiter, self.T = limiter, F.T
-        self._tick = limiter.transition()
-        m = F.inputs
-        before, after = self._buffers = np.zeros((F.order + m, 1)), np.zeros((F.order + m, 1))
-        self._state, self._x, self._next, self._f = before[:-m], before[-m:, 0], after[m:], after[:m, 0]
-
-    def step(self, x: Sequence[float]) -> list[float]:
-        """Forces (m,) [N] within the limits for the displacements x (m,) [m]; the state moves on by one tick."""
         self._x[:] = x
-        self._tick(*self._buffers)
+        self._tick()
         self._state[:] = self._next
         return self._f.tolist()
 
 
 def host_controller(
-    scenario: Scenario,
-    coupling: Coupling,
-    link: int,
-    lag: Sequence[float] | None = None,
-    cap: Sequence[float] = (),
-) -> LinearController | _LimitedController:
-    """F as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where link is too long.
+    loop: Loop, coupling: Coupling, link: int, cap: Sequence[float], lag: Sequence[float] | None = None
+) -> HostController:
+    """The loop as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where it is too long.
 
     With `lag`, rho (m,) [N/m], forces leave through a limiter of `cap` (m,) [N].
     """
-    host = [n - link for n in scenario.theta]
-    if lag is not None:
-        return _LimitedController(limited(scenario.environment, coupling, host, scenario.psi, scenario.T, cap, lag))
-    E = environment(scenario.environment, scenario.T)
-    return LinearController(force_map(E, coupling, host, scenario.psi))
+    return HostController(loop.delayed(tuple(n - link for n in loop.theta)).law(coupling, cap, lag))
 
 
 def fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tuple[float, ...]]:
@@ -342,28 +314,30 @@ class Armable(Protocol):
     """What a session can be armed with."""
 
     @property
-    def link(self) -> int:
-        """Ticks from a sample to the latch of its force."""
-        ...
-
+    def link(self) -> int: ...  # ticks from a sample to the latch of its force
     @property
-    def certified(self) -> bool:
-        """Whether it is certified for every passive human."""
-        ...
-
+    def certified(self) -> bool: ...  # for every passive human
     @property
-    def name(self) -> str:
-        """For the log."""
-        ...
-
+    def name(self) -> str: ...  # for the log
     @property
-    def margin_us(self) -> float:
-        """How long before its latch, or the end of its tick, a force must come; one that comes later is late [us]."""
-        ...
+    def margin_us(self) -> float: ...  # [us] before its latch, or the end of its tick, by which a force must come
+    def controller(self, cap: Sequence[float]) -> Controller: ...  # a fresh one, for forces up to `cap` (m,) [N]
 
-    def controller(self, cap: Sequence[float]) -> Controller:
-        """A fresh one, at rest, for forces of up to `cap` (m,) [N]."""
-        ...
+
+@dataclass(frozen=True, eq=False)
+class ProgramFigures:
+    """A certified coupling as reports have it; null where a session had none."""
+
+    theta: tuple[int, ...] | None = None
+    coupling: CouplingFigures | None = None
+    certificate: Requirement | None = None
+    certificates: Mapping[str, Requirement] | None = None
+    guarantee: str | None = unseen(default=None, older="promise")
+    link_delay: int | None = None
+    latency_s: tuple[tuple[float, float], ...] | None = None
+    T_max_s: float | None = None
+    limiter: Limits | None = None
+    remarks: list[str] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -398,23 +372,24 @@ class CertifiedCoupling:
         span = self.chosen.switching
         return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
 
-    def controller(self, cap: Sequence[float]) -> LinearController | _LimitedController:
-        return host_controller(self.scenario, self.chosen.coupling, self.link, self.limits.rho, cap)
+    def controller(self, cap: Sequence[float]) -> HostController:
+        return host_controller(self.scenario.loop(self.case), self.chosen.coupling, self.link, cap, self.limits.rho)
 
-    def part(self, cap: Sequence[float]) -> dict[str, Any]:
-        """As plain data: coupling, certificates, guarantee, for forces of up to `cap` (m,) [N]."""
-        return {
-            "link_delay": self.link,
-            "theta": list(self.scenario.theta),
-            "latency_s": self.scenario.latency and [list(span) for span in self.scenario.latency],
-            "T_max_s": self.scenario.T_max,
-            "coupling": coupling_part(self.chosen.kind, self.chosen.coupling, self.scenario.T),
-            "certificate": certificate_part(self.requirements[self.chosen.condition]),
-            "certificates": {name: certificate_part(r) for name, r in self.requirements.items()},
-            "promise": guarantee_of(self.requirements, self.scenario.loop(self.case)),
-            "limiter": self.limits.part(cap),
-            "remarks": self.remarks(),
-        }
+    def figures(self, cap: Sequence[float]) -> ProgramFigures:
+        """Coupling, certificates and guarantee, for forces of up to `cap` (m,) [N]."""
+        scenario, requirements = self.scenario, self.requirements
+        return ProgramFigures(
+            scenario.theta,
+            CouplingFigures.of(self.chosen.kind, self.chosen.coupling, scenario.T),
+            requirements[self.chosen.condition],
+            requirements,
+            guarantee_of(requirements, scenario.loop(self.case)),
+            self.link,
+            scenario.latency,
+            scenario.T_max,
+            self.limits.within(cap),
+            self.remarks(),
+        )
 
     def remarks(self) -> list[str]:
         """What a reader should know of the coupling's file, and of the clock."""

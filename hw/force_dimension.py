@@ -11,7 +11,7 @@ import re
 import time
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from hw.device_state import Device
 from hw.emulator import info_of
@@ -27,25 +27,10 @@ _SPIN = 2e-4  # [s] before a tick that are waited for awake: a sleep ends late
 _SHORTEST = 0.75  # of T, that a period after a late one may be
 
 
-class _Library(Protocol):
-    """What is asked of the Force Dimension SDK's Python package; every call gives -1 for an error."""
-
-    openID: Callable[..., int]
-    close: Callable[..., int]
-    getSystemName: Callable[..., str | None]
-    getSerialNumber: Callable[..., int]
-    getPosition: Callable[..., int]
-    setForce: Callable[..., int]
-    enableForce: Callable[..., int]
-    setWatchdog: Callable[..., int]
-    errorGetLastStr: Callable[..., str]
-
-
-def library() -> _Library:
-    """The package, which needs the maker's library. Raises InputError where one of them is missing."""
+def library() -> Any:
+    """The package, which needs the maker's library; its calls give -1 for an error. Raises InputError without them."""
     try:
-        found: Any = import_module(_BINDINGS)
-        return found
+        return import_module(_BINDINGS)
     except ImportError as error:
         package = _BINDINGS.split(".")[0]
         what = f"the Python package {package} and Force Dimension's SDK (https://www.forcedimension.com)"
@@ -64,7 +49,7 @@ class ForceDimension:
         self,
         scenario: Scenario,
         axes: str | None = None,
-        sdk: _Library | None = None,
+        sdk: Any = None,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:

@@ -99,11 +99,12 @@ class _Player:
 def chirp(
     channels: int, T: float, link: int, amplitude: float, band: tuple[float, float], seconds: float
 ) -> Excitation:
-    """Cosines [N] whose frequency rises exponentially: through `band` [Hz], slowly, slowly at half the force; silence.
+    """The force [N] that is played to a device: three cosines of exponentially rising frequency, then silence.
 
-    Each takes `seconds`, the silence half of that: friction that is not viscous is told by the two levels of slow
-    motion, which are as wide. They begin with a cosine, and end at whole cycles, so that a free mass does not drift
-    away; the last ends a quarter later, with a speed for the release.
+    The first passes through `band` [Hz]; the second and the third are slow, the third at half the force. Each takes
+    `seconds`, the silence half of that. Two slow motions at two levels of force show friction that is not viscous.
+    Each cosine ends at a whole cycle, so that a free mass does not drift away; the last one ends a quarter of a cycle
+    later, so that the device is released with a speed.
     """
     t = np.arange(round(seconds / T)) / round(seconds / T)
 
@@ -144,35 +145,28 @@ def worth(counts: Array) -> Array:
 # One axis: the displacement that a record of forces gives, for any mass, friction, transmission.
 #
 # The model is the device's: motor (m1) with viscous friction b and Coulomb friction c, transmission spring k, handle
-# (m2); the rigid one has the motor alone. Between ticks it is exact for a held force (expm); Coulomb friction is
+# (m2). Between ticks it is exact for a held force (expm); Coulomb friction is
 # c tanh(v/v0), held for an eighth of a tick.
 
 
 class _Model:
     """p = [log m1, log b, c, log m2, log k] -> simulated displacement."""
 
-    def __init__(
-        self, x: Array, force: Array, used: _Flags, T: float, step: float, rigid: bool, substeps: int = _COARSE
-    ) -> None:
-        self.x, self.force, self.used, self.T, self.step, self.rigid = x, force, used, T, step, rigid
-        self.substeps = substeps
+    def __init__(self, x: Array, force: Array, used: _Flags, T: float, step: float, substeps: int = _COARSE) -> None:
+        self.x, self.force, self.used, self.T, self.step, self.substeps = x, force, used, T, step, substeps
         self.weight = worth(np.round(x[used] / step))
 
     def finer(self) -> _Model:
         """The same record, friction integrated more finely."""
-        return _Model(self.x, self.force, self.used, self.T, self.step, self.rigid, _FINE)
+        return _Model(self.x, self.force, self.used, self.T, self.step, _FINE)
 
     def matrices(self, p: Array, T: float) -> tuple[Array, Array]:
         """The plant held for T: s+ = A s + B u with s = [positions; velocities]."""
-        m1, b = np.exp(p[0]), np.exp(p[1])
-        if self.rigid:
-            a = np.array([[0.0, 1.0, 0.0], [0.0, -b / m1, 1 / m1], [0.0, 0.0, 0.0]])
-        else:
-            m2, k = np.exp(p[3]), np.exp(p[4])
-            a = np.zeros((5, 5))
-            a[0, 2] = a[1, 3] = 1.0
-            a[2] = [-k / m1, k / m1, -b / m1, 0.0, 1 / m1]
-            a[3, :2] = [k / m2, -k / m2]
+        m1, b, m2, k = np.exp(p[[0, 1, 3, 4]])
+        a = np.zeros((5, 5))
+        a[0, 2] = a[1, 3] = 1.0
+        a[2] = [-k / m1, k / m1, -b / m1, 0.0, 1 / m1]
+        a[3, :2] = [k / m2, -k / m2]
         step = np.asarray(scipy.linalg.expm(a * T), dtype=np.float64)
         return step[:-1, :-1], step[:-1, -1]
 
@@ -180,8 +174,7 @@ class _Model:
         """Displacement (N,) [m] from rest."""
         substeps = self.substeps if p[_COULOMB] else 1
         A, B = self.matrices(p, self.T / substeps)
-        play = _play_rigid if self.rigid else _play_compliant
-        return np.array(play(A.tolist(), B.tolist(), float(p[_COULOMB]), self.force.tolist(), substeps))
+        return np.array(_play(A.tolist(), B.tolist(), float(p[_COULOMB]), self.force.tolist(), substeps))
 
     def allowed(self) -> float:
         """The largest error of an acceptable fit [m] rms."""
@@ -213,21 +206,8 @@ class _Model:
         return float(np.sqrt(residual @ residual / self.weight.sum()))
 
 
-def _play_rigid(A: list[list[float]], B: list[float], c: float, force: list[float], substeps: int) -> list[float]:
-    """Displacements of one mass; plain floats, since a product of so few numbers is nothing but overhead to NumPy."""
-    (_, xv), (_, vv) = A
-    bx, bv = B
-    x, v, out = 0.0, 0.0, []
-    for f in force:
-        out.append(x)
-        for _ in range(substeps):
-            u = f - c * tanh(v / _SLIP)
-            x, v = x + xv * v + bx * u, vv * v + bv * u
-    return out
-
-
-def _play_compliant(A: list[list[float]], B: list[float], c: float, force: list[float], substeps: int) -> list[float]:
-    """Displacements of the motor of two masses."""
+def _play(A: list[list[float]], B: list[float], c: float, force: list[float], substeps: int) -> list[float]:
+    """Displacements of the motor of two masses; plain floats, since so small a product is all overhead to NumPy."""
     (a00, a01, a02, a03), (a10, a11, a12, a13), (a20, a21, a22, a23), (a30, a31, a32, a33) = A
     b0, b1, b2, b3 = B
     x, y, v, w, out = 0.0, 0.0, 0.0, 0.0, []
@@ -344,10 +324,10 @@ def identify(x: Array, force: Array, used: _Flags, T: float, step: float, rigid:
             f"the record does not tell viscous from dry friction: {found.viscous:.3g} N s/m viscous, "
             f"{found.coulomb:.3g} N dry, {1e3 * found.rms:.2g} mN unexplained; take one with more force or a longer one"
         )
+    if rigid:
+        return Estimate(found, None)
     end = _end_of_chirp(force, T)
-    model = _Model(x[:end], force[:end], used[:end], T, step, rigid)
-    transmission = None if rigid else _transmission(model, found)
-    return Estimate(friction=found, transmission=transmission)
+    return Estimate(found, _transmission(_Model(x[:end], force[:end], used[:end], T, step), found))
 
 
 def _end_of_chirp(force: Array, T: float) -> int:

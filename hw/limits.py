@@ -169,7 +169,7 @@ def check_range(counts: Sequence[int], units: Units) -> None:
 class Gain:
     """The factor in front of every force. It moves linearly in time, never jumps, and starts at 0.
 
-    Any constant gain within [0, 1] keeps a certificate: He[g F/(z-1)] > -Delta_D/T holds for g F if it does for F.
+    Any constant gain within [0, 1] keeps a certificate: this-environment holds for g F if it does for F.
     """
 
     limits: SafetyLimits
@@ -234,12 +234,8 @@ class Units:
 
     def steps(self, f: Sequence[float], cap: tuple[int, ...]) -> tuple[int, ...]:
         """What the motors are to do for the forces fed back f (m,) [N]: whole steps, at most `cap`."""
-        return tuple(
-            [
-                max(-most, min(most, round(-force / step)))
-                for force, step, most in zip(f, self.force_step, cap, strict=True)
-            ]
-        )
+        each = zip(f, self.force_step, cap, strict=True)
+        return tuple([max(-most, min(most, round(-force / step))) for force, step, most in each])
 
 
 def _wire_time(baud: int, axes: int) -> tuple[float, str]:
@@ -264,10 +260,8 @@ def objections(info: Info, scenario: Scenario, limits: SafetyLimits, baud: int |
     if baud is not None:
         seconds, arithmetic = _wire_time(baud, m)
         if seconds > scenario.T:
-            instead = "of a link without UART say --baud none"
-            reasons.append(
-                f"one STATE and one FORCE take {arithmetic}, more than T = {1e6 * scenario.T:g} us ({instead})"
-            )
+            more = f"more than T = {1e6 * scenario.T:g} us (of a link without UART say --baud none)"
+            reasons.append(f"one STATE and one FORCE take {arithmetic}, {more}")
     for i in range(m):
         if wrong := _impossible(i, info):
             return [wrong]
@@ -293,16 +287,11 @@ def _impossible(i: int, info: Info) -> str | None:
 
 def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
     """Steps of axis i that are too coarse for limits on forces and displacements."""
-    reasons, force, count = [], 1e-6 * info.force_step[i], 1e-12 * info.encoder_step[i]
-    finest = min(limits.cap[i] / _FEWEST_STEPS, limits.slew * T)
-    if force > finest:
-        reasons.append(f"one force step of axis {i + 1} is {force:g} N, at most {finest:g} N is allowed")
-    if count > _COARSEST * limits.jump:
-        finest = _COARSEST * limits.jump
-        reasons.append(
-            f"one encoder count of axis {i + 1} is {1e3 * count:g} mm, at most {1e3 * finest:g} mm is allowed"
-        )
-    return reasons
+    force, count = 1e-6 * info.force_step[i], 1e-12 * info.encoder_step[i]
+    most, widest = min(limits.cap[i] / _FEWEST_STEPS, limits.slew * T), _COARSEST * limits.jump
+    wide = f"one encoder count of axis {i + 1} is {1e3 * count:g} mm, at most {1e3 * widest:g} mm is allowed"
+    strong = f"one force step of axis {i + 1} is {force:g} N, at most {most:g} N is allowed"
+    return [strong] * (force > most) + [wide] * (count > widest)
 
 
 def probe_delay(T: float) -> int:

@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from struct import Struct
 from typing import Annotated, Any, BinaryIO
@@ -24,8 +24,17 @@ from numpy.typing import NDArray
 from controller.coupling import Form
 from controller.lti import Array
 from controller.older import named_today
-from design.files import counted, plain, read_arrays, write, write_json
-from hw.control import Armable, BudgetPlan, CertifiedCoupling, Controller, SentBudget, TraceRow, host_controller
+from design.files import counted, plain, read_arrays, unseen, write, write_json
+from hw.control import (
+    Armable,
+    BudgetPlan,
+    CertifiedCoupling,
+    Controller,
+    ProgramFigures,
+    SentBudget,
+    TraceRow,
+    host_controller,
+)
 from hw.limits import SafetyLimits, SafetyStop, Units, shape
 from hw.protocol import NO_MARGIN, Config
 from hw.session import Session
@@ -286,22 +295,22 @@ class SessionReport:
 
     case: str
     scenario: str
-    program: dict[str, Any] = field(metadata={"json": "beside"})
-    session: _Ended
-    link: _Link
-    run: _Ran
-    growth: list[Growth]
-    energy_budget: list[dict[str, Any]] | None  # arming by arming
+    program: ProgramFigures = unseen("beside")
+    session: _Ended = unseen()
+    link: _Link = unseen()
+    run: _Ran = unseen()
+    growth: list[Growth] = unseen()
+    energy_budget: list[dict[str, Any]] | None = unseen()  # arming by arming
 
 
 def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:
     """The report of a session that has ended."""
     begin = session.log[0].t_us if session.log else 0
     log = [_Event(1e-6 * (e.t_us - begin), str(e.stage), e.cause) for e in session.log]
-    program: dict[str, Any] = dict.fromkeys(("coupling", "certificate", "certificates", "promise", "theta"))
+    program = ProgramFigures()
     steady, ticks, T = list[list[int]](), len(recorder), session.scenario.T
     if coupled := isinstance(session.program, CertifiedCoupling):
-        program |= session.program.part(session.limits.cap)
+        program = session.program.figures(session.limits.cap)
         steady = steady_ticks(recorder, session.units.force_step, session.limits.cap) if ticks else []
     step = list(session.units.encoder_step) if ticks else None
     ran = _Ran(ticks, ticks * T, T, session.scenario.digest, pace, step, steady)
@@ -388,7 +397,7 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """F as the host ran it. Raises InputError where the recipe is impossible."""
         try:
             coupling = self.coupling.build(self.scenario.T)
-            return host_controller(self.scenario, coupling, self.link_delay, self.lag, self.limits.cap)
+            return host_controller(self.scenario.loop("I"), coupling, self.link_delay, self.limits.cap, self.lag)
         except ValueError as error:
             raise InputError(f"the trace cannot be replayed: {error}") from None
 

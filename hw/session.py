@@ -368,16 +368,11 @@ class Session:
         return (wire.Stop(reason),)
 
 
-def _limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> SafetyLimits:
-    """Limits for the scenario's devices, of at most `cap` [N]. Raises ValueError where T is impossible."""
-    watchdog = watchdog_for(scenario.T)
-    return SafetyLimits(tuple(min(cap, d.force_limit) for d in scenario.device), watchdog_us=watchdog, **more)
-
-
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
-    """A session that never asks for more than `cap` [N]. Raises InputError where `more` limits are impossible."""
+    """A session that never asks for more than `cap` [N]. Raises InputError for impossible `more` limits, or T."""
+    caps = tuple(min(cap, device.force_limit) for device in scenario.device)
     try:
-        return Session(scenario, _limits_for(scenario, cap, **more), settings)
+        return Session(scenario, SafetyLimits(caps, watchdog_us=watchdog_for(scenario.T), **more), settings)
     except ValueError as error:
         raise InputError(str(error)) from None
 

@@ -14,7 +14,6 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from typing import Self
 
 from hw.control import Armable
@@ -92,27 +91,19 @@ class SerialPort:
             self._serial.close()
 
 
-@dataclass(frozen=True)
-class Preflight:
-    """How well this machine can keep time, and what to do where it cannot."""
+def preflight(path: str) -> str:
+    """How well this machine can keep time, and what to do where it cannot, as one line.
 
-    scheduling: str
-    memory: str
-    latency_timer: str
-    clock: str
-    worst_stall_ms: float
-
-    def line(self) -> str:
-        """One line, with what to do about each."""
-        stall = f"worst stall in {_STALL_SECONDS:g} s {self.worst_stall_ms:.1f} ms"
-        if self.worst_stall_ms > _STALL_MS:
-            stall += " (close what is busy; a real machine, no virtual one)"
-        return "pre-flight: " + "; ".join((self.scheduling, self.memory, self.latency_timer, self.clock, stall))
+    It asks the system for real-time scheduling and locked memory, and measures for two seconds how late it wakes us.
+    """
+    found = _scheduling(), _locked_memory(), _latency_timer(path), _clock_source(), _stalls()
+    return "pre-flight: " + "; ".join(found)
 
 
-def preflight(path: str) -> Preflight:
-    """Ask the system for real-time scheduling and locked memory, and measure for two seconds how late it wakes us."""
-    return Preflight(_scheduling(), _locked_memory(), _latency_timer(path), _clock_source(), 1e3 * _worst_stall())
+def _stalls() -> str:
+    stall = 1e3 * _worst_stall()
+    busy = " (close what is busy; a real machine, no virtual one)" if stall > _STALL_MS else ""
+    return f"worst stall in {_STALL_SECONDS:g} s {stall:.1f} ms{busy}"
 
 
 def _scheduling() -> str:

@@ -135,15 +135,6 @@ class _Known:
     source: str
 
 
-@dataclass(frozen=True)
-class _Span:
-    """What was published of a number that is not the same everywhere in the workspace, with its source."""
-
-    least: float
-    most: float
-    source: str
-
-
 _CHAI3D = "CHAI3D's device table, src/devices/{}.cpp"
 _DELTA, _FALCON, _PHANTOM = (
     _CHAI3D.format(f"C{name}Device{s}") for name, s in (("Delta", "s"), ("Falcon", ""), ("Phantom", "s"))
@@ -157,7 +148,7 @@ class _Listed:
     """A real device along one axis; None stands for a number without a published source."""
 
     title: str
-    damping: _Span | None = None  # [N s/m]
+    damping: _Known | None = None  # [N s/m]
     mass: _Known | None = None  # [kg] felt at the handle
     force_limit: _Known | None = None  # [N]
     encoder_step: _Known | None = None  # [m] at the handle
@@ -168,13 +159,11 @@ class _Listed:
     @property
     def known(self) -> dict[str, _Known]:
         """The published fields of a RigidDevice. Friction is left out: what is published is an upper bound."""
-        least = _Known(self.damping.least, self.damping.source) if self.damping else None
-        fields = {"damping": least, "mass": self.mass, "force_limit": self.force_limit}
-        fields["encoder_step"] = self.encoder_step
-        return {name: fact for name, fact in fields.items() if fact}
+        fields = ("damping", "mass", "force_limit", "encoder_step")
+        return {name: fact for name in fields if (fact := getattr(self, name))}
 
 
-_IDENTIFIED = _Span(1.37, 1.37, "section 6 of the paper: a first-order model identified on an Omega")
+_IDENTIFIED = _Known(1.37, "section 6 of the paper: a first-order model identified on an Omega")
 
 CATALOGUE: Mapping[str, _Listed] = {
     "omega.3": _Listed(

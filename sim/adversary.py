@@ -20,10 +20,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from controller.coupling import Coupling, NoCoupling
-from controller.environment import environment
-from controller.loop import force_map
 from controller.lti import Array, Lti
-from design.conditions import this_environment
+from design.environments import THIS_ENVIRONMENT
 from models.human import Hand, Person
 from models.scene import Crowd, HumanSets, variants
 from sim.couplings import choose
@@ -35,7 +33,7 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
 _MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
-DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
+_DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
 
 
 class _Pass(NamedTuple):
@@ -63,7 +61,7 @@ class Worst:
 
     @property
     def destabilises(self) -> bool:
-        return self.growth > DESTABILISED
+        return self.growth > _DESTABILISED
 
 
 def search(
@@ -87,7 +85,7 @@ def search(
         nonlocal done
         done += 1
         progress(done, len(passes) * generations)
-        return first and bool(-intermediate_result.fun > 10 * DESTABILISED)
+        return first and bool(-intermediate_result.fun > 10 * _DESTABILISED)
 
     best, evaluated = None, 0
     for trial, kind in enumerate(passes):
@@ -151,7 +149,7 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
     for alike in layouts.values():
         loops = _loops(scenario, F, HumanSets(tuple(alike), scenario.person))
         fast, growth = (_growth(loops, least) for least in (_PASSES[0].min_frequency_hz, 0.0))
-        ranked += zip(np.where(growth > DESTABILISED, growth, fast).tolist(), alike, strict=True)
+        ranked += zip(np.where(growth > _DESTABILISED, growth, fast).tolist(), alike, strict=True)
     return ranked
 
 
@@ -178,8 +176,8 @@ def attempts(
     """
     rows = []
     for name, (scenario, coupling) in loops.items():
-        F = force_map(environment(scenario.environment, scenario.T), coupling, scenario.theta, scenario.psi)
-        required = np.array(this_environment(F, scenario.delta, scenario.longest_period, scenario.latency).required)
+        loop = scenario.loop("I")  # the reference does not matter
+        F, required = loop.F(coupling), np.array(THIS_ENVIRONMENT.required(loop, coupling).required)
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
             rows.append(_Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))
@@ -215,7 +213,7 @@ def _losses(x: Array, scenario: Scenario, F: Lti, kind: _Pass) -> Array:
 
 
 def _growth(loops: ClosedLoop, min_frequency_hz: float) -> Array:
-    """Of the modes from this frequency on [1/s], (nsim,)."""
+    """Growth of the modes above this frequency [1/s], (nsim,)."""
     values, T = np.linalg.eigvals(loops.A), loops.T
     fast = np.abs(np.angle(values)) / (2 * np.pi * T) >= min_frequency_hz
     return np.log(np.where(fast, np.abs(values), 1e-300).max(axis=1)) / T
@@ -232,7 +230,7 @@ def _worst(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets, evaluated: int)
 
 
 @dataclass(frozen=True)
-class _Shortage:
+class Shortage:
     """Whether a passive human destabilises a loop whose devices lack a share of the damping that is required."""
 
     loop: str
@@ -245,19 +243,19 @@ class _Shortage:
 
     @property
     def holds(self) -> bool:
-        """With the damping that is required no human may succeed."""
+        """Whether the row is as the theory says: with the required damping no human makes the loop unstable."""
         return self.short > 0 or not self.found
 
 
 def shortages(
     couplings: Sequence[str], short: Sequence[float], generations: int, **changes: Any
-) -> Callable[[int], Iterator[_Shortage]]:
+) -> Callable[[int], Iterator[Shortage]]:
     """From a seed: the search against the default loop with these couplings, by name, at these shortages.
 
     Where it succeeds close to the required damping, the condition is tight.
     """
 
-    def rows(seed: int) -> Iterator[_Shortage]:
+    def rows(seed: int) -> Iterator[Shortage]:
         scenario = load().replace(**changes)
         for name in couplings:
             coupling = NoCoupling() if name == "none" else choose(scenario, "I", name).coupling
@@ -266,6 +264,6 @@ def shortages(
                 (attempt,) = attempts(loop, np.array([share]), seed, generations)
                 worst, found = attempt.worst, (attempt.worst.destabilises, attempt.worst.growth)
                 about = worst.frequency_hz, bool(worst.persons), worst.evaluated
-                yield _Shortage(attempt.name, attempt.short, *found, *about)
+                yield Shortage(attempt.name, attempt.short, *found, *about)
 
     return rows

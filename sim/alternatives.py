@@ -17,10 +17,10 @@ from design.certificate import assess
 from design.coverage import Limits
 from design.files import unseen
 from design.guarantees import guarantee_of
-from design.result import Requirement, finite
+from design.result import Chosen, Requirement, finite
 from design.transparency import decibels, transparency
 from sim.accuracy import credible, force_error
-from sim.couplings import Chosen, choose, limits_of
+from sim.couplings import choose, limits_of
 from sim.run import assemble, run
 from sim.scenario import Scenario, load
 from sim.stability import exact_growth, unstable
@@ -43,7 +43,7 @@ class Alternative:
 
     coupling: str  # its kind
     condition: str | None
-    promise: str | None = None  # the guarantee, by its older name
+    guarantee: str | None = unseen(default=None, older="promise")
     dc_ratio: float | None = None  # share of the static stiffness that is felt
     rms_mismatch_db: float | None = None
     growth_rate_per_s: float | None = None  # of the exact loop
@@ -57,13 +57,13 @@ class Alternative:
 
     @property
     def name(self) -> str:
-        """As tables and pictures call it: a spring-damper by its condition."""
+        """The name in tables and pictures; that of a spring-damper is its condition."""
         if self.coupling == "spring-damper":
             return self.condition or ""
         return {"optimal": "best (optimal)"}.get(self.coupling, self.coupling)
 
     def needs(self, condition: str) -> float | None:
-        """The largest share of its guaranteed damping that the condition asks of a device; None: none is enough."""
+        """Required over available damping of the worst device; None where no damping is enough."""
         requirement = (self.requirements or {}).get(condition)
         if requirement is None:
             return None
@@ -115,14 +115,14 @@ def _alternative(
         chosen = own[0] if own else choose(scenario, case, kind, condition)
     except ValueError as error:
         return Alternative(kind, condition, reason=str(error))
-    requirements = own[1] if own else assess(loop, chosen.coupling, chosen.phi, chosen.known, more=False)
+    requirements = own[1] if own else assess(loop, chosen.coupling, chosen.phi, chosen.certificate, more=False)
     simulation = assemble(scenario, chosen.coupling, own[2].rho if own else _lag(scenario, chosen, requirements))
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
     made = Alternative(
         kind,
         condition,
-        promise=guarantee_of(requirements, loop, False),
+        guarantee=guarantee_of(requirements, loop, False),
         dc_ratio=finite(felt.dc_ratio),
         rms_mismatch_db=decibels(felt.rms_mismatch),
         growth_rate_per_s=finite(growth),
@@ -139,5 +139,5 @@ def _alternative(
 
 def _lag(scenario: Scenario, chosen: Chosen, requirements: dict[str, Requirement]) -> tuple[float, ...] | None:
     """rho (m,) [N/m] of the limiter; None: forces are clipped, as those of a coupling just proved without a limiter."""
-    without = chosen.known and chosen.known.condition == "this-environment" and not chosen.limiter
+    without = chosen.certificate and chosen.certificate.condition == "this-environment" and not chosen.limiter
     return None if without else limits_of(scenario, chosen, requirements).rho

@@ -73,19 +73,17 @@ def run_scenario(
     engine is the cheapest that keeps it; `net` stands between the forces and the devices. Raises InputError for
     settings that cannot be.
     """
-    simulation, period = assemble(scenario, coupling, lag, seed), None
+    simulation = assemble(scenario, coupling, lag, seed)
+    period, choices, remarks = None, (), []
     if scenario.switches:
-        simulation, period = switching(simulation, coupling, seed, scenario.samples)
-    choices, remarks = (), []
+        simulation, period = switching(simulation, seed, scenario.samples)
+    ran = simulation if net is None else netted(simulation, net)
     if error is not None:
-        choices = compare_engines(simulation, error)
+        choices = compare_engines(ran, error)
         kept = pick(choices, error)
         integrator, substeps = kept.integrator, kept.substeps
-        if net is not None:
-            remarks.append("speed against error is of the loop without the energy budget, whose own work comes on top")
     else:
         integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)
-    ran = simulation if net is None else netted(simulation, coupling, net)
     stepped = make_engine(simulation, engine, integrator, substeps)
     begin = time.perf_counter()
     trace = run(ran, stepped, progress=progress)
@@ -150,7 +148,7 @@ def simulate(
         "integrator": done.integrator,
         "substeps": done.substeps,
         "seed": seed,
-        "limiter": limits.part([device.force_limit for device in scenario.device]),
+        "limiter": plain(limits),
         "stability": None if scenario.switches or environment else plain(stability_of(done.simulation, trace)),
         "remarks": done.remarks,
         "energy_budget": trace.net.part() if trace.net else None,

@@ -8,7 +8,7 @@ certified couplings; what counts is whether something is faster at the end than 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,11 +16,11 @@ import numpy as np
 from controller.coupling import NoCoupling
 from controller.lti import Array
 from controller.tick import StepBuffer
-from design.result import DesignFailed
+from design.result import Chosen, DesignFailed
 from models.hold import hold
 from models.scene import Crowd, variants
 from sim.accuracy import force_error
-from sim.couplings import Chosen, choose, limits_of
+from sim.couplings import choose, limits_of
 from sim.engines import ExactEngine
 from sim.passivity_layer import BASELINES, Classic, EnergyNet, netted
 from sim.run import Simulation, assemble, run, run_blocks
@@ -53,6 +53,21 @@ class Rival:
     moving: int  # of PAIRS: faster in the last second than at the start
     fastest_m_s: float  # in the last second
     reason: str | None = None  # why a figure does not exist
+
+
+@dataclass(frozen=True)
+class Baselines:
+    """The classics and our couplings on the same runs."""
+
+    scenario: str
+    case: str
+    seed: int
+    rows: Sequence[Rival]
+    wall_s: float
+    interrupted: bool
+    hands: int = PAIRS
+    hands_s: float = SECONDS
+    start_m_s: float = SLOW
 
 
 def rivals(
@@ -103,23 +118,22 @@ def _judged(
     coupling = design.coupling if design else NoCoupling()
     simulation = assemble(scenario, coupling, limits_of(scenario, design, limiter=limiter).rho if design else None)
     most = max(scenario.samples, round(SECONDS / scenario.T))
-    with_net = netted(simulation, coupling, net, most) if net else simulation
+    with_net = netted(simulation, net, most) if net else simulation
     trace = run(with_net, "exact")
     # of the force within its limits: what acted, whatever computed it
     error = force_error(with_net, trace, scenario.loop(case).lam)
     apart = _apart(trace.f, error.ideal) if not scenario.environment.walls else None
     part = trace.net.part() if trace.net else {"limited_ticks": 0}
     moving, fastest = _left_alone(with_net)
-    name = net.name if isinstance(net, Classic) else "energy budget" if net else "none, clipped"
-    guarantee = net.guarantee if isinstance(net, EnergyNet) else None
+    name, guarantee, source = (net.name, net.guarantee, net.source) if net else ("none, clipped", None, None)
     if design:
         guarantee = _GUARANTEES[design.condition]
         name = f"{design.kind}, {guarantee}"
     return Rival(
         name,
-        isinstance(net, Classic),
+        source is not None,
         guarantee,
-        BASELINES[net.name] if isinstance(net, Classic) else None,
+        source,
         apart,
         _fast(trace.f, scenario.T),
         float(np.abs(trace.f).max(initial=0.0)),

@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from controller.loop import Loop
 from controller.lti import Array
 from controller.older import CONDITIONS as OLDER
 from controller.older import with_older
 from design import compare
-from design.result import CONDITIONS, certificate_part
-from design.robustness import robustness_part
-from design.transparency import transparency
-from sim import report
-from sim.couplings import Chosen
+from design.files import unseen
+from design.program import Options
+from design.result import CONDITIONS, Chosen, Requirement
+from design.robustness import Robustness, robustness_nearby
+from design.transparency import Transparency, transparency
+from sim.report import CouplingFigures
 from sim.scenario import Scenario
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionCurve:
+    """What one condition asks of a coupling, over frequency."""
+
+    requirement: Requirement = unseen("beside")
+    ratio: float = unseen()
+    demand: Array | None = unseen()  # required over available damping at each frequency
+    reason: str | None = unseen("given")
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,30 +36,56 @@ class ComparedCoupling:
 
     name: str
     states: int
-    transparency: dict[str, Any]
-    robustness: dict[str, Any] | None
-    curves: compare.Curves = field(metadata={"json": "beside"})
-    coupling: dict[str, Any] = field(metadata={"json": "beside"})
-    conditions: dict[str, dict[str, Any]] = field(metadata={"json": "beside"})
+    transparency: Transparency
+    robustness: Robustness | None
+    curves: compare.Curves = unseen("beside")
+    coupling: CouplingFigures = unseen("beside")
+    conditions: dict[str, ConditionCurve] = unseen("beside")  # also under the names that they had before
 
     @classmethod
     def of(cls, loop: Loop, name: str, chosen: Chosen, judged: compare.Demands, hz: Array) -> ComparedCoupling:
         curves, conditions = compare.curves(loop, judged, hz), {}
         for key, requirement in judged.requirements.items():
-            demand = curves.demands[key]
-            part = certificate_part(requirement) | {"ratio": requirement.ratio, "demand": demand}
-            if demand is None and not requirement.reason:
-                part["reason"] = f"this coupling is no V in feedback around the environment: no curve for {key}"
-            conditions[key] = part
+            demand, reason = curves.demands[key], requirement.reason
+            if demand is None:
+                reason = reason or f"this coupling is no V in feedback around the environment: no curve for {key}"
+            conditions[key] = ConditionCurve(requirement, requirement.ratio, demand, reason)
         return cls(
             Path(name).name,
             judged.F.order,
-            report.transparency_part(transparency(judged.F, loop.E(), loop.lam)),
-            robustness_part(loop, chosen.coupling),
+            transparency(judged.F, loop.E(), loop.lam),
+            robustness_nearby(loop, chosen.coupling),
             curves,
-            report.coupling_part(chosen.kind, chosen.coupling, loop.T),
+            CouplingFigures.of(chosen.kind, chosen.coupling, loop.T),
             with_older(conditions, OLDER),
         )
+
+
+@dataclass(frozen=True)
+class Here:
+    """Where the scenario's own loop stands on the axes of a comparison."""
+
+    delta: tuple[float, ...]  # [N s/m]
+    theta: tuple[int, ...]
+    psi: tuple[int, ...]
+    T_s: float
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How good a coupling can be, along axes of the loop."""
+
+    scenario: str
+    seed: int
+    case: str
+    objective: str
+    delays_kept_in: str
+    options: Options = unseen(older="wish")
+    here: Here = unseen()
+    sweeps: dict[str, compare.Sweep] = unseen()
+    gains: list[str] = unseen()
+    wall_s: float = unseen()
+    interrupted: bool = unseen()
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +117,7 @@ class Comparison:
         couplings = [ComparedCoupling.of(loop, name, c, judged[name], hz) for name, c in chosen.items()]
         notes = [*(f"{name}: {note}" for name, c in chosen.items() for note in c.notes), *failed]
         for c in couplings:
-            parts = ((condition, c.conditions[condition]) for condition in CONDITIONS)
-            notes += [f"{c.name}, {condition}: {part['reason']}" for condition, part in parts if "reason" in part]
+            reasons = {condition: c.conditions[condition].reason for condition in CONDITIONS}
+            notes += [f"{c.name}, {condition}: {reason}" for condition, reason in reasons.items() if reason]
         about = case, scenario.name, seed, loop.T, loop.theta, loop.psi, loop.lam, loop.delta
         return cls(*about, hz, *compare.ideal(loop, hz), couplings, notes)

@@ -9,32 +9,18 @@ from typing import Any
 
 from controller.coupling import PUBLISHED, Coupling, NoCoupling
 from controller.loop import DelayRange, Loop
-from controller.lti import Array
-from design.api import COUPLING, bare
+from design.api import COUPLING, bare, fitting
 from design.certificate import assess, verify
-from design.coupling_file import Certificate, LimiterCertificate, Stored, load
+from design.coupling_file import Stored, load
 from design.coverage import Limits, covered_limits
-from design.designs import KINDS, design_by_kind, usual_condition
+from design.designs import KINDS, design_by_kind, own_coupling, usual_condition
 from design.guarantees import switching_guarantee
-from design.result import Design, DesignFailed, Requirement
+from design.own import called
+from design.result import Chosen, Design, DesignFailed, Requirement
 from sim import design_cache
 from sim.scenario import InputError, Scenario
 
 NAMES = ("none", "published", *KINDS)
-
-
-@dataclass(frozen=True, eq=False)
-class Chosen:
-    """A coupling, how it came about, and the condition that it was made for or is judged by."""
-
-    kind: str
-    coupling: Coupling
-    condition: str
-    phi: Array | None = None  # (m,) multiplier of Theorem 4 that the design found, if it needed one
-    notes: tuple[str, ...] = ()  # what a reader should know of its origin
-    switching: DelayRange | None = None  # its file proves that any switching of the delays within it is safe here
-    limiter: LimiterCertificate | None = None  # what it comes with for limited forces
-    known: Certificate | None = None  # proved in this process, and need not be again
 
 
 def choose(
@@ -57,45 +43,54 @@ def choose(
         name = "none"
     name = name or "spring-damper"
     if name == "none":
-        return Chosen(name, NoCoupling(), condition or "this-environment")
+        return Chosen(NoCoupling(), condition or "this-environment", kind=name)
     if name == "published":
         if scenario.channels != 2:
             raise InputError(f"--coupling published: the paper prints gains for 2 channels, not {scenario.channels}")
-        return Chosen(name, PUBLISHED[case], condition or "any-environment")
+        return Chosen(PUBLISHED[case], condition or "any-environment", kind=name)
+    if name not in KINDS and ":" in name:
+        loop = scenario.loop(case)
+        found = own_coupling(name, loop)
+        called(f"--coupling {name}", fitting, loop, found)
+        own = given(found, name)
+        return replace(own, condition=condition or own.condition)
     if name in KINDS:
         try:
             loop = scenario.loop(case)
             condition = condition or usual_condition(loop, name)
-            asked: dict[str, Any] = {"limiter": limiter} if limiter is not None and name == "spring-damper" else {}
+            asked: dict[str, Any] = {"limiter": limiter} if limiter is not None and KINDS[name].limited else {}
             question = (loop, name, condition, *asked.items())
             if kept := design_cache.find(*question):
                 assert kept.certificate
                 proof = kept.certificate.limiter or None
-                return Chosen(name, kept.built(), condition, limiter=proof, known=kept.certificate)
+                return Chosen(kept.built(), condition, kind=name, limiter=proof, certificate=kept.certificate)
             design = design_by_kind(loop, name, condition, progress, **asked)
             known = design_cache.keep(design, *question)
         except DesignFailed:
             raise
         except ValueError as error:
             raise InputError(str(error)) from None
-        return replace(given(design, name), known=known, limiter=(known and known.limiter) or None)
+        return replace(design, kind=name, certificate=known, limiter=(known and known.limiter) or None)
     if Path(name).suffix != ".json":
-        raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)} or a FILE.json")
+        raise InputError(
+            f"--coupling is {name!r}, allowed are {', '.join(NAMES)}, a FILE.json or package.module:function"
+        )
     stored = read_coupling(name)
     coupling = fitted(stored, name, scenario.channels, scenario.T)
     made_for = stored.certificate.condition if stored.certificate else "this-environment"
     checked = check_stored(stored, scenario.loop(case))
     proof = (stored.certificate and stored.certificate.limiter) or None
-    return Chosen(Path(name).name, coupling, condition or made_for, None, checked.notes, checked.switching, proof)
+    how = {"notes": checked.notes, "switching": checked.switching, "limiter": proof}
+    return Chosen(coupling, condition or made_for, kind=Path(name).name, **how)
 
 
 def given(coupling: Coupling | Design | None, kind: str = "given") -> Chosen:
     """A coupling, or that of a design with its proofs; None is the loop without one."""
     if isinstance(coupling, Design):
         proof = (coupling.certificate and coupling.certificate.limiter) or None
-        return Chosen(kind, coupling.coupling, coupling.condition, coupling.phi, limiter=proof)
+        return replace(coupling, kind=kind, certificate=None, limiter=proof)
     alone = NoCoupling() if coupling is None else bare(coupling, f"{COUPLING}, or None for the loop without one")
-    return Chosen(kind, alone, "this-environment")
+    return Chosen(alone, "this-environment", kind=kind)
 
 
 def limits_of(
@@ -105,14 +100,15 @@ def limits_of(
     limiter: bool | None = None,
 ) -> Limits:
     """How forces are limited in a loop: by the limiter that a guarantee covers, unless `limiter` is False."""
+    within = tuple(device.force_limit for device in scenario.device)
     if limiter is False:
-        return Limits(None, "forces are clipped, as asked")
+        return Limits(None, "forces are clipped, as asked", force_limit=within)
     if scenario.varying_delay:
-        return Limits(None, "limiter: limited forces are proved for constant delays")
+        return Limits(None, "limited forces are proved for constant delays", force_limit=within)
     loop = scenario.loop("I")  # the reference does not matter
     coupling, proof = chosen.coupling, chosen.limiter
-    requirements = requirements or assess(loop, coupling, chosen.phi, chosen.known)
-    return covered_limits(loop, coupling, requirements, proof, chosen.known)
+    asked = requirements or assess(loop, coupling, chosen.phi, chosen.certificate)
+    return covered_limits(loop, coupling, asked, proof, chosen.certificate).within(within)
 
 
 def read_coupling(path: str | Path) -> Stored:

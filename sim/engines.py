@@ -79,8 +79,8 @@ class ExactEngine(_Exact):
 
         def stretch(ticks: int) -> None:
             for count in fused.parts(ticks):
-                for k in range(count):
-                    product(before[k], after[k])
+                for now, then in zip(before[:count], after, strict=False):
+                    product(now, then)
 
         return stretch
 

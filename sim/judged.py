@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from controller.coupling import Coupling
 from controller.loop import Loop
+from controller.older import CONDITIONS, with_older
 from design.certificate import RangesCheck, assess, check_ranges
-from design.coverage import Limits, ranges_part
+from design.coverage import Limits, RangesFigures
 from design.files import unseen
 from design.guarantees import guarantee_of
-from design.result import Requirement
-from sim.couplings import Chosen, limits_of
-from sim.report import certificates_part, coupling_part
+from design.result import Chosen, Requirement
+from sim.couplings import limits_of
+from sim.report import CouplingFigures
 from sim.scenario import Scenario
 
 
@@ -23,13 +23,11 @@ class Judged:
     """The parts that every report of a coupling begins with."""
 
     whole: RangesCheck | None = unseen("no")
-    requirements: dict[str, Requirement] = unseen("no")
-    limits: Limits = unseen("no")
-    coupling: dict[str, Any] = unseen()
-    certificates: dict[str, Any] = unseen()
-    promise: str | None = unseen()  # the guarantee, by its older name
-    ranges: dict[str, Any] | None = unseen()
-    limiter: dict[str, Any] = unseen()
+    coupling: CouplingFigures = unseen()
+    certificates: dict[str, Requirement] = unseen()  # by condition, also under the names that they had before
+    guarantee: str | None = unseen(older="promise")
+    ranges: RangesFigures | None = unseen(older="set")
+    limiter: Limits = unseen()
 
     @classmethod
     def of(
@@ -40,23 +38,25 @@ class Judged:
         requirements: dict[str, Requirement],
         whole: RangesCheck | None,
         limits: Limits,
-        scenario: Scenario,
     ) -> Judged:
-        """With the parts as plain data; forces are limited as the scenario's devices limit them."""
+        """The verdicts on a coupling of this kind in a loop."""
         return cls(
-            whole=whole,
-            requirements=requirements,
-            limits=limits,
-            coupling=coupling_part(kind, coupling, loop.T),
-            certificates=certificates_part(requirements),
-            promise=guarantee_of(requirements, loop, bool(whole and whole.proved)),
-            ranges=whole and ranges_part(whole),
-            limiter=limits.part([device.force_limit for device in scenario.device]),
+            whole,
+            CouplingFigures.of(kind, coupling, loop.T),
+            with_older(requirements, CONDITIONS),
+            guarantee_of(requirements, loop, bool(whole and whole.proved)),
+            whole and RangesFigures.of(whole),
+            limits,
         )
 
     @property
+    def requirements(self) -> dict[str, Requirement]:
+        """The certificates under today's names alone."""
+        return {name: need for name, need in self.certificates.items() if name not in CONDITIONS}
+
+    @property
     def proved(self) -> bool:
-        """For the whole ranges."""
+        """Whether the guarantee is proved for the ranges."""
         return bool(self.whole and self.whole.proved)
 
 
@@ -71,6 +71,6 @@ def judge(
 ) -> Judged:
     """The coupling in the scenario's loop; conditions are asked of `met`, one environment of its ranges."""
     whole = check_ranges(scenario.loop(case), chosen.coupling, seed, progress=progress)
-    requirements = assess(met.loop(case), chosen.coupling, chosen.phi, chosen.known)
+    requirements = assess(met.loop(case), chosen.coupling, chosen.phi, chosen.certificate)
     limits = limits_of(met, chosen, requirements, limiter)
-    return Judged.of(chosen.kind, chosen.coupling, met.loop(case), requirements, whole, limits, met)
+    return Judged.of(chosen.kind, chosen.coupling, met.loop(case), requirements, whole, limits)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from sim import plots
 from sim.limit_cycles import UNDECIDED
 from sim.stability import MARGINAL
 from sim.zwidth import MODEL_KEPT, Map
+from sim.zwidth_report import MapReport
 
 _STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # areas
 
@@ -29,33 +31,31 @@ _LINES: dict[str, dict[str, Any]] = {
 }
 
 
-def plot_zwidth(drawn: Map, outcome: dict[str, Any], path: Path) -> Path:
+def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:
     """Stiffness over damping; cells are the population's verdict, lines the certificates' edges, symbols MuJoCo's."""
     figure = Figure((8, 5.6), layout="constrained")
     axes = figure.subplots()  # areas in place of a grid
-    about_environment = outcome["axes"] == "environment"
+    about_environment = report.fixed is not None
     of = " of the environment's contacts" if about_environment else ""
     axes.set(xscale=drawn.grid.scale, yscale=drawn.grid.scale, xlabel=f"B{of} [N s/m]", ylabel=f"K{of} [N/m]")
-    entries = [*_cells(axes, drawn, outcome), *_edges(axes, drawn, about_environment), *_points(axes, drawn, outcome)]
-    for mark in outcome.get("marks", ()):
-        axes.plot(mark["B"], mark["K"], "*", color="black", markersize=14, clip_on=False, zorder=5)
-        axes.annotate(
-            f"{mark['K']:g}, {mark['B']:g}", (mark["B"], mark["K"]), (9, 5), textcoords="offset points", zorder=5
-        )
+    entries = [*_cells(axes, drawn, report), *_edges(axes, drawn, about_environment), *_points(axes, report)]
+    for mark in report.marks or ():
+        axes.plot(mark.B, mark.K, "*", color="black", markersize=14, clip_on=False, zorder=5)
+        axes.annotate(f"{mark.K:g}, {mark.B:g}", (mark.B, mark.K), (9, 5), textcoords="offset points", zorder=5)
     if about_environment:
-        entries += _designed_for(axes, drawn, outcome)
+        entries += _designed_for(axes, drawn, report)
     figure.legend(handles=entries, loc="outside lower center", ncols=2, fontsize=8.5)
-    figure.suptitle(_title(outcome), fontsize=11)
+    figure.suptitle(_title(report), fontsize=11)
     return plots.save(figure, path, 110)
 
 
-def _cells(axes: Axes, drawn: Map, outcome: dict[str, Any]) -> list[Patch]:
+def _cells(axes: Axes, drawn: Map, report: MapReport) -> list[Patch]:
     growth = drawn.growth.reshape(drawn.grid.shape)
     verdict = np.ma.masked_invalid(np.where(np.isnan(growth), np.nan, growth > MARGINAL))
     colours = ListedColormap([_STABLE, _UNSTABLE])
     edges = [_cell_edges(axis, drawn.grid.scale) for axis in (drawn.grid.B, drawn.grid.K)]
     axes.pcolormesh(*edges, verdict, cmap=colours, vmin=0, vmax=1, rasterized=True)
-    humans = outcome["population"]["humans"]
+    humans = report.population.humans
     return [
         Patch(color=_STABLE, label=f"exact: stable with all of {humans} humans"),
         Patch(color=_UNSTABLE, label="exact: unstable with some"),
@@ -89,31 +89,31 @@ def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
     return entries
 
 
-def _designed_for(axes: Axes, drawn: Map, outcome: dict[str, Any]) -> list[Line2D]:
+def _designed_for(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:
     """The contact springs of the environment that the coupling was designed for, where they lie on the map."""
     style: dict[str, Any] = {"marker": "P", "markersize": 9, "color": "black", "linestyle": "none"}
-    shown = [(s["B"], s["K"]) for s in outcome["designed_for"]["contact_springs"]]
+    shown = [(s.B, s.K) for s in report.fixed.designed_for.contact_springs] if report.fixed else []
     for b, k in shown:
         if drawn.grid.B[0] <= b <= drawn.grid.B[-1] and drawn.grid.K[0] <= k <= drawn.grid.K[-1]:
             axes.plot(b, k, zorder=5, markeredgecolor="white", **style)
     return [Line2D([], [], label="the springs that the coupling was designed for", **style)]
 
 
-def _points(axes: Axes, drawn: Map, outcome: dict[str, Any]) -> list[Line2D]:
-    points = outcome["simulation"]["points"]
+def _points(axes: Axes, report: MapReport) -> list[Line2D]:
+    points = report.simulation.points
     if not points:
         return []
-    entries, effects = [], "" if outcome["simulation"]["nonlinear"] else ", linear loop"
+    entries, effects = [], "" if report.simulation.nonlinear else ", linear loop"
     kinds = (("rests", "o", "white"), ("oscillates", "X", plots.STYLES[1]["color"]), (UNDECIDED, "D", "grey"))
     for word, marker, face in kinds:
-        some = [p for p in points if p["verdict"] == word]
+        some = [p for p in points if p.verdict == word]
         if not some:
             continue
         style = {"marker": marker, "markersize": 5.5, "markerfacecolor": face, "markeredgecolor": "black"}
         style |= {"linestyle": "none", "markeredgewidth": 0.7}
-        axes.plot([p["B"] for p in some], [p["K"] for p in some], clip_on=False, zorder=4, **style)
+        axes.plot([p.B for p in some], [p.K for p in some], clip_on=False, zorder=4, **style)
         entries.append(Line2D([], [], label=f"MuJoCo{effects}: {word} ({len(some)})", **style))
-    other = [p for p in points if p["differs_from_linear"]]
+    other = [p for p in points if p.differs_from_linear]
     if other:
         style = {
             "marker": "o",
@@ -122,37 +122,37 @@ def _points(axes: Axes, drawn: Map, outcome: dict[str, Any]) -> list[Line2D]:
             "markeredgecolor": plots.STYLES[3]["color"],
         }
         style |= {"linestyle": "none", "markeredgewidth": 1.6}
-        axes.plot([p["B"] for p in other], [p["K"] for p in other], clip_on=False, zorder=4, **style)
+        axes.plot([p.B for p in other], [p.K for p in other], clip_on=False, zorder=4, **style)
         entries.append(Line2D([], [], label=f"unlike the linear loop ({len(other)})", **style))
     return entries
 
 
-def _title(outcome: dict[str, Any]) -> str:
-    what = "rigid wall" if outcome["rigid"] else outcome["scenario"]
-    if outcome["coupling"]:
-        what += f", {outcome['coupling']['kind']} coupling"
-    if outcome["one_sided"]:
+def _title(report: MapReport) -> str:
+    what = report.scenario or "rigid wall"
+    if report.coupling:
+        what += f", {report.coupling.kind} coupling"
+    if report.one_sided:
         what += ", one-sided"
     parts = [
-        f"theta {_list(outcome['theta'])}",
-        f"T {1e3 * outcome['T']:g} ms",
-        f"delta {_list(outcome['delta'])} N s/m",
+        f"theta {_list(report.theta)}",
+        f"T {1e3 * report.T:g} ms",
+        f"delta {_list(report.delta)} N s/m",
     ]
-    if any(outcome["psi"]):
-        parts.append(f"psi {_list(outcome['psi'])}")
-    if outcome["velocity_filter_hz"]:
-        parts.append(f"velocity filter {outcome['velocity_filter_hz']:g} Hz")
-    effects = outcome["simulation"]["effects"]
-    if any(effects["encoder_step_m"]):
-        parts.append(f"encoder step {1e6 * max(effects['encoder_step_m']):g} um")
-    if any(effects["friction_n"]):
-        parts.append(f"friction {max(effects['friction_n']):g} N")
-    if effects["force_limit_n"]:
-        parts.append(f"limit {_list(effects['force_limit_n'])} N")
+    if any(report.psi):
+        parts.append(f"psi {_list(report.psi)}")
+    if report.velocity_filter_hz:
+        parts.append(f"velocity filter {report.velocity_filter_hz:g} Hz")
+    effects = report.simulation.effects
+    if any(effects.encoder_step_m):
+        parts.append(f"encoder step {1e6 * max(effects.encoder_step_m):g} um")
+    if any(effects.friction_n):
+        parts.append(f"friction {max(effects.friction_n):g} N")
+    if effects.force_limit_n:
+        parts.append(f"limit {_list(effects.force_limit_n)} N")
     head = f"{what}: {', '.join(parts[:3])}"
     return head if len(parts) == 3 else f"{head}\n{', '.join(parts[3:])}"
 
 
-def _list(values: list[float]) -> str:
+def _list(values: Sequence[float]) -> str:
     """The numbers, or the one that all of them are."""
     return ", ".join(f"{v:g}" for v in (values if len(set(values)) > 1 else values[:1]))

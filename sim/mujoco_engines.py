@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -209,8 +209,7 @@ class MujocoEngine:
         self.data = mujoco.MjData(self.model)
         self._warnings = self.data.warning.number
         self.stretch: Stretch | None = None
-        stacked = _stacked(scene.plant)
-        moves = cache(lambda h: exponential_step(stacked.A, h, scene.model.nv, stacked.felt)[0])
+        stacked, moves = _stacked(scene.plant), partial(_step_of, scene.plant, scene.model.nv)
         self._whole = moves if integrator == EXPONENTIAL and substeps == 1 else None
         self._timing, both, q, v = timing, (self.model, self.data), self.data.qpos, self.data.qvel
         self._access = _Access(
@@ -250,18 +249,19 @@ class MujocoEngine:
     def _fused(self, buffer: StepBuffer, move: Array) -> Stretch:
         access, states = self._access, len(move)
         fused = FusedTicks(buffer, move[:, :states], G=move[:, states:])
-        ctrl, state, qacc, forward = access.ctrl, access.state, access.qacc, access.forward
-        product, held, before, after, rates = fused.product, fused.held, fused.before, fused.next, fused.further
-        shaped = list(access._shaped(fused.states))
+        ctrl, qacc, forward, (q, v) = access.ctrl.data, access.qacc.data, access.forward, access.state
+        q, v = q.data, v.data
+        rows, product = list(zip(*fused.copied(len(q)), fused.before, fused.next, strict=False)), fused.product
 
         def stretch(ticks: int) -> None:
             for count in fused.parts(ticks):
-                for inputs, rate, now, then, moved in zip(held[:count], rates, before, after, shaped, strict=False):
-                    ctrl[...] = inputs
+                for inputs, rate, q_then, v_then, now, then in rows[:count]:
+                    ctrl[:] = inputs
                     forward()
-                    rate[...] = qacc
+                    rate[:] = qacc
                     product(now, then)
-                    state[...] = moved
+                    q[:] = q_then
+                    v[:] = v_then
 
         return stretch
 
@@ -355,6 +355,13 @@ class MujocoBatchEngine:
         return bool(np.any(self.batch.warning))
 
 
+@lru_cache(64)  # runs of the same plant follow each other
+def _step_of(plant: Plant, n: int, h: float) -> Array:
+    """[s; a] to s then, of one plant with n joints, in h seconds."""
+    stacked = _stacked(plant)
+    return exponential_step(stacked.A, h, n, stacked.felt)[0]
+
+
 def _stacked(plant: Plant) -> Plant:
     """One plant, or many, as a stack."""
     if plant.A.ndim > 2:
@@ -377,10 +384,7 @@ def _kicks(plants: Plant) -> Callable[[float], Product] | None:
 
 
 def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
-    """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T.
-
-    Of the exponential one it is the scene's own where nothing rubs: accelerations alone know no step.
-    """
+    """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T."""
     import mujoco
 
     if integrator not in INTEGRATORS:
@@ -389,8 +393,6 @@ def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoc
         raise ValueError(f"substeps is {substeps}, allowed are whole numbers from 1")
     if integrator == EXPONENTIAL != default_integrator(scene) and scene.plant.felt is not None:
         raise InputError("a human has an impedance (A, B, C, D) and a device rubs: use integrator RK4, not exponential")
-    if integrator == default_integrator(scene) == EXPONENTIAL:
-        return scene.model
     model = copy(scene.model)
     model.opt.timestep = T / substeps
     model.opt.integrator = getattr(mujoco.mjtIntegrator, INTEGRATORS[integrator])

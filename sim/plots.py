@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -24,6 +24,13 @@ from controller.lti import Array
 from design.files import printable, write
 from design.result import CONDITIONS
 from sim.trace import Trace
+
+if TYPE_CHECKING:  # whose figures are drawn
+    from design.compare import Limit, Sweep
+    from sim.accuracy import Row
+    from sim.adversary import Shortage
+    from sim.baselines import Baselines
+    from sim.compare_report import Comparison, Limits
 
 # ----------------------------------------------------------------------------------------------------
 # The style.
@@ -52,12 +59,12 @@ def _panels(title: str, rows: int, columns: int, size: tuple[float, float], **sh
 
 
 def _legend(figure: Figure, entries: dict[str, Any], columns: int, **style: Any) -> None:
-    """Below all panels: label -> what is drawn so."""
+    """A legend below all panels; `entries` has the drawn object of each label."""
     figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=columns, **style)
 
 
 def _entries(axis: Axes) -> dict[str, Any]:
-    """label -> what is drawn so, in the order of drawing."""
+    """The drawn object of each label, in the order of drawing."""
     handles, labels = axis.get_legend_handles_labels()
     return dict(zip(labels, handles, strict=True))
 
@@ -84,11 +91,6 @@ def _plain_numbers(axes: Any) -> None:
     for axis in (part for panel in axes.flat for part in (panel.xaxis, panel.yaxis)):
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
-
-
-def _array(values: Any) -> Array:
-    """Numbers of a JSON report; null becomes not-a-number, which is not drawn."""
-    return np.array(values, dtype=float)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -261,7 +263,7 @@ def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], ar
 
 
 def _grey_out(axes: Array | list[Axes], result: Trace, until: float) -> None:
-    """What is the linear model's motion and no device's, under a veil."""
+    """Grey out the part of the run that no real device could follow."""
     for axis in axes:
         axis.axvspan(until, result.t[-1], color="0.85", alpha=0.75, zorder=5, linewidth=0)
     text = "grey: beyond what the\ndevices declare credible"
@@ -391,19 +393,19 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
 # Checks: engines against each other, random humans, how tight a condition is.
 
 
-def plot_accuracy(rows: list[dict[str, Any]], path: Path) -> Path:
+def plot_accuracy(rows: Sequence[Row], path: Path) -> Path:
     """Cost against both errors, one line per integrator; wrong verdicts are crossed."""
     errors = {"position_relative_rms": "position error, relative rms", "growth_rate_error": "|growth-rate error| [1/s]"}
     figure, axes = _panels("speed against error (crossed: wrong verdict)", 1, 2, (11, 4.5), sharex=True)
-    names = list(dict.fromkeys(row["integrator"] for row in rows if row["integrator"]))
+    names = list(dict.fromkeys(row.integrator for row in rows if row.integrator))
     for axis, (key, label) in zip(axes[0], errors.items(), strict=True):
         for name, style in zip(names, STYLES, strict=False):
-            mine = [row for row in rows if row["integrator"] == name and row[key]]
-            points = [(row["wall_s_per_simulated_s"], abs(row[key])) for row in mine]
+            mine = [row for row in rows if row.integrator == name and getattr(row, key)]
+            points = [(row.wall_s_per_simulated_s, abs(getattr(row, key))) for row in mine]
             axis.loglog(*zip(*points, strict=True) if points else ((), ()), marker="o", label=name, **style)
             for row, point in zip(mine, points, strict=True):
-                axis.annotate(f"x{row['substeps']}", point, (4, 4), textcoords="offset points", fontsize=7)
-                if not row["verdict_correct"]:
+                axis.annotate(f"x{row.substeps}", point, (4, 4), textcoords="offset points", fontsize=7)
+                if not row.verdict_correct:
                     axis.plot(*point, "kx", markersize=11)
         axis.set(xlabel="seconds per simulated second", ylabel=label)
     axes[0, 0].legend()
@@ -431,16 +433,16 @@ def plot_population(mass: Array, damping: Array, growth: Array, path: Path, titl
     return save(figure, path)
 
 
-def plot_tightness(rows: list[dict[str, Any]], path: Path) -> Path:
+def plot_tightness(rows: Sequence[Shortage], path: Path) -> Path:
     """Growth rate with the first destabilising human found, over the share of the required damping that was missing."""
     figure, axes = _panels("", 1, 1, (7, 4.2))
     axis = axes[0, 0]
-    for name, style in zip(dict.fromkeys(row["loop"] for row in rows), STYLES, strict=False):
-        mine = [row for row in rows if row["loop"] == name]
-        points = [(100 * row["short"], row["growth_rate_per_s"] if row["found"] else 0.0) for row in mine]
+    for name, style in zip(dict.fromkeys(row.loop for row in rows), STYLES, strict=False):
+        mine = [row for row in rows if row.loop == name]
+        points = [(100 * row.short, row.growth_rate_per_s if row.found else 0.0) for row in mine]
         axis.plot(*zip(*points, strict=True), label=name, **style)
         for row, point in zip(mine, points, strict=True):
-            axis.plot(*point, "^" if row["found"] else "o", color=style["color"])
+            axis.plot(*point, "^" if row.found else "o", color=style["color"])
     axis.plot([], [], "k^", label="unstable with the human found")
     axis.plot([], [], "ko", label="no such human found")
     axis.set(
@@ -464,21 +466,21 @@ _HIGHEST = 20.0  # of the available damping: what a picture of the required one 
 _FLOOR = 1e-4  # of the largest value: what a logarithmic axis still shows
 
 
-def plot_singular_values(data: dict[str, Any], path: Path) -> Path:
+def plot_singular_values(report: Comparison, path: Path) -> Path:
     """E, F and the mismatch M, one panel per coupling; all singular values, the smaller ones thinner."""
-    couplings = data["couplings"]
+    couplings = report.couplings
     figure, axes = _over_frequency("singular values", 1, len(couplings), (4.2, 4.2))
-    hz = _array(data["frequency_hz"])
-    top = max(_array(part).max() for c in couplings for part in (data["sigma_E"], c["sigma_F"], c["sigma_M"]))
+    hz = report.frequency_hz
+    top = max(np.max(part) for c in couplings for part in (report.sigma_E, c.curves.sigma_F, c.curves.sigma_M))
     for axis, coupling in zip(axes[0], couplings, strict=True):
         for key, label, style in _PARTS:
-            values = _array(data[key] if key in data else coupling[key])
+            values = getattr(report if key == "sigma_E" else coupling.curves, key)
             for i, row in enumerate(np.maximum(values, _FLOOR * top / 10).T):
                 width = (3.0 if style is _IDEAL else 1.6) / (1 + i)
                 axis.plot(hz, row, label=label if i == 0 else None, **(style | {"linewidth": width}))
-        if not _array(coupling["sigma_M"]).any():
+        if not np.any(coupling.curves.sigma_M):
             axis.annotate("M = 0", (0.05, 0.05), xycoords="axes fraction", color=STYLES[1]["color"])
-        axis.set(xscale="log", yscale="log", title=coupling["name"], xlabel="frequency [Hz]")
+        axis.set(xscale="log", yscale="log", title=coupling.name, xlabel="frequency [Hz]")
         axis.set_ylim(_FLOOR * top, 2 * top)
     axes[0, 0].set_ylabel("singular values [N/m]")
     _plain_numbers(axes)
@@ -486,28 +488,28 @@ def plot_singular_values(data: dict[str, Any], path: Path) -> Path:
     return save(figure, path, 90)
 
 
-def plot_required_damping(data: dict[str, Any], path: Path) -> Path:
+def plot_required_damping(report: Comparison, path: Path) -> Path:
     """What each condition asks of the devices at each frequency, what they have, and where it binds."""
     title = "required damping over frequency; o: where it binds, ^: above the picture"
     figure, axes = _over_frequency(title, 1, 2, (5.5, 4.2))
-    hz, available = _array(data["frequency_hz"]), data["available_damping"]
+    hz, available = report.frequency_hz, report.available_damping
     alike = len(set(available)) == 1  # devices that are not are drawn as ratios
     scale, unit = (available[0], " [N s/m]") if alike else (1.0, " over available damping")
     for axis, (condition, words) in zip(axes[0], CONDITIONS.items(), strict=True):
         axis.axhline(scale, color="black", linewidth=1.2)
         axis.annotate("available", (hz[0], scale), (2, 3), textcoords="offset points", fontsize=8)
-        parts = [coupling[condition] for coupling in data["couplings"]]
-        top = scale * min(max([1.0, *(part["ratio"] or 0.0 for part in parts)]), _HIGHEST)
-        for coupling, part, style in zip(data["couplings"], parts, STYLES, strict=False):
-            if part["demand"] is None:
-                axis.plot([], [], label=f"{coupling['name']} (no curve: see the notes)", **style)
+        parts = [coupling.conditions[condition] for coupling in report.couplings]
+        top = scale * min(max([1.0, *(part.ratio for part in parts if np.isfinite(part.ratio))]), _HIGHEST)
+        for coupling, part, style in zip(report.couplings, parts, STYLES, strict=False):
+            if part.demand is None:
+                axis.plot([], [], label=f"{coupling.name} (no curve: see the notes)", **style)
                 continue
-            axis.plot(hz, scale * _array(part["demand"]), label=coupling["name"], **style)
-            binds = scale * part["ratio"]
-            at = max(part["binding_frequency_hz"], hz[0]), min(binds, top)
+            axis.plot(hz, scale * part.demand, label=coupling.name, **style)
+            binds = scale * part.ratio
+            at = max(part.requirement.frequency_hz or 0.0, hz[0]), min(binds, top)
             axis.plot(*at, "o" if binds <= top else "^", color=style["color"])
         axis.axhspan(scale, 1.12 * top, color="black", alpha=0.06, linewidth=0)
-        delayed = condition == "any-environment" and any(data["psi"])
+        delayed = condition == "any-environment" and any(report.psi)
         words += " (with a multiplier of this one)" if delayed else ""
         axis.set(xscale="log", title=words, xlabel="frequency [Hz]", ylim=(-0.5 * scale, 1.12 * top))
         axis.legend(fontsize=8)
@@ -516,21 +518,21 @@ def plot_required_damping(data: dict[str, Any], path: Path) -> Path:
     return save(figure, path, 90)
 
 
-def plot_perceived(data: dict[str, Any], path: Path) -> Path:
+def plot_perceived(report: Comparison, path: Path) -> Path:
     """The effective impedance of each channel as a stiffness and a damping, against the ideal."""
     title = "felt by each user, the other devices held still; linear near zero"
-    figure, axes = _over_frequency(title, 2, len(data["available_damping"]), (4.8, 3.2))
-    hz = _array(data["frequency_hz"])
-    curves = [("ideal: E itself", data["ideal"], _IDEAL)]
-    curves += [(c["name"], c["perceived"], s) for c, s in zip(data["couplings"], STYLES, strict=False)]
+    figure, axes = _over_frequency(title, 2, len(report.available_damping), (4.8, 3.2))
+    hz = report.frequency_hz
+    curves = [("ideal: E itself", report.ideal, _IDEAL)]
+    curves += [(c.name, c.curves.perceived, s) for c, s in zip(report.couplings, STYLES, strict=False)]
     for row, (key, label) in zip(axes, (("stiffness", "stiffness [N/m]"), ("damping", "damping [N s/m]")), strict=True):
         for i, axis in enumerate(row):
             for name, values, style in curves:
-                axis.plot(hz, _array(values[key])[:, i], label=name, **style)
+                axis.plot(hz, getattr(values, key)[:, i], label=name, **style)
             axis.axhline(0.0, color="black", linewidth=0.7)
             axis.set_xscale("log")
             # logarithmic both ways, linear around zero up to the power of ten below the median size
-            sizes = np.abs([_array(values[key])[:, i] for _, values, _ in curves])
+            sizes = np.abs([getattr(values, key)[:, i] for _, values, _ in curves])
             typical = float(np.median(sizes[sizes > 0])) if (sizes > 0).any() else 1.0
             axis.set_yscale("symlog", linthresh=10.0 ** np.floor(np.log10(typical)))
         row[0].set_ylabel(label)
@@ -561,61 +563,62 @@ _EXACT = -60.0
 _FIGURES = {"rms": "rms_mismatch_db", "sup": "relative_mismatch_db"}
 
 
-def plot_limits(outcome: dict[str, Any], path: Path) -> Path:
+def plot_limits(report: Limits, path: Path) -> Path:
     """One panel per sweep; a point without a solution is a cross at the top of its panel."""
-    sweeps = {name: sweep for name, sweep in outcome["sweeps"].items() if sweep["optimal"]}
+    sweeps = {name: sweep for name, sweep in report.sweeps.items() if sweep.curves["optimal"]}
     rows, columns = (len(sweeps) + 1) // 2, min(len(sweeps), 2)
-    title = f"The best reachable mismatch: {outcome['scenario']}, case {outcome['case']}"
+    title = f"The best reachable mismatch: {report.scenario}, case {report.case}"
     figure, axes = _panels(title, rows, columns, (5.5 * columns + 0.5, 3.6 * rows + 0.9), sharey=True)
     entries: dict[str, Any] = {}
     for axis, (name, sweep) in zip(axes.flat, sweeps.items(), strict=False):
-        entries |= _draw_sweep(axis, name, sweep, _FIGURES[outcome["objective"]], _here(name, outcome))
+        entries |= _draw_sweep(axis, name, sweep, _FIGURES[report.objective], _here(name, report))
     for axis in axes.flat[len(sweeps) :]:
         axis.set_visible(False)
     for axis in axes[:, 0]:
-        axis.set_ylabel(f"{outcome['objective']} mismatch [dB]")
+        axis.set_ylabel(f"{report.objective} mismatch [dB]")
     _legend(figure, entries, 3, fontsize=9)
     return save(figure, path)
 
 
-def plot_baselines(outcome: dict[str, Any], path: Path) -> Path:
+def plot_baselines(report: Baselines, path: Path) -> Path:
     """Bars, a row per rival: force error, force above 40 Hz, the fastest of the lossless hands that are left alone."""
-    rows = outcome["rows"]
-    title = f"Classics and ours on the same runs: {outcome['scenario']}, case {outcome['case']}"
+    rows = report.rows
+    title = f"Classics and ours on the same runs: {report.scenario}, case {report.case}"
     figure, axes = _panels(title, 1, 3, (12.0, 0.4 * len(rows) + 1.8), sharey=True)
-    labels = [f"{row['name']} (baseline)" if row["baseline"] else row["name"] for row in rows]
-    colours = ["tab:orange" if row["baseline"] else "tab:blue" if row["guarantee"] else "tab:grey" for row in rows]
+    labels = [f"{row.name} (baseline)" if row.baseline else row.name for row in rows]
+    colours = ["tab:orange" if row.baseline else "tab:blue" if row.guarantee else "tab:grey" for row in rows]
     panels = (("error_percent", "force error [%]"), ("fast_n", "force rms above 40 Hz [N]"))
     for axis, (name, label) in zip(axes[0], (*panels, ("fastest_m_s", "fastest lossless hand [m/s]")), strict=True):
-        axis.barh(labels, [row[name] or 0.0 for row in rows], color=colours)
+        axis.barh(labels, [getattr(row, name) or 0.0 for row in rows], color=colours)
         axis.set_xlabel(label)
     axes[0, 1].set_xscale("symlog", linthresh=1e-3)
     axes[0, 2].set_xscale("log")
-    axes[0, 2].axvline(outcome["start_m_s"], color="black", linestyle=":")
+    axes[0, 2].axvline(report.start_m_s, color="black", linestyle=":")
     axes[0, 0].invert_yaxis()
     names = {"baseline": "tab:orange", "with a guarantee": "tab:blue", "without": "tab:grey"}
     _legend(figure, {name: Patch(color=colour) for name, colour in names.items()}, 3)
     return save(figure, path)
 
 
-def _here(name: str, outcome: dict[str, Any]) -> float:
+def _here(name: str, report: Limits) -> float:
     """Where the scenario stands on this axis, in the unit drawn."""
-    here = outcome["here"]
-    each = {"damping": min(here["delta"]), "delay": max(here["theta"]), "period": 1e3 * here["T_s"]}
-    return (each | {"order": len(outcome["wish"]["ladder"])})[name]
+    here = report.here
+    each = {"damping": min(here.delta), "delay": max(here.theta), "period": 1e3 * here.T_s}
+    return (each | {"order": len(report.options.ladder)})[name]
 
 
-def _level(row: dict[str, Any], figure: str) -> float | None:
+def _level(row: Limit, figure: str) -> float | None:
     """The mismatch [dB]; of a coupling that is exact the least that is drawn, None where there is no coupling."""
-    return _EXACT if row[figure] is None and row.get("proof") else row[figure]
+    level = getattr(row, figure)
+    return _EXACT if level is None and row.proof else level
 
 
-def _draw_sweep(axis: Axes, name: str, sweep: dict[str, Any], figure: str, here: float) -> dict[str, Any]:
-    """Draw one sweep; what belongs into the legend by its words."""
-    scale, unit = (1e3, "ms") if sweep["unit"] == "s" else (1.0, sweep["unit"])
+def _draw_sweep(axis: Axes, name: str, sweep: Sweep, figure: str, here: float) -> dict[str, Any]:
+    """Draw one sweep and return its entries of the legend."""
+    scale, unit = (1e3, "ms") if sweep.unit == "s" else (1.0, sweep.unit)
     entries: dict[str, Any] = {}
     for kind, (words, style) in _CURVES.items():
-        levels = [(scale * row["value"], _level(row, figure)) for row in sweep.get(kind, [])]
+        levels = [(scale * row.value, _level(row, figure)) for row in sweep.curves.get(kind, [])]
         known = [(x, y) for x, y in levels if y is not None]
         if known:
             points = [(x, max(y, _EXACT)) for x, y in known]
@@ -625,7 +628,7 @@ def _draw_sweep(axis: Axes, name: str, sweep: dict[str, Any], figure: str, here:
             low = [_EXACT] * len(exact)
             (entries[f"{_EXACT:g} dB or less"],) = axis.plot(exact, low, "v", color="black", markersize=9, zorder=3)
     top = axis.get_xaxis_transform()
-    nothing = [scale * row["value"] for row in sweep["optimal"] if _level(row, figure) is None]
+    nothing = [scale * row.value for row in sweep.curves["optimal"] if _level(row, figure) is None]
     if nothing:
         (entries["no such optimal coupling"],) = axis.plot(
             nothing, [0.96] * len(nothing), "kx", markersize=8, transform=top, clip_on=False
@@ -633,10 +636,10 @@ def _draw_sweep(axis: Axes, name: str, sweep: dict[str, Any], figure: str, here:
     entries["this scenario"] = axis.axvline(here, color="grey", linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
     if name in ("damping", "period"):
         axis.set_xscale("log")
-        ticks = [scale * row["value"] for row in sweep["optimal"]]
+        ticks = [scale * row.value for row in sweep.curves["optimal"]]
         axis.set_xticks(ticks, [f"{tick:.3g}" for tick in ticks])
         axis.set_xticks([], minor=True)
     else:
-        axis.set_xticks([row["value"] for row in sweep["optimal"]])
-    axis.set_xlabel(f"{sweep['label']}" + ("" if name == "order" else f" [{unit}]"))
+        axis.set_xticks([row.value for row in sweep.curves["optimal"]])
+    axis.set_xlabel(f"{sweep.label}" + ("" if name == "order" else f" [{unit}]"))
     return entries

@@ -1,69 +1,49 @@
-"""Results of a run as plain data in SI units: null with a "reason" where a figure does not exist.
-
-The rows on the screen are made of it in cli/run.py.
-"""
+"""Parts of the reports of runs and validations, in SI units."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Self
 
 import numpy as np
 
 from controller.coupling import PUBLISHED, Coupling
-from controller.delay import LOST, Ticks, VaryingDelay, ages
-from controller.older import CONDITIONS, with_older
+from controller.delay import LOST, VaryingDelay, ages
 from controller.timing import Timing
 from design.certificate import assess
-from design.guarantees import encoder_part
-from design.result import Requirement, certificate_part, finite, listed
-from design.transparency import Transparency, decibels
-from sim.couplings import Chosen
+from design.files import unseen
+from design.guarantees import EncoderSteps
+from design.result import Chosen, finite, listed
 from sim.run import Simulation
 from sim.scenario import Scenario, load
 from sim.stability import Stability, close, dominant_mode, eigenvalues, linear_growth
-from sim.switching import Period, certified_part
+from sim.switching import DelaysCovered, Period
 from sim.trace import Trace
 
 # ----------------------------------------------------------------------------------------------------
-# Certificates, couplings and transparency.
+# Couplings and encoders.
 
 
-def certificates_part(requirements: Mapping[str, Requirement]) -> dict[str, Any]:
-    """Both conditions, each under its name and under the name that it had before: the same objects."""
-    parts = {name: certificate_part(requirement) for name, requirement in requirements.items()}
-    return with_older(parts, CONDITIONS)
-
-
-def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
+@dataclass(frozen=True)
+class CouplingFigures:
     """Kind, gains (None where it has none) and order of V, Q or R."""
-    return {"kind": kind, "K": None, "B": None} | coupling.figures(T)
+
+    kind: str
+    order: int
+    K: list[float] | None = None  # (m,) [N/m]
+    B: list[float] | None = None  # (m,) [N s/m]
+    stiffness: list[float] | None = unseen("given", None)  # (m,) [N/m], static, of a moving average
+
+    @classmethod
+    def of(cls, kind: str, coupling: Coupling, T: float) -> CouplingFigures:
+        return cls(kind, **coupling.figures(T))
 
 
-def transparency_part(figures: Transparency) -> dict[str, Any]:
-    """The figures of the mismatch, in decibels, with a reason where one is infinite."""
-    part: dict[str, Any] = {
-        "tau_db": finite(decibels(figures.tau)),
-        "relative_mismatch_db": finite(decibels(figures.relative_mismatch)),
-        "rms_mismatch_db": finite(decibels(figures.rms_mismatch)),
-        "dc_ratio": finite(figures.dc_ratio),
-        "high_frequency_gain": finite(figures.high_frequency_gain),
-        "band_hz": list(figures.band_hz),
-    }
-    if figures.relative_mismatch == 0:
-        part["reason"] = "the devices see the reference exactly: the mismatch is zero, minus infinity in dB"
-    elif math.isinf(figures.tau):
-        part["reason"] = "tau (25) divides by inf sigma_min(E), which is 0: some motion costs no static force"
-    return part
-
-
-def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> dict[str, Any] | None:
+def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> EncoderSteps | None:
     """Whether the devices' friction pays for their encoders' steps."""
     steps, friction = ([getattr(device, of) for device in scenario.device] for of in ("encoder_step", "friction"))
     try:
-        return encoder_part(scenario.loop(case), coupling, steps, friction)
+        return EncoderSteps.of(scenario.loop(case), coupling, steps, friction)
     except ValueError:  # no solution of the algebraic loop, which the conditions have said
         return None
 
@@ -73,12 +53,12 @@ def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> dict[str
 
 
 #: The transparency indices (25) printed beside the gains [dB]; no reading of Figure 4 that we tried gives them.
-PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
+_PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A figure of the paper, and what it is here."""
+    """A figure that the paper prints, and the same one computed here."""
 
     what: str
     paper: str
@@ -87,23 +67,23 @@ class PaperRow:
 
 
 def beside_the_paper(
-    scenario: Scenario, case: str, stability: Stability, coupling: dict[str, Any]
+    scenario: Scenario, case: str, stability: Stability, coupling: CouplingFigures
 ) -> tuple[PaperRow, ...]:
-    """Every figure that the paper prints of its loop; none where the loop is another."""
+    """Every figure that the paper prints, beside ours; empty for any loop but the paper's."""
     if scenario.varying_delay or scenario.loop(case) != load().loop(case):
         return ()
     figure = _figure(case, stability)
     return (figure,) if case == "none" else (*_printed_gains(scenario, case, coupling), _tau(case), figure)
 
 
-def _printed_gains(scenario: Scenario, case: str, got: dict[str, Any]) -> tuple[PaperRow, ...]:
+def _printed_gains(scenario: Scenario, case: str, got: CouplingFigures) -> tuple[PaperRow, ...]:
     printed = PUBLISHED[case]
     need = assess(scenario.loop(case), printed)
     any_environment, this_environment = (need[name].required for name in ("any-environment", "this-environment"))
     gains = PaperRow(
         "gains [N/m], [N s/m]",
         f"K = {listed(printed.K, 5)}, B = {listed(printed.B, 5)}",
-        "none" if got["K"] is None else f"K = {listed(got['K'], 5)}, B = {listed(got['B'], 5)}",
+        "none" if got.K is None else f"K = {listed(got.K, 5)}, B = {listed(got.B or (), 5)}",
         "the printed gains are no solution of the paper's own problem (next row)",
     )
     damping = PaperRow(
@@ -117,7 +97,7 @@ def _printed_gains(scenario: Scenario, case: str, got: dict[str, Any]) -> tuple[
 
 def _tau(case: str) -> PaperRow:
     why = "inf sigma_min(E) = 0: moving both contacts together costs no static force"
-    return PaperRow("transparency index tau (25)", f"{PRINTED_TAU_DB[case]} dB", "infinite", why)
+    return PaperRow("transparency index tau (25)", f"{_PRINTED_TAU_DB[case]} dB", "infinite", why)
 
 
 def _figure(case: str, stability: Stability) -> PaperRow:
@@ -138,92 +118,142 @@ def _figure(case: str, stability: Stability) -> PaperRow:
 _JUDGED = 4.0  # [s] at most of the linear loop from which a growth is read: later numbers may overflow
 
 
-def delays_part(
-    simulation: Simulation, chosen: Chosen, period: Period | None, ticks: int, certified: bool
-) -> dict[str, Any] | None:
-    """All that a report says of delays that vary; None where the scenario has none."""
-    scenario = simulation.scenario
-    if scenario.varying_delay is None:
-        return None
-    met = _delays_met(simulation, period, ticks) if scenario.switches else {}
-    return delay_range_part(scenario.varying_delay) | met | certified_part(scenario, chosen, certified)
-
-
-def delay_range_part(varying: VaryingDelay) -> dict[str, Any]:
+@dataclass(frozen=True)
+class DelaySpan:
     """The range of delays and how they vary within it."""
-    return {
-        "lo": list(varying.lo),
-        "hi": list(varying.hi),
-        "pattern": varying.pattern,
-        "loss": varying.loss,
-        "playout": varying.playout,
-        "constant": varying.steady,
-    }
+
+    lo: tuple[int, ...]
+    hi: tuple[int, ...]
+    pattern: str
+    loss: float
+    playout: bool
+    constant: bool
+
+    @classmethod
+    def of(cls, varying: VaryingDelay) -> DelaySpan:
+        return cls(varying.lo, varying.hi, varying.pattern, varying.loss, varying.playout, varying.steady)
 
 
-def _delays_met(switched: Simulation, period: Period | None, ticks: int) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Age:
+    """Of the forces in use, per channel, from the first arrival on [samples]."""
+
+    least: list[int]
+    largest: list[int]
+    mean: list[float]
+
+
+@dataclass(frozen=True)
+class _PeriodGrowth:
+    """Of the worst switching found, over one period of it."""
+
+    ticks: int
+    growth_rate_per_s: float
+    spectral_radius: float
+    verdict: str
+
+
+@dataclass(frozen=True)
+class _DelaysMet:
     """The delays that a run met, and the growth of its linear loop under them."""
-    delays = switched.process.delays
-    assert delays is not None
-    met = ages(delays[:ticks])[..., 0]
-    used = met[(met >= 0).all(axis=1)]
-    growth, window = linear_growth(switched, max(4, min(ticks, round(_JUDGED / switched.scenario.T))))
-    return {
-        "age": _age(used),
-        "lost_packets": (delays[:ticks] == LOST).sum(axis=(0, 2)).tolist(),
-        "held_ticks": (np.diff(used, axis=0) == 1).sum(axis=0).tolist(),
-        "growth_rate_per_s": finite(growth),
-        "verdict": "unstable" if growth > 0 else "stable",
-        "judged_s": window,
-        "period": None
-        if period is None
-        else {
-            "ticks": len(period.ages),
-            "growth_rate_per_s": finite(period.growth),
-            "spectral_radius": period.spectral_radius,
-            "verdict": "unstable" if period.growth > 0 else "stable",
-        },
-    }
+
+    age: _Age | None  # None where no force arrives
+    lost_packets: list[int]
+    held_ticks: list[int]
+    growth_rate_per_s: float
+    verdict: str
+    judged_s: float
+    period: _PeriodGrowth | None
+
+    @classmethod
+    def of(cls, switched: Simulation, period: Period | None, ticks: int) -> _DelaysMet:
+        delays = switched.process.delays
+        assert delays is not None
+        met = ages(delays[:ticks])[..., 0]
+        used = met[(met >= 0).all(axis=1)]
+        growth, window = linear_growth(switched, max(4, min(ticks, round(_JUDGED / switched.scenario.T))))
+        ends = (used.min(axis=0), used.max(axis=0), used.mean(axis=0)) if used.size else ()
+        worst = period and (len(period.ages), period.growth, period.spectral_radius, _verdict(period.growth))
+        return cls(
+            _Age(*(values.tolist() for values in ends)) if ends else None,
+            (delays[:ticks] == LOST).sum(axis=(0, 2)).tolist(),
+            (np.diff(used, axis=0) == 1).sum(axis=0).tolist(),
+            growth,
+            _verdict(growth),
+            window,
+            _PeriodGrowth(*worst) if worst else None,
+        )
+
+    @property
+    def worst(self) -> _DelaysMet | _PeriodGrowth:
+        """Where the growth is read: of the worst switching found, else of the run's delays."""
+        return self.period or self
+
+    @property
+    def how(self) -> str:
+        """How that growth was found."""
+        if self.period:
+            return f"growth by the eigenvalues of the product over the {self.period.ticks} ticks of a period"
+        return f"growth of the linear loop after an impulse, over {self.judged_s:.3g} s under the run's delays"
 
 
-def _age(used: Ticks) -> dict[str, Any] | None:
-    """Of the forces in use [samples], per channel, from the first arrival on; None where none arrives."""
-    if not used.size:
-        return None
-    figures = {"least": used.min(axis=0), "largest": used.max(axis=0), "mean": used.mean(axis=0)}
-    return {name: values.tolist() for name, values in figures.items()}
+def _verdict(growth: float) -> str:
+    return "unstable" if growth > 0 else "stable"
 
 
-def timing_part(timing: Timing | None, scenario: Scenario) -> dict[str, Any] | None:
-    """What periods a run had and how late its forces latched; None where ticks are even and forces latch at them."""
-    if timing is None:
-        return None
-    period = timing.period
-    return {
-        "period_s": {"least": float(period.min()), "mean": float(period.mean()), "largest": float(period.max())},
-        "recorded": bool(scenario.period and scenario.period.recorded),
-        "T_max_s": scenario.longest_period,
-        "latency_s": scenario.latency and [list(span) for span in scenario.latency],
-    }
+@dataclass(frozen=True)
+class VaryingDelays:
+    """All that a report says of delays that vary; `met` is of a run, where they switch."""
+
+    span: DelaySpan = unseen("beside")
+    met: _DelaysMet | None = unseen("beside")
+    certified: DelaysCovered = unseen("beside")
+
+    @classmethod
+    def of(cls, simulation: Simulation, chosen: Chosen, period: Period | None, ticks: int, certified: bool) -> Self:
+        scenario = simulation.scenario
+        assert scenario.varying_delay is not None
+        met = _DelaysMet.of(simulation, period, ticks) if scenario.switches else None
+        return cls(DelaySpan.of(scenario.varying_delay), met, DelaysCovered.of(scenario, chosen, certified))
 
 
-def switched_stability(simulation: Simulation, trace: Trace, delays: dict[str, Any]) -> Stability:
-    """As stability_of, for a loop that switches: it has no eigenvalue of its own but over a period."""
-    worst = delays["period"] or delays
+@dataclass(frozen=True)
+class _Periods:
+    """How long ticks are [s]."""
+
+    least: float
+    mean: float
+    largest: float
+
+
+@dataclass(frozen=True)
+class UnevenTicks:
+    """What periods a run had, and how late its forces latched."""
+
+    period_s: _Periods
+    recorded: bool
+    T_max_s: float | None
+    latency_s: tuple[tuple[float, float], ...] | None
+
+    @classmethod
+    def of(cls, timing: Timing, scenario: Scenario) -> UnevenTicks:
+        period, recorded = timing.period, bool(scenario.period and scenario.period.recorded)
+        lengths = _Periods(float(period.min()), float(period.mean()), float(period.max()))
+        return cls(lengths, recorded, scenario.longest_period, scenario.latency)
+
+
+def switched_stability(simulation: Simulation, trace: Trace, delays: VaryingDelays) -> Stability:
+    """stability_of for delays that switch: such a loop has eigenvalues only over a period of the switching."""
+    met = delays.met
+    assert met is not None
     constant = eigenvalues(dominant_mode(close(simulation.plant, simulation.F)))
-    grows = trace.diverged or "unstable" in (worst["verdict"], delays["verdict"])
+    grows = trace.diverged or "unstable" in (met.worst.verdict, met.verdict)
     theta = listed(simulation.scenario.theta)
     return Stability(
         **vars(constant),
         verdict="unstable" if grows else "stable",
         clipped_ticks=int(trace.clipped(simulation.process.force_limit).sum()),
-        growth_rate_per_s=worst["growth_rate_per_s"],
+        growth_rate_per_s=finite(met.worst.growth_rate_per_s),
         frequency_hz=trace.dominant_frequency_hz(),
-        reason=f"{_how(delays)}; the eigenvalues are those of the constant delay theta = {theta}",
+        reason=f"{met.how}; the eigenvalues are those of the constant delay theta = {theta}",
     )
-
-
-def _how(delays: dict[str, Any]) -> str:
-    if delays["period"]:
-        return f"growth by the eigenvalues of the product over the {delays['period']['ticks']} ticks of a period"
-    return f"growth of the linear loop after an impulse, over {delays['judged_s']:.3g} s under the run's delays"

@@ -1,4 +1,4 @@
-"""What a run came to: the figures of its report, and what a reader must know to read them rightly."""
+"""The report of a run: its figures, and remarks that explain them."""
 
 from __future__ import annotations
 
@@ -7,23 +7,22 @@ from typing import Any
 
 from controller.lti import Array
 from design.files import unseen
-from design.guarantees import ANY, CAVEATS, MAKING
-from design.result import listed
-from design.transparency import transparency
+from design.guarantees import ANY, CAVEATS, MAKING, EncoderSteps
+from design.optimal import Nearby
+from design.result import Chosen, Requirement, listed
+from design.transparency import Transparency, transparency
 from sim import accuracy
 from sim.alternatives import Alternative
 from sim.api import ScenarioRun
-from sim.couplings import Chosen
 from sim.judged import Judged
 from sim.passivity_layer import idle
 from sim.report import (
     PaperRow,
+    UnevenTicks,
+    VaryingDelays,
     beside_the_paper,
-    delays_part,
     encoder_steps,
     switched_stability,
-    timing_part,
-    transparency_part,
 )
 from sim.run import beginnings, engine_name
 from sim.scenario import Scenario
@@ -45,7 +44,7 @@ class Ran:
     psi: tuple[int, ...]
     lam: tuple[int, ...]
     T_s: float
-    timing: dict[str, Any] | None
+    timing: UnevenTicks | None
     seed: int
     engines: tuple[accuracy.EngineChoice, ...] | None  # compared for --error
     cross_check: accuracy.CrossCheck | None
@@ -62,19 +61,19 @@ class RunReport:
 
     case: str
     scenario: str
-    certificate: dict[str, Any]
+    certificate: Requirement
     judged: Judged = unseen("beside")
-    encoder: dict[str, Any] | None
-    transparency: dict[str, Any]
+    encoder: EncoderSteps | None
+    transparency: Transparency
     stability: Stability
-    varying_delay: dict[str, Any] | None
+    varying_delay: VaryingDelays | None = unseen(older="jitter")
     run: Ran
     error: accuracy.PositionError
     credible: accuracy.Credible
     ideal_force: accuracy.ForceError
     energy_budget: dict[str, Any] | None
     baseline: dict[str, Any] | None
-    robustness: dict[str, Any] = unseen("beside")
+    nearby: Nearby = unseen("beside")
     alternatives: list[Alternative]
     reproducibility: tuple[PaperRow, ...]
     remarks: tuple[str, ...]
@@ -82,37 +81,36 @@ class RunReport:
     @property
     def switched(self) -> bool:
         """Whether the delays switch, so that no eigenvalue says whether the loop grows."""
-        return "verdict" in (self.varying_delay or {})
+        return bool(self.varying_delay and self.varying_delay.met)
 
     def notes(self) -> list[str]:
-        """What a reader must know to read the figures rightly."""
-        lines, promise = [], self.judged.promise
-        certificates = {name: self.judged.certificates[name] for name in ("any-environment", "this-environment")}
-        name = "any-environment" if self.certificate["condition"] == "any-environment" else "this-environment"
+        """Remarks that explain the figures."""
+        lines, guarantee = [], self.judged.guarantee
+        certificates = self.judged.requirements
+        name = "any-environment" if self.certificate.condition == "any-environment" else "this-environment"
         part = certificates[name]
-        if not part["certified"] and "reason" not in part:
-            worst = max(n / a for n, a in zip(part["required_damping"], part["available_damping"], strict=True))
+        if not part.certified and not part.reason:
             condition = f"the {name} condition" + (" (the paper's Theorem 4)" if name == "any-environment" else "")
-            what = "The loop without" if self.judged.coupling["kind"] == "none" else "This"
-            needs = f"it needs {worst:.3g} times the damping that the devices guarantee"
+            what = "The loop without" if self.judged.coupling.kind == "none" else "This"
+            needs = f"it needs {part.ratio:.3g} times the damping that the devices guarantee"
             lines.append(f"{what} coupling fails {condition}: {needs}.")
         if contact := self.stability.contact:
-            covered = {ANY: "any-environment", MAKING: "this-environment"}.get(promise or "", "no certificate")
+            covered = {ANY: "any-environment", MAKING: "this-environment"}.get(guarantee or "", "no certificate")
             softer = f", and any walls with K + 2 B/T up to {listed(contact.slopes_n_per_m)} N/m"
-            softer = softer if promise == MAKING else ""
+            softer = softer if guarantee == MAKING else ""
             lines.append(f"Contact that makes and breaks: {covered} covers it in this loop{softer}.")
         reasons = {
             "stability": self.stability.reason,
             "error": self.error.reason,
-            "transparency": self.transparency.get("reason"),
+            "transparency": self.transparency.reason,
             "credible": self.credible.reason,
-            **{name: part.get("reason") for name, part in certificates.items()},
+            **{name: part.reason for name, part in certificates.items()},
         }
         lines += [f"{name}: {reason}." for name, reason in reasons.items() if reason]
         if self.varying_delay:
-            lines.append(f"Delays that vary: {self.varying_delay['covers']}.")
+            lines.append(f"Delays that vary: {self.varying_delay.certified.covers}.")
         if self.encoder:
-            lines.append(f"{self.encoder['words'][0].upper()}{self.encoder['words'][1:]}.")
+            lines.append(f"{self.encoder.words[0].upper()}{self.encoder.words[1:]}.")
         return [*lines, CAVEATS]
 
 
@@ -124,7 +122,7 @@ def run_report(
     run: ScenarioRun,
     environment: str,
     others: list[Alternative],
-    robustness: dict[str, Any],
+    nearby: Nearby,
     *,
     seed: int,
     band_hz: tuple[float, float],
@@ -133,8 +131,10 @@ def run_report(
     """The report of a run; `check` runs another integrator beside it."""
     simulation, trace, loop = run.simulation, run.trace, scenario.loop(case)
     covered = any(requirement.certified for requirement in judged.requirements.values())
-    delays, grows = delays_part(simulation, chosen, run.period, trace.t.size, covered), None
-    if delays and simulation.scenario.switches:
+    delays, grows = None, None
+    if simulation.scenario.varying_delay:
+        delays = VaryingDelays.of(simulation, chosen, run.period, trace.t.size, covered)
+    if delays and delays.met:
         stability = switched_stability(simulation, trace, delays)
         grows = stability.verdict == "unstable"
     else:
@@ -148,7 +148,7 @@ def run_report(
         certificate=judged.certificates[chosen.condition],
         judged=judged,
         encoder=encoder_steps(scenario, case, chosen.coupling),
-        transparency=transparency_part(felt),
+        transparency=felt,
         stability=stability,
         varying_delay=delays,
         run=_ran(run, loop.lam, environment, seed, check),
@@ -157,7 +157,7 @@ def run_report(
         ideal_force=accuracy.force_error(run.ran, trace, loop.lam),
         energy_budget=budget and budget | {"idle": idle(simulation, any_environment, budget)},
         baseline=None if budget else net,
-        robustness=robustness,
+        nearby=nearby,
         alternatives=others,
         reproducibility=beside_the_paper(simulation.scenario, case, stability, judged.coupling),
         remarks=(*run.remarks, *chosen.notes),
@@ -181,7 +181,7 @@ def _ran(run: ScenarioRun, lam: tuple[int, ...], environment: str, seed: int, ch
         psi=scenario.psi,
         lam=lam,
         T_s=scenario.T,
-        timing=timing_part(simulation.timing, scenario),
+        timing=simulation.timing and UnevenTicks.of(simulation.timing, scenario),
         seed=seed,
         engines=run.choices or None,
         cross_check=accuracy.cross_check(run.ran, trace, *steps) if check else None,

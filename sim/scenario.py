@@ -21,13 +21,15 @@ import msgspec
 import numpy as np
 
 from controller.delay import VaryingDelay
-from controller.environment import RIGID_WALL, Network, Spring, Wall, environment
+from controller.environment import RIGID_WALL, Block, Environment, Network, Spring, Wall, environment, parts_of
 from controller.loop import MOST_SAMPLES, DelayRange, Loop
+from controller.lti import Lti
 from controller.older import SCENARIOS as OLDER_SCENARIOS
 from controller.older import named_first, named_today
 from controller.ranges import Ranges, UncertainSpring
 from controller.timing import Periods, Timing, drawn
 from design.files import InputError, counted, printable, read_text, toml, write
+from design.own import called, holds_own_code, named, place_of
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
 from models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
@@ -229,7 +231,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping [N s/m].
 
         As strict as a file, and what comes out is what a file would have given: lists become tuples. Humans may also
-        be of a user's own class (models.human.Hand), and so may a population with `draw(rng, n)`, n humans.
+        be of a user's own class (models.human.Hand), and so may a population with `draw(rng, n)`, n humans, and an
+        environment with `contacts` and `E(T)` or `parts()`, which becomes a network.
         Raises InputError naming the field, what came and what is allowed.
         """
         fields = {name: getattr(self, name) for name in self.__struct_fields__} | changes
@@ -240,6 +243,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
                 if len(damping) != self.channels:
                     raise InputError(f"delta has {len(damping)} entries for {self.channels} channels")
                 fields["device"] = tuple(with_damping(d, b) for d, b in zip(self.device, damping, strict=True))
+            if not isinstance(fields["environment"], Network | dict):
+                fields["environment"] = _network(fields["environment"], fields["T"])
             if "human" in own:
                 fields["human"] = [_NOBODY] * len(own["human"])
             made = _strictly(fields, type(self))
@@ -314,15 +319,15 @@ class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def held_by(scenario: Scenario, path: str | Path) -> Scenario:
-    """The scenario in the hands, or of the population, that a file names. Raises InputError as `load_humans` does."""
-    people = load_humans(path, scenario.channels)
+    """The scenario in the hands, or of the population, that a file names. Raises InputError as `_load_humans` does."""
+    people = _load_humans(path, scenario.channels)
     who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
     if people.population is not None:
         who["population"] = people.population
     return scenario.replace(**who)
 
 
-def load_humans(path: str | Path, channels: int) -> _HumanFile:
+def _load_humans(path: str | Path, channels: int) -> _HumanFile:
     """The humans of a file, one per channel, and who holds several devices.
 
     A Python file is run, and says who they are: `humans`, and `persons` if it likes, of any class (models.human.Hand).
@@ -366,6 +371,7 @@ def _run_file(path: str | Path) -> _HumanFile:
     heard.close = lambda: None
     try:
         with redirect_stdout(heard):  # where a report may be written to
+            holds_own_code(str(path))
             names = runpy.run_path(str(path))
         sys.stderr.write(printable(heard.getvalue()))
         hands, persons = _kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ()))
@@ -409,10 +415,12 @@ def _converted(text: str, kind: Any, source: str) -> Any:
     raw = toml(text, source)
     try:
         raw = _whole(named_today(raw)) if kind is Scenario else raw
-        return msgspec.convert(_with_catalogue(raw), kind)
+        return msgspec.convert(_with_own(_with_catalogue(raw)), kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
     except ValueError as error:
+        if place_of(error):  # in a class of the user's own
+            raise
         raise InputError(f"{source}: {error}") from None
 
 
@@ -442,6 +450,55 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
                 raise InputError(f"device #{i}: {error}") from None
         made.append(given)
     return raw | {"device": made}
+
+
+def _with_own(raw: dict[str, Any]) -> dict[str, Any]:
+    """The file with environments and elements of a user's own classes written out as what they are made of."""
+    found = raw.get("environment")
+    if not isinstance(found, dict):
+        return raw
+    if "type" in found:
+        return raw | {"environment": msgspec.to_builtins(_network(_own("environment", found), raw.get("T")))}
+    elements = found.get("elements")
+    if not isinstance(elements, list):
+        return raw
+    parts = {name: found.get(name, []) for name in ("springs", "walls")}
+    for i, table in enumerate(elements, start=1):
+        what = f"environment.elements #{i}"
+        for part in called(what, parts_of, _own(what, table)):
+            name = "springs" if isinstance(part, Spring) else "walls"
+            parts[name] = [*parts[name], msgspec.to_builtins(part)]
+    rest = {name: value for name, value in found.items() if name != "elements"}
+    return raw | {"environment": rest | {name: some for name, some in parts.items() if some}}
+
+
+def _own(what: str, table: Any) -> Any:
+    """What the class that a table names makes of its other keys. Raises InputError."""
+    if not isinstance(table, dict) or not isinstance(table.get("type"), str):
+        raise InputError(f"{what} is {table!r}, expected a table with type = 'package.module:Class'")
+    kind, given = named(f"{what}.type", table["type"]), {key: v for key, v in table.items() if key != "type"}
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        try:
+            return msgspec.convert(given, kind)
+        except msgspec.ValidationError as error:
+            raise InputError(f"{what}.{_located(str(error), given)}") from None
+    return called(what, kind, **given) if callable(kind) else kind
+
+
+def _network(own: Any, T: Any) -> Network:
+    """A user's own environment, which has `contacts` and `E(T)` or `parts()`, at this period. Raises InputError."""
+    what = f"environment {type(own).__name__}"
+    contacts, block = getattr(own, "contacts", None), None
+    known = getattr(type(own), "E", Environment.E) is not Environment.E
+    if not isinstance(contacts, list | tuple) or not (known or hasattr(own, "parts")):
+        raise InputError(f"{what}: expected a class with contacts, and E(T) or parts()")
+    if known:
+        E = called(f"{what}.E(T)", own.E, T)
+        if not isinstance(E, Lti):
+            raise InputError(f"{what}.E(T) is {E!r}, expected a controller.lti.Lti")
+        block = called(what, Block.of, E)
+    elements = (own,) if hasattr(own, "parts") else ()
+    return called(what, Network, tuple(contacts), block=block, elements=elements)
 
 
 class _Damping(msgspec.Struct, frozen=True):

@@ -16,27 +16,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
-from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Coupling
 from controller.delay import LOST, Ticks, VaryingDelay, realising
-from controller.loop import DelayRange, force_map
+from controller.loop import DelayRange
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
-from design.coverage import switching_part
+from design.coverage import Switching
+from design.files import unseen
 from design.guarantees import switching_guarantee
+from design.result import Chosen
 from models.hold import HeldPlant, hold
 from models.scene import Scene, Variants
-from sim.couplings import Chosen
 from sim.engines import Engine, ExactEngine, ExactTimedEngine
 from sim.mujoco_engines import MujocoBatchEngine
 from sim.run import Simulation
 from sim.scenario import Scenario
-from sim.stability import impulse_forces, impulse_growth, unlimited
+from sim.stability import impulse_forces, impulse_growth
 
 _SEARCHED = 1600  # ticks of greedy switching in which the worst period is sought
 _LONGEST_PERIOD = 250  # [ticks]
@@ -59,38 +57,22 @@ class Period:
 # ---- one run
 
 
-def switching(
-    simulation: Simulation, coupling: Coupling, seed: int, ticks: int, index: int = 0
-) -> tuple[Simulation, Period | None]:
-    """The loop with the scenario's varying delays, and their period where they are adversarial."""
+def switching(simulation: Simulation, seed: int, ticks: int, index: int = 0) -> tuple[Simulation, Period | None]:
+    """The loop with the scenario's varying delays in place of theta, and their period where they are adversarial."""
     varying = simulation.scenario.varying_delay
     assert varying is not None
-    period = worst_switching(simulation, coupling, varying) if varying.pattern == "adversarial" else None
+    period = _worst_switching(simulation, varying) if varying.pattern == "adversarial" else None
     given = period.delays if period else None
     delays = _draw_delays(simulation.scenario, seed, index, max(ticks, _SHORTEST), given)
-    return with_delays(simulation, coupling, delays[:, :, None]), period
+    return replace(simulation, process=replace(simulation.process, delays=delays[:, :, None])), period
 
 
-def with_delays(simulation: Simulation, coupling: Coupling, delays: Ticks) -> Simulation:
-    """The same loop with packets that take `delays` (ticks, m, nsim or 1) in place of the constant theta.
-
-    `simulation.F` stays that of the constant theta: certificates and transparency are about it.
-    """
-    process = replace(simulation.process, F=without_theta(simulation, coupling), delays=delays)
-    return replace(simulation, process=process)
-
-
-def worst_switching(simulation: Simulation, coupling: Coupling, varying: VaryingDelay) -> Period:
+def _worst_switching(simulation: Simulation, varying: VaryingDelay) -> Period:
     """The periodic switching within the range that was found to grow fastest in this loop."""
-    G, plant = without_theta(simulation, coupling), simulation.plant
+    plant, process = simulation.plant, simulation.process
     one = HeldPlant(plant.A[None], plant.B[None], plant.C, plant.T)
-    ages = greedy_ages(replace(simulation.process, F=G), one, simulation.scene, varying, _SEARCHED)
-    return _worst_period(ages[:, :, 0], plant, G, varying)
-
-
-def without_theta(simulation: Simulation, coupling: Coupling) -> Lti:
-    """G = (I + Psi E V)^-1 Psi E: the forces as they leave for the devices."""
-    return force_map(simulation.E, coupling, (0,) * simulation.process.channels, simulation.scenario.psi)
+    ages = _greedy_ages(process, one, simulation.scene, varying, _SEARCHED)
+    return _worst_period(ages[:, :, 0], plant, process.law.sent, varying)
 
 
 def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: Ticks | None = None) -> Ticks:
@@ -104,7 +86,7 @@ def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: T
 # ---- the worst delays
 
 
-def mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[int]) -> Array:
+def _mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[int]) -> Array:
     """A of xi[k+1] = A xi[k] while the forces in use have these ages [samples], age_i <= depth_i."""
     states, m = plant.A.shape[0], G.outputs
     n, first = states + G.order + sum(depth), states + G.order
@@ -127,13 +109,14 @@ def mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[i
     return A
 
 
-def greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: VaryingDelay, ticks: int) -> Ticks:
-    """Ages (ticks, m, nsim) that feed the linear loop of every plant; `process` is that without Theta."""
+def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: VaryingDelay, ticks: int) -> Ticks:
+    """Ages (ticks, m, nsim) that feed the linear loop of every plant."""
     nsim, states, nv = plants.A.shape[0], plants.A.shape[1], scene.model.nv
-    m, free = process.channels, np.full(process.channels, np.inf)
+    m, law = process.channels, process.law.without_theta
+    free = replace(process, law=law, force_limit=np.full(m, np.inf), delays=None)
     lo, hi = (np.array(side)[:, None] for side in (varying.lo, varying.hi))
     depth = int(hi.max()) + 1
-    buffer = StepBuffer(replace(process, force_limit=free, delays=None), 1, states, scene.outside, nsim)
+    buffer = StepBuffer(free, 1, states, scene.outside, nsim)
     engine = ExactEngine(plants)
     engine.start(buffer)
     pushed = impulse_forces(scene, process.F.T, 0, ticks)
@@ -161,7 +144,7 @@ def greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Vary
 def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay) -> Period:
     """The fastest growing repetition of a window of `ages` (ticks, m), or of one delay at an end of its range."""
     ticks = ages.shape[0]
-    matrix = cache(lambda *now: mode_matrix(plant, G, varying.hi, now))
+    matrix = cache(lambda *now: _mode_matrix(plant, G, varying.hi, now))
     best, chosen = -np.inf, ages[:1]
     starts = np.linspace(ticks // 3, max(ticks - _LONGEST_PERIOD, ticks // 3), _STARTS, dtype=int)
     ends = [np.array([row]) for row in product(*zip(varying.lo, varying.hi, strict=True))][:_MOST_ENDS]
@@ -209,7 +192,6 @@ class Switched:
 
 def switched_crowd(
     simulation: Simulation,
-    coupling: Coupling,
     held_by: Variants,
     index: NDArray[np.intp],
     seed: int,
@@ -224,18 +206,16 @@ def switched_crowd(
     scenario, nsim, scene = simulation.scenario, len(held_by), held_by.scene
     plants = hold(held_by.plants(), scenario.T, scenario.usual_latency)
     states = plants.A.shape[1]
-    free = replace(simulation.process, F=without_theta(simulation, coupling)) if scenario.switches else None
 
     def judged(ticks: int) -> Switched:
         process, timing = simulation.process, scenario.timing(seed, ticks)
-        if free:
-            process = replace(free, delays=_crowd_delays(scenario, free, scene, plants, index, seed, ticks))
-        endless = unlimited(process)
+        if scenario.switches:
+            process = replace(process, delays=_crowd_delays(scenario, process, scene, plants, index, seed, ticks))
         if timing:
             moved: Engine = ExactTimedEngine(held_by.plants(), timing)
         else:
             moved = ExactEngine(plants)
-        exact, _ = impulse_growth(endless, moved, scene, states, ticks, nsim)
+        exact, _ = impulse_growth(process.unlimited, moved, scene, states, ticks, nsim)
         if not mujoco:
             return Switched(exact, np.full(nsim, np.nan))
         engine = MujocoBatchEngine(scene, scenario.T, nsim=nsim, nthread=threads, humans=held_by, timing=timing)
@@ -264,7 +244,7 @@ def _crowd_delays(
     assert scenario.varying_delay is not None
     given: list[Ticks | None] = [None] * len(index)
     if scenario.varying_delay.pattern == "adversarial":
-        worst = realising(greedy_ages(process, plants, scene, scenario.varying_delay, ticks))
+        worst = realising(_greedy_ages(process, plants, scene, scenario.varying_delay, ticks))
         given = [worst[:, :, j] for j in range(len(index))]
     numbered = zip(index.tolist(), given, strict=True)
     return np.stack([_draw_delays(scenario, seed, i, ticks, own) for i, own in numbered], axis=2)
@@ -273,54 +253,47 @@ def _crowd_delays(
 # ---- what is certified: by the coupling's file, or judged anew
 
 
-def certified_part(scenario: Scenario, chosen: Chosen, certified: bool) -> dict[str, Any]:
-    """What switching asks, and what the certificates cover; `certified` is about the constant theta."""
-    assert scenario.varying_delay is not None
-    if not scenario.switches:
-        nothing = {"switching": None, "jitter_proof": None, "on_file": None}
-        return nothing | _coverage(scenario.varying_delay, certified, None)
-    span = scenario.delay_range
-    loop = scenario.loop("I").switching(span)  # the case does not matter to stability
-    on_file = chosen.switching if chosen.switching and chosen.switching.contains(span) else None
-    figures = switching_part(loop, chosen.coupling)
-    proof = _how_proved(figures, on_file)
-    parts = {"switching": figures, "jitter_proof": figures, "on_file": on_file and msgspec.to_builtins(on_file)}
-    return parts | _coverage(
-        scenario.varying_delay, certified, proof, figures.get("playout", {}).get("certified", False)
-    )
+@dataclass(frozen=True)
+class DelaysCovered:
+    """Whether what is certified covers the delays of a scenario, and what switching asks."""
+
+    covered: bool
+    covers: str  # which delays, in words
+    switching: Switching | None = unseen(default=None, older="jitter_proof")
+    on_file: DelayRange | None = None
+
+    @classmethod
+    def of(cls, scenario: Scenario, chosen: Chosen, certified: bool) -> DelaysCovered:
+        """`certified` is about the constant theta."""
+        varying, span = scenario.varying_delay, scenario.delay_range
+        assert varying is not None
+        constants = "certificates are about constant delays"
+        if not certified:
+            constants = "nothing is certified, even for constant delays"
+        if not scenario.switches:
+            text = "the delay is constant after all (theta): the certificates cover it"
+            return cls(certified, text if certified else constants)
+        loop = scenario.loop("I").switching(span)  # the case does not matter to stability
+        on_file = chosen.switching if chosen.switching and chosen.switching.contains(span) else None
+        figures = Switching.of(loop, chosen.coupling)
+        lossy = varying.loss > 0 or any(LOST in row for row in varying.recorded)
+        if proof := _how_proved(figures, on_file):
+            what = "any switching of the delays within their range is covered"
+            losses = ", but a lost packet makes a force older than hi, which is not" if lossy else ""
+            words = f"certified for switching delays in this environment ({proof}): {what}{losses}"
+            return cls(not lossy, words, figures, on_file)
+        buffered = figures.playout is not None and figures.playout.certified
+        verdict = "for which it is certified" if buffered else "for which it is not certified either"
+        constant = f"the constant {list(varying.hi)}" + (" but for lost packets" if lossy else "")
+        advice = f"a playout buffer (--playout) makes the delay {constant}, {verdict}"
+        words = f"{constants}; switching is not covered, as this coupling is not certified for it; {advice}"
+        return cls(False, words, figures, on_file)
 
 
-def _coverage(varying: VaryingDelay, certified: bool, proof: str | None, buffered: bool = False) -> dict[str, Any]:
-    """Whether what is certified covers these delays: {"covered", "covers"}.
-
-    `certified` is about the constant theta, `proof` says what shows that every switching within the range is safe
-    ("" if nothing does, None where the delay is constant), `buffered` is about the constant delay hi.
-    """
-    constants = (
-        "certificates are about constant delays" if certified else "nothing is certified, even for constant delays"
-    )
-    if proof is None:
-        text = "the delay is constant after all (theta): the certificates cover it" if certified else constants
-        return {"covered": certified, "covers": text}
-    lossy = varying.loss > 0 or any(LOST in row for row in varying.recorded)
-    if proof:
-        what = "any switching of the delays within their range is covered"
-        within = f"certified for switching delays in this environment ({proof}): {what}"
-        losses = ", but a lost packet makes a force older than hi, which is not"
-        return {"covered": not lossy, "covers": within + (losses if lossy else "")}
-    verdict = "for which it is certified" if buffered else "for which it is not certified either"
-    constant = f"the constant {list(varying.hi)}" + (" but for lost packets" if lossy else "")
-    advice = f"a playout buffer (--playout) makes the delay {constant}, {verdict}"
-    return {
-        "covered": False,
-        "covers": f"{constants}; switching is not covered, as this coupling is not certified for it; {advice}",
-    }
-
-
-def _how_proved(part: dict[str, Any], on_file: DelayRange | None) -> str:
+def _how_proved(figures: Switching, on_file: DelayRange | None) -> str:
     """What shows that any switching within the range is safe, "" where nothing does."""
     if on_file:
         return f"proved in the coupling's file for {switching_guarantee(on_file)}"
-    if not part["certified"]:
+    if not figures.requirement.certified:
         return ""
-    return "proved exactly" if part["proof"] == "rational" else "by a refined sweep, without an exact proof"
+    return "proved exactly" if figures.requirement.proof == "rational" else "by a refined sweep, without an exact proof"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import msgspec
 import numpy as np
@@ -161,11 +161,15 @@ class EnergyAudit:
         return f"{self.audited - self.violated} of {self.audited}{left}"
 
 
+_Met = TypeVar("_Met")  # which delays, or which ticks
+
+
 @dataclass(frozen=True)
-class Growing:
+class Growing(Generic[_Met]):
     """How many humans grow while delays or ticks vary; it holds unless certificates cover these and one grows."""
 
-    met: Mapping[str, Any] = unseen("beside")
+    met: _Met = unseen("beside")
+    covered: bool = unseen()  # by certificates
     unstable: Unstable = unseen()
     humans: int = unseen()
     mujoco_unclipped: int = unseen()
@@ -174,13 +178,13 @@ class Growing:
     holds: bool = unseen()
 
     @classmethod
-    def of(cls, findings: Findings, met: Mapping[str, Any]) -> Growing:
+    def of(cls, findings: Findings, met: _Met, covered: bool) -> Growing[_Met]:
         exact, mujoco = findings.switching, findings.switching_mujoco
         seen, mujoco = ~np.isnan(exact), mujoco[~np.isnan(mujoco)]
         grow = Unstable(int((exact > 0).sum()), int((mujoco > 0).sum()) if mujoco.size else None)
         worst = int(np.nanargmax(exact)) if seen.any() else None
         figures = (None, None) if worst is None else (float(exact[worst]), int(findings.index[worst]))
-        return cls(met, grow, int(seen.sum()), mujoco.size, *figures, not (met["covered"] and grow.exact))
+        return cls(met, covered, grow, int(seen.sum()), mujoco.size, *figures, not (covered and grow.exact))
 
     def row(self, what: str) -> tuple[str, str | None]:
         mujoco, growth = self.unstable.mujoco, self.largest_growth_per_s
@@ -229,6 +233,6 @@ def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
 
 
 def largest(values: Array) -> float | None:
-    """Of the finite ones; None where there is none."""
+    """The largest finite value; None where there is none."""
     values = values[np.isfinite(values)]
     return float(values.max()) if values.size else None

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from controller.environment import RIGID_WALL
+from controller.environment import RIGID_WALL, Network
 from controller.lti import Array
-from design.files import write
+from design.coverage import Limits, RangesFigures
+from design.files import unseen, write
 from design.guarantees import CAVEATS
-from design.result import CONDITIONS, certificate_part
+from design.result import CONDITIONS, Requirement
+from sim.judged import Judged
 from sim.limit_cycles import UNDECIDED, Plan
+from sim.report import CouplingFigures
 from sim.scenario import Scenario
 from sim.stability import MARGINAL
 from sim.trace import slowest_seen
-from sim.zwidth import Map, Mark, Sweep, map_error
+from sim.zwidth import Map, MapError, Mark, Sweep, contact_springs, map_error
 
-_GIVEN: dict[str, Any] = {"json": "given"}  # a key only where there is something to say
 _NOT_REACHED = "not reached before the interruption"
 
 
@@ -32,8 +33,8 @@ class _Ratio:
 
     required_over_available: Array  # (rows, columns)
     certified_cells: int
-    contradicted_cells: int | None = field(metadata=_GIVEN)  # by the population, where it meets this condition's loop
-    reason: str | None = field(metadata=_GIVEN)
+    contradicted_cells: int | None = unseen("given")  # by the population, where it meets this condition's loop
+    reason: str | None = unseen("given")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +47,100 @@ class _Population:
     unstable_humans_at_least: Array  # (rows, columns)
     stable_cells: int
     decided_cells: int
-    reason: str | None = field(metadata=_GIVEN)
+    reason: str | None = unseen("given")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the simulated points have beside the linear loop."""
+
+    encoder_step_m: list[float]
+    friction_n: list[float]
+    force_limit_n: list[float] | None
+    one_sided: bool
+
+
+@dataclass(frozen=True)
+class _Point:
+    """One simulated coupling."""
+
+    K: float
+    B: float
+    verdict: str
+    amplitude_m: float
+    frequency_hz: float
+    linear_growth_rate_per_s: float
+    differs_from_linear: bool
+
+
+@dataclass(frozen=True)
+class _Marked:
+    """What is asked about a single coupling."""
+
+    K: float
+    B: float
+    requirements: dict[str, Requirement] = unseen("beside")
+    growth_rate_per_s: float = unseen()
+    unstable_humans: int = unseen()
+    stiffest_K_at_this_B: dict[str, float | str | None] = unseen()
+
+    @classmethod
+    def of(cls, mark: Mark) -> _Marked:
+        stiffest: dict[str, float | str | None] = {
+            name: "beyond the map" if K is not None and np.isinf(K) else K for name, K in mark.stiffest.items()
+        }
+        return cls(mark.K, mark.B, dict(mark.requirement), mark.growth, mark.unstable, stiffest)
+
+
+@dataclass(frozen=True)
+class _ContactSpring:
+    """One spring at a contact of the environment that a coupling was designed for."""
+
+    between: tuple[str, str]
+    K: float
+    B: float
+
+
+@dataclass(frozen=True, eq=False)
+class _DesignedFor:
+    """Where a fixed coupling was designed, and what is guaranteed of it there."""
+
+    contact_springs: list[_ContactSpring]
+    certificates: dict[str, Requirement]
+    guarantee: str | None = unseen(older="promise")
+    ranges: RangesFigures | None = unseen(older="set")
+
+
+@dataclass(frozen=True, eq=False)
+class FixedCoupling:
+    """The coupling of a map over environments."""
+
+    coupling: CouplingFigures
+    designed_for: _DesignedFor
+    limiter: Limits
+    remarks: tuple[str, ...]
+
+    @classmethod
+    def of(cls, judged: Judged, network: Network, remarks: tuple[str, ...]) -> FixedCoupling:
+        springs = [_ContactSpring(s.between, s.stiffness, s.damping) for s in contact_springs(network)]
+        there = _DesignedFor(springs, judged.certificates, judged.guarantee, judged.ranges)
+        return cls(judged.coupling, there, judged.limiter, remarks)
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """The cells: rows are stiffnesses."""
+
+    K: Array
+    B: Array
+    scale: str
 
 
 @dataclass(frozen=True, eq=False)
 class _Simulated:
     """What MuJoCo shows at some of the cells."""
 
-    effects: dict[str, Any]
+    effects: Shown
     nonlinear: bool
     trials: int
     duration_s: float
@@ -61,7 +148,7 @@ class _Simulated:
     press_n: float
     threshold_m: float
     from_hz: float
-    points: list[dict[str, Any]]
+    points: list[_Point]
     oscillate: int
     undecided: int
     differ_from_linear: int
@@ -71,24 +158,23 @@ class _Simulated:
         """The points that were reached, and what they have beside the linear loop."""
         points, (K, B) = drawn.points, (axis[drawn.points.cell] for axis in drawn.grid.flat)
         figures = (K, B, points.verdicts, points.amplitude, points.frequency_hz, points.growth, points.differ)
-        names = ("K", "B", "verdict", "amplitude_m", "frequency_hz", "linear_growth_rate_per_s", "differs_from_linear")
         devices = plan.effects.on(sweep.devices)
-        effects = {
-            "encoder_step_m": [device.encoder_step for device in devices],
-            "friction_n": [device.friction for device in devices],
-            "force_limit_n": [d.force_limit for d in devices] if plan.effects.saturation else None,
-            "one_sided": sweep.walled is not None,
-        }
+        effects = Shown(
+            [device.encoder_step for device in devices],
+            [device.friction for device in devices],
+            [d.force_limit for d in devices] if plan.effects.saturation else None,
+            bool(sweep.simulated.environment.walls),
+        )
         return cls(
             effects,
-            plan.effects.nonlinear(sweep.devices) or sweep.walled is not None,
+            plan.effects.nonlinear(sweep.devices) or bool(sweep.simulated.environment.walls),
             plan.trials,
             plan.duration,
             plan.start,
             plan.press,
             plan.threshold,
             slowest_seen(plan.duration),
-            [dict(zip(names, row, strict=True)) for row in zip(*figures, strict=True)],
+            [_Point(*row) for row in zip(*figures, strict=True)],
             points.verdicts.count("oscillates"),
             points.verdicts.count(UNDECIDED),
             int(points.differ.sum()),
@@ -114,16 +200,18 @@ class MapReport:
     velocity_filter_hz: float | None
     one_sided: bool
     conditions: list[str]
-    grid: dict[str, Any]
+    grid: _Grid
     population: _Population
     simulation: _Simulated
     holds: bool
     interrupted: bool
     wall_s: dict[str, float]
-    ratios: dict[str, _Ratio] = field(metadata={"json": "beside"})
-    fixed: Mapping[str, Any] = field(metadata={"json": "beside"})  # of a map over environments: the coupling
-    error: dict[str, Any] | None = field(metadata=_GIVEN)
-    marks: list[dict[str, Any]] | None = field(metadata=_GIVEN)
+    axes: str  # coupling or environment: whose K and B they are
+    coupling: CouplingFigures | None
+    ratios: dict[str, _Ratio] = unseen("beside")
+    fixed: FixedCoupling | None = unseen("beside")  # of a map over environments
+    error: dict[str, MapError | None] | None = unseen("given")
+    marks: list[_Marked] | None = unseen("given")
     not_covered: str = CAVEATS
 
     @classmethod
@@ -133,12 +221,12 @@ class MapReport:
         sweep: Sweep,
         drawn: Map,
         plan: Plan,
-        fixed: Mapping[str, Any],
+        fixed: FixedCoupling | None,
         marks: Sequence[Mark],
         humans: int,
         seed: int,
     ) -> MapReport:
-        """Of a map that met `humans` random humans for each device."""
+        """The report of a map; `humans` were drawn for each device."""
         loop, whole, rigid = sweep.loop, not drawn.interrupted, sweep.loop.environment is RIGID_WALL
         ratios = {name: _ratio(sweep, drawn, name) for name in drawn.ratio}
         simulation = _Simulated.of(sweep, drawn, plan)
@@ -153,23 +241,25 @@ class MapReport:
             loop.psi,
             loop.delta,
             sweep.cutoff,
-            sweep.walled is not None,
+            bool(sweep.simulated.environment.walls),
             list(drawn.ratio),
-            {"K": drawn.grid.K, "B": drawn.grid.B, "scale": drawn.grid.scale},
+            _Grid(drawn.grid.K, drawn.grid.B, drawn.grid.scale),
             _population(drawn, humans, seed),
             simulation,
             certified and not contradicted,
             drawn.interrupted,
             drawn.seconds,
+            "environment" if fixed else "coupling",
+            fixed and fixed.coupling,
             ratios,
             fixed,
             {name: map_error(sweep, drawn, name) for name in drawn.ratio} if whole else None,
-            [_mark(mark) for mark in marks] if whole else None,
+            [_Marked.of(mark) for mark in marks] if whole else None,
         )
 
     @property
     def cells(self) -> int:
-        return len(self.grid["K"]) * len(self.grid["B"])
+        return len(self.grid.K) * len(self.grid.B)
 
 
 def _ratio(sweep: Sweep, drawn: Map, name: str) -> _Ratio:
@@ -179,7 +269,7 @@ def _ratio(sweep: Sweep, drawn: Map, name: str) -> _Ratio:
 
 
 def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
-    """Why a condition has cells without a figure, in words of one such cell; None where it has none."""
+    """Why some cells have no figure, by the example of one of them; None where all have one."""
     if name in sweep.refusals:
         return sweep.refusals[name]
     ratio, (K, B) = drawn.ratio[name], drawn.grid.flat
@@ -204,20 +294,6 @@ def _population(drawn: Map, humans: int, seed: int) -> _Population:
         int(known.sum()),
         f"null: {_NOT_REACHED}" if np.isnan(drawn.growth).any() else None,
     )
-
-
-def _mark(mark: Mark) -> dict[str, Any]:
-    """What is asked about a single coupling."""
-    return {
-        "K": mark.K,
-        "B": mark.B,
-        **{name: certificate_part(requirement) for name, requirement in mark.requirement.items()},
-        "growth_rate_per_s": mark.growth,
-        "unstable_humans": mark.unstable,
-        "stiffest_K_at_this_B": {
-            name: "beyond the map" if K is not None and np.isinf(K) else K for name, K in mark.stiffest.items()
-        },
-    }
 
 
 def save_csv(drawn: Map, path: Path) -> Path:

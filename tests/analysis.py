@@ -18,9 +18,9 @@ from design.lmi import (
     e_hat_regular,
     lemma1,
     lemma4,
-    theta_hat,
     unit_coupling,
     unit_environment,
+    v_hat_ports,
 )
 
 
@@ -59,12 +59,9 @@ def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int],
 
 
 def balanced_ports(V: Lti, theta: Sequence[int]) -> Ports:
-    """`v_hat_regular` with both outputs balanced together (V in unit coordinates)."""
-    H = V - theta_hat(theta, V.T)
-    static = H.dc()
-    C2 = -H.quotient_at_one().C
-    both = balanced(Lti(H.A, H.B, np.vstack([C2, H.C]), np.vstack([static / 2, H.D]), H.T))
-    m = H.outputs
+    """`v_hat_ports` with both outputs balanced together (V in unit coordinates)."""
+    G, m = v_hat_ports(V, theta), V.outputs
+    both = balanced(Lti(G.A, G.B, np.vstack([G.C2, G.C1]), np.vstack([G.D2, G.D1]), V.T))
     return Ports(both.A, both.B, both.C[:m], both.D[:m], both.C[m:], both.D[m:])
 
 

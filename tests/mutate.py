@@ -48,9 +48,10 @@ TABLE = {
     "design/conditions.py": "design/test_exact_blocks design/test_margin design/test_latency design/test_encoder_steps "
     "design/test_moving_average",
     "controller/tick.py": "controller/test_tick controller/test_walls controller/test_varying_delay "
-    "controller/test_limiter controller/test_budget sim/test_switched sim/test_passivity_layer",
+    "controller/test_limiter controller/test_budget sim/test_switched sim/test_passivity_layer sim/test_engines "
+    "sim/test_limited",
     "controller/complementarity.py": "controller/test_tick controller/test_walls controller/test_limiter",
-    "controller/walls.py": "controller/test_tick controller/test_walls",
+    "controller/law.py": "controller/test_tick controller/test_walls",
     "controller/limiter.py": "controller/test_tick controller/test_limiter",
     "hw/limits.py": "hw/test_limits",
     "hw/device_state.py": "hw/test_device hw/test_latch_on_arrival",

@@ -20,7 +20,7 @@ from controller.coupling import SpringDamper
 from controller.environment import GROUND, Network, Spring
 from controller.loop import Loop
 from controller.lti import Array, SingularLoop
-from design.multipliers import this_environment_of
+from design.environments import THIS_ENVIRONMENT
 from models.hold import at_the_latch, hold
 from models.scene import Plant
 from sim.stability import close
@@ -54,7 +54,7 @@ def uneven_ticks(seed: int, loops: int = 8, ticks: int = _TICKS) -> Iterator[_Un
         rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
         kind = ("periods", "latency", "both")[index % 3]
         loop, coupling = _draw(rng, kind)
-        required = np.array(this_environment_of(loop, coupling).required)
+        required = np.array(THIS_ENVIRONMENT.required(loop, coupling).required)
         m = loop.channels
         hands = 10 ** rng.uniform(-3, 0, (HANDS, m)), 10 ** rng.uniform(0, 4, (HANDS, m))
         for drawn in (True, False):
@@ -80,7 +80,7 @@ def _draw(rng: np.random.Generator, kind: str) -> tuple[Loop, SpringDamper]:
         longest = _LONG if kind != "latency" else None
         loop = Loop(T, theta, (0,) * m, theta, (1.0,) * m, network, T_max=longest, latency=latency)
         try:
-            if 0.01 < this_environment_of(loop, coupling).ratio < 20:
+            if 0.01 < THIS_ENVIRONMENT.required(loop, coupling).ratio < 20:
                 return loop, coupling
         except SingularLoop:
             continue

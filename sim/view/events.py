@@ -11,8 +11,8 @@ from design.certificate import assess
 from design.coverage import Limits
 from design.designs import KINDS
 from design.guarantees import guarantee_of
-from design.result import Requirement
-from sim.couplings import NAMES, Chosen, choose, limits_of
+from design.result import Chosen, Requirement
+from sim.couplings import NAMES, choose, limits_of
 from sim.run import Simulation, assemble
 from sim.scenario import LONGEST_DELAY, InputError, Scenario
 from sim.stability import Mode, worst_mode

@@ -49,17 +49,18 @@ def engines() -> None:
     for _ in range(ROUNDS):
         for name, setting in settings.items():
             spent = cpu_seconds(lambda setting=setting: looped(simulation, *setting))
-            bare = raw(simulation, *setting[1:], exact) if setting[1] else np.nan
-            used[name].append((spent, spent / bare))
+            bare = [raw(simulation, *setting[1:], exact, view) for view in (np.asarray, memoryview) if setting[1]]
+            used[name].append((spent, *(spent / np.array(bare or [np.nan] * 2))))
     slow = np.array(used["RK4 x 4"])[:, 0]
     for name, (_, integrator, count) in settings.items():
-        times, ratios = np.array(used[name]).T
+        times, ratios, least = np.array(used[name]).T
         trace = looped(simulation, *settings[name])
         position = position_error(trace, exact, simulation).position_relative_rms
+        beside = f"loop / raw {np.median(ratios):.2f}, {np.median(least):.2f} where raw calls copy by memoryview"
         growth = simulated_growth(simulation, integrator, count) - exact_growth(simulation) if integrator else 0.0
         print(
             f"| {name} | {1e3 * np.median(times):.0f} ms | {np.median(slow / times):.1f} x as fast as RK4 x 4 | "
-            f"loop / raw {np.median(ratios):.2f} | position {position:.1e} | growth {growth:+.1e} 1/s |",
+            f"{beside if integrator else '-'} | position {position:.1e} | growth {growth:+.1e} 1/s |",
             flush=True,
         )
 

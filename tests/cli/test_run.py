@@ -173,7 +173,7 @@ BAD = [
     (["--substeps", "0"], "--substeps is 0, allowed are 1 to 10000"),
     (["--duration", "inf"], "duration is inf"),
     (["--seed", "-1"], "--seed is -1"),
-    (["--engine", "drake"], "invalid choice: 'drake'"),
+    (["--engine", "drake"], "--engine is 'drake', allowed are mujoco, exact"),
     (["--integrator", "RK5"], "invalid choice: 'RK5'"),
     (["--case", "none", "--coupling", "published"], "--coupling published with --case none"),
     (["--coupling", "magic"], "--coupling is 'magic', allowed are none, published, spring-damper"),

@@ -2,17 +2,17 @@
 
 import numpy as np
 import pytest
-from worlds import DELTA, SOFT_NETWORK, T
+from worlds import DELTA, SOFT_NETWORK, T, force_map
 
 from controller.coupling import SpringDamper
 from controller.environment import FIGURE_4
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.lti import Lti
 from design import fixed_order as ccl
 from design import spring_damper
 from design.conditions import any_environment, this_environment
 from design.fixed_order import FixedOrder, FixedPoles, descend
-from design.lmi import RESERVE, Shaping, v_hat_regular
+from design.lmi import RESERVE, Shaping, v_hat_ports
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
 NO_MULTIPLIER = np.full(2, np.inf)
@@ -52,7 +52,7 @@ def test_the_affine_realisations_are_the_transfer_matrices(order, diagonal, case
     left, right, late = Shaping(loop).parts(np.angle(Z))
     expected = (left @ family.coupling(p).at(Z) + late) @ right
     np.testing.assert_allclose(Lti(*family.weighted_loop(p), T).at(Z), expected, atol=1e-9 * np.abs(expected).max())
-    found, wanted = family.ports(p), v_hat_regular(family.unit_coupling(p), loop.theta)
+    found, wanted = family.ports(p), v_hat_ports(family.unit_coupling(p), loop.theta)
     y2 = Lti(found.A, found.B, found.C2, found.D2, 1.0).at(Z)
     np.testing.assert_allclose(y2, Lti(wanted.A, wanted.B, wanted.C2, wanted.D2, 1.0).at(Z), atol=1e-9)
 

@@ -14,12 +14,14 @@ from controller.environment import FIGURE_4, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, SingularLoop, rational
 from design import certificate as design_certificate
-from design import spring_damper
+from design import environments, exact, spring_damper
 from design.certificate import Verdict, prove, required_damping, verify
 from design.conditions import this_environment
 from design.coupling_file import Stored, digest, load, save, sealed
+from design.environments import THIS_ENVIRONMENT
 from design.files import InputError
 from design.frequency import frequencies, on_circle, rounding
+from design.lmi import ANY_ENVIRONMENT
 from design.result import NotProved, from_ratio
 from sim.checks.random_loops import proofs
 from sim.scenario import load as scenario
@@ -388,8 +390,8 @@ def test_what_is_no_regular_file_or_too_large_is_one_line(tmp_path):
 
 
 def test_any_environment_asks_the_same_of_a_coupling_as_its_state_space_behind_walls_too():
-    own = design_certificate.any_environment_of(PAIR, SOFT)
-    whole = design_certificate.any_environment_of(PAIR, Compliance(SOFT.compliance(PAIR.T)))
+    own = ANY_ENVIRONMENT.required(PAIR, SOFT)
+    whole = ANY_ENVIRONMENT.required(PAIR, Compliance(SOFT.compliance(PAIR.T)))
     assert max(own.required) == pytest.approx(max(whole.required), rel=1e-6)
     assert own.certified
     walled = change(FIGURE_4, walls=(Wall(("contact 1", "ground"), 3000.0),))
@@ -450,13 +452,13 @@ def test_every_block_is_measured_before_it_is_proved(monkeypatch):
     limited = loop.sent(coupling).order + 2 * loop.channels + sum(loop.theta)
     blocks = {
         coupling.compliance(loop.T).order + sum(loop.theta): lambda: design_certificate._blocks(
-            loop, coupling, "any-environment", None
+            loop, coupling, ANY_ENVIRONMENT, None
         ),
         limited: lambda: design_certificate._limiter_block(loop, coupling, (0.0, 0.0), c),
-        wall.walled(one).order: lambda: design_certificate._walls_block(wall, one, [Fraction(1)]),
+        wall.walled(one).order: lambda: design_certificate._blocks(wall, one, THIS_ENVIRONMENT, [Fraction(1)]),
     }
     for states, make in blocks.items():
-        monkeypatch.setattr(design_certificate, "too_large", lambda n, most=states: "too many" if n >= most else None)
+        monkeypatch.setattr(exact, "too_large", lambda n, most=states: "too many" if n >= most else None)
         with pytest.raises(NotProved, match="too many"):
             make()
 
@@ -465,9 +467,10 @@ def test_walls_without_a_solution_are_refused(monkeypatch):
     def singular(*_):
         raise SingularLoop("no solution")
 
-    monkeypatch.setattr(design_certificate.multipliers, "walls_demand", singular)
+    monkeypatch.setattr(environments, "walls_demand", singular)
+    loop, coupling = scenario("one-wall").loop("I"), SpringDamper((400.0,), (0.1,))
     with pytest.raises(NotProved, match="algebraic loop without solution"):
-        design_certificate._walls_block(scenario("one-wall").loop("I"), SpringDamper((400.0,), (0.1,)), [Fraction(1)])
+        design_certificate._blocks(loop, coupling, THIS_ENVIRONMENT, [Fraction(1)])
 
 
 def test_a_long_delay_is_proved_stored_and_read_again(tmp_path):

@@ -23,13 +23,14 @@ from design import certificate
 from design.certificate import condition_block, prove, verify
 from design.conditions import (
     any_environment_demand,
-    delayed_coupling_block,
-    delayed_environment_block,
+    delayed_coupling_demand,
+    delayed_environment_demand,
     this_environment_demand,
 )
 from design.coupling_file import Stored, digest, sealed
+from design.environments import walls_demand
 from design.exact import find_storage, prove_positive_real
-from design.multipliers import SwitchingSweep, limiter_demand, switching_block, walls_demand
+from design.multipliers import SwitchingSweep, limiter_demand, switching_block
 from design.result import NotProved, from_ratio
 
 CLOSE = 1e-6  # relative, on either side of a limit
@@ -181,14 +182,14 @@ def test_the_multiplier_that_a_delayed_spring_asks(psi):
     """Phi > (psi - 1/2) K T: He[z^-psi z/(z-1)] = 1/2 - (1 + cos w + .. + cos (psi-1) w)."""
     E = loop(to_ground(1000.0), (0,), (psi,))
     delayed = E.sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
-    assert_limit(lambda phi: delayed_environment_block(delayed, [phi])[1], (psi - 0.5) * 1000 * T)
+    assert_limit(lambda phi: certificate._block(delayed_environment_demand(delayed, [phi])), (psi - 0.5) * 1000 * T)
 
 
 def test_the_multiplier_that_a_delayed_spring_and_damper_ask():
     """K T/2 + B, at w = 0 no, at w = pi yes."""
     E = loop(to_ground(700.0, damping=0.9), (0,), (1,))
     delayed = E.sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
-    assert_limit(lambda phi: delayed_environment_block(delayed, [phi])[1], 700 * T / 2 + 0.9)
+    assert_limit(lambda phi: certificate._block(delayed_environment_demand(delayed, [phi])), 700 * T / 2 + 0.9)
 
 
 def test_the_multiplier_of_figure_4_against_a_dense_sweep():
@@ -197,7 +198,7 @@ def test_the_multiplier_of_figure_4_against_a_dense_sweep():
         return np.linalg.eigvalsh(-T * he((z / (z - 1))[:, None, None] * (late(z, (1, 2)) @ figure_4(z)))).max(axis=1)
 
     delayed = loop(FIGURE_4, (0, 0), (1, 2)).sent(Compliance(Lti.constant(np.zeros((2, 2)), T)), exact=True)
-    assert_limit(lambda phi: delayed_environment_block(delayed, [phi, phi])[1], highest(short))
+    assert_limit(lambda phi: certificate._block(delayed_environment_demand(delayed, [phi, phi])), highest(short))
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.45])
@@ -207,7 +208,7 @@ def test_a_spring_behind_delay_with_its_multiplier(share):
     phi = share * K * T / 2
     least = min(a * (T / phi - 2 * a) / (4 * T / phi - 6 * a), (T / phi - 2 * a) / 2)
     V, multiplier = SpringDamper([K], [0.0]).compliance(rational(T)), [rational(phi)]
-    assert_limit(lambda d: delayed_coupling_block(V, (1,), multiplier, [rational(d)])[1], T / (2 * least))
+    assert_limit(lambda d: certificate._block(delayed_coupling_demand(V, (1,), multiplier, [d])), T / (2 * least))
 
 
 def test_a_spring_damper_behind_delay_with_its_multiplier():
@@ -225,7 +226,7 @@ def test_a_spring_damper_behind_delay_with_its_multiplier():
         middle = (low + high) / 2
         low, high = (low, middle) if holds(middle) else (middle, high)
     V, multiplier = SpringDamper([K], [B]).compliance(rational(T)), [rational(phi)]
-    assert_limit(lambda d: delayed_coupling_block(V, (theta,), multiplier, [rational(d)])[1], high)
+    assert_limit(lambda d: certificate._block(delayed_coupling_demand(V, (theta,), multiplier, [d])), high)
 
 
 # switching
@@ -424,7 +425,7 @@ def test_the_proof_of_the_nominal_environment_does_not_serve_a_vertex():
     assert forged(asked, NoCoupling(), made, matrices={"P": nominal}) == "matrices are P, expected P, P1, P2"
 
 
-@pytest.mark.parametrize(("condition", "name"), [("this-environment", "F(1)"), ("any-environment", "H(1)")])
+@pytest.mark.parametrize(("condition", "name"), [("this-environment", "F(1)"), ("any-environment", "V(1)")])
 def test_a_static_part_that_is_asymmetric_by_1e_12_is_refused(condition, name):
     asked = loop(to_ground(900.0, 700.0), (1, 0), delta=(3.0, 3.0))
 

@@ -9,13 +9,14 @@ from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
-from controller.lti import Lti, Sampled
+from controller.lti import Lti, Sampled, hstack, numbers, vstack
 from design.api import design_coupling, transparency_of
 from design.certificate import assess, prove, required_damping, verify
-from design.conditions import latency_demand, least_scale, this_environment, this_environment_demand
-from design.coupling_file import Stored
+from design.conditions import Condition, Demand, latency_demand, least_scale, this_environment, this_environment_demand
+from design.coupling_file import Stored, load, save, sealed
+from design.environments import THIS_ENVIRONMENT, ThisEnvironment
 from design.frequency import frequencies, hermitian, on_circle
-from design.guarantees import LATE
+from design.lmi import LATE
 from design.result import NotProved
 
 T, TAU, K = 1.2e-3, 0.13e-3, 1000.0
@@ -168,3 +169,56 @@ def test_a_design_for_late_forces_uses_the_damping_and_beats_a_whole_sample():
     assert transparency_of(loop, found).rms_mismatch_db < transparency_of(loop, whole).rms_mismatch_db - 1
     with pytest.raises(ValueError, match="latency"):
         design_coupling(loop, "spring-damper", "any-environment")
+
+
+# a condition of one's own: one class in one file
+
+
+class LatchesLate(Condition):
+    """B4's block written out again: forces of the tick before act up to t2 after kT on every channel."""
+
+    name = "latches-late"
+
+    def demand(self, loop, coupling, exact=False):
+        F, m = loop.F(coupling, exact), loop.channels
+        before = delay((1,) * m, F.T) @ F
+        split = [G.split_at_one() for G in (hstack(before, before), hstack(F, F))]
+        static, rest = np.vstack([G1 for G1, _ in split]), vstack(*(R for _, R in split))
+        gain = numbers(loop.delta * 2, F.T) / numbers([TAU] * m + [loop.T] * m, F.T)
+        F1 = static[m:, m:]
+        return Demand(rest - static / 2, Lti.constant(np.diag(gain), F.T), {"F(1)": F1}, ("F(1)",))
+
+
+class OneSampleMore(ThisEnvironment):
+    """this-environment, stricter: forces arrive a sample later."""
+
+    name = "one-sample-more"
+
+    def demand(self, loop, coupling, exact=False):
+        return super().demand(change(loop, theta=tuple(n + 1 for n in loop.theta)), coupling, exact)
+
+    required = Condition.required
+
+
+@pytest.mark.parametrize(
+    ("own", "shipped"),
+    [
+        (LatchesLate(), change(PAIR, latency=((0.0, TAU),) * 2)),
+        (OneSampleMore(), change(PAIR, theta=(1, 2))),
+    ],
+)
+def test_a_condition_of_ones_own_is_required_and_proved_as_the_shipped_one_is(own, shipped, tmp_path):
+    found, wanted = (required_damping(*asked) for asked in ((PAIR, SOFT, own), (shipped, SOFT, "this-environment")))
+    assert found.required == pytest.approx(wanted.required, rel=1e-8)
+    assert found.condition == own.name
+    stored = Stored.of(PAIR, SOFT, prove(PAIR, SOFT, own))
+    save(stored, tmp_path / "own.json")
+    stored = load(tmp_path / "own.json")
+    assert verify(stored, own).proved
+    assert f"condition is '{own.name}'" in verify(stored).reason
+    assert "not of 'this-environment'" in verify(stored, THIS_ENVIRONMENT).reason
+    forged = change(stored.certificate, matrices={"P": prove(PAIR, SOFT, "this-environment").matrices["P"]})
+    assert not verify(change(stored, certificate=sealed(forged)), own).proved
+    short = change(PAIR, delta=tuple(0.99 * d for d in found.required))
+    with pytest.raises(NotProved, match="N s/m of damping"):
+        prove(short, SOFT, own)

@@ -2,19 +2,21 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from worlds import force_map
 
 from cli import compare as command
 from cli.compare import main
 from controller.coupling import CASE_I
 from controller.environment import environment
-from controller.loop import force_map
 from design import compare as limit_curve
-from design.compare import AXES, LADDERS, SHORT, Point, ladder_row, measured, optimum, points_along, remembered
+from design.compare import AXES, LADDERS, SHORT, Point, Sweep, ladder_row, measured, optimum, points_along, remembered
 from design.conditions import this_environment
 from design.program import LADDER, Options
+from sim.compare_report import Here, Limits
 from sim.plots import plot_limits
 from sim.scenario import InputError, load
 
@@ -177,7 +179,7 @@ def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
         (["--over", "--band", "8"], "--band is '8', expected two numbers"),
         (["--over", "--case", "none"], "--case none has no coupling to design"),
         (["--ladder", "--over", "order"], "--over with --ladder: give one of them"),
-        (["--ladder", "--seconds", "3"], "--seconds is for --over, not for --ladder"),
+        (["--ladder", "--seconds", "3"], "--seconds is only with --over"),
         (["--ladder", "--case", "II"], "--ladder shows both cases"),
         (["--ladder", "long"], "argument --ladder: invalid choice: 'long'"),
         (["--over", "order=1:500"], "--over order=1:500: the range 1:500 is none between 1 and 5 rungs"),
@@ -194,13 +196,13 @@ def test_bad_options(options, message, tmp_path, monkeypatch):
 
 
 def test_a_picture_of_every_number_of_panels(tmp_path):
-    row = {"value": 1.0, "rms_mismatch_db": -10.0, "relative_mismatch_db": -5.0}
-    sweep = {"label": "x", "unit": "s", "values": [1.0], "optimal": [row, row | {"rms_mismatch_db": None}]}
-    here = {"delta": [1.37], "theta": [1], "T_s": 1e-3}
-    outcome = {"objective": "rms", "scenario": "s", "case": "I", "here": here, "wish": {"ladder": [[4, 3]]}}
+    rows = [SimpleNamespace(value=1.0, rms_mismatch_db=db, relative_mismatch_db=-5.0, proof=None) for db in (-10, None)]
+    sweep = Sweep("x", "s", [1.0], {"optimal": rows})
+    here = Here((1.37,), (1,), (0,), 1e-3)
     for n in range(1, 5):
         chosen = dict.fromkeys(list(AXES)[:n], sweep)
-        assert plot_limits(outcome | {"sweeps": chosen}, tmp_path / f"{n}.png").stat().st_size > 5000
+        report = Limits("s", 0, "I", "rms", "samples", SMALL, here, chosen, [], 0.0, False)
+        assert plot_limits(report, tmp_path / f"{n}.png").stat().st_size > 5000
 
 
 # the ladder ---------------------------------------------------------------------------------------------------------

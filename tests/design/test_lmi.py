@@ -10,7 +10,7 @@ from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.lti import Lti
-from design.conditions import any_environment
+from design.conditions import any_environment, v_hat
 from design.frequency import frequencies, hermitian, on_circle
 from design.lmi import (
     Ports,
@@ -22,7 +22,7 @@ from design.lmi import (
     theta_hat,
     unit_coupling,
     unit_environment,
-    v_hat_regular,
+    v_hat_ports,
 )
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
@@ -39,7 +39,7 @@ def v_hat_printed(V, theta):
     """V-hat = (1 - 1/z)(V - Theta-hat) in the realisation (16)."""
     m = V.inputs
     one, zero = np.eye(m), np.zeros((m, m))
-    return Lti(zero, one, -one, one, V.T) @ (V - theta_hat(theta, V.T))
+    return Lti(zero, one, -one, one, V.T) @ (V - theta_hat(theta))
 
 
 def random_stable(rng, order, m=2):
@@ -89,9 +89,10 @@ def test_the_realisation_16_and_its_quotient():
     theta = (1, 3)
     hat = (1 - 1 / Z)[:, None, None] * (V.at(Z) - theta_hat(theta).at(Z))
     np.testing.assert_allclose(v_hat_printed(V, theta).at(Z), hat, atol=1e-12)
-    ports = v_hat_regular(V, theta)
+    ports = v_hat_ports(V, theta)
     y2 = Lti(ports.A, ports.B, ports.C2, ports.D2, 1.0).at(Z)
     np.testing.assert_allclose(hermitian(y2), hermitian(hat) / np.abs(1 - 1 / Z)[:, None, None] ** 2, atol=1e-9)
+    np.testing.assert_allclose(y2, v_hat(V - theta_hat(theta))[1].at(Z), atol=1e-9)  # the home of the formula
 
 
 def test_the_regular_part_of_e_hat_has_its_hermitian_part():

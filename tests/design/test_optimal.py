@@ -273,14 +273,14 @@ def test_the_supremum_and_the_cap_are_kept():
 def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
     loop = loop_of("n3")
     nominal = best("n3")
-    assert not robustness(loop, nominal.coupling).kept
+    assert not robustness(loop, nominal.coupling).certified
     ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
     found = design(ranged, SHORT)
     assert found.proved
     assert len(found.certificate.matrices) == len(ranged.members())
     assert found.certificate.guarantee == "these ranges"
     spread = robustness(loop, found.coupling)
-    assert spread.kept
+    assert spread.certified
     for network in vertices(loop.environment).values():
         assert this_environment(loop.at(network).F(found.coupling), loop.delta).certified
     assert nominal.figures.rms_mismatch < found.figures.rms_mismatch < 10 ** (1 / 20) * nominal.figures.rms_mismatch

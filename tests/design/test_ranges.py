@@ -7,7 +7,7 @@ from itertools import combinations, pairwise, product
 import msgspec
 import numpy as np
 import pytest
-from worlds import environment_by_hand, filter_by_hand
+from worlds import environment_by_hand, filter_by_hand, force_map
 
 from cli.audit import main as audit_main
 from cli.check import main as check_main
@@ -18,12 +18,12 @@ from controller.coupling import SpringDamper
 from controller.coupling import SpringDamper as StoredSpringDamper
 from controller.delay import VaryingDelay
 from controller.environment import FIGURE_4, Network, Spring, environment
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices
 from design import optimal
 from design.certificate import check_ranges, prove, verify
 from design.coupling_file import Stored, digest, load, save, sealed
-from design.coverage import ranges_part
+from design.coverage import RangesFigures
 from design.program import Options
 from design.result import NotProved
 from sim import scenario
@@ -274,9 +274,9 @@ def test_wider_ranges_are_another_claim(stored):
 def test_a_coupling_for_one_environment_is_not_proved_for_the_ranges(nominal_only):
     with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.40"):
         prove(LOOP, nominal_only.coupling, "this-environment")
-    part = ranges_part(check_ranges(LOOP, nominal_only.coupling, samples=8))
-    assert not part["certified"]
-    assert part["vertices_certified"] == 2
+    part = RangesFigures.of(check_ranges(LOOP, nominal_only.coupling, samples=8))
+    assert not part.certified
+    assert part.vertices_certified == 2
 
 
 def test_nothing_is_promised_where_a_sample_inside_violates(robust):

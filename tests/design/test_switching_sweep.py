@@ -6,16 +6,16 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from analysis import solve
-from worlds import DELTA, SOFT, STIFF, T
+from worlds import DELTA, SOFT, STIFF, T, force_map
 
 from cli.audit import main
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
-from controller.loop import DelayRange, Loop, force_map
+from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
 from design.certificate import prove_switching, storage, switching_requirement
 from design.conditions import this_environment
-from design.coverage import switching_part
+from design.coverage import Switching
 from design.exact import Matrix
 from design.frequency import hermitian
 from design.multipliers import half_widths, switching_block, switching_sweep
@@ -151,10 +151,10 @@ def test_what_holds_is_proved_exactly(lo, hi):
     found = switching_requirement(loop_of(lo, hi), SOFT)
     assert found.requirement.certified
     assert found.requirement.proof == "rational"
-    part = switching_part(loop_of(lo, hi), SOFT)
+    part = Switching.of(loop_of(lo, hi), SOFT)
     # equal where nothing varies
-    assert part["playout"]["required_damping"][0] <= part["required_damping"][0] * (1 + 1e-9)
-    assert part["certified"]
+    assert part.playout.required_damping[0] <= part.requirement.required[0] * (1 + 1e-9)
+    assert part.requirement.certified
 
 
 def test_what_does_not_hold_has_no_exact_proof():

@@ -16,7 +16,7 @@ from design import optimal
 from design.api import certify, store
 from design.certificate import check_ranges, prove, verify
 from design.coupling_file import Stored, load, save
-from design.coverage import ranges_part, ranges_rows
+from design.coverage import RangesFigures
 from design.environments import search
 from design.program import Options
 from design.result import Design
@@ -173,10 +173,10 @@ def test_neither_the_vertices_nor_random_points_see_it_but_no_set_is_promised(kn
     assert len(known.at_samples) == 64
     assert all(r.certified for r in (*known.at_members, *known.at_samples))
     assert not known.proved
-    part = ranges_part(known)
-    assert (part["proof"], part["certified"], part["search"]["violated"]) == ("rational", False, True)
-    assert part["reason"].startswith("proved at the vertices, but violated between them: 1.04")
-    assert any("not guaranteed" in words for _, words in ranges_rows(part))
+    part = RangesFigures.of(known)
+    assert (part.proof, part.certified, part.search.violated) == ("rational", False, True)
+    assert part.reason.startswith("proved at the vertices, but violated between them: 1.04")
+    assert any("not guaranteed" in words for _, words in part.rows())
 
 
 def test_fewer_samples_do_not_make_it_a_guarantee():

@@ -205,6 +205,16 @@ def test_with_theta_zero_a_force_acts_as_soon_as_it_comes():
     assert rig.device.misses == 1  # the tick of the CONFIG
 
 
+def test_with_theta_zero_a_force_is_latched_once():
+    """A force that came within its tick is not taken again when the next begins: it moved by the slew rate once."""
+    rig = Rig(CONFIG._replace(theta=0, slew=(3, 3)))
+    rig.answer(command=Command.ARM)
+    for k in range(1, 5):
+        rig.tick()
+        rig.answer((100, -100))
+        assert rig.device.applied == (3 * k, -3 * k)
+
+
 def test_with_theta_zero_late_answers_are_missed_and_held_through():
     rig = Rig(CONFIG._replace(theta=0, hold=2, ramp=2))
     rig.answer(command=Command.ARM)

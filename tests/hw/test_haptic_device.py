@@ -167,11 +167,11 @@ def test_a_session_with_a_device_that_the_host_clocks(scenario, tmp_path):
 def test_the_certificate_says_what_changes_when_the_host_is_the_clock(scenario):
     """T at most T_max, and a latency of part of a sample where a link of a whole tick is charged otherwise."""
     _, _, (made,) = held_session(scenario, StandIn(scenario), seconds=0.1)
-    part = made.part((12.0, 12.0))
-    assert part["theta"] == list(scenario.theta)  # no tick is added for the link
-    assert part["link_delay"] == 0
-    assert part["certificate"]["certified"]
-    (said,) = [remark for remark in part["remarks"] if "act as they come" in remark]
+    part = made.figures((12.0, 12.0))
+    assert part.theta == scenario.theta  # no tick is added for the link
+    assert part.link_delay == 0
+    assert part.certificate.certified
+    (said,) = [remark for remark in part.remarks if "act as they come" in remark]
     T_max, (t1, t2) = made.scenario.T_max or made.scenario.T, made.scenario.latency[0]
     kept = (
         f"periods up to {1e6 * T_max:.0f} us and forces that act {1e6 * t1:.0f} to {1e6 * t2:.0f} us after their sample"

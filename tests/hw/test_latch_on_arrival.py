@@ -18,7 +18,7 @@ from hw.rehearsal import Rehearsal
 from hw.session import Stage, session_for
 from models.scene import plant
 from sim import load
-from sim.report import coupling_part
+from sim.report import CouplingFigures
 from sim.run import outside_forces
 from sim.scenario import InputError
 
@@ -97,10 +97,10 @@ def test_what_one_overlong_tick_may_cost():
 
 def test_the_report_names_the_latency():
     (made,) = certified_couplings(LAB.replace(latency=((3e-5, 2.3e-4),) * 2), "I", None, None, 0, spare=0)
-    part = made.part((12.0, 12.0))
-    assert part["latency_s"] == [[3e-5, 2.3e-4]] * 2
-    assert part["link_delay"] == 0
-    assert part["coupling"] == coupling_part(made.chosen.kind, made.chosen.coupling, LAB.T)
+    part = made.figures((12.0, 12.0))
+    assert part.latency_s == ((3e-5, 2.3e-4),) * 2
+    assert part.link_delay == 0
+    assert part.coupling == CouplingFigures.of(made.chosen.kind, made.chosen.coupling, LAB.T)
     assert made.name == "spring-damper for theta = [0, 0] and 30 to 230 us"
 
 

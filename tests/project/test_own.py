@@ -4,7 +4,12 @@ import pytest
 from forked import run
 
 MINE = """
+from dataclasses import dataclass
+
 import numpy as np
+
+from controller.environment import Spring, Wall
+from controller.lti import Lti
 
 
 class Trapezoidal:
@@ -30,7 +35,50 @@ class Untroubled(Trapezoidal):
 class Short(Trapezoidal):
     def advance(self, k):
         self.states[k + 1][...] = np.zeros(7)
+
+
+@dataclass
+class Hardening:
+    between: list
+    stiffness: float
+    step: float
+
+    def parts(self):
+        (a, b), k = self.between, self.stiffness
+        return [Spring((a, b), k), Wall((a, b), 3 * k, gap=self.step), Wall((b, a), 3 * k, gap=self.step)]
+
+
+class Negative(Hardening):
+    def parts(self):
+        return [Spring(tuple(self.between), -5.0)]
+
+
+@dataclass
+class Gel:
+    stiffness: float
+    contacts = ("left", "right")
+
+    def E(self, T):
+        return Lti.constant(self.stiffness * np.array([[1, -1], [-1, 1]]), T)
+
+
+class Active(Gel):
+    def E(self, T):
+        return Lti.constant(-np.eye(2), T)
+
+
+class Broken(Gel):
+    def E(self, T):
+        return 1 / 0
 """
+SCENARIO = """
+name = "own"
+T = 1e-3
+theta = [1, 1]
+device = [{ kind = "rigid", damping = 1.37 }, { kind = "rigid", damping = 1.37 }]
+[environment]
+"""
+HARD = 'elements = [{ type = "mine:Hardening", between = ["left", "right"], stiffness = 300.0, step = 0.002 }]'
 RUN = "python -m sim.run --case I --duration 0.3 --no-alternatives --no-plot"
 
 
@@ -38,22 +86,55 @@ RUN = "python -m sim.run --case I --duration 0.3 --no-alternatives --no-plot"
 def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("own")
     (folder / "mine.py").write_text(MINE)
+    (folder / "hard.toml").write_text(f'{SCENARIO}contacts = ["left", "right"]\n{HARD}\n')
+    (folder / "gel.toml").write_text(f'{SCENARIO}type = "mine:Gel"\nstiffness = 600.0\n')
     return folder
 
 
-def test_an_engine_by_its_name(place):
-    """The trapezoidal rule is near the exact solution, and beside another engine its loop has the same verdict."""
-    done = run(f"{RUN} --engine mine:Trapezoidal --cross-check", place)
+@pytest.mark.parametrize(("scenario", "covered"), [("hard", "any-environment"), ("gel", "this-environment")])
+def test_an_element_and_an_environment_in_a_scenario(scenario, covered, place):
+    """Designed, proved and stored, and proved again from the file alone, which asks for no class."""
+    done = run(f"python -m design --scenario {scenario}.toml --condition {covered} --out {scenario}.json", place)
     assert done.returncode == 0, done.stderr
-    assert "(mine:Trapezoidal)" in done.stdout
-    assert "same verdict" in done.stdout
+    (place / "elsewhere").mkdir(exist_ok=True)
+    done = run(f"python -m design.check ../{scenario}.json", place / "elsewhere")
+    assert "proved, in exact arithmetic" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("environment", "message"),
+    [
+        ('type = "mine:Active"\nstiffness = 6', "environment Active: block: not passive"),
+        ('type = "mine:Gel"\nstifness = 6', "environment: TypeError: Gel.__init__() got an unexpected keyword arg"),
+        ('type = "mine:Trapezoidal"', "environment: TypeError: Trapezoidal.__init__() missing 1 required"),
+        (f'contacts = ["left", "right"]\n{HARD.replace("mine", "yours")}', "environment.elements #1.type is 'yours:H"),
+        (
+            f'contacts = ["left", "right"]\n{HARD.replace("300.0", "-5.0")}',
+            "your own: ValueError: stiffness between left",
+        ),
+        (f'contacts = ["left", "right"]\n{HARD.replace("type", "kind")}', "environment.elements #1 is {'kind': 'mine"),
+        (f'contacts = ["left", "up"]\n{HARD}', "contact 'up' has neither spring"),
+        ('type = "mine:Broken"\nstiffness = 6', "which is your own: ZeroDivisionError: division by zero"),
+        (
+            f'contacts = ["left", "right"]\n{HARD.replace("Hardening", "Negative")}',
+            "own: ValueError: stiffness between",
+        ),
+    ],
+)
+def test_what_is_wrong_with_them_is_said_in_a_line(environment, message, place):
+    (place / "wrong.toml").write_text(SCENARIO + environment)
+    done = run(f"{RUN} --scenario wrong.toml", place)
+    *before, last = done.stderr.splitlines()
+    assert done.returncode == 2
+    assert message in last
+    assert bool(before) == ("your own" in last), "only an error within their code has a traceback"
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ("--engine mine:Untroubled", "engine mine:Untroubled has no troubled: expected what has start(buffer), adv"),
-        ("--engine mine:Nobody", "--engine is 'mine:Nobody': mine has no Nobody, but Trapezoidal, Untroubled, Short"),
+        ("--engine mine:Nobody", "--engine is 'mine:Nobody': mine has no Nobody, but Trapezoidal, Untroubled, Short, "),
         ("--engine yours:X", "--engine is 'yours:X': there is no module 'yours' in"),
         ("--engine mine:1", "--engine is 'mine:1', expected package.module:Name"),
         ("--engine euler", "--engine is 'euler', allowed are mujoco, exact and package.module:Name"),
@@ -66,4 +147,4 @@ def test_what_is_wrong_with_it_is_said_in_a_line(options, message, place):
     *before, last = done.stderr.splitlines()
     assert done.returncode == 2
     assert message in last
-    assert bool(before) == ("your own" in message), "only an error within their code has a traceback"
+    assert bool(before) == ("your own" in last), "only an error within their code has a traceback"

@@ -8,8 +8,9 @@ import pytest
 
 from controller.coupling import SpringDamper
 from design.certificate import assess
+from design.result import Chosen
 from sim import couplings, design_cache
-from sim.couplings import Chosen, choose
+from sim.couplings import choose
 from sim.scenario import load
 
 
@@ -109,8 +110,8 @@ def test_the_papers_cases_need_no_design_and_are_proved_when_read(asked, case, k
     assert not asked
     needs = assess(loop, chosen.coupling)  # which knows nothing of the file
     assert needs[condition].proof == "rational"
-    assert chosen.known is not None
-    assert chosen.known.required == pytest.approx(needs[condition].required)
+    assert chosen.certificate is not None
+    assert chosen.certificate.required == pytest.approx(needs[condition].required)
     assert bool(chosen.limiter) == ((kind, condition) == ("spring-damper", "this-environment"))
 
 

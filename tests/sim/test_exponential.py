@@ -4,9 +4,6 @@
 the position that the fastest spring turns it into.
 """
 
-from copy import copy
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 import pytest
@@ -21,10 +18,12 @@ from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
 from sim import mujoco_engines
 from sim.accuracy import compare_engines, cross_check, pick
+from sim.api import run_scenario
 from sim.engines import Engine, ExactEngine
 from sim.mujoco_engines import EXPONENTIAL, INTEGRATORS, MujocoBatchEngine, MujocoEngine, default_integrator
+from sim.passivity_layer import EnergyNet
 from sim.run import assemble, make_engine, run
-from sim.scenario import InputError, load
+from sim.scenario import InputError, VaryingDelay, load
 from sim.stability import exact_growth
 from sim.step_choice import check_substeps, default_substeps, measured_hold, pace, simulated_growth
 
@@ -120,9 +119,8 @@ def test_the_forces_are_mujocos(simulation):
     wrong = 1.5
     errors = []
     for substeps in (8, 16):
-        scene = replace(simulation.scene, model=copy(simulation.scene.model))
-        engine, _ = MujocoEngine(scene, SCENARIO.T, EXPONENTIAL, substeps), scene.plant
-        engine.model.tendon_stiffness[...] *= wrong
+        engine = MujocoEngine(simulation.scene, SCENARIO.T, EXPONENTIAL, substeps)
+        engine.model.tendon_stiffness[...] *= wrong  # of this engine alone
         errors.append(_one_period(simulation.process, engine, simulation.scene.outside))
     truth = hold(plant(engine.model), SCENARIO.T).A
     old = hold(plant(simulation.scene.model), SCENARIO.T).A
@@ -321,6 +319,18 @@ def test_a_wrong_verdict_is_shown_and_never_chosen():
     assert pick(list(choices.values()), 1.0).verdict_correct
 
 
+def test_speed_against_error_is_of_the_run_with_its_budget_and_its_delays():
+    scenario, found = SCENARIO.replace(duration=0.5, varying_delay=VaryingDelay((1, 1), (3, 2))), []
+    for net in (None, EnergyNet(0.0)):
+        done = run_scenario(scenario, NoCoupling(), error=1e-9, net=net)
+        assert (done.integrator, done.substeps) == (EXPONENTIAL, 1)
+        truth, own = (run(done.ran, make_engine(done.ran, *how)).x for how in (("exact",), ("mujoco", "RK4", 2)))
+        apart = np.sqrt(np.mean((own - truth) ** 2) / np.mean(truth**2))
+        found += [c.position_relative_rms for c in done.choices if c.name == "RK4 x 2"]
+        assert found[-1] == pytest.approx(apart)
+    assert found[0] != found[1]  # the budget acts
+
+
 def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
     """The exponential engine with a J that is off by one part in a thousand; RK4 knows no J."""
     loop = assemble(SCENARIO.replace(duration=0.5), CASE_I)
@@ -328,7 +338,8 @@ def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
     assert (sound.integrator, sound.substeps, sound.agrees) == ("RK4", 4, True)
     assert sound.position_relative_rms < 1e-6  # of RK4 x 4 here
     assert abs(sound.growth_rate_difference_per_s) < 1e-3
-    monkeypatch.setattr(mujoco_engines, "exponential_step", lambda J, *rest: exponential_step(1.001 * J, *rest))
+    wrong_step = exponential_step(1.001 * loop.scene.plant.A[None], SCENARIO.T, loop.scene.model.nv)[0]
+    monkeypatch.setattr(mujoco_engines, "_step_of", lambda *_: wrong_step)
     wrong = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), "mujoco", EXPONENTIAL, 1)
     assert wrong.position_relative_rms > 30 * sound.position_relative_rms
     assert abs(wrong.growth_rate_difference_per_s) > 1e-3

@@ -67,8 +67,8 @@ def test_both_engines_agree_on_limited_forces(coupling, rho):
     np.testing.assert_allclose(own.x, exact.x, atol=3e-11)
     assert (np.abs(exact.f) <= limits).all()
     assert 0.2 < exact.clipped(limits).mean() < 0.95
-    assert simulation.process.limiter is not None
-    assert np.abs(simulation.process.limiter.slips(exact.z)).max() > 1e-4
+    assert simulation.process.law.bounds
+    assert np.abs(simulation.process.law.slips(exact.z)).max() > 1e-4
 
 
 @pytest.mark.parametrize(("engine", "apart"), [("exact", 1e-12), ("exponential", 1e-12), ("RK4", 0.0)])
@@ -126,4 +126,4 @@ def test_the_report_says_which_guarantee_holds(tmp_path):
     assert usual["words"].startswith("proved, also while forces are limited to 12 N")
     uncovered = report("--case", "I", "--coupling", "optimal")["limiter"]
     assert uncovered["rho"] is None
-    assert "no proof found with the limiter" in uncovered["words"]
+    assert "no limiter is proved for this coupling" in uncovered["words"]

@@ -137,8 +137,8 @@ def test_an_onset_is_drawn_at_its_size_and_slope_and_what_is_not_credible_is_gre
 def test_wrong_verdicts_are_crossed(drawn):
     names = "integrator", "substeps", "wall_s_per_simulated_s", "position_relative_rms", "growth_rate_error"
     rows = [("RK4", 1, 0.1, 1e-6, -1e-3), ("RK4", 4, 0.3, 1e-8, 1e-5), ("Euler", 1, 0.05, 0.0, 2.0)]
-    rows = [dict(zip(names, row, strict=True)) | {"verdict_correct": row[0] == "RK4"} for row in rows]
-    rows.append({"integrator": None, "position_relative_rms": 0.0, "growth_rate_error": 0.0})
+    rows = [SimpleNamespace(**dict(zip(names, row, strict=True)), verdict_correct=row[0] == "RK4") for row in rows]
+    rows.append(SimpleNamespace(integrator=None, position_relative_rms=0.0, growth_rate_error=0.0))
     position, growth = drawn(plots.plot_accuracy, rows).axes
     np.testing.assert_array_equal(lines(growth)["RK4"], [(0.1, 1e-3), (0.3, 1e-5)])
     assert not lines(position)["Euler"].size  # no error to be drawn on a logarithmic axis
@@ -157,7 +157,7 @@ def test_every_human_is_a_point(drawn):
 def test_who_was_found_is_told_from_who_was_not(drawn):
     rows = [("a", 0.01, False, None), ("a", 0.05, True, 0.3), ("b", 0.02, True, 0.1)]
     names = "loop", "short", "found", "growth_rate_per_s"
-    (axis,) = drawn(plots.plot_tightness, [dict(zip(names, row, strict=True)) for row in rows]).axes
+    (axis,) = drawn(plots.plot_tightness, [SimpleNamespace(**dict(zip(names, row, strict=True))) for row in rows]).axes
     marks = [(line.get_marker(), *line.get_xydata()[0]) for line in axis.lines if len(line.get_xydata()) == 1]
     assert ("o", 1.0, 0.0) in marks
     assert ("^", 5.0, 0.3) in marks
@@ -165,22 +165,26 @@ def test_who_was_found_is_told_from_who_was_not(drawn):
     np.testing.assert_array_equal(lines(axis)["a"], [(1.0, 0.0), (5.0, 0.3)])
 
 
-HZ = [1.0, 10.0, 100.0]
+HZ = np.array([1.0, 10.0, 100.0])
 
 
 def coupling(name, ratio, at):
-    part = {"ratio": ratio, "demand": [0.1, ratio / 2, ratio], "binding_frequency_hz": at}
-    none = {"ratio": None, "demand": None, "binding_frequency_hz": None, "reason": "no V"}
-    felt = {"stiffness": [[1.0, 9.0], [-5.0, 9.0], [7.0, 9.0]], "damping": [[0.1, 2.0]] * 3}
-    sigma = {"sigma_F": [[3.0, 1.0]] * 3, "sigma_M": [[0.0, 0.0]] * 3}
-    return {"name": name, "this-environment": part, "any-environment": none, "perceived": felt} | sigma
+    demand = np.array([0.1, ratio / 2, ratio])
+    part = SimpleNamespace(ratio=ratio, demand=demand, requirement=SimpleNamespace(frequency_hz=at))
+    none = SimpleNamespace(ratio=np.inf, demand=None)
+    felt = SimpleNamespace(
+        stiffness=np.array([[1.0, 9.0], [-5.0, 9.0], [7.0, 9.0]]), damping=np.array([[0.1, 2.0]] * 3)
+    )
+    curves = SimpleNamespace(sigma_F=[[3.0, 1.0]] * 3, sigma_M=[[0.0, 0.0]] * 3, perceived=felt)
+    conditions = {"this-environment": part, "any-environment": none}
+    return SimpleNamespace(name=name, conditions=conditions, curves=curves)
 
 
 def report(available=(1.37, 1.37), psi=(0, 0)):
-    felt = {"stiffness": [[2.0, 2.0]] * 3, "damping": [[0.0, 0.0]] * 3}
+    felt = SimpleNamespace(stiffness=np.full((3, 2), 2.0), damping=np.zeros((3, 2)))
     couplings = [coupling("soft", 0.5, 100.0), coupling("stiff", 40.0, 0.0)]
-    data = {"frequency_hz": HZ, "available_damping": list(available), "psi": list(psi), "ideal": felt}
-    return data | {"sigma_E": [[4.0, 2.0]] * 3, "couplings": couplings}
+    data = {"frequency_hz": HZ, "available_damping": available, "psi": psi, "ideal": felt}
+    return SimpleNamespace(**data, sigma_E=[[4.0, 2.0]] * 3, couplings=couplings)
 
 
 def test_what_binds_is_marked_on_its_curve_or_above_the_picture(drawn):
@@ -221,14 +225,19 @@ def k_b_map():
 
 def told(**changes):
     def point(B, K, verdict, differs=False):
-        return {"B": B, "K": K, "verdict": verdict, "differs_from_linear": differs}
+        return SimpleNamespace(B=B, K=K, verdict=verdict, differs_from_linear=differs)
 
-    effects = {"encoder_step_m": [1e-5, 0.0], "friction_n": [0.0, 0.0], "force_limit_n": None}
+    effects = SimpleNamespace(encoder_step_m=[1e-5, 0.0], friction_n=[0.0, 0.0], force_limit_n=None)
     points = [point(0, 10, "rests"), point(2, 20, "oscillates", True), point(1, 20, map_plot.UNDECIDED)]
-    simulation = {"points": points, "effects": effects, "nonlinear": True}
-    head = {"axes": "coupling", "rigid": True, "coupling": None, "one_sided": False, "population": {"humans": 7}}
+    simulation = SimpleNamespace(points=points, effects=effects, nonlinear=True)
+    head = {"fixed": None, "scenario": None, "coupling": None, "one_sided": False}
     loop = {"theta": [1, 1], "psi": [0, 1], "T": 1e-3, "delta": [1.37, 2.0], "velocity_filter_hz": None}
-    return head | loop | {"simulation": simulation, "marks": [{"K": 15.0, "B": 0.5}]} | changes
+    rest = {
+        "population": SimpleNamespace(humans=7),
+        "simulation": simulation,
+        "marks": [SimpleNamespace(K=15.0, B=0.5)],
+    }
+    return SimpleNamespace(**(head | loop | rest | changes))
 
 
 def test_a_map_shows_verdicts_edges_and_points(drawn):
@@ -254,9 +263,10 @@ def test_a_map_shows_verdicts_edges_and_points(drawn):
 
 
 def test_a_map_of_an_environment_shows_what_was_designed_for(drawn):
-    springs = {"contact_springs": [{"B": 1.0, "K": 15.0}, {"B": 9.0, "K": 15.0}]}
-    empty = {"points": [], "effects": told()["simulation"]["effects"], "nonlinear": False}
-    figure = drawn(map_plot.plot_zwidth, k_b_map(), told(axes="environment", designed_for=springs, simulation=empty))
+    springs = SimpleNamespace(contact_springs=[SimpleNamespace(B=1.0, K=15.0), SimpleNamespace(B=9.0, K=15.0)])
+    empty = SimpleNamespace(points=[], effects=told().simulation.effects, nonlinear=False)
+    fixed = SimpleNamespace(designed_for=springs)
+    figure = drawn(map_plot.plot_zwidth, k_b_map(), told(fixed=fixed, simulation=empty))
     marks = [line.get_xydata().tolist() for line in figure.axes[0].lines if line.get_marker() == "P"]
     assert marks == [[[1.0, 15.0]]]  # the other one is not on the map
     assert "this environment: certified inside this edge" in legend(figure)

@@ -1,0 +1,114 @@
+"""Environments of one's own classes: what they are made of, and E(z) by its numbers."""
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+import pytest
+
+from controller.environment import Block, Network, Spring, Wall, environment, parts_of
+from controller.lti import Lti, rational
+from sim import load
+from sim.scenario import InputError
+
+T = 1e-3
+SQUARE = np.exp(1j * np.array([1e-3, 0.01, 0.1, 1.0, 3.0]))
+#: with inerters between a contact and an inner node, between two inner nodes, and from a contact to ground
+INERT = Network(
+    ("a", "b"),
+    (
+        Spring(("a", "m"), 300.0, 1.0, 0.05),
+        Spring(("m", "n"), 250.0, 0.0, 0.03),
+        Spring(("n", "b"), 200.0, 0.5),
+        Spring(("b", "ground"), 0.0, 0.1, 0.02),
+    ),
+    {"m": 0.3, "n": 0.1},
+)
+
+
+@dataclass
+class Hardening:
+    between: tuple[str, str]
+    stiffness: float
+    step: float
+
+    def parts(self):
+        (a, b), k = self.between, self.stiffness
+        return [Spring((a, b), k), Wall((a, b), 3 * k, gap=self.step), Wall((b, a), 3 * k, gap=self.step)]
+
+
+def test_an_inerter_is_its_dynamic_stiffness():
+    """Z_cc - Z_ci Z_ii^-1 Z_ic at s = (z-1)/(Tz), in floats; and over Fractions the same block."""
+    E = environment(INERT, T)
+    (M, D, K), c = INERT.matrices(), slice(None, 2)
+    inner = slice(2, None)
+    for z in SQUARE:
+        s = (z - 1) / (T * z)
+        Z = M * s**2 + D * s + K
+        expected = Z[c, c] - Z[c, inner] @ np.linalg.solve(Z[inner, inner], Z[inner, c])
+        np.testing.assert_allclose(E.at(np.array([z]))[0], expected, rtol=1e-11, atol=1e-11 * np.abs(expected).max())
+    exact = environment(INERT, rational(T))
+    np.testing.assert_allclose(exact.D.astype(float), E.D, rtol=1e-12)
+
+
+def test_springs_without_inertance_are_stored_as_they_were():
+    assert b"inertance" not in msgspec.json.encode(Spring(("a", "b"), 1.0))
+    assert msgspec.json.decode(msgspec.json.encode(INERT), type=Network) == INERT
+
+
+def test_an_element_is_put_among_springs_and_walls():
+    made = Network(("a",), (Spring(("a", "ground"), 5.0),), elements=(Hardening(("a", "ground"), 100.0, 2e-3),))
+    assert [spring.stiffness for spring in made.springs] == [5.0, 100.0]
+    assert [wall.between for wall in made.walls] == [("a", "ground"), ("ground", "a")]
+    assert made.elements == ()
+    assert made == msgspec.json.decode(msgspec.json.encode(made), type=Network)
+    with pytest.raises(ValueError, match="element int: it is 3, expected a class whose parts"):
+        parts_of(3)
+    with pytest.raises(ValueError, match="the network has 8 walls, allowed are 6"):
+        Network(("a",), elements=(Hardening(("a", "ground"), 100.0, 2e-3),) * 4)
+
+
+def test_a_block_is_the_network_whose_numbers_it_has():
+    """Alone, and beside springs and walls; over Fractions it is exact."""
+    E = environment(INERT, T)
+    alone = Network(INERT.contacts, block=Block.of(E))
+    np.testing.assert_array_equal(environment(alone, T).at(SQUARE), E.at(SQUARE))
+    spring = (Spring(("a", "b"), 70.0, 0.2),)
+    beside, whole = (msgspec.structs.replace(n, springs=(*n.springs, *spring)) for n in (alone, INERT))
+    np.testing.assert_allclose(beside.E(T).at(SQUARE), whole.E(T).at(SQUARE), rtol=1e-9)
+    exact = alone.E(rational(T))
+    assert all(rational(a) == b for a, b in zip(E.A.ravel(), exact.A.ravel(), strict=True))
+    with pytest.raises(ValueError, match=r"block: its numbers are for T = 0.001 s, the loop has 0.002 s"):
+        alone.E(2e-3)
+
+
+@pytest.mark.parametrize(
+    ("E", "message"),
+    [
+        (Lti.constant([[-1.0]], T), "not passive"),
+        (Lti([[0.0]], [[1.0]], [[300.0]], [[0.0]], T), "not passive, its force feeds power in at"),  # a late spring
+        (Lti.constant([[0.0, 1.0], [-1.0, 0.0]], T), "not passive"),
+        (Lti([[1.0]], [[1.0]], [[1.0]], [[1.0]], T), "an eigenvalue on or outside the unit circle"),
+        (Lti.constant([[1.0, 0.0]], T), "it has 2 inputs and 1 outputs"),
+    ],
+)
+def test_what_is_no_passive_block_is_refused(E, message):
+    with pytest.raises(ValueError, match=message):
+        Block.of(E)
+
+
+class Gel:
+    contacts = ("left", "right")
+
+    def E(self, T):
+        return Network(self.contacts, (Spring(self.contacts, 600.0, 2.0),)).E(T)
+
+
+def test_a_scenario_takes_an_environment_of_one_s_own():
+    own = load().replace(environment=Gel())
+    same = load().replace(environment=Network(Gel.contacts, (Spring(Gel.contacts, 600.0, 2.0),)))
+    np.testing.assert_array_equal(own.loop("I").E().at(SQUARE), same.loop("I").E().at(SQUARE))
+    with pytest.raises(InputError, match=r"environment int: expected a class with contacts, and E\(T\) or parts\(\)"):
+        load().replace(environment=3)
+    with pytest.raises(InputError, match=r"ranges and environment.block"):
+        own.replace(ranges={"masses": {"left": [0.1, 0.2]}})
