@@ -312,7 +312,7 @@ class LimiterLoop(SampledLoop):
             self._undelayed = (at, (D, E, now))
         return self._undelayed[1]
 
-    def _lines(self, x: Array) -> Complex:
+    def _lines(self, x: Array) -> Array:
         """N of `limiter_demand`, (k, m)."""
         windows = [polynomials(n, self.conditions)[0] for n in self.loop.theta]
         return -np.stack(windows, axis=1) - self._weights(x).T
