@@ -17,7 +17,7 @@ import msgspec
 
 from controller.coupling import Coupling, Strict
 from controller.delay import delay
-from controller.environment import Environment, Network, RigidWall, walled_force_map
+from controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_force_map
 from controller.lti import Complex, Lti, Number, Sampled, rational
 from controller.ranges import Member, Ranges, members
 
@@ -163,6 +163,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
     def at(self, network: Environment) -> Loop:
         """The loop around this environment, known exactly."""
         return msgspec.structs.replace(self, environment=network, ranges=None)
+
+    def channel(self, i: int) -> Loop:
+        """Device i alone, at a rigid wall: any-environment is of the same gains whatever is behind them."""
+        return Loop(self.T, self.theta[i : i + 1], (0,), (0,), self.delta[i : i + 1], RIGID_WALL, T_max=self.T_max)
 
     def switching(self, span: DelayRange | None) -> Loop:
         """The loop whose delays may switch within this range, or are the constant theta."""

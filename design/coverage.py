@@ -9,8 +9,7 @@ from typing import Any
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.environment import environment
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
 from design.conditions import this_environment
@@ -131,7 +130,7 @@ class Switching:
         if found.requirement.reason:
             return cls(found.requirement, span.lo, span.hi)
         G = loop.sent(coupling)
-        buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available, loop.T_max)
+        buffered = this_environment(delay(span.hi, G.T) @ G, loop)
         playout = _Playout(span.hi, buffered.required, buffered.certified)
         return cls(found.requirement, span.lo, span.hi, tuple(found.alpha), playout, _NOT_COVERED)
 
@@ -164,9 +163,9 @@ class OverRanges:
         """Members that no device feels have no mismatch."""
         ratios, figures = [], {}
         for member in members:
-            E = environment(member.network, loop.T)
-            F = force_map(E, coupling, loop.theta, loop.psi)
-            ratios.append(this_environment(F, loop.delta, loop.T_max, loop.latency).ratio)
+            here = loop.at(member.network)
+            E, F = here.E(), here.F(coupling)
+            ratios.append(this_environment(F, loop).ratio)
             if E.D.any():
                 figures[member.name] = transparency(F, E, loop.lam)
         nominal, worst = figures[members[0].name], max(figures, key=lambda member: figures[member].rms_mismatch)

@@ -20,8 +20,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from controller.coupling import Coupling, NoCoupling
-from controller.environment import environment
-from controller.loop import force_map
 from controller.lti import Array, Lti
 from design.conditions import this_environment
 from models.human import Hand, Person
@@ -178,8 +176,9 @@ def attempts(
     """
     rows = []
     for name, (scenario, coupling) in loops.items():
-        F = force_map(environment(scenario.environment, scenario.T), coupling, scenario.theta, scenario.psi)
-        required = np.array(this_environment(F, scenario.delta, scenario.longest_period, scenario.latency).required)
+        loop = scenario.loop("I")
+        F = loop.F(coupling)
+        required = np.array(this_environment(F, loop).required)
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
             rows.append(_Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))

@@ -9,6 +9,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from asked import any_environment, this_environment
 from driven import driven
 from scipy.signal import dlsim, lfilter
 from worlds import SOFT, STIFF
@@ -18,7 +19,6 @@ from controller.environment import FIGURE_4, GROUND, Network, Spring, environmen
 from controller.limiter import limited
 from controller.loop import Loop, force_map
 from controller.lti import Lti
-from design.conditions import any_environment, this_environment
 from design.lmi import Infeasible, Shaping, least_multiplier
 from design.multipliers import limiter_lag
 from design.spring_damper import step

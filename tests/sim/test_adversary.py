@@ -142,8 +142,8 @@ def test_the_rate_by_shortage():
 def test_a_human_who_destabilises_a_loop_with_enough_damping_fails_the_check(tmp_path, monkeypatch):
     """Were the condition wrong, the suite would say so: here it is told that a third of the damping is enough."""
 
-    def third(F, delta, *timing):
-        return replace(real(F, delta), required=(0.5, 0.5))
+    def third(F, loop):
+        return replace(real(F, loop), required=(0.5, 0.5))
 
     monkeypatch.setattr("sim.adversary.this_environment", third)
     check = Check(
