@@ -176,10 +176,7 @@ def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Co
 
 
 def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
-    """The range of --varying-delay, or of the scenario, around the constant theta that the other conditions are about.
-
-    Raises InputError.
-    """
+    """The range of --varying-delay, or that of the scenario; it must contain theta. Raises InputError."""
     if args.varying_delay is None:
         return loop.varying_delay
     span = options.delay_range(args.varying_delay, loop.channels, LONGEST_DELAY)
@@ -211,13 +208,13 @@ def _verdict(found: Audit) -> str:
     return f"{coupling.kind}{gains}: {verdict}"
 
 
-def _percent(error: float | None, sign: str) -> str:
-    """A relative error, rounded down so that what is printed is tolerated."""
-    return render.optional(error and math.floor(1e4 * error) / 100, sign + "{:.2f} %")
+def _percent(error: float | None) -> str:
+    """A relative error in percent, rounded down, so that the printed one is tolerated."""
+    return render.optional(error and math.floor(1e4 * error) / 100, "{:.2f} %")
 
 
 def _stiffest(K: Sequence[float | None]) -> str:
-    """To five digits, rounded down so that what is printed is certified."""
+    """Stiffnesses to five digits, rounded down, so that the printed ones are certified."""
     if None in K:
         return "-"
     units = ((k, 10.0 ** (math.floor(math.log10(k)) - 4)) for k in K if k is not None)
@@ -230,9 +227,9 @@ _ROWS: dict[str, Callable[[ConditionAudit], str]] = {
     "margin": lambda c: render.optional(c.requirement.margin, "{:.5g}"),
     "binds at": lambda c: render.optional(c.requirement.frequency_hz, "{:.5g} Hz"),
     "stiffest K here": lambda c: _stiffest(c.stiffest.K),
-    "delta error": lambda c: _percent(c.sensitivity.delta_error, "-"),
-    "T error": lambda c: _percent(c.sensitivity.T_error, "+"),
-    "spare samples": lambda c: render.optional(c.sensitivity.extra_samples, "{:.5g}"),
+    "delta may be less by": lambda c: _percent(c.sensitivity.delta_error),
+    "T may be longer by": lambda c: _percent(c.sensitivity.T_error),
+    "delay may be longer by": lambda c: render.optional(c.sensitivity.extra_samples, "{:.5g} samples"),
 }
 
 
@@ -258,7 +255,7 @@ def _remarks(report: _Report) -> Iterator[str]:
 
 
 def _proposed(helps: Sequence[Help]) -> Iterator[str]:
-    """Changes that were certified, the one that leaves most damping over first."""
+    """Changes that certify the coupling; the one that needs the least damping comes first."""
     enough = sorted((each for each in helps if each.certified), key=lambda each: max(each.required_damping))
     if not enough:
         yield "What helps: no single change of delay, damper or period was found to; a design finds other gains."

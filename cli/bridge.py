@@ -55,13 +55,13 @@ def main(argv: list[str]) -> int:
         met, link = timed(scenario, ages, args.quantile, 1e6 * args.guard, at_once)
         asked = args.case, args.coupling, args.condition
         programs = certified_couplings(met, *asked, link, limiter=args.limiter)
-        print_certificate(ages, link, programs, session.limits.cap, render.console(args))
+        _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         return programs
 
     live = session_cli.hold_session(args, session, plan, seconds, out)
     report = outcome(args.case, session, recorder, live.dropped, args.pace)
     try:  # first, for a disk may be full
-        print_session(report, render.console(args))
+        _print_session(report, render.console(args))
     except OSError:
         if signal.SIGHUP not in live.signals:
             raise
@@ -95,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def print_certificate(
+def _print_certificate(
     ages: Ages, link: int, programs: Sequence[CertifiedCoupling], caps: Sequence[float], console: Console
 ) -> None:
     """What was measured, and what is certified for it: printed before anything is armed."""
@@ -138,7 +138,7 @@ def _link(link: int, scenario: Scenario) -> str:
 
 
 def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
-    """How long ticks are, and what one longer than the certificate counts with may cost."""
+    """How long ticks are, and how much energy a tick longer than the certified one may give."""
     least, most = (f"{1e-3 * side(ages.ticks, default=1e6 * scenario.T):.4g}" for side in (min, max))
     span = least if least == most else f"{least} to {most}"
     longest = 1e3 * (scenario.T_max or scenario.T)
@@ -149,7 +149,7 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
     )
 
 
-def print_session(report: SessionReport, console: Console) -> None:
+def _print_session(report: SessionReport, console: Console) -> None:
     """The log, then what the link did."""
     cells = {"after": "{r.t_s:.3f} s", "stage": lambda r: _colour(r.stage), "cause": "{r.cause}"}
     console.print(render.columns(f"case {report.case} · {report.scenario}", cells, report.session.log, left=(1, 2)))

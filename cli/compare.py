@@ -74,6 +74,12 @@ def _parser() -> options.Parser:
     optimal = parser.add_argument_group("the optimal coupling of --over")
     add_optimal_options(optimal)
     options.add_output_options(parser, picture=True)
+    plain = "without --over, --ladder and --baselines"
+    parser.only(plain, lambda args: not (args.over or args.ladder or args.baselines), "coupling", "condition")
+    parser.only("without --ladder, which has no picture", lambda args: not args.ladder, "no_plot")
+    parser.only("with --baselines", lambda args: args.baselines, "limiter")
+    optimal = ("objective", "band_hz", "high_gain", "seconds")
+    parser.only("with --over", lambda args: args.over, "points", "keep", "beside", *optimal)
     return parser
 
 
@@ -81,31 +87,15 @@ def _beside(text: str) -> tuple[str, ...]:
     return {"none": (), "both": tuple(CONDITIONS)}[text] if text in ("none", "both") else (options.condition(text),)
 
 
-#: options -> the modes that take them
-_MODES = {
-    "coupling": ("",),
-    "condition": ("",),
-    "no_plot": ("", "--over", "--baselines"),
-    "limiter": ("--baselines",),
-    **dict.fromkeys(("points", "keep", "beside", "objective", "band_hz", "high_gain", "seconds"), ("--over",)),
-}
-
-
 def _check_mode(args: argparse.Namespace, parser: options.Parser) -> None:
-    """Raises InputError where an option is given that this comparison would have to ignore."""
+    """Raises InputError where two comparisons are asked for, or a case that this one does not have."""
     asked = [f"--{name}" for name in ("over", "ladder", "baselines") if getattr(args, name)]
     if len(asked) > 1:
         raise InputError(f"{' with '.join(asked)}: give one of them")
-    mode = "".join(asked)
     if args.ladder and args.case != parser.get_default("case"):
         raise InputError(f"--ladder shows both cases: leave out --case {args.case}")
-    if mode and args.case == "none":
+    if asked and args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
-    for name, modes in _MODES.items():
-        if mode not in modes and getattr(args, name) != parser.get_default(name):
-            where = [f"for {modes[0]}"] * bool(modes[0]) + [f"not for {mode}"] * bool(mode)
-            option = {"limiter": "no-limiter"}.get(name, name.removesuffix("_hz").replace("_", "-"))
-            raise InputError(f"--{option} is {', '.join(where)}")
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -198,7 +188,7 @@ def _needs(part: ConditionCurve, scale: float) -> str:
 
 
 def _robust(part: Robustness | None, scale: float = 1.0) -> str:
-    """The need at the worst stiffness or mass within ten percent."""
+    """The damping that is needed at the worst stiffness or mass within ten percent."""
     if part is None:
         return "-"
     return f"{scale * part.required_over_available:.4g}"
@@ -218,7 +208,7 @@ def _feel(report: Comparison) -> Table:
 
 
 def _list(values: Iterable[float]) -> str:
-    """'1, 2', or '1' where all are equal."""
+    """The values with commas between them; a single one where all are equal."""
     shown = [format(v, ".0f" if abs(v) >= 1000 else ".3g") for v in values]
     return shown[0] if len(set(shown)) == 1 else ", ".join(shown)
 
@@ -371,7 +361,7 @@ def _error(limit: Limit | None, objective: str) -> str:
 
 
 def _proofs(limits: dict[str, Limit | None]) -> str:
-    """Rational where every design of a row is proved exactly, else which are only sampled."""
+    """'rational' where every design of a row is proved exactly, else the names of those that are only sampled."""
     found = {name: limit.proof for name, limit in limits.items() if limit and limit.proof}
     sampled = [name for name, proof in found.items() if proof != "rational"]
     if not found:

@@ -42,7 +42,7 @@ def _snapshot(session: Session) -> dict[str, Any]:
 
 
 def _doing(session: Session) -> str:
-    """What is being done where it takes longer than a moment."""
+    """The present work, if it takes longer than a moment."""
     if session.stage == Stage.MEASURING:
         return f"measuring the delay: {len(session.measurement.ages)} of {session.settings.measure} answers"
     return "designing the coupling" if session.stage == Stage.MEASURED else ""
@@ -65,7 +65,7 @@ def view(data: dict[str, Any], width: int = _WIDTH) -> Table:
 
 
 def _bar(part: float) -> str:
-    """A force between its limits: the bar grows from the middle."""
+    """A bar for a force between its two limits, growing from the middle."""
     half = _BAR // 2
     n = round(min(1.0, abs(part)) * half)
     return ("█" * n).rjust(half) + "│" + " " * half if part < 0 else " " * half + "│" + ("█" * n).ljust(half)

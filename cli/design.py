@@ -17,7 +17,7 @@ from design.api import Filed, proved, store
 from design.audit import LONGEST_DELAY
 from design.bound import BoundBeside
 from design.certificate import SAMPLES, assess, check_ranges
-from design.designs import KINDS, design_by_kind, usual_condition
+from design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
 from design.guarantees import ANY
@@ -40,7 +40,7 @@ def main(argv: list[str]) -> int:
     scenario = options.scenario_from(args)
     loop = _loop(args, scenario)
     if args.samples is not None and loop.ranges is None:
-        raise InputError("--samples without ranges: give --ranges, or a scenario with [ranges]")
+        raise InputError("--samples is only with ranges: give --ranges, or a scenario with [ranges]")
     design = _design(args, loop)
     judged = _judged(args, scenario, loop, design)
     stored = store(loop, design, out, judged.whole, judged.limiter.certificate)
@@ -56,7 +56,8 @@ def _parser() -> options.Parser:
     parser = options.Parser("design", "Design a coupling, prove its certificate and store both.", example)
     options.add_loop_options(parser)
     kind = parser.add_mutually_exclusive_group()
-    kind.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
+    kinds = f"{', '.join(KINDS)}, or package.module:function of your own (default spring-damper)"
+    kind.add_argument("--coupling", metavar="NAME", default="spring-damper", help=kinds)
     best = "the coupling of the least transparency error: --coupling optimal"
     kind.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
     around = "certify for every stiffness and mass this much more or less, as [ranges] of a scenario does"
@@ -108,7 +109,8 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
         with options.refused(f"--ranges {args.ranges:g}: "):
             loop = msgspec.structs.replace(loop, ranges=ranges_around(loop.network, args.ranges))
             loop.members()
-    args.condition = args.condition or usual_condition(loop, args.coupling)
+    if args.coupling in KINDS:
+        args.condition = args.condition or usual_condition(loop, args.coupling)
     if args.varying_delay is not None:
         if not _for_switching(args):
             raise InputError("--varying-delay is for --coupling optimal or --condition this-environment")
@@ -122,15 +124,15 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 
 def _for_switching(args: argparse.Namespace) -> bool:
     """Whether this design can be made for delays that vary; any other is only judged under them."""
-    condition = args.condition or KINDS[args.coupling].conditions[0]
-    return "switching" in KINDS[args.coupling].options and condition == "this-environment"
+    kind = kind_of(args.coupling)
+    return "switching" in kind.options and (args.condition or kind.conditions[0]) == "this-environment"
 
 
 def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
-    """What is asked of a design, in its own words. Raises InputError for options of another coupling."""
+    """The options of a design by the names of its arguments. Raises InputError for options of another coupling."""
     known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
     given = {name: value for name in known if options.given(value := getattr(args, name, None))}
-    if KINDS[kind].limited and args.limiter is not None:
+    if kind_of(kind).limited and args.limiter is not None:
         given["limiter"] = args.limiter
     for name in given:
         taking = [other for other, design in KINDS.items() if name in design.options]
@@ -141,7 +143,7 @@ def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 
 def _design(args: argparse.Namespace, loop: Loop) -> Design:
-    """Raises InputError for a request that contradicts itself, DesignFailed where there is no such coupling."""
+    """Design and prove. Raises InputError for options that contradict each other, DesignFailed without a coupling."""
     asked = asked_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
         asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
@@ -184,6 +186,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         price=coverage.price(loop, design, args.coupling, asked_of(args, args.coupling)) if judged.whole else None,
         judged=judged,
         switching=switching,
+        delays=stored.switching.guarantee if stored.switching and stored.switching.proof else None,
         transparency=transparency(loop.F(design.coupling), loop.E(), loop.lam, band),
         nearby=nearby,
         best=best and _Best(limit, best.g, best.ladder),
@@ -242,7 +245,6 @@ def _switching_words(proof: coverage.Switching) -> str:
 
 def _stored_rows(stored: Filed) -> render.Rows:
     delays = stored.switching
-    yield "guarantee, delays", delays.guarantee if delays and delays.proof else None
     yield "stored", f"{stored.file} (proof: {stored.proof or stored.reason})"
     yield "", f"for constant delays only: {delays.reason}" if delays and not delays.proof else None
 
@@ -259,6 +261,7 @@ class _Report:
     price: list[coverage.OverRanges] | None
     judged: Judged = render.several(_judged_rows, "beside")
     switching: coverage.Switching | None = render.figure("damping, any switching", _switching_words)
+    delays: str | None = render.figure("guarantee, delays", json="table")
     objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
     transparency: Transparency = render.figure("transparency error", render.transparency_error)
     nearby: Nearby = render.several(render.robustness_rows, "beside")

@@ -64,11 +64,6 @@ def main(argv: list[str]) -> int:
     """Export a stored coupling. 0: written, 1: written, but the certificate in its file does not hold."""
     args = _parser().parse_args(argv)
     options.check_json(args)
-    if args.without_theta and not args.process:
-        raise InputError("--without-theta without --process: a coupling alone has no delay")
-    if args.force_limit and (not args.process or args.format == "control"):
-        other = "--format control: that is linear" if args.process else "a coupling alone sends no forces"
-        raise InputError(f"--force-limit is for --process, {other}")
     stored = read_coupling(args.coupling)
     try:
         verdict = verify(stored)
@@ -114,6 +109,9 @@ def _parser() -> options.Parser:
     limit = "with the limiter that the certificate covers, for forces of up to so much [N]; one is for all channels"
     parser.add_argument("--force-limit", type=options.several(float, 1e-3, 1e6, "N"), metavar="N,N,..", help=limit)
     options.add_output_options(parser, "FILE", "the file (default out/export/<coupling>-<what>.<suffix>)")
+    parser.only("with --process: a coupling alone has no delay", lambda args: args.process, "without_theta")
+    parser.only("with --process: a coupling alone sends no forces", lambda args: args.process, "force_limit")
+    parser.only("without --format control: that is linear", lambda args: args.format != "control", "force_limit")
     return parser
 
 

@@ -76,8 +76,6 @@ def main(argv: list[str]) -> int:
     low, high = args.band
     if not 0.5 <= low < high <= 0.4 / scenario.T:
         raise InputError(f"--band is {low:g},{high:g}, expected LOW,HIGH within 0.5 to {0.4 / scenario.T:.0f} Hz")
-    if args.hand and not args.rehearse:
-        raise InputError("--hand is for --rehearse")
     out, sittings = options.out_folder(args, "identify"), list[_Sitting]()
     settings = replace(settings, test_encoders=False)
     while len(sittings) < args.sittings and not (sittings and sittings[-1].signals):
@@ -117,6 +115,9 @@ def _parser() -> argparse.ArgumentParser:
     rests = "with --rehearse, the damping of a hand at every handle in the first sitting (default 0)"
     add("--hand", type=number(0.0, 10.0), default=0.0, metavar="N_S/M", help=rests)
     options.add_output_options(parser)
+    parser.only("with --rehearse", lambda args: args.rehearse, "hand")
+    parser.only("with --rehearse or --emulate", lambda args: not args.port, "coulomb")
+    parser.only("with --port", lambda args: args.port, "same_place")
     return parser
 
 

@@ -54,6 +54,11 @@ class Parser(argparse.ArgumentParser):
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
+        self._only: list[tuple[str, Callable[[argparse.Namespace], Any], tuple[str, ...]]] = []
+
+    def only(self, where: str, acts: Callable[[argparse.Namespace], Any], *names: str) -> None:
+        """Refuse the options of these destinations where `acts` is false of what is given: they would be ignored."""
+        self._only.append((where, acts, names))
 
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
         """As argparse's; an empty word is refused for every option."""
@@ -61,6 +66,11 @@ class Parser(argparse.ArgumentParser):
         for action in self._actions:
             if getattr(found, action.dest, None) == "":
                 raise InputError(f"{action.option_strings[-1] if action.option_strings else action.dest} is empty")
+        for where, acts, names in self._only:
+            for name in names if not acts(found) else ():
+                if getattr(found, name) != self.get_default(name):
+                    option = next(a.option_strings[-1] for a in self._actions if a.dest == name and a.option_strings)
+                    raise InputError(f"{option} is only {where}")
         return found, rest
 
     def error(self, message: str) -> NoReturn:
@@ -136,7 +146,7 @@ def energy_budget(text: str) -> tuple[float, float]:
     return start, cap
 
 
-def delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
+def _delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
     """'1,2' as one range for all channels, '1-2,0-3' as one per channel [samples]."""
     parts = _parts(text, int, expected := "LO,HI or LO-HI,LO-HI,.. in whole samples", "-")
     if [len(part) for part in parts] == [1, 1]:
@@ -172,15 +182,15 @@ def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
 
 
 def given(value: Any) -> bool:
-    """Whether the value of an option says that the option was given; 0 does."""
+    """Whether an option was given, by its value: neither None nor False."""
     return value is not None and value is not False
 
 
 @contextmanager
 def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[None]:
-    """What is refused within is bad input: InputError, with this name in front of what was said.
+    """Turn a ValueError raised within into InputError, with `name` in front of its message.
 
-    Of `args` the option's name takes the place of the argument's that a message begins with.
+    A message that begins with the name of an argument begins with the name of the option in `args` instead.
     """
     try:
         yield
@@ -278,13 +288,15 @@ def add_human_option(parser: argparse.ArgumentParser, more: str = "") -> None:
 
 
 def with_humans(args: argparse.Namespace, scenario: Scenario) -> Scenario:
-    """The scenario in the hands that --human names. Raises InputError."""
+    """The scenario with the humans of --human. Raises InputError."""
     return scenario if args.human is None else held_by(scenario, args.human)
 
 
 def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: str = "spring-damper") -> None:
     """Which coupling, and the condition that it is designed for or judged by."""
-    parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default {default})")
+    parser.add_argument(
+        "--coupling", metavar="NAME|FILE", help=f"{names}, FILE.json or package.module:function (default {default})"
+    )
     add_condition_option(parser)
 
 
@@ -354,7 +366,7 @@ def add_rigid_option(parser: argparse.ArgumentParser) -> None:
 
 
 def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
-    """The loop of the one channel that --rigid is about. Raises InputError where options name more of them."""
+    """The loop of one channel before a rigid wall. Raises InputError where options give values for more channels."""
     for name in ("theta", "psi", "delta"):
         per_channel(f"--rigid is one channel: --{name}", getattr(args, name) or (0,), 1)
     with refused():
@@ -370,8 +382,8 @@ _DRAWN = ("constant", "random", "bursty", "adversarial")
 
 def add_varying_delay_option(parser: argparse._ActionsContainer, what: str) -> None:
     """--varying-delay, and --jitter, as it was called."""
-    parser.add_argument("--varying-delay", type=delay_ranges, metavar="LO,HI", help=what)
-    parser.add_argument("--jitter", dest="varying_delay", type=delay_ranges, help=argparse.SUPPRESS)
+    parser.add_argument("--varying-delay", type=_delay_ranges, metavar="LO,HI", help=what)
+    parser.add_argument("--jitter", dest="varying_delay", type=_delay_ranges, help=argparse.SUPPRESS)
 
 
 def add_varying_delay_options(parser: argparse.ArgumentParser) -> None:
@@ -450,7 +462,7 @@ def _rows(
 
 
 def until_interrupted(rows: Iterable[_Given]) -> tuple[list[_Given], bool]:
-    """What was done until the keyboard ended it, and whether it did."""
+    """The rows that were finished, and whether Ctrl-C ended the work."""
     done: list[_Given] = []
     try:
         done.extend(rows)
@@ -460,7 +472,7 @@ def until_interrupted(rows: Iterable[_Given]) -> tuple[list[_Given], bool]:
 
 
 def exit_code(holds: bool, interrupted: bool = False) -> int:
-    """Of a command that has reported what it found."""
+    """The exit code of a command that has printed its report."""
     return INTERRUPTED if interrupted else DONE if holds else DOES_NOT_HOLD
 
 
@@ -513,7 +525,7 @@ def _say(message: str, code: int) -> int:
 
 
 def _cannot(error: OSError) -> int:
-    """One line for a refusal of the system; later output goes nowhere."""
+    """Say in one line what the operating system refused; later output is discarded."""
     nobody_reads()
     return _say(f"error: {error.filename or 'standard output'}: {error.strerror or error}", BAD_INPUT)
 

@@ -43,10 +43,10 @@ _OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # what opens
 
 
 class Screen(Console):
-    """A console whose tables lose nothing: words may break, numbers do not; what is too wide runs over the edge."""
+    """A console that cuts nothing off: words may be broken, numbers are not; a table may be wider than the terminal."""
 
     def print(self, *objects: Any, **how: Any) -> None:
-        """As rich's, at the least width from the terminal's at which no table loses a character."""
+        """Print as rich does, but widen until no table loses a character."""
         own = self._width
         self._width = max([self.width, *(self._needed(one) for one in objects if isinstance(one, Table))])
         try:
@@ -65,7 +65,7 @@ class Screen(Console):
         return super().render_str(text, **how)
 
     def on_broken_pipe(self) -> None:  # rich itself would leave with 1, our "it does not hold"
-        """A reader that has seen enough (`| head -1`) changes neither the work nor its exit code."""
+        """Go on without output where its reader has gone (`| head -1`); the exit code stays the same."""
         self.quiet = True
         nobody_reads()
 
@@ -175,9 +175,9 @@ Rows = Iterable[tuple[str, str | None]]
 _Form = str | Callable[[Any], str | None]
 
 
-def facts(title: str, rows: Rows, heads: Sequence[str] = (), left: bool = False) -> Table:
+def facts(title: str, rows: Rows, left: bool = False) -> Table:
     """A table of names and texts; a text of None is left out."""
-    table = Table(*heads, title=title, title_justify="left" if left else "center", show_header=bool(heads))
+    table = Table(title=title, title_justify="left" if left else "center", show_header=False)
     for name, text in rows:
         if text is not None:
             table.add_row(name, text)
@@ -185,7 +185,7 @@ def facts(title: str, rows: Rows, heads: Sequence[str] = (), left: bool = False)
 
 
 def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (0,)) -> Table:
-    """A table of figures, to the right but for the columns `left`."""
+    """A table of figures, aligned to the right except in the columns `left`."""
     table, rows = Table(title=title), list(rows)
     short = all(len(row[0]) <= _SHORT_NAME for row in rows)
     for i, head in enumerate(heads):
@@ -199,7 +199,7 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
 def columns(title: str, cells: Mapping[str, _Form], records: Iterable[Any], left: Sequence[int] = (0,)) -> Table:
     """A table of records: under each head a format of the record `r`, or what a function says of it.
 
-    A head that stands there twice has a blank behind it once.
+    Two columns of the same head: one of the keys has a blank at its end.
     """
     rows = [[str(form(r)) if callable(form) else form.format(r=r) for form in cells.values()] for r in records]
     return grid(title, [head.strip() for head in cells], rows, left)
@@ -248,7 +248,7 @@ def rows_of(report: Any) -> Rows:
 
 
 def certified(need: Requirement, proof: bool = True) -> str:
-    """Whether it is, and, where `proof` is asked, whether that is proved in exact arithmetic."""
+    """Whether the condition holds; with `proof` also whether that is proved in exact arithmetic."""
     if not need.certified:
         return "[red]not certified[/]"
     return "[green]certified[/]" + (", proved exactly" if proof and need.proof == "rational" else "")
@@ -260,13 +260,14 @@ def needs(need: Requirement, digits: int = 6) -> str:
 
 
 def certificate_rows(requirements: Mapping[str, Requirement], digits: int = 6, proof: bool = True) -> Rows:
-    """What each condition needs, and whether that is proved exactly, where no other row says it."""
+    """The damping that each condition needs; with `proof` also whether it is proved in exact arithmetic."""
     for name, need in requirements.items():
-        yield f"damping, {name}", f"needs {needs(need, digits)}: {certified(need, proof)}"
+        asks = f"needs {needs(need, digits)}" if math.isfinite(need.ratio) else "no damping is enough"
+        yield f"damping, {name}", f"{asks}: {certified(need, proof)}"
 
 
 def channel_row(contacts: Sequence[str]) -> tuple[str, str | None]:
-    """Which contact each number of a list in the table belongs to, where there are several."""
+    """The names of the contacts, in the order of the numbers of every list; None for a single one."""
     return "channels", ", ".join(contacts) if len(contacts) > 1 else None
 
 

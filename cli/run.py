@@ -88,7 +88,7 @@ def _parser() -> options.Parser:
 
 
 def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
-    """The coupling; with a baseline there is none, and the note says whose that is. Raises InputError."""
+    """The coupling that was asked for. A baseline has none, and a note names its authors. Raises InputError."""
     if args.coupling not in layer.BASELINES:
         with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
             return choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
@@ -107,7 +107,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Scenario]:
-    """Which environment is simulated, and the scenario with that one, known exactly. Raises InputError."""
+    """The name of the environment that is simulated, and the scenario with it in place of ranges. Raises InputError."""
     members = scenario.loop(args.case).members()
     if not 0 <= args.vertex < len(members):
         why = f"allowed are 0 to {len(members) - 1}" if scenario.ranges else "but the scenario has no ranges ([ranges])"
@@ -134,7 +134,7 @@ def _run(
 
 
 def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun, own: Any) -> list[Alternative]:
-    """What other couplings come to in the scenario's own environment. Raises InputError for a picture of nothing."""
+    """The run repeated with other couplings. Raises InputError where --side-by-side would have nothing to draw."""
     skipped = args.no_alternatives or run.trace.interrupted or args.vertex > 0
     with render.progress("other couplings") as move:
         made = [] if skipped else alternatives(scenario, args.case, move, own)
@@ -164,7 +164,7 @@ def _panel_title(other: Alternative) -> str:
 
 
 def _nearby(chosen: Chosen, loop: Loop, judged: Judged) -> Nearby:
-    """What a wrong model of the environment costs a guarantee for this environment alone."""
+    """The damping needed where the environment is not as modelled; empty where no guarantee depends on that."""
     alone = chosen.condition == "this-environment" and judged.certificates[chosen.condition].certified
     if not alone or judged.guarantee == ANY:
         return Nearby()
@@ -193,8 +193,8 @@ def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunRepo
 
 def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
     """Walls between a contact and ground, (channel, place, name), and in which ticks any wall was touched, (N,)."""
-    contact, network = run.simulation.process.contact, run.simulation.scenario.environment
-    if not network.walls or contact is None:
+    law, network = run.simulation.process.law, run.simulation.scenario.environment
+    if not network.walls:
         return [], None
     found = []
     for number, wall in enumerate(network.walls, start=1):
@@ -204,11 +204,11 @@ def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
         if second == GROUND and first in network.contacts:
             name = f"wall {number}, {1e3 * wall.gap:g} mm from {first} at rest"
             found.append((network.contacts.index(first), sign * wall.gap, name))
-    return found, (contact.depths(run.trace.z)[:, : len(network.walls)] > 0).any(axis=1)
+    return found, (law.depths(run.trace.z) > 0).any(axis=1)
 
 
 def _title(what: str, report: RunReport) -> str:
-    """Of the picture."""
+    """The title of the picture."""
     stability, kind = report.stability, report.judged.coupling.kind
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
     if kind != "none" and report.judged.guarantee:
@@ -226,7 +226,7 @@ def _title(what: str, report: RunReport) -> str:
 
 def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
     title = f"{scenario.title(report.case)}: coupling {report.judged.coupling.kind}"
-    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(report)], ("", ""))]
+    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(report)])]
     if report.run.engines:
         shown.append(_speed_against_error(report.run, report.run.engines))
     if report.alternatives:
@@ -238,7 +238,7 @@ def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
 
 
 def _rows(report: RunReport) -> render.Rows:
-    """Of its table."""
+    """The rows of the table."""
     coupling, stability, run, ratio = (
         report.judged.coupling,
         report.stability,
@@ -297,7 +297,7 @@ def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> 
 
 
 def _beside(report: RunReport) -> Any:
-    """The price of each guarantee; the run's own coupling is marked where it is one of them."""
+    """A table of other couplings; the one of this run is marked."""
     own = report.judged.coupling.kind, report.certificate.condition
     cells = []
     for other in report.alternatives:

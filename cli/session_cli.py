@@ -1,4 +1,4 @@
-"""What the commands at a port share: their options, the keyboard, and the session from HELLO to the end."""
+"""What hw.bridge and hw.identify share: options, the keyboard, and the session from HELLO to its end."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from sim.scenario import InputError, Scenario, require_constant_delay, require_e
 
 _USUAL_BAUD = 921_600
 _SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself
-_SHOWN_US = 100_000  # of a rehearsal, between two looks
+_SHOWN_US = 100_000  # of a rehearsal, between two moves of its progress bar
 _PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
 
 
-def add_link_options(parser: argparse.ArgumentParser) -> None:
+def add_link_options(parser: options.Parser) -> None:
     """Which device, over which line, and how its delay is judged."""
     link = parser.add_argument_group("the link")
     add, number = link.add_argument, options.number
@@ -55,6 +55,9 @@ def add_link_options(parser: argparse.ArgumentParser) -> None:
     add("--quantile", type=number(0.5, 1.0), default=0.99, metavar="Q", help=share)
     guard = "spare time added to that age (default 1e-4)"
     add("--guard", type=number(0.0, 0.1), default=1e-4, metavar="SECONDS", help=guard)
+    parser.only("with --emulate or --rehearse: a device has faults of its own", lambda args: not args.port, "fault")
+    parser.only("with --port: an emulated device arms by itself", lambda args: args.port, "arm")
+    parser.only("without --rehearse, whose time is virtual", lambda args: not args.rehearse, "pace")
 
 
 def add_pace_option(parser: argparse._ActionsContainer, what: str) -> None:
@@ -62,8 +65,8 @@ def add_pace_option(parser: argparse._ActionsContainer, what: str) -> None:
     parser.add_argument("--pace", type=options.number(0.01, 1), default=1.0, metavar="P", help=what)
 
 
-def add_safety_options(parser: argparse.ArgumentParser) -> None:
-    """What the bridge never does, and who has to be there."""
+def add_safety_options(parser: options.Parser) -> None:
+    """Limits of force and speed, and the switch that somebody has to hold."""
     add, number = parser.add_argument_group("safety").add_argument, options.number
     cap = "largest force (default 2, for first sessions)"
     add("--force-cap", type=number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
@@ -78,6 +81,8 @@ def add_safety_options(parser: argparse.ArgumentParser) -> None:
     who = "forces act only while somebody presses a key or touches FILE once a second, or holds the device's own switch"
     add("--deadman", metavar="key|device|FILE", help=who)
     add("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
+    parser.only("with --port", lambda args: args.port, "no_preflight")
+    parser.only("with --continuous-force", lambda args: args.continuous_force, "thermal_time")
 
 
 def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
@@ -102,16 +107,19 @@ def touched(path: str) -> Callable[[], bool]:
     """Whether a file was touched since the last call; False where there is no such file."""
     last = [_mtime(path)]
 
-    def look() -> bool:
+    def touched_again() -> bool:
         now, before = _mtime(path), last[0]
         last[0] = now
         return now is not None and now != before
 
-    return look
+    return touched_again
 
 
 def _deadman(named: str | None) -> Callable[[], bool] | None:
-    """Whether somebody is there, beside the keys of the keyboard; None: nobody has to be, or the device knows."""
+    """A function that says whether somebody touched the file of --deadman; keys are read elsewhere.
+
+    None where no one has to be present, or where the device has a switch of its own.
+    """
     if named in (None, "device"):
         return None
     return touched(named) if named != "key" else lambda: False
@@ -128,17 +136,15 @@ def check_link(args: argparse.Namespace) -> LinkSettings:
     """The settings of a session. Raises InputError where the options contradict each other."""
     if bool(args.port) + args.emulate + args.rehearse != 1:
         raise InputError("give either --port PATH or --emulate or --rehearse")
-    if args.fault and args.port:
-        raise InputError("--fault is for --emulate and --rehearse; a device behind --port has its own")
     if args.port and not args.arm and not sys.stdin.isatty():
         raise InputError("no keyboard to arm with: give --arm, if nobody can get hurt")
     return LinkSettings(baud=_baud(args), measure=args.measure)
 
 
 def _baud(args: argparse.Namespace) -> int | None:
-    """Of the UART in the line, None where there is none.
+    """The speed of the UART in the line, or None without a UART.
 
-    A pseudo-terminal has none. Of /dev/ttyACM0 nobody can tell: native USB, or a chip with a UART behind it.
+    A pseudo-terminal has none. /dev/ttyACM0 may be native USB, or a USB chip with a UART behind it: a UART is assumed.
     """
     if args.baud is None:
         pseudo = not args.port or host_clocked(args) or os.path.realpath(args.port).startswith("/dev/pts/")
@@ -151,13 +157,13 @@ def _baud_or_none(text: str) -> int:
 
 
 def host_clocked(args: argparse.Namespace) -> bool:
-    """Whether the device has no clock, so that the host is it."""
+    """Whether the host gives the clock, because the device has none."""
     return (args.port or "").split(":")[0] == FORCE_DIMENSION
 
 
 @dataclass(frozen=True)
 class _Held:
-    """What happens beside the session: signals, and bytes that the port did not take at once."""
+    """Signals that came during the session, and how many bytes the port did not take at once."""
 
     signals: Sequence[int] = ()
     dropped: int = 0

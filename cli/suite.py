@@ -1,4 +1,4 @@
-"""python -m sim.suite (make validate): every check that a verdict rests on, in one report for a stranger.
+"""python -m sim.suite (make validate): all checks of this project, in one report.
 
 A check is another command with its options, run as a user would run it, or rows that are measured here; the report
 shows the command that repeats it beside its numbers. A further check is one more line in CHECKS.
@@ -47,7 +47,7 @@ class Check:
     picture: Callable[[Any], Callable[..., Path]] | None = None  # of rows: from sim.plots the function that draws them
 
     def command(self, humans: int, seed: int) -> str:
-        """What repeats this check."""
+        """The command that repeats this check."""
         own = f"sim.suite --only {self.name} --seed {{seed}}"
         return (self.answer if isinstance(self.answer, str) else own).format(humans=humans, seed=seed)
 
@@ -80,7 +80,7 @@ CHECKS = (
     Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", reports.accuracy),
     Check("hard", "Numerically hard loops", lambda seed: (measure(case) for case in cases()), reports.hard),
     Check("proofs", "Are random networks proved where the sweep says so?", proofs, reports.proved),
-    Check("traces", "Does a trace ever say the opposite of the eigenvalues?", traces, reports.told),
+    Check("traces", "Does a trace ever say the opposite of the eigenvalues?", traces, reports.traced),
     Check("uneven", "Do uneven periods and late forces keep the guarantee?", uneven_ticks, reports.uneven),
     Check("guarantees", "Do limits, budgets, walls and friction hold at what they ask?", challenges, reports.edges),
     Check("faults", "Does every fault of a link end as it must?", lambda seed: rehearse_faults(), reports.faults),
@@ -89,7 +89,7 @@ CHECKS = (
 
 
 def ask(check: Check, out: Path, humans: int, seed: int) -> reports.Answer:
-    """Run one check with its files in `out`/name; bad input and impossible designs are its trouble."""
+    """Run one check with its files in `out`/name; where it cannot run, `trouble` of its answer says why."""
     command, place = check.command(humans, seed), folder(out / check.name)
     begin, trouble, code, printed = time.perf_counter(), None, None, StringIO()
     for old in (place / "report.json", *place.glob("*.png")):  # of an earlier run: never shown as this one's
@@ -117,7 +117,7 @@ def _called(command: str, place: Path, printed: StringIO) -> int:
 
 
 def _measured(check: Check, place: Path, seed: int) -> int:
-    """Rows of our own; what is done when the keyboard interrupts is kept."""
+    """Measure the rows of a check that is no command; after Ctrl-C those that are finished are kept."""
     assert callable(check.answer)
     found, interrupted = options.until_interrupted(check.answer(seed))
     rows = [row if isinstance(row, dict) else render.plain(row) | {"holds": row.holds} for row in found]

@@ -1,4 +1,4 @@
-"""The report of the suite for a stranger: how each answer reads; verdicts first, then figures with their commands."""
+"""The report of the suite: verdicts first, then the figures of each check with the command that repeats it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from sim.stability import unstable
 
 
 @dataclass(frozen=True)
-class Part:
-    """A table of a check; `answer` is its gist, shown in the table of verdicts."""
+class _Part:
+    """A table of a check; `answer` sums it up for the table of verdicts."""
 
     answer: str
     columns: tuple[str, ...] = ()
@@ -36,7 +36,7 @@ class Answer:
     holds: bool
     trouble: str | None
     wall_s: float
-    parts: tuple[Part, ...]
+    parts: tuple[_Part, ...]
     printed: str  # by a command
     pictures: tuple[str, ...]  # paths from the report's folder
     report: dict[str, Any]
@@ -69,7 +69,7 @@ class Suite:
 
 
 def machine() -> dict[str, str]:
-    """What figures of speed, and the last digits of all others, depend on."""
+    """The versions and the machine, on which speeds and the last digits of other figures depend."""
     packages = {name: version(name) for name in ("mujoco", "numpy", "scipy", "clarabel")}
     return {
         "Python": platform.python_version(),
@@ -83,40 +83,40 @@ def machine() -> dict[str, str]:
 
 
 _Row = dict[str, Any]
-Figures = Callable[[dict[str, Any]], list[Part]]
+Figures = Callable[[dict[str, Any]], list[_Part]]
 
 
-def verdicts(report: dict[str, Any]) -> list[Part]:
+def verdicts(report: dict[str, Any]) -> list[_Part]:
     """Of sim.validate."""
     gist = f"{'certified' if report['certified'] else 'not certified'}; "
     gist += f"{report['unstable']['exact']} of {report['humans']} hands unstable"
     if adversary := report.get("adversary"):
         gist += f", adversary {'succeeds' if adversary['found'] else 'fails'}"
-    return [Part(f"{gist}, {report['disagreements']} disagreements")]
+    return [_Part(f"{gist}, {report['disagreements']} disagreements")]
 
 
-def accuracy(report: dict[str, Any]) -> list[Part]:
+def accuracy(report: dict[str, Any]) -> list[_Part]:
     """Of sim.accuracy."""
     default = report["default_substeps"]
     ours = next((r for r in report["rows"] if (r["integrator"], r["substeps"]) == ("RK4", default)), None)
     gist = f"default RK4 x {default}: growth off by {ours['growth_rate_error']:+.0e} 1/s" if ours else ""
-    return [Part(gist)]
+    return [_Part(gist)]
 
 
-def gain_map(report: dict[str, Any]) -> list[Part]:
+def gain_map(report: dict[str, Any]) -> list[_Part]:
     """Of sim.zwidth."""
     contradicted = sum(report[name]["contradicted_cells"] for name in CONDITIONS)
-    return [Part(f"{contradicted} certified cells that a hand destabilises")]
+    return [_Part(f"{contradicted} certified cells that a hand destabilises")]
 
 
 def _table(gist: str, columns: dict[str, str | Callable[[_Row], str]]) -> Figures:
-    """A row for each row: its cells as formats of its figures."""
+    """A table of rows, each cell a format, or a function, of the row's figures."""
 
-    def figures(report: dict[str, Any]) -> list[Part]:
+    def figures(report: dict[str, Any]) -> list[_Part]:
         rows, cells = report["rows"], columns.values()
         good = sum(row["holds"] for row in rows)
         shown = tuple(tuple(c(row) if callable(c) else c.format(**row) for c in cells) for row in rows)
-        return [Part(gist.format(good=good, count=len(rows)), tuple(columns), shown)]
+        return [_Part(gist.format(good=good, count=len(rows)), tuple(columns), shown)]
 
     return figures
 
@@ -126,7 +126,7 @@ def _optional(name: str, form: str) -> Callable[[_Row], str]:
 
 
 def _failing(row: _Row) -> str:
-    """The setting that fails, how and by how much."""
+    """The coarsest setting that fails, what is wrong with it, and by how much."""
     if not row["fails"]:
         return "none tried"
     off = "" if row["off"] is None else f" {row['off']:+.1e}"
@@ -175,7 +175,7 @@ _uneven_rows = _table(
 )
 
 
-def uneven(report: dict[str, Any]) -> list[Part]:
+def uneven(report: dict[str, Any]) -> list[_Part]:
     """Of uneven ticks."""
     (part,) = _uneven_rows(report)
     found = sum(row["grow"] > 0 for row in report["rows"])
@@ -183,20 +183,20 @@ def uneven(report: dict[str, Any]) -> list[Part]:
     return [replace(part, answer=f"{part.answer}; at half of it {below}")]
 
 
-def tightness(report: dict[str, Any]) -> list[Part]:
-    """Of loops that lack damping: the adversary's success by shortage."""
+def tightness(report: dict[str, Any]) -> list[_Part]:
+    """How often the adversary succeeds, by the share of the damping that is missing."""
     found = {short: [row["found"] for row in rows] for short, rows in sorted(_by(report["rows"], "short").items())}
     rows = tuple((f"{short:.1%}", str(len(f)), f"{sum(f) / len(f):.0%}") for short, f in found.items())
     first = next((short for short, f in found.items() if all(f)), None)
     gist = "at no shortage that was tried does a human destabilise every loop"
     if first is not None:
         gist = f"a human destabilises every loop whose devices lack {first:.1%} of the damping required"
-    whole = Part(gist, ("damping missing", "loops", "destabilised"), rows, "Success rate of the adversary")
+    whole = _Part(gist, ("damping missing", "loops", "destabilised"), rows, "Success rate of the adversary")
     return [whole, *(replace(part, title="Each loop") for part in _each_loop(report))]
 
 
 def _by(rows: Sequence[_Row], *names: str) -> dict[Any, list[_Row]]:
-    """The rows in groups of those that are alike in these figures."""
+    """The rows, grouped by these figures."""
     groups: dict[Any, list[_Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[name] for name in names) if names[1:] else row[names[0]], []).append(row)
@@ -220,8 +220,8 @@ _each_loop = _table(
 )
 
 
-def edges(report: dict[str, Any]) -> list[Part]:
-    """Of guarantees at their edge: a row for each and each share of what it asks."""
+def edges(report: dict[str, Any]) -> list[_Part]:
+    """Guarantees at their limit: one row for each guarantee and each multiple of the damping that it asks."""
     rows, taken = [], []
     for (name, factor), some in _by(report["rows"], "guarantee", "factor").items():
         motions, took, grew = (sum(row[of] for row in some) for of in ("motions", "took", "grew"))
@@ -231,21 +231,21 @@ def edges(report: dict[str, Any]) -> list[Part]:
         if factor >= 1:
             taken.append(took + grew)
     columns = ("guarantee", "times what it asks", "motions that took energy", "hands that grew", "limited", "least J")
-    return [Part(f"{sum(taken)} violations at 1.02 times what {len(taken)} guarantees ask", columns, tuple(rows))]
+    return [_Part(f"{sum(taken)} violations at 1.02 times what {len(taken)} guarantees ask", columns, tuple(rows))]
 
 
-def proved(report: dict[str, Any]) -> list[Part]:
-    """Of proofs of random networks: by what the sweep says."""
+def proved(report: dict[str, Any]) -> list[_Part]:
+    """How many random networks are proved, by what the sweep says of them."""
     rows, good = [], sum(row["holds"] for row in report["rows"])
     for says, enough in (("there is enough damping", True), ("there is too little", False)):
         some = [row for row in report["rows"] if (row["required"] is not None and row["required"] < 1) == enough]
         rows.append((says, str(len(some)), str(sum(row["proved"] for row in some))))
     gist = f"proof and sweep agree about {good} of {len(report['rows'])} networks"
-    return [Part(gist, ("the sweep says that", "networks", "proved"), tuple(rows))]
+    return [_Part(gist, ("the sweep says that", "networks", "proved"), tuple(rows))]
 
 
-def told(report: dict[str, Any]) -> list[Part]:
-    """Of traces of random scenarios: by what their eigenvalues say."""
+def traced(report: dict[str, Any]) -> list[_Part]:
+    """What the traces of random scenarios show, by what their eigenvalues say."""
     rows, good = [], sum(row["holds"] for row in report["rows"])
     for says, grows in (("stable", False), ("unstable", True)):
         some = [row for row in report["rows"] if bool(unstable(row["exact_per_s"])) == grows]
@@ -254,8 +254,8 @@ def told(report: dict[str, Any]) -> list[Part]:
         quiet = sum(row["not_excited"] for row in some)
         rows.append((says, *map(str, (len(some), same, len(read) - same, quiet, len(some) - len(read) - quiet))))
     answers = ("the trace agrees", "says the opposite", "not excited", "no rate, for another reason")
-    gist = f"{good} of {len(report['rows'])} traces tell no other than the eigenvalues"
-    return [Part(gist, ("by the eigenvalues", "runs", *answers), tuple(rows))]
+    gist = f"{good} of {len(report['rows'])} traces agree with the eigenvalues"
+    return [_Part(gist, ("by the eigenvalues", "runs", *answers), tuple(rows))]
 
 
 # ----------------------------------------------------------------------------------------------------

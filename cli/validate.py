@@ -36,7 +36,7 @@ _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
 
 def main(argv: list[str]) -> int:
-    """Meet random humans. 0: the claims hold, 1: not, 3: workers were lost, 130: interrupted."""
+    """Test random humans. 0: what is claimed holds, 1: it does not, 3: workers were lost, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
     with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
@@ -54,7 +54,7 @@ def main(argv: list[str]) -> int:
         *([f"Delays that vary: {report.switching.met.certified.covers}."] if report.switching else []),
         *report.remarks,
     ]
-    render.publish(args, report, [render.facts(title, render.rows_of(report), ("", ""))], lines, out, files)
+    render.publish(args, report, [render.facts(title, render.rows_of(report))], lines, out, files)
     if report.unfinished and not report.interrupted:
         return options.UNFINISHED
     return options.exit_code(bool(report.holds), report.interrupted)
@@ -86,6 +86,7 @@ def _parser() -> options.Parser:
     met = "nominal (default), or ranges: in turn all vertices of the scenario's ranges and as many others inside"
     add("--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
     options.add_output_options(parser, picture=True)
+    parser.only("with --adversary", lambda args: args.adversary, "generations")
     return parser
 
 
@@ -95,8 +96,6 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     require_linear(scenario, "sim.validate", walls=True)
     if args.dask is not None and args.shards > 1:
         raise InputError(f"--shards {args.shards} with --dask: the cluster decides who does what, give one of them")
-    if args.generations is not None and not args.adversary:
-        raise InputError("--generations without --adversary: it is how long that searches")
     if not (args.duration == 0 or 4 * scenario.T <= args.duration <= 1e5):
         allowed = f"allowed are 0 and {4 * scenario.T:g} to 100000 s"
         raise InputError(f"--duration is {args.duration:g}, {allowed}")
@@ -104,9 +103,9 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environments(args: argparse.Namespace, whole: RangesCheck | None) -> tuple[Member, ...]:
-    """Vertices and as many others of the ranges, the worst that was found first; none where all meet the nominal one.
+    """The vertices of the ranges, and as many other points of them, the worst one found first. Raises InputError.
 
-    Raises InputError.
+    Without --environments ranges there are none: every loop has the nominal environment.
     """
     if args.environments == "nominal":
         return ()
@@ -117,7 +116,7 @@ def _environments(args: argparse.Namespace, whole: RangesCheck | None) -> tuple[
 
 
 def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, judged: Judged) -> Validation:
-    """What is asked of whom. Raises InputError."""
+    """The loop, the humans that are to hold it, and the engines that decide. Raises InputError."""
     links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
     work, met = (args.humans, links, args.engine, args.duration), _environments(args, judged.whole)
     return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=judged.limiter.rho)
@@ -136,7 +135,7 @@ def _findings(args: argparse.Namespace, question: Validation, table: Table) -> t
 
 @dataclass(frozen=True)
 class _Searched:
-    """What the adversary found; None where it was not asked, or the keyboard ended its search."""
+    """What the adversary found; None where none was asked for, or where Ctrl-C ended its search."""
 
     worst: Worst | None = None
     drawn: Worst | None = None  # the worst that the scenario's own population draws
@@ -145,7 +144,7 @@ class _Searched:
 
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, judged: Judged) -> _Searched:
-    """The worst humans, in the environment that asks most; what was found before Ctrl-C is kept."""
+    """The worst humans, in the environment that needs the most damping; what was found before Ctrl-C is kept."""
     scenario, ratio = question.scenario, judged.requirements["this-environment"].ratio
     if question.environments and judged.whole:
         member, requirement = judged.whole.worst_found
@@ -154,7 +153,7 @@ def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, ju
     try:
         for seek in (search, search_population)[: 1 if isinstance(scenario.population, Population) else 2]:
             with render.progress("searching the worst human") as move:
-                frozen = assemble(scenario, chosen.coupling).process.frozen().values()
+                frozen = assemble(scenario, chosen.coupling).process.law.frozen().values()
                 loop = scenario.loop(args.case)
                 F = max(frozen, key=lambda F: this_environment(F, loop).ratio)  # the state that asks most
                 found.append(seek(scenario, F, args.seed, args.generations or 150, progress=move))
@@ -212,7 +211,7 @@ class _Own:
 
 @dataclass(frozen=True, kw_only=True)
 class _Report:
-    """What a validation found; parts are null, or left out, where there is none of them."""
+    """What a validation found; a part that does not exist is null or left out."""
 
     case: str
     scenario: str

@@ -58,7 +58,7 @@ def main(argv: list[str]) -> int:
 
 @dataclass(frozen=True)
 class _Event:
-    """What was changed when, and what could be said of the loop that came of it."""
+    """A change of the loop: when it was made, and the verdicts on the loop after it."""
 
     t_s: float
     event: str
@@ -155,6 +155,7 @@ def _parser() -> options.Parser:
     add("--fps", type=options.whole(1, 100), default=10, metavar="N", help=rate)
     drawn = "by OpenGL, or flat without it (default: by what works)"
     add("--draw", choices=_DRAWN, default="auto", help=drawn)
+    parser.only("with --video", lambda args: args.video, "fps", "draw")
     return parser
 
 
@@ -170,7 +171,7 @@ def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
 
 
 def _label(args: argparse.Namespace) -> str:
-    """How the user calls the coupling of --coupling. Raises InputError."""
+    """The name of the first coupling, as the window shows it. Raises InputError."""
     name = args.coupling
     if args.case == "none":
         if name not in (None, "none"):
@@ -186,12 +187,12 @@ def _label(args: argparse.Namespace) -> str:
 
 
 def _names() -> list[str]:
-    """The couplings as the other commands call them, and as the window does."""
+    """The names of couplings in other commands, and those in the window."""
     return list(dict.fromkeys([*LABELS, *COUPLINGS]))
 
 
 def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
-    """The session against a clock of its own: the same film every time. Interrupted, it is as long as it got."""
+    """Film the session by its own clock, so that the film is the same every time; after Ctrl-C it is shorter."""
     seconds = args.duration or (session.script_ends + _AFTER)
     count, interrupted = round(seconds * args.fps) + 1, False
     simulation = session.prepared.simulation

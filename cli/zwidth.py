@@ -38,7 +38,9 @@ def main(argv: list[str]) -> int:
     require_constant_delay(scenario, "sim.zwidth")
     if scenario.period is not None:
         raise InputError("period: a map simulates even periods; give T_max alone, which its certificates are for")
-    _check_case(args)
+    if args.case == "none":
+        instead = "use --case I, or --coupling none for a map over environments"
+        raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
     chosen = _chosen(args, scenario)
     sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
@@ -87,6 +89,13 @@ def _parser() -> options.Parser:
     of_map.add_argument("--humans", type=options.whole(1, 100_000), default=200, metavar="N", help=humans)
     _add_points(parser.add_argument_group("the points simulated in MuJoCo, and what they have beside the linear loop"))
     options.add_output_options(parser, picture=True)
+    simulated = ("trials", "duration", "start", "press", "threshold", "quantisation", "saturation", "friction")
+    parser.only("about simulated points: --points 0 has none", lambda args: args.points, *simulated)
+    parser.only("about simulated points with --rigid: --points 0 has none", lambda a: a.points or not a.rigid, "wall")
+    parser.only("with --saturation: motors without limits clip nothing", lambda args: args.saturation, "limiter")
+    parser.only("with --coupling: nothing else is designed", lambda args: args.coupling, "condition")
+    gains = "for a map of spring-dampers: with --coupling the axes are the environment's"
+    parser.only(gains, lambda args: args.coupling is None, "rigid", "wall", "velocity_filter")
     return parser
 
 
@@ -118,24 +127,8 @@ def _mark(text: str) -> tuple[float, float]:
     return K, B
 
 
-def _check_case(args: argparse.Namespace) -> None:
-    """Whether the options ask for a map of one kind. Raises InputError."""
-    if args.limiter is False and not args.saturation:
-        raise InputError("--no-limiter without --saturation: motors without limits clip nothing")
-    if args.case == "none":
-        instead = "use --case I, or --coupling none for a map over environments"
-        raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
-    if args.coupling is None and args.condition:
-        why = "without --coupling nothing is designed, and both are drawn"
-        raise InputError(f"--condition {args.condition}: {why}")
-    for name in ("rigid", "wall", "velocity_filter"):
-        if args.coupling is not None and getattr(args, name):
-            what = "is about a map of spring-dampers; with --coupling the axes are the environment's"
-            raise InputError(f"--{name.replace('_', '-')} with --coupling {args.coupling}: it {what}")
-
-
 def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
-    """The coupling that stays as it is over the whole map, or None where the axes are the coupling's own gains."""
+    """The coupling of a map over environments; None where the axes are the gains of the coupling."""
     if args.coupling is None:
         return None
     with render.designing() as heard:
@@ -143,7 +136,7 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
 
 
 def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) -> zwidth.Sweep:
-    """The loop whose couplings, or environments behind the coupling chosen, the map is of. Raises InputError."""
+    """What varies over the map: the couplings of a loop, or the environments behind one coupling. Raises InputError."""
     devices, loop = scenario.device, scenario.loop("I")
     if args.rigid:
         devices, loop = devices[:1], options.rigid_loop(args, scenario)
@@ -234,7 +227,7 @@ def _limit(K: float | str | None) -> str:
 
 
 def _needs(need: Requirement) -> str:
-    """Of the worst channel."""
+    """The damping that the worst channel needs."""
     worst, least = max(need.required), min(need.available)
     return f"needs {worst:.6g} of {least:.6g} N s/m ({render.certified(need, proof=False)})"
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.lti import Array, Complex, Lti, Number, Sampled, inverse, numbers, rational
+from controller.lti import Array, Complex, Lti, Number, Sampled, as_like, inverse, numbers, rational
 
 GROUND = "ground"
 
@@ -55,7 +55,7 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A one-sided spring-damper: it pushes the first node back once it is `gap` beyond the second; see walls.py."""
+    """A one-sided spring-damper: it pushes the first node back once it is `gap` beyond the second; see law.py."""
 
     between: tuple[str, str]
     stiffness: float  # [N/m]
@@ -289,6 +289,33 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         return rows
 
 
+#: mass [kg], damping [N s/m] and stiffness [N/m], (..., nodes, nodes) each, as Network.matrices gives them
+Matrices = tuple[Array, Array, Array]
+
+
+class Networks(Environment):
+    """Networks with the same nodes, the contacts first, by their matrices: a stack where these have axes."""
+
+    def __init__(self, contacts: tuple[str, ...], matrices: Matrices) -> None:
+        self.contacts, self.matrices = contacts, matrices
+
+    def E(self, T: Number) -> Lti:
+        return Lti(*_realise(self.matrices, len(self.contacts), T), T)
+
+    def sampled(self, z: Complex, T: float) -> Sampled:
+        """E at z (n, k) from the dynamic stiffness itself, Z_cc - Z_ci Z_ii^-1 Z_ic at s = (z-1)/(Tz)."""
+        M, D, K = (part[..., None, :, :] for part in self.matrices)
+        s = ((z - 1) / (T * z))[..., None, None]
+        Z = M * s**2 + D * s + K
+        cc, ci, ic, ii = (Z[(..., *quarter)] for quarter in _quarters(len(self.contacts)))
+        inner = ic / ii if ii.shape[-1] == 1 else np.linalg.solve(ii, ic)
+        return Sampled(z, cc - ci @ inner, T)
+
+    def sent_at(self, coupling: Coupling, psi: Sequence[int], z: Complex, T: float) -> Sampled:
+        E = self.sampled(z, T)
+        return coupling.around(as_like(E, delay(psi, T)) @ E)
+
+
 #: Figure 4 as we read it: contact 1 -(K1, B1)- M -(K2, B2)- contact 2, the mass free.
 FIGURE_4 = Network(
     contacts=("contact 1", "contact 2"),
@@ -311,25 +338,6 @@ def environment(network: Network, T: Number) -> Lti:
     adrift = _adrift(network, network.springs)
     E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, adrift=adrift), T)
     return E + network.block.at(T) if network.block else E
-
-
-#: mass [kg], damping [N s/m] and stiffness [N/m], (..., nodes, nodes) each, as Network.matrices gives them
-Matrices = tuple[Array, Array, Array]
-
-
-def environment_of(matrices: Matrices, contacts: int, T: Number) -> Lti:
-    """E(z) of the networks with these matrices, whose first nodes are the contacts: a stack where they have axes."""
-    return Lti(*_realise(matrices, contacts, T), T)
-
-
-def sampled_environment(matrices: Matrices, contacts: int, z: Complex, T: float) -> Sampled:
-    """The same at z (n, k) from the dynamic stiffness itself, Z_cc - Z_ci Z_ii^-1 Z_ic at s = (z-1)/(Tz)."""
-    M, D, K = (part[..., None, :, :] for part in matrices)
-    s = ((z - 1) / (T * z))[..., None, None]
-    Z = M * s**2 + D * s + K
-    cc, ci, ic, ii = (Z[(..., *quarter)] for quarter in _quarters(contacts))
-    inner = ic / ii if ii.shape[-1] == 1 else np.linalg.solve(ii, ic)
-    return Sampled(z, cc - ci @ inner, T)
 
 
 def walled_environment(network: Network, T: Number) -> Lti:
@@ -449,17 +457,3 @@ def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
     walls = zip(network.walls, touching, strict=True)
     springs = (Spring(w.between, on * w.stiffness, on * w.damping) for w, on in walls)
     return msgspec.structs.replace(network, springs=(*network.springs, *springs), walls=())
-
-
-def walled_force_map(network: Network, coupling: Coupling, theta: Sequence[int], psi: Sequence[int], T: Number) -> Lti:
-    """[x; p] to [f; y]: displacements and wall forces [N] to what the devices feel and the ways into the walls [m].
-
-    Psi and Theta delay what the devices feel of the walls. Raises SingularLoop, and ValueError for a coupling that
-    walls cannot stand behind.
-    """
-    w = len(network.walls)
-
-    def late(steps: Sequence[int]) -> Lti:
-        return Lti.diag(delay(steps, T), Lti.constant(np.eye(w), T))
-
-    return late(theta) @ coupling.around(late(psi) @ walled_environment(network, T), further=w)

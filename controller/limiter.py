@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING, Self, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller.complementarity import BoxProblem
-from controller.coupling import Coupling
-from controller.delay import delay
-from controller.environment import Network, Wall, walled_environment
-from controller.lti import Array, Lti, ReadOnly, frozen, taps
-from controller.walls import Contact, State
+from controller.environment import Wall
+from controller.law import Law, Transition, last_axis, one_by_one, side_by_side
+from controller.lti import Array, Lti, frozen, taps
 
 # ----------------------------------------------------------------------------------------------------
 # The limiter: forces leave as f_e with |f_e,i| <= L_i always, because the contact slips by e.
@@ -29,39 +28,53 @@ from controller.walls import Contact, State
 # together with the walls, whose forces are the same kind of unknown over the box (-inf, 0]: a box problem.
 
 
-@dataclass(frozen=True, eq=False)
-class Limiter(ReadOnly):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Limiter(Law):
     """The forces of a loop before Theta, [x; p] -> [f_e; y], limited by a slip e; walls turn y into p.
 
-    Its state is [that of `sent`, e [m] at the tick before, the lines of Theta, h [m] of the walls as in Contact].
+    Its state is [that of `sent`, e [m] at the tick before, the lines of Theta, h [m] of the walls].
     Raises SingularLoop where the limited forces are not determined.
     """
 
-    sent: Lti  # m + w inputs and outputs
-    theta: tuple[int, ...]  # (m,) delays of the limited forces [samples]
     limit: Array  # (m,) [N], inf where there is none
     rho: Array  # (m,) [N/m] the slip's lag: 0 under any-environment, beta delta/T under this-environment
-    walls: tuple[Wall, ...] = ()
+
+    if TYPE_CHECKING:  # what __post_init__ accepts is more than what the fields then hold
+
+        def __init__(
+            self,
+            sent: Lti,
+            theta: Sequence[int] = (),
+            walls: tuple[Wall, ...] = (),
+            *,
+            limit: ArrayLike,
+            rho: ArrayLike,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
-        m = len(self.theta)
+        super().__post_init__()
         for name in ("limit", "rho"):
             value = frozen(getattr(self, name), 1, name)
             object.__setattr__(self, name, value)
-            if value.shape != (m,):
-                raise ValueError(f"{name} has {value.size} entries for {m} channels")
+            if value.shape != (self.channels,):
+                raise ValueError(f"{name} has {value.size} entries for {self.channels} channels")
         if not (self.limit > 0).all():
             raise ValueError(f"limit is {self.limit.tolist()}, expected positive forces in N")
         if not ((self.rho >= 0) & (self.rho < np.inf)).all():
             raise ValueError(f"rho is {self.rho.tolist()}, expected stiffnesses >= 0 in N/m")
-        if self.sent.inputs != m + len(self.walls) or self.sent.outputs != self.sent.inputs:
-            shape = f"{self.sent.outputs} x {self.sent.inputs}"
-            raise ValueError(f"a block of {shape} cannot serve {m} channels and {len(self.walls)} walls")
         _ = self.problem
 
     @property
-    def channels(self) -> int:
-        return len(self.theta)
+    def unlimited(self) -> Self:
+        return replace(self, limit=np.full(self.channels, np.inf))
+
+    @property
+    def bounds(self) -> list[tuple[int, float]]:
+        return list(zip(self.sent_rows.tolist(), self.limit.tolist(), strict=True))
+
+    def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
+        """Where the contact slipped, which is before the force arrives."""
+        return self.slips(z) != 0
 
     @cached_property
     def _step(self) -> Lti:
@@ -74,20 +87,15 @@ class Limiter(ReadOnly):
         return self.sent @ ports + np.vstack([np.eye(m), zero]) @ lag @ into
 
     @cached_property
-    def _whole(self) -> Lti:
+    def _block(self) -> Lti:
         """[x; e; p] -> [f; y], states [sent, e_-, Theta]."""
-        w, T = len(self.walls), self.sent.T
-        return Lti.diag(delay(self.theta, T), Lti.constant(np.eye(w), T)) @ self._step
-
-    @property
-    def _steepness(self) -> Array:
-        return np.array([w.stiffness + w.damping / self.sent.T for w in self.walls])
+        return self._delayed(self._step)
 
     @cached_property
     def problem(self) -> BoxProblem:
         """What a tick solves for [e; p]; all its limits are in N."""
         m, w = self.channels, len(self.walls)
-        scale = np.concatenate([np.ones(m), self._steepness])[:, None]
+        scale = np.concatenate([np.ones(m), self.steepness])[:, None]
         M = -scale * self._step.D[:, m:] + np.diag(np.concatenate([np.zeros(m), np.ones(w)]))
         lower = np.concatenate([-self.limit, np.full(w, -np.inf)])
         return BoxProblem(M, lower, np.concatenate([self.limit, np.zeros(w)]))
@@ -95,7 +103,7 @@ class Limiter(ReadOnly):
     @cached_property
     def kick(self) -> Array:
         """What [e; p] adds to [f; z+], (m + order, m + w)."""
-        G, m, w = self._whole, self.channels, len(self.walls)
+        G, m, w = self._block, self.channels, len(self.walls)
         return np.vstack([G.D[:m, m:], G.B[:, m:], np.zeros((w, m + w))])
 
     @cached_property
@@ -105,23 +113,9 @@ class Limiter(ReadOnly):
         lines = m + self._step.order + np.concatenate([[0], np.cumsum(self.theta)[:-1]]).astype(int)
         return np.where(np.array(self.theta) == 0, np.arange(m), lines)
 
-    @property
-    def open(self) -> Lti:
-        """F while no force is limited and no wall touches, with the state of the whole."""
-        G, m, w = self._whole, self.channels, len(self.walls)
-        A, B = np.pad(G.A, ((0, w), (0, w))), np.pad(G.B[:, :m], ((0, w), (0, 0)))
-        return Lti(A, B, np.pad(G.C[:m], ((0, 0), (0, w))), G.D[:m, :m], G.T)
-
-    def frozen(self) -> dict[State, Lti]:
-        """F of every contact state while no force is limited, see Contact.frozen."""
-        T = self.sent.T
-        late = Lti.diag(delay(self.theta, T), Lti.constant(np.eye(len(self.walls)), T)) @ self.sent
-        return Contact(late, self.walls).frozen() if self.walls else {(): late}
-
-    def transition(self) -> Callable[[Array, Array], None]:
-        """One tick for any number of simulations: see Process.transition."""
-        m, w, F, step, whole = self.channels, len(self.walls), self.open, self._step, self._whole
-        linear, kick, sent = np.block([[F.C, F.D], [F.A, F.B]]).dot, self.kick, self.sent_rows
+    def transition(self) -> Transition:
+        m, w, F, step, whole = self.channels, len(self.walls), self.open, self._step, self._block
+        linear, kick, sent = self.linear.dot, self.kick, self.sent_rows
         limit, solve = self.limit[:, None], self.problem.solve
         if not w:
 
@@ -140,7 +134,7 @@ class Limiter(ReadOnly):
             return tick
 
         gap = np.array([wall.gap for wall in self.walls])[:, None]
-        steep = self._steepness[:, None]
+        steep = self.steepness[:, None]
         memory = np.array([wall.damping / F.T for wall in self.walls])[:, None]
         way_of = np.hstack([step.C[m:], np.zeros((w, whole.order - step.order + w)), step.D[m:, :m]]).dot
         give, depth = step.D[m:, m:], slice(whole.order, whole.order + w)
@@ -162,6 +156,23 @@ class Limiter(ReadOnly):
 
         return walled_tick
 
+    def together(self, laws: Sequence[Law]) -> Transition:
+        """Only those with a force beyond its limit solve their problem."""
+        if self.walls:
+            return one_by_one(laws)
+        limiters = cast("Sequence[Limiter]", laws)
+        linear, sent, limit = side_by_side(laws), self.sent_rows, last_axis([each.limit for each in limiters])
+
+        def together(before: Array, after: Array) -> None:
+            linear(before, after)
+            free = after[sent]
+            for i in np.flatnonzero((np.abs(free) > limit).any(axis=0)).tolist():
+                slip, force = limiters[i].problem.solve(free[:, i : i + 1])
+                after[:, i : i + 1] += limiters[i].kick @ slip
+                after[sent, i] = force[:, 0]
+
+        return together
+
     def at_rest(self, x: Array) -> Array:
         """The state that displacements x (m,) [m] lead to where they are held, no wall touching: see resting.
 
@@ -174,26 +185,6 @@ class Limiter(ReadOnly):
         lines = np.repeat(f, self.theta)
         return np.concatenate([free.at_rest(x - e), e, lines, np.zeros(len(self.walls))])
 
-    def depths(self, z: Array) -> Array:
-        """h [m] at each tick but the last, (ticks - 1, w, ..), from the states at all of them, (ticks, order, ..)."""
-        return z[1:, z.shape[1] - len(self.walls) :]
-
     def slips(self, z: Array) -> Array:
         """e [m] at each tick but the last, (ticks - 1, m, ..), not zero where a force was limited."""
         return z[1:, self.sent.order : self.sent.order + self.channels]
-
-
-def limited(
-    network: Network,
-    coupling: Coupling,
-    theta: Sequence[int],
-    psi: Sequence[int],
-    T: float,
-    limit: ArrayLike,
-    rho: ArrayLike,
-) -> Limiter:
-    """The loop of (6) with limited forces and the walls of the network."""
-    w = len(network.walls)
-    late = Lti.diag(delay(psi, T), Lti.constant(np.eye(w), T))
-    sent = coupling.around(late @ walled_environment(network, T), further=w)
-    return Limiter(sent, tuple(theta), np.asarray(limit), np.asarray(rho), network.walls)

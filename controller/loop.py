@@ -10,14 +10,17 @@ No device is known but by its damping, and no human at all. It computes nothing 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Any
 
 import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
 
 from controller.coupling import Coupling, Strict
 from controller.delay import delay
-from controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_force_map
+from controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_environment
+from controller.law import Law
+from controller.limiter import Limiter
 from controller.lti import Complex, Lti, Number, Sampled, rational
 from controller.ranges import Member, Ranges, members
 
@@ -139,9 +142,30 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
     def walled(self, coupling: Coupling, exact: bool = False) -> Lti:
         """[x; p] to [f; y]: as F with no wall touching, wall forces [N] put in and the ways into walls [m] out.
 
+        Psi and Theta delay what the devices feel of the walls. Raises SingularLoop, and ValueError for a coupling that
+        walls cannot stand behind.
+        """
+        return self._beside_walls(self.theta, exact) @ self._walled(coupling, exact)
+
+    def _walled(self, coupling: Coupling, exact: bool = False) -> Lti:
+        """The same before Theta."""
+        E = walled_environment(self.network, self.period(exact))
+        return coupling.around(self._beside_walls(self.psi, exact) @ E, further=len(self.environment.walls))
+
+    def _beside_walls(self, steps: Steps, exact: bool) -> Lti:
+        T = self.period(exact)
+        return Lti.diag(delay(steps, T), Lti.constant(np.eye(len(self.environment.walls)), T))
+
+    def law(self, coupling: Coupling, limit: ArrayLike | None = None, rho: ArrayLike | None = None) -> Law:
+        """What a tick computes; with `rho` (m,) [N/m] forces leave through a limiter of `limit` (m,) [N].
+
         Raises SingularLoop, and ValueError for a coupling that walls cannot stand behind.
         """
-        return walled_force_map(self.network, coupling, self.theta, self.psi, self.period(exact))
+        walls = self.environment.walls
+        sent = self._walled(coupling) if walls else self.sent(coupling)
+        if limit is None or rho is None:
+            return Law(sent, self.theta, walls)
+        return Limiter(sent, self.theta, walls, limit=limit, rho=rho)
 
     def members(self) -> tuple[Member, ...]:
         """The environment, and the vertices of its ranges where it has some."""
@@ -168,6 +192,11 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         """Device i alone, at a rigid wall: any-environment is of the same gains whatever is behind them."""
         return Loop(self.T, self.theta[i : i + 1], (0,), (0,), self.delta[i : i + 1], RIGID_WALL, T_max=self.T_max)
 
+    def delayed(self, theta: Steps) -> Loop:
+        """The loop whose forces have these delays, constant ones."""
+        lam = tuple(min(n, t + p) for n, t, p in zip(self.lam, theta, self.psi, strict=True))
+        return msgspec.structs.replace(self, theta=theta, lam=lam, varying_delay=None)
+
     def switching(self, span: DelayRange | None) -> Loop:
         """The loop whose delays may switch within this range, or are the constant theta."""
         return msgspec.structs.replace(self, varying_delay=span)
@@ -180,8 +209,3 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
 
 #: What was built last over Fractions, and of what: a proof asks for it three times, and it is most of its work.
 _exactly: list[Any] = [(None,) * 4, None]
-
-
-def force_map(E: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:
-    """F = Theta (I + Psi E V)^-1 Psi E (6): displacements to forces, as the devices see them."""
-    return delay(theta, E.T) @ coupling.around(delay(psi, E.T) @ E)

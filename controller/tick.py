@@ -9,7 +9,7 @@
 
 With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
 Steps 2, 3 and 5 are linear: they are ONE state-space block, and a tick is one matrix product
-[f; z+] = [C D; A B] [z; x] for any number of simulations at once. Walls that touch (controller.walls) and forces that
+[f; z+] = [C D; A B] [z; x] for any number of simulations at once. Walls that touch (controller.law) and forces that
 are limited (controller.limiter) ask for a small complementarity problem more; a force that is clipped is what the
 actuators make of it.
 Where delays vary, Theta is not in the block: its forces pass through a line that holds (controller.delay).
@@ -18,7 +18,7 @@ Where delays vary, Theta is not in the block: its forces pass through a line tha
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Protocol
 
@@ -26,9 +26,8 @@ import numpy as np
 
 from controller.delay import HeldLine, Ticks, packet_delays
 from controller.environment import Wall
-from controller.limiter import Limiter
+from controller.law import Law, Transition
 from controller.lti import Array, Lti, ReadOnly, frozen
-from controller.walls import Contact, State
 
 Stretch = Callable[[int], None]  # so many ticks from row 0 on
 
@@ -57,42 +56,57 @@ class Net(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Process(ReadOnly):
-    """The linear block F with what wraps around it: force limits, encoder steps, delays that vary, and a net."""
+    """A law with what wraps around it: force limits, encoder steps, delays that vary, and a net."""
 
-    F: Lti
+    law: Law  # with the constant delays of the loop
     force_limit: Array  # (m,) [N], inf where there is none
     encoder_step: Array  # (m,) [m], 0 for an ideal encoder
-    contact: Contact | Limiter | None = None  # walls and limits that F, which knows them open, is joined with
-    delays: Ticks | None = None  # (ticks, m, nsim or 1) of every packet behind F [samples]; None where none varies
-    net: Callable[[int], Net] | None = None  # a fresh one for so many simulations; F is then without Theta
+    delays: Ticks | None = None  # (ticks, m, nsim or 1) of every packet [samples], in place of Theta; None: constant
+    net: Callable[[int], Net] | None = None  # a fresh one for so many simulations; it takes delays
 
     def __post_init__(self) -> None:
         for name in ("force_limit", "encoder_step"):
             value = frozen(getattr(self, name), 1, name)
             object.__setattr__(self, name, value)
-            if value.shape != (self.F.inputs,):
-                raise ValueError(f"{name} has {value.size} entries for {self.F.inputs} channels")
+            if value.shape != (self.channels,):
+                raise ValueError(f"{name} has {value.size} entries for {self.channels} channels")
         if not (self.force_limit > 0).all():
             raise ValueError(f"force_limit is {self.force_limit.tolist()}, expected positive forces in N")
         if not ((self.encoder_step >= 0) & (self.encoder_step < np.inf)).all():
             raise ValueError(f"encoder_step is {self.encoder_step.tolist()}, expected steps >= 0 in m")
         if self.delays is not None:
             object.__setattr__(self, "delays", packet_delays(self.delays))
-            if self.delays.shape[1] != self.F.outputs:
-                raise ValueError(f"delays have {self.delays.shape[1]} channels, expected {self.F.outputs}")
+            if self.delays.shape[1] != self.channels:
+                raise ValueError(f"delays have {self.delays.shape[1]} channels, expected {self.channels}")
+
+    @cached_property
+    def ticked(self) -> Law:
+        """What a tick computes: the law, without Theta where forces travel as packets."""
+        return self.law if self.delays is None else self.law.without_theta
 
     @property
+    def F(self) -> Lti:
+        """The linear block of a tick."""
+        return self.ticked.open
+
+    @property
+    def linear(self) -> Array:
+        """[f; z+] of a tick by its [z; x], (m + order, order + m), while no wall touches and no force is limited."""
+        return self.ticked.linear
+
+    @cached_property
     def channels(self) -> int:
-        return self.F.inputs
+        return self.law.channels
 
     @property
     def walls(self) -> tuple[Wall, ...]:
-        return self.contact.walls if self.contact else ()
+        return self.law.walls
 
     @property
-    def limiter(self) -> Limiter | None:
-        """What limits the forces before they are sent; None where the actuators clip them."""
-        return self.contact if isinstance(self.contact, Limiter) else None
+    def unlimited(self) -> Process:
+        """The linear process: without force limits and encoder steps."""
+        endless, ideal = np.full(self.channels, np.inf), np.zeros(self.channels)
+        return replace(self, law=self.law.unlimited, force_limit=endless, encoder_step=ideal)
 
     def measured(self, x: Array) -> Array:
         """Positions (.., m) as the encoders give them: rounded to whole steps, or x itself where none is coarse."""
@@ -102,27 +116,10 @@ class Process(ReadOnly):
         step = np.where(coarse, self.encoder_step, 1.0)
         return np.where(coarse, np.round(x / step) * step, x)
 
-    def at_rest(self, x: Array) -> Array:
-        """The state in which the process rests with the displacements x (m,) [m] held."""
-        return self.limiter.at_rest(x) if self.limiter else self.F.at_rest(x)
-
-    def frozen(self) -> dict[State, Lti]:
-        """The linear force maps that the process switches between, by the walls that touch: F alone without walls."""
-        return self.contact.frozen() if self.contact else {(): self.F}
-
     def applied(self, force: Array, out: Array | None = None) -> Array:
         """What the actuators make of forces (.., m, nsim) [N] that are asked of them."""
         high = self.force_limit[:, None]
         return np.maximum(np.minimum(force, high, out=out), -high, out=out)
-
-    @property
-    def linear(self) -> Array:
-        """[f; z+] of a tick by its [z; x], (m + order, order + m), while no wall touches and no force is limited."""
-        return np.block([[self.F.C, self.F.D], [self.F.A, self.F.B]])
-
-    def transition(self) -> Callable[[Array, Array], object]:
-        """Writes [f; z+] of a tick, (m + order, nsim), given its [z; x], (order + m, nsim)."""
-        return self.contact.transition() if self.contact else self.linear.dot
 
 
 class StepBuffer:
@@ -141,7 +138,7 @@ class StepBuffer:
         plant_states: int,
         outside: int = 0,
         nsim: int = 1,
-        transition: Callable[[Array, Array], object] | None = None,  # in place of the process's own
+        transition: Transition | None = None,  # in place of the process's own
     ) -> None:
         nz, m = process.F.order, process.channels
         if plant_states < m:
@@ -165,20 +162,19 @@ class StepBuffer:
         self._straight = nsim == 1 and not (self._quantised or process.walls or self._line or self.net)
         #: whether to try the next ticks by the linear law alone: nothing can bend it but limits that are far now
         self.calm = self._straight
-        limiter, bounds = process.limiter, []
-        if limiter:
-            bounds += zip(limiter.sent_rows.tolist(), limiter.limit.tolist(), strict=True)
-        within = limiter and self.net is None and (limiter.limit <= process.force_limit).all()
+        bounds, most = process.ticked.bounds, process.force_limit.tolist()
+        within = bool(bounds) and self.net is None
+        within &= all(limit <= largest for (_, limit), largest in zip(bounds, most, strict=False))
         #: whether a force may leave the tick that is more than the actuators have
         self.clips = not within and bool((process.force_limit < np.inf).any())
         if self.clips:
-            bounds += enumerate(process.force_limit.tolist())
+            bounds += enumerate(most)
         self._bounds = bounds if self._straight else []
         self._asked = [(self.after[:, row, 0], limit) for row, limit in self._bounds]
 
     @cached_property
-    def _transition(self) -> Callable[[Array, Array], object]:
-        return self._given or self.process.transition()
+    def _transition(self) -> Transition:
+        return self._given or self.process.ticked.transition()
 
     # views are made once, and only those that are used: making one costs as much as a small product
 
@@ -252,7 +248,7 @@ class StepBuffer:
                 return None
             return lambda k: transition(seen[k], after[k])
         # a single simulation spends its time in calls: its forces are looked at without numpy, of two channels by name
-        linear, force, clips, limiter = process.linear.dot, self.force, self.clips, process.limiter
+        linear, force, clips, limited = process.linear.dot, self.force, self.clips, process.law.bounds
         first = self._width - process.channels
         asked = [(self._memory[first + i :: self._width, 0].data, -limit, limit) for i, limit in self._bounds]
         (one, low, high), (other, lowest, highest), *others = asked if len(asked) > 1 else 2 * asked
@@ -262,7 +258,7 @@ class StepBuffer:
             within = low <= one[k] <= high and lowest <= other[k] <= highest
             if within and (not others or all(least <= asked[k] <= most for asked, least, most in others)):
                 return
-            if limiter:
+            if limited:
                 transition(seen[k], after[k])
                 if clips:
                     process.applied(force[k], force[k])

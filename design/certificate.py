@@ -591,6 +591,6 @@ def check_ranges(
 
 
 def violated_between(place: Member, ratio: float) -> str:
-    """Why a coupling that is proved at every vertex has no guarantee for the ranges."""
+    """The reason why ranges are not guaranteed although every vertex is proved: a point between them violates."""
     needs = f"{ratio:.4f} of the damping is needed" if np.isfinite(ratio) else "no damping is enough"
     return f"proved at the vertices, but violated between them: {needs} at {place.name}"

@@ -525,7 +525,7 @@ def _figure(limit: Limit, objective: str) -> float | None:
 
 
 def printed_decibels(value: float) -> str:
-    """In case I a loop that needs no coupling reaches minus infinity, of which a solver finds some -60 to -120 dB."""
+    """A mismatch in dB; one below the accuracy of a solver, where minus infinity is exact, is printed as such."""
     return f"below {_EXACT_DB:g} dB" if value < _EXACT_DB else f"{value:.2f} dB"
 
 

@@ -45,7 +45,8 @@ class Limits:
         amounts = [f"{f:.4g}" for f in self.force_limit]
         limit = f"{', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N"
         if self.rho is None:
-            return f"clipped at {limit}: a guarantee holds while forces stay below ({self.reason})"
+            why = self.reason.removeprefix("limiter: ")
+            return f"clipped at {limit}: a guarantee holds while forces stay below ({why})"
         if not self.proved:
             return f"certified, also while forces are limited to {limit} ({self.reason})"
         return f"proved, also while forces are limited to {limit}"
@@ -283,7 +284,7 @@ class RangesFigures:
         ratio = max(d / a for d, a in zip(self.required_damping, self.available_damping, strict=True))
         most = f"{ratio:.4f} of the damping" if math.isfinite(ratio) else _NEVER
         exact, found, count, every = self.proof == "rational", self.inside, self.vertices, self.all_vertices
-        proof = "[green]proved exactly[/] at all" if exact else f"[red]not proved[/]: {self.reason}"
+        proof = "[green]all proved exactly[/]" if exact else f"[red]not proved[/]: {self.reason}"
         of = f", of all {every}: any three parameters have all their ends among them" if every > count + 1 else ""
         yield "ranges, vertices", f"{self.vertices_certified} of {count} certified, {proof}{of}"
         yield "ranges, worst vertex", f"{most}, at {self.worst}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from design.result import NotProved, Requirement
 
 
 _Integers = NDArray[np.object_]
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +73,7 @@ class Matrix:
         return self if common == 1 else Matrix(self.num // common, self.den // common)
 
     def __matmul__(self, other: Matrix) -> Matrix:
-        num = np.empty((self.shape[0], other.shape[1]), dtype=object)
-        for i, row in enumerate(self.num):
-            on_time()
-            num[i] = row @ other.num
-        return Matrix(num, self.den * other.den).reduced()
+        return Matrix(_product(self.num, other.num), self.den * other.den).reduced()
 
     def __add__(self, other: Matrix) -> Matrix:
         den = math.lcm(self.den, other.den)
@@ -104,6 +102,43 @@ class Matrix:
 
     def equals(self, other: Matrix) -> bool:
         return self.shape == other.shape and bool((self.num * other.den == other.num * self.den).all())
+
+
+_FEW = 4000  # products of numbers: below that they are made one by one
+_DIGIT = 16  # bits
+
+
+def _product(a: _Integers, b: _Integers) -> _Integers:
+    """a @ b, exactly, by an eighth of the time that Python's integers take of a hundred rows.
+
+    Their digits are multiplied as floating point numbers: every sum of such products is a whole number below 2^53,
+    and so is exact in any order.
+    """
+    on_time()
+    (n, inner), m = a.shape, b.shape[1]
+    if a.size * m < _FEW or inner >= 1 << 20:
+        return a @ b
+    left, right = _digits(a), _digits(b)  # (digits, rows, columns)
+    beside = right.transpose(1, 0, 2).reshape(inner, -1)
+    sums = np.zeros((len(left) + len(right) + 2, n, m), dtype=np.int64)
+    for i, digit in enumerate(left):
+        sums[i : i + len(right)] += (digit @ beside).astype(np.int64).reshape(n, len(right), m).transpose(1, 0, 2)
+    for low, high in itertools.pairwise(sums):  # carries; the last digit keeps the sign
+        high += low >> _DIGIT
+        low &= (1 << _DIGIT) - 1
+    numbers = np.ascontiguousarray(sums.transpose(1, 2, 0)).astype("<u2").tobytes()
+    size = 2 * len(sums)
+    found = [int.from_bytes(numbers[i : i + size], "little", signed=True) for i in range(0, len(numbers), size)]
+    return np.array(found, dtype=object).reshape(n, m)
+
+
+def _digits(a: _Integers) -> Floats:
+    """Of every entry, (digits, ..): in base 2^16 from the lowest on, all but the last one positive."""
+    size = 2 * (max(int(v).bit_length() for v in a.flat) // _DIGIT + 1)
+    numbers = b"".join(int(v).to_bytes(size, "little", signed=True) for v in a.flat)
+    digits = np.frombuffer(numbers, dtype="<u2").reshape(*a.shape, -1).astype(np.float64)
+    digits[..., -1] -= (digits[..., -1] >= 1 << (_DIGIT - 1)) * float(1 << _DIGIT)
+    return np.ascontiguousarray(np.moveaxis(digits, -1, 0))
 
 
 def block(rows: Sequence[Sequence[Matrix]]) -> Matrix:
@@ -173,8 +208,6 @@ _FACTOR_BITS = 56  # of the entries of each factor of R, relative to the largest
 _PASSES = 4  # one is enough for a condition number below 1e14; each further one takes as much off what is left
 GROWTH = 2.0**-40  # part of the identity that is added where rounding has made the factorisation fail
 
-Floats = NDArray[np.float64]
-
 
 def strictly_positive(S: Matrix) -> bool:
     """Whether S > 0 is proved, for an exactly symmetric S (n, n).
@@ -195,7 +228,7 @@ def strictly_positive(S: Matrix) -> bool:
         R = _whitening(_floats(W))
         if R is None:
             return False
-        W = R.T @ W @ R
+        W = _product(_product(R.T, W), R)
     return _dominates(W)
 
 

@@ -111,7 +111,7 @@ def _limited_block(
     loop, rho = stored.loop, lag(stored.loop, stored.certificate)
     if rho is None:
         raise NothingToExport("its certificate covers no limited forces: design it anew, or leave out --force-limit")
-    limiter = Limiter(loop.sent(stored.built()), tuple(theta), np.array(force_limit), np.array(rho))
+    limiter = Limiter(loop.sent(stored.built()), theta, limit=force_limit, rho=rho)
     about = (
         "f: the whole discrete process with its limiter; the devices get -f, held for T. Forces never exceed "
         f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead, and the certificate holds there.",

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 from zipfile import ZipFile, ZipInfo
 
+import msgspec
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
@@ -324,6 +325,8 @@ def plain(report: Any) -> Any:
     if is_dataclass(report) and not isinstance(report, type):
         own = getattr(report, "part", None)
         return plain(own()) if own else _part(report)
+    if isinstance(report, msgspec.Struct):
+        return plain(msgspec.to_builtins(report))
     if isinstance(report, Mapping):
         return {name: plain(value) for name, value in report.items()}
     if isinstance(report, np.ndarray | np.generic):

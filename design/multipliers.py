@@ -329,7 +329,7 @@ class _LimiterSearch:
     def requirement(self, ratio: float, w: float) -> Requirement:
         T, delta = self._loop.T, self._loop.delta
         if np.isinf(ratio):
-            reason = f"no proof found with the limiter, for {w / (2 * np.pi * T):.4g} Hz"
+            reason = "no limiter is proved for this coupling"
             return refusal("limiter", delta, reason)
         return from_ratio("limiter", max(ratio, 0.0), delta, w / (2 * np.pi * T))
 

@@ -20,10 +20,9 @@ import numpy as np
 
 from controller.budget import EPS, EnergyBudget
 from controller.coupling import Coupling
-from controller.environment import environment
-from controller.limiter import limited
-from controller.loop import force_map
-from controller.lti import Array, Lti
+from controller.law import Law
+from controller.loop import Loop
+from controller.lti import Array
 from design.certificate import assess
 from design.coverage import Limits
 from design.files import unseen
@@ -60,16 +59,15 @@ class Controller(Protocol):
 
 
 class HostController:
-    """[f; z+] from [z; x], tick by tick and from rest."""
+    """A law at work, tick by tick and from rest."""
 
-    def __init__(self, F: Lti, tick: Callable[[Array, Array], object] | None = None) -> None:
-        """`tick` writes [f; z+] from [z; x], both (m + order, 1); without one F does."""
+    def __init__(self, law: Law) -> None:
+        F = law.open
         n, m = F.order, F.inputs
         before, after = np.zeros((n + m, 1)), np.zeros((n + m, 1))
         self.F, self.T = F, F.T
         self._state, self._x, self._f, self._next = before[:n], before[n:, 0], after[:m, 0], after[m:]
-        law = np.block([[F.C, F.D], [F.A, F.B]])
-        self._tick = partial(tick, before, after) if tick else partial(law.dot, before[:, 0], after[:, 0])
+        self._tick = partial(law.transition(), before, after)
 
     def step(self, x: Sequence[float]) -> list[float]:
         """Forces (m,) [N] for the displacements x (m,) [m]; the state moves on by one tick."""
@@ -80,22 +78,13 @@ class HostController:
 
 
 def host_controller(
-    scenario: Scenario,
-    coupling: Coupling,
-    link: int,
-    lag: Sequence[float] | None = None,
-    cap: Sequence[float] = (),
+    loop: Loop, coupling: Coupling, link: int, cap: Sequence[float], lag: Sequence[float] | None = None
 ) -> HostController:
-    """F as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where link is too long.
+    """The loop as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where it is too long.
 
     With `lag`, rho (m,) [N/m], forces leave through a limiter of `cap` (m,) [N].
     """
-    host = [n - link for n in scenario.theta]
-    if lag is not None:
-        limiter = limited(scenario.environment, coupling, host, scenario.psi, scenario.T, cap, lag)
-        return HostController(limiter.open, limiter.transition())
-    E = environment(scenario.environment, scenario.T)
-    return HostController(force_map(E, coupling, host, scenario.psi))
+    return HostController(loop.delayed(tuple(n - link for n in loop.theta)).law(coupling, cap, lag))
 
 
 def fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tuple[float, ...]]:
@@ -384,7 +373,7 @@ class CertifiedCoupling:
         return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
 
     def controller(self, cap: Sequence[float]) -> HostController:
-        return host_controller(self.scenario, self.chosen.coupling, self.link, self.limits.rho, cap)
+        return host_controller(self.scenario.loop(self.case), self.chosen.coupling, self.link, cap, self.limits.rho)
 
     def figures(self, cap: Sequence[float]) -> ProgramFigures:
         """Coupling, certificates and guarantee, for forces of up to `cap` (m,) [N]."""

@@ -202,7 +202,7 @@ class _Fit:
 
     @property
     def price(self) -> float:
-        """Of friction beside the viscous one, as Akaike's criterion has it: of laws alike, the simplest is told."""
+        """Akaike's penalty for friction that is not viscous: of laws that fit alike the simplest is taken."""
         return 2.0 * int(np.count_nonzero(self.p[[_DRAG, _DRY, _STATIC]]))
 
 

@@ -23,7 +23,6 @@ from hw.control import Controller
 from hw.friction import Friction, friction
 from hw.recording import Recorder
 from hw.session import Session
-from models.device import RigidDevice
 from sim.scenario import Scenario
 
 _APART = 1  # [counts] that noise may move an encoder at rest: it reads two neighbours in turn
@@ -99,11 +98,12 @@ class _Player:
 def chirp(
     channels: int, T: float, link: int, amplitude: float, band: tuple[float, float], seconds: float
 ) -> Excitation:
-    """Cosines [N] whose frequency rises exponentially: through `band` [Hz], slowly, slowly at half the force; silence.
+    """The force [N] that is played to a device: three cosines of exponentially rising frequency, then silence.
 
-    Each takes `seconds`, the silence half of that: friction that is not viscous is told by the two levels of slow
-    motion, which are as wide. They begin with a cosine, and end at whole cycles, so that a free mass does not drift
-    away; the last ends a quarter later, with a speed for the release.
+    The first passes through `band` [Hz]; the second and the third are slow, the third at half the force. Each takes
+    `seconds`, the silence half of that. Two slow motions at two levels of force show friction that is not viscous.
+    Each cosine ends at a whole cycle, so that a free mass does not drift away; the last one ends a quarter of a cycle
+    later, so that the device is released with a speed.
     """
     t = np.arange(round(seconds / T)) / round(seconds / T)
 
@@ -464,10 +464,9 @@ def estimate(
     estimates = []
     for i, device in enumerate(scenario.device):
         progress(i, scenario.channels, f"estimating axis {i + 1}")
-        rigid = isinstance(device, RigidDevice)
-        x, force = link["x"][:, i], applied[:, i] * units.force_step[i]
+        x, force, step = link["x"][:, i], applied[:, i] * units.force_step[i], units.encoder_step[i]
         try:
-            estimates.append(identify(x, force, link["received"], scenario.T, units.encoder_step[i], rigid))
+            estimates.append(identify(x, force, link["received"], scenario.T, step, device.transmission is None))
         except ValueError as error:
             raise ValueError(f"axis {i + 1}: {error}") from None
     return estimates

@@ -397,7 +397,7 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """F as the host ran it. Raises InputError where the recipe is impossible."""
         try:
             coupling = self.coupling.build(self.scenario.T)
-            return host_controller(self.scenario, coupling, self.link_delay, self.lag, self.limits.cap)
+            return host_controller(self.scenario.loop("I"), coupling, self.link_delay, self.limits.cap, self.lag)
         except ValueError as error:
             raise InputError(f"the trace cannot be replayed: {error}") from None
 

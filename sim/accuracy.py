@@ -91,7 +91,7 @@ class Row:
     cycle_amplitude_error: float | None  # relative
     cycle_frequency_error_hz: float | None
     wall_s_per_simulated_s: float
-    pareto: bool = False  # see `with_front`
+    pareto: bool = False  # see `_with_front`
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
         free = run(uncoupled, "exact")
         if free.t.size > _TAIL and not free.diverged:
             channel = int(np.argmax(free.f[-_TAIL:].std(axis=0)))
-            cycle = (channel, *limit_cycle(free, channel))
+            cycle = (channel, *_limit_cycle(free, channel))
     return _Reference(coupled, uncoupled, run(coupled, "exact"), cycle)
 
 
@@ -136,8 +136,8 @@ def measure_all(
             except ValueError as error:
                 skipped.append(f"{integrator} x {substeps}: {error}")
     except KeyboardInterrupt:
-        return with_front(rows), skipped, True
-    return with_front(rows), skipped, False
+        return _with_front(rows), skipped, True
+    return _with_front(rows), skipped, False
 
 
 def measure(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
@@ -151,7 +151,7 @@ def measure(truth: _Reference, engine: str, integrator: str | None, substeps: in
     return Row(*settings, position, *_growth(truth, *settings), *_cycle(truth, *settings), share)
 
 
-def with_front(rows: Sequence[Row]) -> list[Row]:
+def _with_front(rows: Sequence[Row]) -> list[Row]:
     """Set `pareto`: no other row of that kind of engine is at least as good in cost and both errors, and better in one.
 
     The exact engine is on it by itself: only a linear plant has one.
@@ -164,7 +164,7 @@ def with_front(rows: Sequence[Row]) -> list[Row]:
     return marked
 
 
-def limit_cycle(trace: Trace, channel: int) -> tuple[float, float]:
+def _limit_cycle(trace: Trace, channel: int) -> tuple[float, float]:
     """Standard deviation [N] and frequency [Hz] of a force's tail; the spectral peak is refined by a parabola."""
     force = trace.f[-_TAIL:, channel]
     level = np.log(np.abs(np.fft.rfft((force - force.mean()) * np.hanning(force.size))) + 1e-300)
@@ -204,7 +204,7 @@ def _cycle(
     trace = run(truth.uncoupled, make_engine(truth.uncoupled, engine, integrator, substeps))
     if trace.diverged:
         return None, None, None, None
-    own, turns = limit_cycle(trace, channel)
+    own, turns = _limit_cycle(trace, channel)
     return own, turns, own / amplitude - 1, turns - frequency
 
 
@@ -309,7 +309,7 @@ def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> For
     if process.walls:
         return ForceError.of(trace.f, trace.f, "walls have no linear ideal to compare with")
     F = process.F
-    asked = trace.f if process.delays is not None or process.limiter else trace.z @ F.C.T + trace.x @ F.D.T
+    asked = trace.f if process.delays is not None or process.law.bounds else trace.z @ F.C.T + trace.x @ F.D.T
     return ForceError.of(asked, response(delay(lam, F.T) @ simulation.E, trace.x))
 
 
@@ -355,19 +355,17 @@ class EngineChoice:
         return f"{self.integrator} x {self.substeps}"
 
 
-def compare_engines(
-    simulation: Simulation, error: float, ticks: int | None = None, linear: Simulation | None = None
-) -> tuple[EngineChoice, ...]:
+def compare_engines(simulation: Simulation, error: float, ticks: int | None = None) -> tuple[EngineChoice, ...]:
     """Every setting that is stable on the scene's plant, the cheapest first, over `ticks` of the scenario (all).
 
-    Walls, limits, encoder steps, varying delays and nets are those of `simulation`; verdicts are of `linear`, the loop
-    without a net and with constant delays, by default the same. Where something rubs the reference is refined until RK4
-    keeps `error`. Raises InputError where it cannot.
+    With its walls, limits, encoder steps, varying delays and net; verdicts are of the loop without a net and with
+    constant delays. Where something rubs the reference is refined until RK4 keeps `error`. Raises InputError where it
+    cannot.
     """
     if not error > 0:
         raise InputError(f"--error is {error:g}, expected a positive relative error")
     ticks = simulation.scenario.samples if ticks is None else ticks
-    linear = (linear or simulation).smooth.even
+    linear = simulation.smooth.even
     runs: dict[tuple[str, int], tuple[Array, float]] = {}
     if default_integrator(simulation.scene) == EXPONENTIAL:
         settings = list(dict.fromkeys((*_CANDIDATES, ("RK4", default_substeps(linear, "RK4")))))
@@ -387,7 +385,7 @@ def compare_engines(
 
 
 def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
-    """The cheapest that keeps the error and the verdict. Raises InputError where none does."""
+    """The cheapest setting with an error small enough and the right verdict. Raises InputError without one."""
     kept = [choice for choice in choices if choice.verdict_correct and choice.position_relative_rms <= error]
     if kept:
         return min(kept, key=lambda choice: choice.cpu_s)
@@ -457,7 +455,7 @@ def _positions(
 
 
 def _apart(own: Array, truth: Array) -> float:
-    """Relative rms difference; infinite where one of them ended before its time."""
+    """Relative rms difference; infinite where one of the runs ended early."""
     if own.shape != truth.shape:
         return math.inf
     scale = float(np.mean(truth**2))

@@ -21,7 +21,7 @@ import numpy as np
 
 from controller.coupling import Coupling, NoCoupling
 from controller.lti import Array, Lti
-from design.conditions import this_environment
+from design.environments import THIS_ENVIRONMENT
 from models.human import Hand, Person
 from models.scene import Crowd, HumanSets, variants
 from sim.couplings import choose
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
 _MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
-DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
+_DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
 
 
 class _Pass(NamedTuple):
@@ -61,7 +61,7 @@ class Worst:
 
     @property
     def destabilises(self) -> bool:
-        return self.growth > DESTABILISED
+        return self.growth > _DESTABILISED
 
 
 def search(
@@ -85,7 +85,7 @@ def search(
         nonlocal done
         done += 1
         progress(done, len(passes) * generations)
-        return first and bool(-intermediate_result.fun > 10 * DESTABILISED)
+        return first and bool(-intermediate_result.fun > 10 * _DESTABILISED)
 
     best, evaluated = None, 0
     for trial, kind in enumerate(passes):
@@ -149,7 +149,7 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
     for alike in layouts.values():
         loops = _loops(scenario, F, HumanSets(tuple(alike), scenario.person))
         fast, growth = (_growth(loops, least) for least in (_PASSES[0].min_frequency_hz, 0.0))
-        ranked += zip(np.where(growth > DESTABILISED, growth, fast).tolist(), alike, strict=True)
+        ranked += zip(np.where(growth > _DESTABILISED, growth, fast).tolist(), alike, strict=True)
     return ranked
 
 
@@ -176,9 +176,8 @@ def attempts(
     """
     rows = []
     for name, (scenario, coupling) in loops.items():
-        loop = scenario.loop("I")
-        F = loop.F(coupling)
-        required = np.array(this_environment(F, loop).required)
+        loop = scenario.loop("I")  # the reference does not matter
+        F, required = loop.F(coupling), np.array(THIS_ENVIRONMENT.required(loop, coupling).required)
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
             rows.append(_Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))
@@ -214,7 +213,7 @@ def _losses(x: Array, scenario: Scenario, F: Lti, kind: _Pass) -> Array:
 
 
 def _growth(loops: ClosedLoop, min_frequency_hz: float) -> Array:
-    """Of the modes from this frequency on [1/s], (nsim,)."""
+    """Growth of the modes above this frequency [1/s], (nsim,)."""
     values, T = np.linalg.eigvals(loops.A), loops.T
     fast = np.abs(np.angle(values)) / (2 * np.pi * T) >= min_frequency_hz
     return np.log(np.where(fast, np.abs(values), 1e-300).max(axis=1)) / T
@@ -244,7 +243,7 @@ class Shortage:
 
     @property
     def holds(self) -> bool:
-        """With the damping that is required no human may succeed."""
+        """Whether the row is as the theory says: with the required damping no human makes the loop unstable."""
         return self.short > 0 or not self.found
 
 

@@ -57,13 +57,13 @@ class Alternative:
 
     @property
     def name(self) -> str:
-        """As tables and pictures call it: a spring-damper by its condition."""
+        """The name in tables and pictures; that of a spring-damper is its condition."""
         if self.coupling == "spring-damper":
             return self.condition or ""
         return {"optimal": "best (optimal)"}.get(self.coupling, self.coupling)
 
     def needs(self, condition: str) -> float | None:
-        """The largest share of its guaranteed damping that the condition asks of a device; None: none is enough."""
+        """Required over available damping of the worst device; None where no damping is enough."""
         requirement = (self.requirements or {}).get(condition)
         if requirement is None:
             return None

@@ -73,13 +73,13 @@ def run_scenario(
     engine is the cheapest that keeps it; `net` stands between the forces and the devices. Raises InputError for
     settings that cannot be.
     """
-    constant = simulation = assemble(scenario, coupling, lag, seed)
+    simulation = assemble(scenario, coupling, lag, seed)
     period, choices, remarks = None, (), []
     if scenario.switches:
-        simulation, period = switching(simulation, coupling, seed, scenario.samples)
-    ran = simulation if net is None else netted(simulation, coupling, net)
+        simulation, period = switching(simulation, seed, scenario.samples)
+    ran = simulation if net is None else netted(simulation, net)
     if error is not None:
-        choices = compare_engines(ran, error, linear=constant)
+        choices = compare_engines(ran, error)
         kept = pick(choices, error)
         integrator, substeps = kept.integrator, kept.substeps
     else:

@@ -118,23 +118,22 @@ def _judged(
     coupling = design.coupling if design else NoCoupling()
     simulation = assemble(scenario, coupling, limits_of(scenario, design, limiter=limiter).rho if design else None)
     most = max(scenario.samples, round(SECONDS / scenario.T))
-    with_net = netted(simulation, coupling, net, most) if net else simulation
+    with_net = netted(simulation, net, most) if net else simulation
     trace = run(with_net, "exact")
     # of the force within its limits: what acted, whatever computed it
     error = force_error(with_net, trace, scenario.loop(case).lam)
     apart = _apart(trace.f, error.ideal) if not scenario.environment.walls else None
     part = trace.net.part() if trace.net else {"limited_ticks": 0}
     moving, fastest = _left_alone(with_net)
-    name = net.name if isinstance(net, Classic) else "energy budget" if net else "none, clipped"
-    guarantee = net.guarantee if isinstance(net, EnergyNet) else None
+    name, guarantee, source = (net.name, net.guarantee, net.source) if net else ("none, clipped", None, None)
     if design:
         guarantee = _GUARANTEES[design.condition]
         name = f"{design.kind}, {guarantee}"
     return Rival(
         name,
-        isinstance(net, Classic),
+        source is not None,
         guarantee,
-        BASELINES[net.name] if isinstance(net, Classic) else None,
+        source,
         apart,
         _fast(trace.f, scenario.T),
         float(np.abs(trace.f).max(initial=0.0)),

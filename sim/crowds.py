@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from controller.coupling import Coupling
+from controller.law import Law
 from controller.lti import Array
 from controller.ranges import Member
 from controller.timing import Timing
@@ -45,7 +46,7 @@ from sim.switching import Switched, switched_crowd
 
 ENGINES = ("exact", "mujoco", "both")
 MIXED = 0  # as a number of links: half the humans are simple, half are networks of two links
-BATCH = 125  # humans that are decided together
+_BATCH = 125  # humans that are decided together
 
 
 # ---- random passive humans, each from its own seed
@@ -127,10 +128,10 @@ class Validation:
         return round(self.duration / self.scenario.T)
 
     def batches(self) -> list[range]:
-        """All indices, BATCH of them at a time, all in one environment."""
+        """All indices, _BATCH of them at a time, all in one environment."""
         spread = max(1, len(self.environments))
         each = [range(i, self.humans, spread) for i in range(min(spread, self.humans))]
-        return [indices[i : i + BATCH] for indices in each for i in range(0, len(indices), BATCH)]
+        return [indices[i : i + _BATCH] for indices in each for i in range(0, len(indices), _BATCH)]
 
     def environment(self, index: int) -> Member | None:
         """What the humans of this index meet, None for the scenario's own environment: each in turn."""
@@ -138,7 +139,7 @@ class Validation:
 
     @property
     def digest(self) -> str:
-        """Of all that the findings depend on."""
+        """A digest of everything that the findings depend on."""
         how = (
             self.coupling.form(),
             self.seed,
@@ -238,7 +239,7 @@ def _group(
     held_by = variants(scenario.device, crowd)
     late, mujoco = scenario.usual_latency, nowhere
     loops = exact_loops(held_by, simulation.F, late=late)
-    frozen = [replace(simulation.process, F=F, contact=None) for F in simulation.process.frozen().values()]
+    frozen = [replace(simulation.process, law=Law(F)) for F in simulation.process.law.frozen().values()]
     mode = Mode.worst([dominant_mode(exact_loops(held_by, process.F, late=late)) for process in frozen])
     if validation.engine != "exact":
         maps = (mujoco_loops(held_by, process, nthread=validation.threads, late=late) for process in frozen)
@@ -247,8 +248,8 @@ def _group(
     switched = Switched(nowhere, nowhere)
     if scenario.switches or scenario.uneven:
         with_mujoco = validation.engine != "exact" and validation.ticks > 0
-        arguments = (held_by, index, validation.seed, validation.duration, with_mujoco, validation.threads)
-        switched = switched_crowd(simulation, validation.coupling, *arguments)
+        asked = (validation.seed, validation.duration, with_mujoco, validation.threads)
+        switched = switched_crowd(simulation, held_by, index, *asked)
     return Findings(
         index=index,
         radius=mode.spectral_radius,

@@ -74,7 +74,7 @@ def proved(made: Design, loop: Loop) -> Certificate:
 
 
 def shipped(loop: Loop, kind: str, condition: str, *options: Any) -> Path:
-    """Where the package has its design for this question, if it has one."""
+    """The file of the design that comes with the package, if there is one for this question."""
     named = hashlib.sha256(repr((digest(loop), options)).encode()).hexdigest()
     return _SHIPPED / f"{kind}-{condition}-{named[:12]}.json"
 

@@ -39,7 +39,7 @@ class Judged:
         whole: RangesCheck | None,
         limits: Limits,
     ) -> Judged:
-        """What is to be said of a coupling of this kind in a loop."""
+        """The verdicts on a coupling of this kind in a loop."""
         return cls(
             whole,
             CouplingFigures.of(kind, coupling, loop.T),
@@ -51,12 +51,12 @@ class Judged:
 
     @property
     def requirements(self) -> dict[str, Requirement]:
-        """By the conditions' names of today."""
+        """The certificates under today's names alone."""
         return {name: need for name, need in self.certificates.items() if name not in CONDITIONS}
 
     @property
     def proved(self) -> bool:
-        """For the whole ranges."""
+        """Whether the guarantee is proved for the ranges."""
         return bool(self.whole and self.whole.proved)
 
 

@@ -14,11 +14,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.limiter import Limiter
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
 from controller.timing import Timing
-from controller.walls import Contact
 from models.device import Device
 from models.hold import HeldPlant, hold
 from models.human import Population
@@ -203,7 +201,7 @@ class Points:
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:
-        """The cells of all parts; of none, no cell."""
+        """The cells of all parts in one; no cells where there are no parts."""
         if not parts:
             return cls(np.zeros(0, dtype=int), np.zeros(0, dtype=bool), *np.zeros((3, 0)))
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
@@ -307,10 +305,11 @@ def _simulate(
     substeps = pace(held_by.plants().A).substeps(T)
     timing = Timing(np.array([T]), np.array([held.late])) if held.late else None
     n, processes = held_by.states + len(held.late or ()), [trial.process for trial in trials]
-    buffer = _ManyProcesses(processes, min(_BLOCK, ticks), n, scene.outside)
-    starts = np.stack([trial.start for trial in trials], axis=1)
+    law, starts = processes[0].law, np.stack([trial.start for trial in trials], axis=1)
+    together = law.together([process.law for process in processes])
+    buffer = StepBuffer(processes[0], min(_BLOCK, ticks), n, scene.outside, len(trials), together)
     buffer.s[0] = starts[:n]
-    if processes[0].contact is None:  # the states of a process with walls or a limiter are others: it begins at rest
+    if not (law.walls or law.bounds):  # the states of a process with walls or a limiter are others: it begins at rest
         buffer.z[0] = starts[n:]
     seen, kept, done = list(_motors_and_handles(scene)), [], 0
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
@@ -335,76 +334,3 @@ def _press_forces(scene: Scene, T: float, press: Array, first: int, ticks: int) 
     for force, column in zip(press, scene.pushed, strict=True):
         w[:, column] += force * eased
     return w
-
-
-_Transition = Callable[[Array, Array], object]  # [z; x] (order + m, nsim) -> writes [f; z+] (m + order, nsim)
-
-
-class _ManyProcesses(StepBuffer):
-    """A process for each simulation, all of the same order, number of walls, force limits and encoder steps."""
-
-    def __init__(self, processes: Sequence[Process], ticks: int, plant_states: int, outside: int) -> None:
-        made, contact = _linear if processes[0].contact is None else _each, processes[0].contact
-        if isinstance(contact, Contact) and len(contact.walls) == 1:
-            made = _one_wall
-        elif contact and not contact.walls:
-            made = _limited
-        super().__init__(processes[0], ticks, plant_states, outside, len(processes), made(processes))
-
-
-def _linear(processes: Sequence[Process]) -> _Transition:
-    blocks = _last_axis([np.block([[p.F.C, p.F.D], [p.F.A, p.F.B]]) for p in processes])
-    return lambda before, after: np.einsum("oin,in->on", blocks, before, out=after)
-
-
-def _limited(processes: Sequence[Process]) -> _Transition:
-    """Limiter.transition for one simulation each: only those with a force beyond its limit solve their problem."""
-    limiters = [p.contact for p in processes if isinstance(p.contact, Limiter)]
-    linear, sent, limit = _linear(processes), limiters[0].sent_rows, _last_axis([each.limit for each in limiters])
-
-    def together(before: Array, after: Array) -> None:
-        linear(before, after)
-        free = after[sent]
-        for i in np.flatnonzero((np.abs(free) > limit).any(axis=0)):
-            slip, force = limiters[i].problem.solve(free[:, i : i + 1])
-            after[:, i : i + 1] += limiters[i].kick @ slip
-            after[sent, i] = force[:, 0]
-
-    return together
-
-
-def _one_wall(processes: Sequence[Process]) -> _Transition:
-    """Contact.transition for one wall each, whose complementarity problem is p = max(0, q)/M."""
-    contacts = [p.contact for p in processes if isinstance(p.contact, Contact)]
-    m, order = contacts[0].channels, contacts[0].block.order
-    linear = _linear(processes)
-    reach = _last_axis([np.concatenate([c.block.C[m], [0.0], c.block.D[m, :m]]) for c in contacts])
-    kick = _last_axis([np.concatenate([c.block.D[:m, m], c.block.B[:, m], [0.0]]) for c in contacts])
-    give, M = np.array([c.block.D[m, m] for c in contacts]), np.array([c.problem.M[0, 0] for c in contacts])
-    gap, damping = (np.array([getattr(c.walls[0], name) for c in contacts]) for name in ("gap", "damping"))
-    memory = damping / contacts[0].block.T / np.array([c.steepness[0] for c in contacts])
-
-    def together(before: Array, after: Array) -> None:
-        way = np.einsum("in,in->n", reach, before) - gap
-        force = np.maximum(way - memory * before[order], 0.0) / M
-        linear(before, after)
-        after += kick * force
-        after[-1] = np.maximum(way + give * force, 0.0)
-
-    return together
-
-
-def _each(processes: Sequence[Process]) -> _Transition:
-    transitions = [process.transition() for process in processes]
-
-    def together(before: Array, after: Array) -> None:
-        column = np.empty((after.shape[0], 1))
-        for i, transition in enumerate(transitions):
-            transition(np.ascontiguousarray(before[:, i : i + 1]), column)
-            after[:, i : i + 1] = column
-
-    return together
-
-
-def _last_axis(parts: Sequence[Array]) -> Array:
-    return np.ascontiguousarray(np.moveaxis(np.array(parts), 0, -1))

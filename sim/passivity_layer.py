@@ -1,8 +1,8 @@
 """Passivity layers under a simulated controller: the energy budget, and the classics that it is compared with.
 
-    traced = run(netted(simulation, coupling, EnergyNet(0.01)), "exact").net.part()
+    traced = run(netted(simulation, EnergyNet(0.01)), "exact").net.part()
 
-With a net, Theta is no part of the linear block: the forces of G = (I + Psi E V)^-1 Psi E go through the net, then
+With a net, Theta is no part of a tick's block: the forces of G = (I + Psi E V)^-1 Psi E go through the net, then
 through a line that holds them, constant delays or not. The budget and energy bounding stand before the line, and see
 forces that the actuators can apply; the passivity controller stands behind it, at the devices.
 """
@@ -17,17 +17,12 @@ from typing import Any
 import numpy as np
 
 from controller.budget import EPS, EnergyBounding, EnergyBudget, PassivityControl, Shell
-from controller.coupling import Coupling
 from controller.delay import LOST, Ticks, ages
-from controller.limiter import Limiter, limited
-from controller.loop import DelayRange
-from controller.lti import Array, Lti
+from controller.lti import Array
 from controller.tick import Net, Process
-from controller.walls import contact
 from design.result import Requirement
 from sim.run import Simulation
-from sim.scenario import InputError, Scenario
-from sim.switching import with_delays
+from sim.scenario import InputError
 
 _HELD = 4  # ticks for which a device goes on holding a force, beyond the largest delay, where packets are lost
 
@@ -48,11 +43,28 @@ class EnergyNet:
     start: float  # W0 [J]
     cap: float = np.inf  # the most that it may save [J]
 
+    name, source = "energy budget", None
+
     @property
     def guarantee(self) -> str:
         """In one line."""
         given = f"more than {self.start:g} J" if self.start else "any energy"
         return f"no passive hand is given {given} beyond what the devices dissipate, whatever computes the forces"
+
+    def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
+        """A fresh one."""
+        assert process.delays is not None
+        loop, lost = simulation.loop, bool((process.delays == LOST).any())
+        hold, span = _HELD if lost else 0, loop.delays
+        given: dict[str, Any] = {"eps": EPS, "start": self.start, "cap": self.cap, "nsim": nsim, "hold": hold}
+        given["encoder_step"] = process.encoder_step
+        longest = loop.T_max or loop.T  # the most that a held force can lose grows with the period
+        try:
+            budget = EnergyBudget(loop.delta, longest, span.lo, span.hi, **given)
+        except ValueError as error:
+            raise InputError(f"energy budget: {error}") from None
+        late = ages(process.delays) if lost else None
+        return _Budgeted(budget, self, process, late, np.array(span.hi) + hold)
 
 
 @dataclass(frozen=True)
@@ -60,6 +72,20 @@ class Classic:
     """One of BASELINES."""
 
     name: str
+    guarantee = None
+
+    @property
+    def source(self) -> str:
+        """What it is, and whose."""
+        return BASELINES[self.name]
+
+    def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
+        """A fresh one."""
+        delta, T = np.array(simulation.loop.delta), simulation.loop.T
+        if self.name == "eba":
+            return _Bounded(EnergyBounding(delta, T, nsim=nsim), self.name, process)
+        credit = delta if self.name.endswith(":delta") else None
+        return _Damped(PassivityControl(len(delta), T, delta=credit, nsim=nsim), self.name, process)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +95,20 @@ class Plugged:
     force: Callable[[Array], Array]  # where the port would be, (m,) [m], once a tick -> force fed back (m,) [N]
     start: float = 0.0  # W0 [J]
 
+    def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
+        """A fresh one."""
+        V = simulation.coupling.compliance(simulation.loop.T)
+        if V is None:
+            raise ValueError("an environment of your own needs a coupling with a compliance V before it")
+        if (process.encoder_step > 0).any():
+            raise ValueError("an environment of your own needs ideal encoders: no shell is known for coarse ones")
+        return _Shelled(Shell(V, start=self.start, nsim=nsim), self, process)
+
 
 Wanted = EnergyNet | Classic | Plugged
 
 
-def netted(simulation: Simulation, coupling: Coupling, wanted: Wanted, ticks: int | None = None) -> Simulation:
+def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> Simulation:
     """The same loop with a net under it, for runs of up to `ticks` (default: the scenario's).
 
     What is linear about a loop, such as certificates and modes, ask the simulation without. Delays that vary are those
@@ -82,57 +117,13 @@ def netted(simulation: Simulation, coupling: Coupling, wanted: Wanted, ticks: in
     scenario, process = simulation.scenario, simulation.process
     if scenario.latency:
         raise InputError("latency: a net counts forces that latch at ticks; count a whole sample of theta")
-    delays, spans = process.delays, DelayRange(scenario.theta, scenario.theta)
-    if delays is None:
+    if process.delays is None:
         samples = scenario.samples if ticks is None else ticks
         constant = np.broadcast_to(np.array(scenario.theta)[None, :, None], (samples, process.channels, 1))
-        process = with_delays(simulation, coupling, constant).process
-        undelayed, before = ((0,) * process.channels, scenario.psi, scenario.T), process.contact
-        if isinstance(before, Limiter):
-            walled = limited(scenario.environment, coupling, *undelayed, before.limit, before.rho)
-            process = replace(process, F=walled.open, contact=walled)
-        elif before:
-            walled = contact(scenario.environment, coupling, *undelayed)
-            process = replace(process, F=walled.open, contact=walled)
-    else:
-        spans = scenario.delay_range
-    if isinstance(wanted, Plugged):
-        make = partial(_shelled, wanted, coupling.compliance(scenario.T), process)
-    else:
-        make = partial(_budget if isinstance(wanted, EnergyNet) else _classic, wanted, scenario, process, spans)
+        process = replace(process, delays=constant)
+    make = partial(wanted.net, simulation, process)
     make(1)  # raises for numbers that cannot be
     return replace(simulation, process=replace(process, net=make))
-
-
-def _budget(wanted: EnergyNet, scenario: Scenario, process: Process, spans: DelayRange, nsim: int) -> Net:
-    assert process.delays is not None
-    lost = bool((process.delays == LOST).any())
-    hold, delta = _HELD if lost else 0, scenario.delta
-    given: dict[str, Any] = {"eps": EPS, "start": wanted.start, "cap": wanted.cap, "nsim": nsim, "hold": hold}
-    given["encoder_step"] = process.encoder_step
-    longest = scenario.longest_period or scenario.T  # the most that a held force can lose grows with the period
-    try:
-        budget = EnergyBudget(delta, longest, spans.lo, spans.hi, **given)
-    except ValueError as error:
-        raise InputError(f"energy budget: {error}") from None
-    late = ages(process.delays) if lost else None
-    return _Budgeted(budget, wanted, process, late, np.array(spans.hi) + hold)
-
-
-def _classic(wanted: Classic, scenario: Scenario, process: Process, spans: DelayRange, nsim: int) -> Net:
-    delta = np.array(scenario.delta)
-    if wanted.name == "eba":
-        return _Bounded(EnergyBounding(delta, scenario.T, nsim=nsim), wanted.name, process)
-    credit = delta if wanted.name.endswith(":delta") else None
-    return _Damped(PassivityControl(len(delta), scenario.T, delta=credit, nsim=nsim), wanted.name, process)
-
-
-def _shelled(wanted: Plugged, V: Lti | None, process: Process, nsim: int) -> Net:
-    if V is None:
-        raise ValueError("an environment of your own needs a coupling with a compliance V before it")
-    if (process.encoder_step > 0).any():
-        raise ValueError("an environment of your own needs ideal encoders: no shell is known for coarse ones")
-    return _Shelled(Shell(V, start=wanted.start, nsim=nsim), wanted, process)
 
 
 def idle(simulation: Simulation, any_environment: Requirement, part: dict[str, Any]) -> str | None:

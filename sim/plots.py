@@ -59,12 +59,12 @@ def _panels(title: str, rows: int, columns: int, size: tuple[float, float], **sh
 
 
 def _legend(figure: Figure, entries: dict[str, Any], columns: int, **style: Any) -> None:
-    """Below all panels: label -> what is drawn so."""
+    """A legend below all panels; `entries` has the drawn object of each label."""
     figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=columns, **style)
 
 
 def _entries(axis: Axes) -> dict[str, Any]:
-    """label -> what is drawn so, in the order of drawing."""
+    """The drawn object of each label, in the order of drawing."""
     handles, labels = axis.get_legend_handles_labels()
     return dict(zip(labels, handles, strict=True))
 
@@ -263,7 +263,7 @@ def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], ar
 
 
 def _grey_out(axes: Array | list[Axes], result: Trace, until: float) -> None:
-    """What is the linear model's motion and no device's, under a veil."""
+    """Grey out the part of the run that no real device could follow."""
     for axis in axes:
         axis.axvspan(until, result.t[-1], color="0.85", alpha=0.75, zorder=5, linewidth=0)
     text = "grey: beyond what the\ndevices declare credible"
@@ -614,7 +614,7 @@ def _level(row: Limit, figure: str) -> float | None:
 
 
 def _draw_sweep(axis: Axes, name: str, sweep: Sweep, figure: str, here: float) -> dict[str, Any]:
-    """Draw one sweep; what belongs into the legend by its words."""
+    """Draw one sweep and return its entries of the legend."""
     scale, unit = (1e3, "ms") if sweep.unit == "s" else (1.0, sweep.unit)
     entries: dict[str, Any] = {}
     for kind, (words, style) in _CURVES.items():

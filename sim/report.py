@@ -53,12 +53,12 @@ def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> EncoderS
 
 
 #: The transparency indices (25) printed beside the gains [dB]; no reading of Figure 4 that we tried gives them.
-PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
+_PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A figure of the paper, and what it is here."""
+    """A figure that the paper prints, and the same one computed here."""
 
     what: str
     paper: str
@@ -69,7 +69,7 @@ class PaperRow:
 def beside_the_paper(
     scenario: Scenario, case: str, stability: Stability, coupling: CouplingFigures
 ) -> tuple[PaperRow, ...]:
-    """Every figure that the paper prints of its loop; none where the loop is another."""
+    """Every figure that the paper prints, beside ours; empty for any loop but the paper's."""
     if scenario.varying_delay or scenario.loop(case) != load().loop(case):
         return ()
     figure = _figure(case, stability)
@@ -97,7 +97,7 @@ def _printed_gains(scenario: Scenario, case: str, got: CouplingFigures) -> tuple
 
 def _tau(case: str) -> PaperRow:
     why = "inf sigma_min(E) = 0: moving both contacts together costs no static force"
-    return PaperRow("transparency index tau (25)", f"{PRINTED_TAU_DB[case]} dB", "infinite", why)
+    return PaperRow("transparency index tau (25)", f"{_PRINTED_TAU_DB[case]} dB", "infinite", why)
 
 
 def _figure(case: str, stability: Stability) -> PaperRow:
@@ -243,7 +243,7 @@ class UnevenTicks:
 
 
 def switched_stability(simulation: Simulation, trace: Trace, delays: VaryingDelays) -> Stability:
-    """As stability_of, for a loop that switches: it has no eigenvalue of its own but over a period."""
+    """stability_of for delays that switch: such a loop has eigenvalues only over a period of the switching."""
     met = delays.met
     assert met is not None
     constant = eigenvalues(dominant_mode(close(simulation.plant, simulation.F)))

@@ -13,7 +13,7 @@ import tempfile
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,13 +21,10 @@ import msgspec
 import numpy as np
 
 from controller.coupling import Coupling
-from controller.environment import environment, held
-from controller.limiter import limited
-from controller.loop import force_map
+from controller.loop import Loop
 from controller.lti import Array, Lti
 from controller.tick import Net, Process, StepBuffer
 from controller.timing import Timing
-from controller.walls import contact
 from design.own import called
 from models.hold import HeldPlant, hold
 from models.scene import Scene, build
@@ -55,12 +52,26 @@ class Simulation:
     """A scenario with its coupling, ready to run: what the computer does every tick, and the plant that it moves."""
 
     scenario: Scenario
-    E: Lti  # what is to be felt: the environment, with every wall touching
-    F: Lti  # what the devices feel while no wall touches
+    coupling: Coupling
     process: Process
     scene: Scene
     plant: HeldPlant  # for periods T, and forces that latch in the middle of their range
     timing: Timing | None = None  # of the ticks of a run, where they are not all alike
+
+    @cached_property
+    def loop(self) -> Loop:
+        """All that a design may know; the reference does not matter."""
+        return self.scenario.loop("I")
+
+    @cached_property
+    def E(self) -> Lti:
+        """What is to be felt: the environment, with every wall touching."""
+        return self.loop.E()
+
+    @property
+    def F(self) -> Lti:
+        """What the devices feel while no wall touches, at the constant delays."""
+        return self.process.law.open
 
     @property
     def friction(self) -> bool:
@@ -86,7 +97,7 @@ class Simulation:
     @property
     def felt(self) -> Lti:
         """What the devices feel of E: F with every wall touching."""
-        return list(self.process.frozen().values())[-1] if self.process.contact else self.F
+        return list(self.process.law.frozen().values())[-1]
 
 
 def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None = None, seed: int = 0) -> Simulation:
@@ -96,20 +107,13 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
     Raises SingularLoop where the algebraic loop of environment and coupling has no solution, InputError for walls that
     no compliance V stands before.
     """
-    network, delays = scenario.environment, (scenario.theta, scenario.psi)
-    if network.walls and coupling.holds_model:
+    if scenario.environment.walls and coupling.holds_model:
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
-    E = environment(held(network), scenario.T)
     limits, steps = (np.array([getattr(d, of) for d in scenario.device]) for of in ("force_limit", "encoder_step"))
-    if lag is not None:
-        walled = limited(network, coupling, *delays, scenario.T, limits, lag)
-    else:
-        walled = contact(network, coupling, *delays, scenario.T) if network.walls else None
-    F = walled.open if walled else force_map(E, coupling, *delays)
+    process = Process(scenario.loop("I").law(coupling, limits, lag), limits, steps)
     scene = build(scenario.device, scenario.human, scenario.person)
-    usual = hold(scene.plant, scenario.T, scenario.usual_latency)
-    timing = scenario.timing(seed, scenario.samples)
-    return Simulation(scenario, E, F, Process(F, limits, steps, walled), scene, usual, timing)
+    plant = hold(scene.plant, scenario.T, scenario.usual_latency)
+    return Simulation(scenario, coupling, process, scene, plant, scenario.timing(seed, scenario.samples))
 
 
 def run(
@@ -303,7 +307,7 @@ def make_engine(
 
 
 def engine_name(engine: AnyEngine) -> str:
-    """How reports name it."""
+    """The name of an engine in reports."""
     if isinstance(engine, str):
         return engine
     kind: Any = engine if hasattr(engine, "__qualname__") else type(engine)

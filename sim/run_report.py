@@ -1,4 +1,4 @@
-"""What a run came to: the figures of its report, and what a reader must know to read them rightly."""
+"""The report of a run: its figures, and remarks that explain them."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class RunReport:
         return bool(self.varying_delay and self.varying_delay.met)
 
     def notes(self) -> list[str]:
-        """What a reader must know to read the figures rightly."""
+        """Remarks that explain the figures."""
         lines, guarantee = [], self.judged.guarantee
         certificates = self.judged.requirements
         name = "any-environment" if self.certificate.condition == "any-environment" else "this-environment"

@@ -319,15 +319,15 @@ class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def held_by(scenario: Scenario, path: str | Path) -> Scenario:
-    """The scenario in the hands, or of the population, that a file names. Raises InputError as `load_humans` does."""
-    people = load_humans(path, scenario.channels)
+    """The scenario in the hands, or of the population, that a file names. Raises InputError as `_load_humans` does."""
+    people = _load_humans(path, scenario.channels)
     who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
     if people.population is not None:
         who["population"] = people.population
     return scenario.replace(**who)
 
 
-def load_humans(path: str | Path, channels: int) -> _HumanFile:
+def _load_humans(path: str | Path, channels: int) -> _HumanFile:
     """The humans of a file, one per channel, and who holds several devices.
 
     A Python file is run, and says who they are: `humans`, and `persons` if it likes, of any class (models.human.Hand).

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controller.limiter import Limiter
+from controller.law import State
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
 from controller.timing import Timing
-from controller.walls import State
 from design.files import unseen
 from models.hold import HeldPlant, at_the_latch, hold
 from models.scene import Scene, Variants
@@ -115,7 +114,7 @@ def dominant_mode(loop: ClosedLoop) -> Mode:
     return Mode(np.take_along_axis(values, largest, axis=-1)[..., 0].astype(complex), loop.T)
 
 
-def left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
+def _left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
     """The dominant mode's, (..., n), of unit length: left* A = lambda left*. No other mode contributes to left* xi."""
     values, vectors = np.linalg.eig(np.swapaxes(loop.A, -1, -2))
     largest = np.argmax(np.abs(values), axis=-1)[..., None, None]
@@ -164,7 +163,7 @@ def mujoco_loops(
 
 def _frozen_modes(simulation: Simulation) -> dict[State, Mode]:
     """The dominant mode of the exact loop for every set of walls that touch; one entry where there is no wall."""
-    return {walls: dominant_mode(close(simulation.plant, F)) for walls, F in simulation.process.frozen().items()}
+    return {walls: dominant_mode(close(simulation.plant, F)) for walls, F in simulation.process.law.frozen().items()}
 
 
 def worst_mode(simulation: Simulation) -> Mode:
@@ -185,7 +184,7 @@ _UNLIKE = 0.05  # rms of what y does beside the mode, relative to it: above, it 
 _AT_ONCE = 1 << 16  # ticks of a trace, whose states may be more than memory holds
 
 
-def measured_growth(
+def _measured_growth(
     loop: ClosedLoop, trace: Trace, force_limit: Array, ahead: int = 0
 ) -> tuple[float | None, str | None]:
     """The growth rate [1/s] of the loop's dominant mode in a trace, or None with the reason.
@@ -199,7 +198,7 @@ def measured_growth(
     if usable < _SHORTEST_TRACE:
         which = "ticks before the first clipped one" if clipped.any() else "ticks"
         return None, f"only {max(usable, 0)} {which}; a growth rate needs {_SHORTEST_TRACE}"
-    left = left_eigenvector(loop).conj()
+    left = _left_eigenvector(loop).conj()
     pushed = trace.w[:usable] @ (loop.B.T @ left)
     # what rounding is relative to: large parts that cancel in y, and the eigenvector's own zeros
     sizes = np.abs(left) + _VECTOR_ROUNDING / _NOISE_FLOOR * np.abs(left).max()
@@ -285,8 +284,8 @@ def stability_of(simulation: Simulation, trace: Trace) -> Stability:
         growth, reason = _timed_growth(simulation)
     else:
         loop = close(simulation.plant, simulation.F)
-        ahead = max(simulation.scenario.theta) if simulation.process.limiter else 0
-        growth, reason = measured_growth(loop, trace, simulation.process.force_limit, ahead)
+        ahead = max(simulation.scenario.theta) if simulation.process.law.bounds else 0
+        growth, reason = _measured_growth(loop, trace, simulation.process.force_limit, ahead)
     if trace.diverged:
         reason = "the simulation left the range of finite numbers: reported as unstable"
     exact = eigenvalues(worst_mode(simulation))
@@ -303,8 +302,7 @@ def stability_of(simulation: Simulation, trace: Trace) -> Stability:
 
 
 def _contact(simulation: Simulation, trace: Trace) -> _Contact:
-    walls = simulation.process.contact
-    assert walls is not None
+    walls = simulation.process.ticked
     touching = walls.depths(trace.z) > 0
     return _Contact(
         made=int((touching[1:] & ~touching[:-1]).sum() + touching[:1].sum()),
@@ -401,7 +399,7 @@ def impulse_growth(
     `states` is the order of the plant.
 
     The growth [1/s] is that of the handles' speeds from the second quarter to the last: inf where numbers overflow,
-    -inf at exact rest. Of an `unlimited` process it does not depend on the size of the impulse.
+    -inf at exact rest. Of an unlimited process it does not depend on the size of the impulse.
     """
     T, quarter, limit = process.F.T, ticks // 4, process.force_limit[:, None]
     speeds, clipped = _Speeds(scene, nsim, (quarter, 2 * quarter), (ticks - quarter, ticks)), np.zeros(nsim, dtype=bool)
@@ -416,17 +414,9 @@ def impulse_growth(
     return np.where(speeds.late == 0, -np.inf, np.where(np.isnan(rate), np.inf, rate)), clipped
 
 
-def unlimited(process: Process) -> Process:
-    """The linear process: without force limits and encoder steps."""
-    endless, contact = np.full(process.channels, np.inf), process.contact
-    if isinstance(contact, Limiter):
-        contact = replace(contact, limit=endless)
-    return replace(process, force_limit=endless, encoder_step=np.zeros(process.channels), contact=contact)
-
-
 def linear_growth(simulation: Simulation, ticks: int) -> tuple[float, float]:
     """(rate [1/s], window [s]) of the exact linear loop after an impulse, with its timing and its delays."""
-    free = replace(simulation.smooth, process=unlimited(simulation.process))
+    free = replace(simulation.smooth, process=simulation.process.unlimited)
     T, states = simulation.scenario.T, simulation.plant.A.shape[0]
     rate, _ = impulse_growth(free.process, make_engine(free, "exact"), free.scene, states, ticks)
     window = float(beginnings(T, simulation.timing, ticks, 1)[0])
@@ -463,11 +453,10 @@ class _Audit:
         self, process: Process, scene: Scene, loops: ClosedLoop, delta: Array, ticks: int, latch: Latch | None
     ) -> None:
         nsim, self._latch = loops.A.shape[0], latch
-        self._limit, self._limiter = process.force_limit[:, None], process.limiter
-        self._contact = process.contact if process.walls else None
+        self._limit, self._law = process.force_limit[:, None], process.ticked
         self._made, self._touching = np.zeros(nsim, dtype=int), np.zeros((len(process.walls), nsim), dtype=bool)
         self._B, self._T, self._damping = loops.B, loops.T, delta[:, None] / loops.T
-        self._left = left_eigenvector(loops)  # (nsim, n)
+        self._left = _left_eigenvector(loops)  # (nsim, n)
         self._speeds = _Speeds(scene, nsim, (ticks // 4, ticks // 2), (ticks - ticks // 4, ticks))
         self._linear = np.ones(nsim, dtype=bool)
         self._usable, self._clipped = np.zeros(nsim, dtype=int), np.zeros(nsim, dtype=int)
@@ -477,10 +466,10 @@ class _Audit:
     def see(self, buffer: StepBuffer, first: int, count: int) -> None:
         """Take in the first `count` rows of the buffer; row 0 is tick `first`."""
         z, s, w, f = (rows[: count + 1] for rows in (buffer.z, buffer.s, buffer.w, buffer.f))
-        limiter = self._limiter  # acts before its force arrives
-        clipped = (limiter.slips(z) != 0 if limiter else np.abs(f[:count]) >= self._limit).any(axis=1)  # (ticks, nsim)
-        if self._contact:
-            touching = np.concatenate([self._touching[None], self._contact.depths(z) > 0])
+        law = self._law
+        clipped = law.limited(z, f[:count], self._limit).any(axis=1)  # (ticks, nsim)
+        if law.walls:
+            touching = np.concatenate([self._touching[None], law.depths(z) > 0])
             self._made += (touching[1:] & ~touching[:-1]).sum(axis=(0, 1))
             self._touching = touching[-1]
         linear = self._linear & ~np.logical_or.accumulate(clipped, axis=0)
@@ -488,7 +477,7 @@ class _Audit:
         self._usable += linear.sum(axis=0)
         self._linear = linear[-1]
 
-        audited = np.ones_like(linear) if limiter else linear
+        audited = np.ones_like(linear) if law.bounds else linear
         work, spent = (np.where(audited[:, None], part, 0.0).sum(axis=1) for part in self._balance(buffer, count))
         energy = self._energy + np.cumsum(work + spent, axis=0)
         self._least = np.minimum(self._least, energy.min(axis=0))
@@ -496,7 +485,7 @@ class _Audit:
         self._size += (np.abs(work) + spent).sum(axis=0)
 
         self._speeds.see(buffer, first, count)
-        if self._contact:  # no one linear loop whose mode could be followed
+        if law.walls:  # no one linear loop whose mode could be followed
             return
         xi = np.concatenate([s, z], axis=1)
         y = np.einsum("ns,ksn->kn", self._left.conj(), xi)

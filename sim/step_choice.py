@@ -31,7 +31,7 @@ _UNIT = 1e-6
 
 
 @dataclass(frozen=True)
-class PlantSpeed:
+class _PlantSpeed:
     """How fast a plant moves."""
 
     mode: float  # [rad/s] its fastest weakly damped mode, 0 where there is none
@@ -52,11 +52,11 @@ class PlantSpeed:
         return f"the damping of {self.rate:.4g} 1/s times the step is {self.rate * h:.3g}"
 
 
-def pace(A: Array) -> PlantSpeed:
+def pace(A: Array) -> _PlantSpeed:
     """The pace of x' = A x, or the fastest of many. Weakly damped is what turns faster than it decays."""
     values = np.linalg.eigvals(A)
     weak = np.abs(values.imag) > np.abs(values.real)
-    return PlantSpeed(float(np.abs(values[weak]).max(initial=0.0)), float(-values.real.min(initial=0.0)))
+    return _PlantSpeed(float(np.abs(values[weak]).max(initial=0.0)), float(-values.real.min(initial=0.0)))
 
 
 def settle(
@@ -175,4 +175,4 @@ def simulated_growth(
 ) -> float:
     """The growth rate [1/s] of the loop that an engine simulates with these settings; of walls, in the worst state."""
     held = measured_hold(simulation, engine, integrator, substeps)
-    return max(float(dominant_mode(close(held, F)).growth) for F in simulation.process.frozen().values())
+    return max(float(dominant_mode(close(held, F)).growth) for F in simulation.process.law.frozen().values())

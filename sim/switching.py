@@ -20,9 +20,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Coupling
 from controller.delay import LOST, Ticks, VaryingDelay, realising
-from controller.loop import DelayRange, force_map
+from controller.loop import DelayRange
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
 from design.coverage import Switching
@@ -35,7 +34,7 @@ from sim.engines import Engine, ExactEngine, ExactTimedEngine
 from sim.mujoco_engines import MujocoBatchEngine
 from sim.run import Simulation
 from sim.scenario import Scenario
-from sim.stability import impulse_forces, impulse_growth, unlimited
+from sim.stability import impulse_forces, impulse_growth
 
 _SEARCHED = 1600  # ticks of greedy switching in which the worst period is sought
 _LONGEST_PERIOD = 250  # [ticks]
@@ -58,38 +57,22 @@ class Period:
 # ---- one run
 
 
-def switching(
-    simulation: Simulation, coupling: Coupling, seed: int, ticks: int, index: int = 0
-) -> tuple[Simulation, Period | None]:
-    """The loop with the scenario's varying delays, and their period where they are adversarial."""
+def switching(simulation: Simulation, seed: int, ticks: int, index: int = 0) -> tuple[Simulation, Period | None]:
+    """The loop with the scenario's varying delays in place of theta, and their period where they are adversarial."""
     varying = simulation.scenario.varying_delay
     assert varying is not None
-    period = worst_switching(simulation, coupling, varying) if varying.pattern == "adversarial" else None
+    period = _worst_switching(simulation, varying) if varying.pattern == "adversarial" else None
     given = period.delays if period else None
     delays = _draw_delays(simulation.scenario, seed, index, max(ticks, _SHORTEST), given)
-    return with_delays(simulation, coupling, delays[:, :, None]), period
+    return replace(simulation, process=replace(simulation.process, delays=delays[:, :, None])), period
 
 
-def with_delays(simulation: Simulation, coupling: Coupling, delays: Ticks) -> Simulation:
-    """The same loop with packets that take `delays` (ticks, m, nsim or 1) in place of the constant theta.
-
-    `simulation.F` stays that of the constant theta: certificates and transparency are about it.
-    """
-    process = replace(simulation.process, F=without_theta(simulation, coupling), delays=delays)
-    return replace(simulation, process=process)
-
-
-def worst_switching(simulation: Simulation, coupling: Coupling, varying: VaryingDelay) -> Period:
+def _worst_switching(simulation: Simulation, varying: VaryingDelay) -> Period:
     """The periodic switching within the range that was found to grow fastest in this loop."""
-    G, plant = without_theta(simulation, coupling), simulation.plant
+    plant, process = simulation.plant, simulation.process
     one = HeldPlant(plant.A[None], plant.B[None], plant.C, plant.T)
-    ages = greedy_ages(replace(simulation.process, F=G), one, simulation.scene, varying, _SEARCHED)
-    return _worst_period(ages[:, :, 0], plant, G, varying)
-
-
-def without_theta(simulation: Simulation, coupling: Coupling) -> Lti:
-    """G = (I + Psi E V)^-1 Psi E: the forces as they leave for the devices."""
-    return force_map(simulation.E, coupling, (0,) * simulation.process.channels, simulation.scenario.psi)
+    ages = _greedy_ages(process, one, simulation.scene, varying, _SEARCHED)
+    return _worst_period(ages[:, :, 0], plant, process.law.sent, varying)
 
 
 def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: Ticks | None = None) -> Ticks:
@@ -103,7 +86,7 @@ def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: T
 # ---- the worst delays
 
 
-def mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[int]) -> Array:
+def _mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[int]) -> Array:
     """A of xi[k+1] = A xi[k] while the forces in use have these ages [samples], age_i <= depth_i."""
     states, m = plant.A.shape[0], G.outputs
     n, first = states + G.order + sum(depth), states + G.order
@@ -126,13 +109,14 @@ def mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[i
     return A
 
 
-def greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: VaryingDelay, ticks: int) -> Ticks:
-    """Ages (ticks, m, nsim) that feed the linear loop of every plant; `process` is that without Theta."""
+def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: VaryingDelay, ticks: int) -> Ticks:
+    """Ages (ticks, m, nsim) that feed the linear loop of every plant."""
     nsim, states, nv = plants.A.shape[0], plants.A.shape[1], scene.model.nv
-    m, free = process.channels, np.full(process.channels, np.inf)
+    m, law = process.channels, process.law.without_theta
+    free = replace(process, law=law, force_limit=np.full(m, np.inf), delays=None)
     lo, hi = (np.array(side)[:, None] for side in (varying.lo, varying.hi))
     depth = int(hi.max()) + 1
-    buffer = StepBuffer(replace(process, force_limit=free, delays=None), 1, states, scene.outside, nsim)
+    buffer = StepBuffer(free, 1, states, scene.outside, nsim)
     engine = ExactEngine(plants)
     engine.start(buffer)
     pushed = impulse_forces(scene, process.F.T, 0, ticks)
@@ -160,7 +144,7 @@ def greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Vary
 def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay) -> Period:
     """The fastest growing repetition of a window of `ages` (ticks, m), or of one delay at an end of its range."""
     ticks = ages.shape[0]
-    matrix = cache(lambda *now: mode_matrix(plant, G, varying.hi, now))
+    matrix = cache(lambda *now: _mode_matrix(plant, G, varying.hi, now))
     best, chosen = -np.inf, ages[:1]
     starts = np.linspace(ticks // 3, max(ticks - _LONGEST_PERIOD, ticks // 3), _STARTS, dtype=int)
     ends = [np.array([row]) for row in product(*zip(varying.lo, varying.hi, strict=True))][:_MOST_ENDS]
@@ -208,7 +192,6 @@ class Switched:
 
 def switched_crowd(
     simulation: Simulation,
-    coupling: Coupling,
     held_by: Variants,
     index: NDArray[np.intp],
     seed: int,
@@ -223,18 +206,16 @@ def switched_crowd(
     scenario, nsim, scene = simulation.scenario, len(held_by), held_by.scene
     plants = hold(held_by.plants(), scenario.T, scenario.usual_latency)
     states = plants.A.shape[1]
-    free = replace(simulation.process, F=without_theta(simulation, coupling)) if scenario.switches else None
 
     def judged(ticks: int) -> Switched:
         process, timing = simulation.process, scenario.timing(seed, ticks)
-        if free:
-            process = replace(free, delays=_crowd_delays(scenario, free, scene, plants, index, seed, ticks))
-        endless = unlimited(process)
+        if scenario.switches:
+            process = replace(process, delays=_crowd_delays(scenario, process, scene, plants, index, seed, ticks))
         if timing:
             moved: Engine = ExactTimedEngine(held_by.plants(), timing)
         else:
             moved = ExactEngine(plants)
-        exact, _ = impulse_growth(endless, moved, scene, states, ticks, nsim)
+        exact, _ = impulse_growth(process.unlimited, moved, scene, states, ticks, nsim)
         if not mujoco:
             return Switched(exact, np.full(nsim, np.nan))
         engine = MujocoBatchEngine(scene, scenario.T, nsim=nsim, nthread=threads, humans=held_by, timing=timing)
@@ -263,7 +244,7 @@ def _crowd_delays(
     assert scenario.varying_delay is not None
     given: list[Ticks | None] = [None] * len(index)
     if scenario.varying_delay.pattern == "adversarial":
-        worst = realising(greedy_ages(process, plants, scene, scenario.varying_delay, ticks))
+        worst = realising(_greedy_ages(process, plants, scene, scenario.varying_delay, ticks))
         given = [worst[:, :, j] for j in range(len(index))]
     numbered = zip(index.tolist(), given, strict=True)
     return np.stack([_draw_delays(scenario, seed, i, ticks, own) for i, own in numbered], axis=2)

@@ -161,14 +161,14 @@ class EnergyAudit:
         return f"{self.audited - self.violated} of {self.audited}{left}"
 
 
-Met = TypeVar("Met")  # which delays, or which ticks
+_Met = TypeVar("_Met")  # which delays, or which ticks
 
 
 @dataclass(frozen=True)
-class Growing(Generic[Met]):
+class Growing(Generic[_Met]):
     """How many humans grow while delays or ticks vary; it holds unless certificates cover these and one grows."""
 
-    met: Met = unseen("beside")
+    met: _Met = unseen("beside")
     covered: bool = unseen()  # by certificates
     unstable: Unstable = unseen()
     humans: int = unseen()
@@ -178,7 +178,7 @@ class Growing(Generic[Met]):
     holds: bool = unseen()
 
     @classmethod
-    def of(cls, findings: Findings, met: Met, covered: bool) -> Growing[Met]:
+    def of(cls, findings: Findings, met: _Met, covered: bool) -> Growing[_Met]:
         exact, mujoco = findings.switching, findings.switching_mujoco
         seen, mujoco = ~np.isnan(exact), mujoco[~np.isnan(mujoco)]
         grow = Unstable(int((exact > 0).sum()), int((mujoco > 0).sum()) if mujoco.size else None)
@@ -233,6 +233,6 @@ def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
 
 
 def largest(values: Array) -> float | None:
-    """Of the finite ones; None where there is none."""
+    """The largest finite value; None where there is none."""
     values = values[np.isfinite(values)]
     return float(values.max()) if values.size else None

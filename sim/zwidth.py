@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from controller import environment
 from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.delay import delay
-from controller.limiter import Limiter, limited
+from controller.law import Law
+from controller.limiter import Limiter
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
 from controller.tick import Process
-from controller.walls import contact
 from design import conditions
 from design.audit import check_loop, edge
 from design.coverage import covered_limits
@@ -56,15 +56,15 @@ class _Sweep:
     population: Population
     loop: Loop  # without ranges and with constant delays
 
-    def _ratios(self, F: Lti, sent: Callable[[Complex], Sampled]) -> Array:
-        """this-environment's ratios, (n,), of the force maps F, whose responses without Theta are `sent`."""
-        theta = delay(self.loop.theta, self.loop.T)
+    def _ratios(self, loop: Loop, coupling: Coupling) -> Array:
+        """this-environment's ratios, (n,), of a loop and a coupling of which one is a stack."""
+        theta = delay(loop.theta, loop.T)
 
         def at(z: Complex) -> Sampled:
-            G = sent(z)
+            G = loop.sent_at(coupling, z)
             return as_like(G, theta) @ G
 
-        return conditions.this_environment_ratios(at, F.poles(), self.loop)
+        return conditions.this_environment_ratios(at, loop.F(coupling).poles(), loop)
 
     def _limits(self, devices: Sequence[Device]) -> tuple[Array, Array]:
         """Force limits [N] and encoder steps [m], (m,) each."""
@@ -83,11 +83,9 @@ class CouplingSweep(_Sweep):
         check_loop(self.loop)
 
     @property
-    def walled(self) -> environment.Network | None:
-        """The network whose contact is made and broken in the simulated loop, if there is one."""
-        if self.one_sided:
-            return _HARD_WALL
-        return self.loop.network if self.loop.environment.walls else None
+    def simulated(self) -> Loop:
+        """With the contact that is made and broken in MuJoCo, if there is one."""
+        return self.loop.at(_HARD_WALL) if self.one_sided else self.loop
 
     @property
     def usual_scale(self) -> str:
@@ -101,12 +99,12 @@ class CouplingSweep(_Sweep):
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """What is asked of every cell."""
+        """The conditions that every cell is judged by."""
         return tuple(CONDITIONS)
 
     @property
     def refusals(self) -> dict[str, str]:
-        """Conditions that say nothing of any cell, and why."""
+        """Conditions that do not apply to this map, with the reason."""
         reason = self.multiplier[1]
         return {"any-environment": reason} if reason else {}
 
@@ -127,38 +125,25 @@ class CouplingSweep(_Sweep):
 
         Where motors have limits, forces leave through the limiter that a guarantee covers; the rest are clipped.
         """
-        limits = self._limits(devices)
-        if (limits[0] < limit_cycles.UNLIMITED).any() and not self.clip:
-            return [Process(limiter.open, *limits, limiter) for limiter in self._limiters(K, B, limits[0])]
-        if self.walled is None:
-            F = self.force_maps(K, B)[0]
-            return [Process(F[i], *limits) for i in range(K.size)]
-        V = self._couplings(K, B).compliance(self.loop.T)
-        timing = self.loop.theta, self.loop.psi, self.loop.T
-        walls = [contact(self.walled, Compliance(V[i]), *timing) for i in range(K.size)]
-        return [Process(each.open, *limits, each) for each in walls]
+        limits, steps = self._limits(devices)
+        loop, V = self.simulated, self._couplings(K, B).compliance(self.loop.T)
+        limited = not self.clip and (limits < limit_cycles.UNLIMITED).any()
+        limiters = [self._limiter(k, b, limits) if limited else () for k, b in zip(K.tolist(), B.tolist(), strict=True)]
+        return [Process(loop.law(Compliance(V[i]), *limiters[i]), limits, steps) for i in range(K.size)]
 
-    def _limiters(self, K: Array, B: Array, force_limit: Array) -> Iterator[Limiter]:
-        """Those of the couplings; one that is not covered never slips, so that its motors clip."""
-        loop, couplings = self.loop, self._couplings(K, B)
-        sent, V = loop.sent(couplings) if self.walled is None else None, couplings.compliance(loop.T)
-        for i, (k, b) in enumerate(zip(K.tolist(), B.tolist(), strict=True)):
-            coupling = SpringDamper([k] * loop.channels, [b] * loop.channels, self.cutoff)
-            requirements = {name: self.requirement(name, k, b) for name in CONDITIONS}
-            rho = covered_limits(loop, coupling, requirements).rho
-            if self.one_sided and rho and any(rho):
-                rho = None  # a proof of the wall that holds
-            limit, lag = force_limit if rho else np.full(loop.channels, np.inf), rho or (0.0,) * loop.channels
-            if sent:
-                yield Limiter(sent[i], loop.theta, limit, np.array(lag))
-            elif self.walled:
-                yield limited(self.walled, Compliance(V[i]), loop.theta, loop.psi, loop.T, limit, lag)
+    def _limiter(self, K: float, B: float, force_limit: Array) -> tuple[Array, Array]:
+        """Limit and rho of the limiter of one coupling; one that is not covered never slips, and its motors clip."""
+        coupling = self._coupling(K, B)
+        rho = covered_limits(self.loop, coupling, {name: self.requirement(name, K, B) for name in CONDITIONS}).rho
+        if rho is None or (self.one_sided and any(rho)):  # which is a proof of the wall that holds
+            return np.full(self.loop.channels, np.inf), np.zeros(self.loop.channels)
+        return force_limit, np.array(rho)
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough. Of walls, in the worst state."""
         if condition == "this-environment":
             couplings = self._couplings(K, B)
-            return np.max([self._this_environment_ratios(state, couplings) for state in self._states], axis=0)
+            return np.max([self._ratios(state, couplings) for state in self._states], axis=0)
         phi, reason = self.multiplier
         if reason:
             return np.full(K.size, np.inf)
@@ -176,11 +161,14 @@ class CouplingSweep(_Sweep):
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """The same of one coupling by a sweep of its own, which a map is checked against."""
         loop = self.loop
-        coupling = SpringDamper([K] * loop.channels, [B] * loop.channels, self.cutoff)
+        coupling = self._coupling(K, B)
         if condition == "this-environment":
             states = [conditions.this_environment(s.F(coupling), loop) for s in self._states]
             return max(states, key=lambda requirement: requirement.ratio)
         return ANY_ENVIRONMENT.required(loop, coupling, self.multiplier[0])
+
+    def _coupling(self, K: float, B: float) -> SpringDamper:
+        return SpringDamper([K] * self.loop.channels, [B] * self.loop.channels, self.cutoff)
 
     def _couplings(self, K: Array, B: Array, channels: int | None = None) -> SpringDamper:
         m = channels or self.loop.channels
@@ -191,9 +179,6 @@ class CouplingSweep(_Sweep):
     def _states(self) -> tuple[Loop, ...]:
         """The loop in each frozen contact state, all walls touching first."""
         return self.loop.frozen()[::-1]
-
-    def _this_environment_ratios(self, loop: Loop, couplings: SpringDamper) -> Array:
-        return self._ratios(loop.F(couplings), lambda z: loop.sent_at(couplings, z))
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +198,7 @@ class EnvironmentSweep(_Sweep):
     coupling: Coupling
     lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of its limiter, in every environment; None: motors clip
 
-    cutoff = walled = None  # a velocity filter and contact made and broken belong to the other sweep
+    cutoff = None  # a velocity filter belongs to the other sweep
     usual_scale = "log"
 
     def __post_init__(self) -> None:
@@ -227,6 +212,11 @@ class EnvironmentSweep(_Sweep):
             raise ValueError("environment: no spring or damper ends at a contact, so there is no K and B to vary")
 
     @property
+    def simulated(self) -> Loop:
+        """Contact made and broken belongs to the other sweep."""
+        return self.loop
+
+    @property
     def stiffness_scale(self) -> float:
         """What the middle of the map is about [N/m]: the geometric mean of these springs."""
         stiff = [s.stiffness for s in contact_springs(self.loop.network) if s.stiffness > 0]
@@ -234,12 +224,12 @@ class EnvironmentSweep(_Sweep):
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """What is asked of every cell."""
+        """The conditions that every cell is judged by."""
         return (*CONDITIONS, MODEL_KEPT) if self._kept else tuple(CONDITIONS)
 
     @property
     def refusals(self) -> dict[str, str]:
-        """Conditions that say nothing of any cell, and why."""
+        """Conditions that do not apply to this map, with the reason."""
         if any(self.loop.psi):
             why = "with delay in the environment it takes a multiplier for each: ask design.audit about single ones"
             return {"any-environment": why}
@@ -248,36 +238,32 @@ class EnvironmentSweep(_Sweep):
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """F in every environment, the coupling's model following it; one stack, since there is no contact to freeze."""
-        return (self._force_map(self._matrices(K, B), self.coupling),)
+        return (self._at(K, B).F(self.coupling),)
 
     def processes(self, K: Array, B: Array, devices: Sequence[Device]) -> list[Process]:
         """What the computer does every T in each environment; limits and encoder steps are those of `devices`."""
-        limits = self._limits(devices)
-        if self.lag is None or not (limits[0] < limit_cycles.UNLIMITED).any():
-            F = self.force_maps(K, B)[0]
-            return [Process(F[i], *limits) for i in range(K.size)]
-        sent, lag = self._sent(self._matrices(K, B), self.coupling), np.array(self.lag)
-        limiters = [Limiter(sent[i], self.loop.theta, limits[0], lag) for i in range(K.size)]
-        return [Process(limiter.open, *limits, limiter) for limiter in limiters]
+        (limits, steps), theta = self._limits(devices), self.loop.theta
+        sent, limited = self._at(K, B).sent(self.coupling), (limits < limit_cycles.UNLIMITED).any()
+        laws = [
+            Law(sent[i], theta)
+            if self.lag is None or not limited
+            else Limiter(sent[i], theta, limit=limits, rho=self.lag)
+            for i in range(K.size)
+        ]
+        return [Process(law, limits, steps) for law in laws]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough."""
         if condition == "any-environment":
             return np.full(K.size, self._any_environment.ratio)
-        matrices, coupling, psi = self._matrices(K, B), self._facing(condition), delay(self.loop.psi, self.loop.T)
-
-        def sent(z: Complex) -> Sampled:
-            E = environment.sampled_environment(matrices, self.loop.channels, z, self.loop.T)
-            return coupling.around(as_like(E, psi) @ E)
-
-        return self._ratios(self._force_map(matrices, coupling), sent)
+        return self._ratios(self._at(K, B), self._facing(condition))
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """The damping that the condition asks of the devices in one environment, by a sweep of its own."""
         if condition == "any-environment":
             return self._any_environment
         try:
-            F = self._force_map(self._matrices(np.array([K]), np.array([B])), self._facing(condition))[0]
+            F = self._at(np.array([K]), np.array([B])).F(self._facing(condition))[0]
             return conditions.this_environment(F, self.loop)
         except SingularLoop as error:
             return refusal("this-environment", self.loop.delta, str(error))
@@ -297,15 +283,8 @@ class EnvironmentSweep(_Sweep):
     def _kept(self) -> Coupling | None:
         return self.coupling.with_model(self.loop.sent(NoCoupling()))
 
-    def _sent(self, matrices: environment.Matrices, coupling: Coupling) -> Lti:
-        loop = self.loop
-        return coupling.around(delay(loop.psi, loop.T) @ environment.environment_of(matrices, loop.channels, loop.T))
-
-    def _force_map(self, matrices: environment.Matrices, coupling: Coupling) -> Lti:
-        return delay(self.loop.theta, self.loop.T) @ self._sent(matrices, coupling)
-
-    def _matrices(self, K: Array, B: Array) -> environment.Matrices:
-        """Mass, damping and stiffness of every network, (n, nodes, nodes)."""
+    def _at(self, K: Array, B: Array) -> Loop:
+        """The loop around all these environments, (n,), as a stack."""
         network = self.loop.network
         M, D, S = network.matrices()
         varied = contact_springs(network)
@@ -314,14 +293,15 @@ class EnvironmentSweep(_Sweep):
             one = np.outer(across, across)
             pattern, D, S = pattern + one, D - spring.damping * one, S - spring.stiffness * one
         vary = lambda fixed, value: fixed + np.asarray(value)[:, None, None] * pattern  # noqa: E731
-        return np.broadcast_to(M, (np.size(K), *M.shape)), vary(D, B), vary(S, K)
+        M = np.broadcast_to(M, (np.size(K), *M.shape))
+        return self.loop.at(environment.Networks(network.contacts, (M, vary(D, B), vary(S, K))))
 
 
 Sweep = CouplingSweep | EnvironmentSweep
 
 
 def contact_springs(network: environment.Network) -> tuple[environment.Spring, ...]:
-    """Those that end at a contact."""
+    """The springs that end at a contact."""
     return tuple(s for s in network.springs if set(s.between) & set(network.contacts))
 
 
@@ -338,11 +318,11 @@ def one_sided(network: environment.Network) -> environment.Network:
     return environment.Network(network.contacts, kept, network.masses, (*network.walls, *walls))
 
 
-def _press_directions(network: environment.Network | None, channels: int) -> Array:
+def _press_directions(loop: Loop) -> Array:
     """(m,) +1 or -1: into the walls where contacts have some, else alternately."""
-    directions = (-1.0) ** np.arange(channels)
-    for i, name in enumerate(network.contacts if network else ()):
-        for wall in network.walls if network else ():
+    directions = (-1.0) ** np.arange(loop.channels)
+    for i, name in enumerate(loop.environment.contacts):
+        for wall in loop.environment.walls:
             if name in wall.between:
                 directions[i] = 1.0 if wall.between[0] == name else -1.0
     return directions
@@ -486,7 +466,7 @@ def draw_map(
     if not stopped and plan.points:
         begin = time.perf_counter()
         cells = grid.subset(plan.points)
-        press = plan.press * _press_directions(sweep.walled, sweep.loop.channels)
+        press = plan.press * _press_directions(sweep.simulated)
         points, stopped = limit_cycles.simulate_cells(
             cells, loops, held, plan, press, lambda k, of: progress("MuJoCo", k, of)
         )
@@ -616,7 +596,7 @@ def _edge(sweep: Sweep, condition: str, low: float, high: float, B: float) -> fl
 
 
 def _growth(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: float) -> Array:
-    """Of every human, in the worst contact state."""
+    """Growth with every human, in the worst contact state [1/s]."""
     states = sweep.force_maps(np.array([K]), np.array([B]))
     return np.max([held.growth(F[0])[0] for F in states], axis=0)
 
@@ -629,7 +609,7 @@ def _bisected(calm: Callable[[float], bool], low: float, high: float) -> float:
 
 
 def _last(tried: Array, safe: NDArray[np.bool_], between: Callable[[float, float], float]) -> float | None:
-    """Where safety ends for the last time; inf where it does not, None where nothing is safe."""
+    """The largest value that is safe; inf where all are, None where none is."""
     if not safe.any():
         return None
     last = int(np.flatnonzero(safe)[-1])

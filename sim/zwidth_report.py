@@ -74,7 +74,7 @@ class _Point:
 
 
 @dataclass(frozen=True)
-class Marked:
+class _Marked:
     """What is asked about a single coupling."""
 
     K: float
@@ -85,7 +85,7 @@ class Marked:
     stiffest_K_at_this_B: dict[str, float | str | None] = unseen()
 
     @classmethod
-    def of(cls, mark: Mark) -> Marked:
+    def of(cls, mark: Mark) -> _Marked:
         stiffest: dict[str, float | str | None] = {
             name: "beyond the map" if K is not None and np.isinf(K) else K for name, K in mark.stiffest.items()
         }
@@ -163,11 +163,11 @@ class _Simulated:
             [device.encoder_step for device in devices],
             [device.friction for device in devices],
             [d.force_limit for d in devices] if plan.effects.saturation else None,
-            sweep.walled is not None,
+            bool(sweep.simulated.environment.walls),
         )
         return cls(
             effects,
-            plan.effects.nonlinear(sweep.devices) or sweep.walled is not None,
+            plan.effects.nonlinear(sweep.devices) or bool(sweep.simulated.environment.walls),
             plan.trials,
             plan.duration,
             plan.start,
@@ -211,7 +211,7 @@ class MapReport:
     ratios: dict[str, _Ratio] = unseen("beside")
     fixed: FixedCoupling | None = unseen("beside")  # of a map over environments
     error: dict[str, MapError | None] | None = unseen("given")
-    marks: list[Marked] | None = unseen("given")
+    marks: list[_Marked] | None = unseen("given")
     not_covered: str = CAVEATS
 
     @classmethod
@@ -226,7 +226,7 @@ class MapReport:
         humans: int,
         seed: int,
     ) -> MapReport:
-        """Of a map that met `humans` random humans for each device."""
+        """The report of a map; `humans` were drawn for each device."""
         loop, whole, rigid = sweep.loop, not drawn.interrupted, sweep.loop.environment is RIGID_WALL
         ratios = {name: _ratio(sweep, drawn, name) for name in drawn.ratio}
         simulation = _Simulated.of(sweep, drawn, plan)
@@ -241,7 +241,7 @@ class MapReport:
             loop.psi,
             loop.delta,
             sweep.cutoff,
-            sweep.walled is not None,
+            bool(sweep.simulated.environment.walls),
             list(drawn.ratio),
             _Grid(drawn.grid.K, drawn.grid.B, drawn.grid.scale),
             _population(drawn, humans, seed),
@@ -254,7 +254,7 @@ class MapReport:
             ratios,
             fixed,
             {name: map_error(sweep, drawn, name) for name in drawn.ratio} if whole else None,
-            [Marked.of(mark) for mark in marks] if whole else None,
+            [_Marked.of(mark) for mark in marks] if whole else None,
         )
 
     @property
@@ -269,7 +269,7 @@ def _ratio(sweep: Sweep, drawn: Map, name: str) -> _Ratio:
 
 
 def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
-    """Why a condition has cells without a figure, in words of one such cell; None where it has none."""
+    """Why some cells have no figure, by the example of one of them; None where all have one."""
     if name in sweep.refusals:
         return sweep.refusals[name]
     ratio, (K, B) = drawn.ratio[name], drawn.grid.flat

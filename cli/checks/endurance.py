@@ -41,7 +41,7 @@ class _Endured:
 _Mark = Callable[[float], None]  # is told what share of the work is done
 
 
-def long_session(mark: _Mark, seconds: float = 3600.0) -> tuple[bool, str]:
+def _long_session(mark: _Mark, seconds: float = 3600.0) -> tuple[bool, str]:
     """A session of the default loop in virtual time, armed for `seconds`; whether it ended as planned, and how."""
     scenario = load()
     made = certified_couplings(scenario, "I", None, None, 1, spare=0)
@@ -55,7 +55,7 @@ def long_session(mark: _Mark, seconds: float = 3600.0) -> tuple[bool, str]:
     return ends, f"{session.stage} ({session.cause}) after {session.counters.states} ticks"
 
 
-def many_hands(mark: _Mark, count: int = 100_000) -> tuple[bool, str]:
+def _many_hands(mark: _Mark, count: int = 100_000) -> tuple[bool, str]:
     """Random hands on the default loop with its usual coupling, by eigenvalues; whether all are stable."""
     scenario = load()
     question = Validation(scenario, choose(scenario, "I", "spring-damper").coupling, 0, count, 1, "exact", 0.0)
@@ -69,8 +69,8 @@ _Work = Callable[[_Mark], tuple[bool, str]]
 #: what is done, and by how much its peak of memory may rise after a tenth of it [MiB]: a session keeps nothing of a
 #: tick, a crowd 128 bytes of a hand, twice while its batches are joined
 _LONG: tuple[tuple[str, _Work, float], ...] = (
-    ("an hour of a session", long_session, 8.0),
-    ("100,000 hands", many_hands, 32.0),
+    ("an hour of a session", _long_session, 8.0),
+    ("100,000 hands", _many_hands, 32.0),
 )
 
 
@@ -92,12 +92,12 @@ def endurance(seed: int) -> Iterator[_Endured]:
 
 
 def _alone(work: _Work, allowed: float, there: Connection) -> None:
-    """Of the process that does it, which ends with the one that waits."""
+    """Run in a process of its own, which ends when the waiting one does."""
     as_worker()
-    there.send(endure(work, allowed))
+    there.send(_endure(work, allowed))
 
 
-def endure(work: _Work, allowed: float) -> _Endured:
+def _endure(work: _Work, allowed: float) -> _Endured:
     """Do it, and look at this process's peak of memory after a tenth and at the end [MiB]."""
     peaks: list[float] = []
 

@@ -257,12 +257,12 @@ class _FaultOutcome:
 
 def rehearse_faults() -> list[_FaultOutcome]:
     """Every case with the default scenario and lively people, in virtual time; some seconds in all."""
-    scenario = lively(load())
+    scenario = _lively(load())
     made = certified_couplings(scenario, "I", None, None, 1, spare=1)
-    return [rehearse_case(case, scenario, made)[1] for case in CASES]
+    return [_rehearse_case(case, scenario, made)[1] for case in CASES]
 
 
-def lively(scenario: Scenario) -> Scenario:
+def _lively(scenario: Scenario) -> Scenario:
     """People who move at full amplitude soon after arming, so that a fault finds a force to take away."""
     people = tuple(
         msgspec.structs.replace(h, voluntary=h.voluntary and msgspec.structs.replace(h.voluntary, ease=0.1, phase=0.8))
@@ -271,7 +271,7 @@ def lively(scenario: Scenario) -> Scenario:
     return scenario.replace(human=people)
 
 
-def rehearse_case(
+def _rehearse_case(
     case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...]
 ) -> tuple[Rehearsal, _FaultOutcome]:
     """One case. `made` are couplings for a link of one tick, and softer ones."""

@@ -19,7 +19,6 @@ import numpy as np
 
 from controller.coupling import SpringDamper
 from controller.environment import GROUND, Network, Spring, Wall
-from controller.limiter import limited
 from controller.loop import Loop
 from controller.lti import Array
 from controller.tick import Process, StepBuffer
@@ -73,15 +72,12 @@ class _Case:
 
     def limited(self, buffer: StepBuffer, ticks: int) -> float:
         """The share of the ticks in which forces were limited, or a wall touched."""
-        limiter = buffer.process.limiter
-        if limiter:
-            return float((limiter.slips(buffer.z)[:ticks] != 0).any(axis=1).mean())
         if buffer.net:
             part = buffer.net.part()
             return part["limited_ticks"] / part["ticks"]
-        if buffer.process.contact:
-            return float((buffer.process.contact.depths(buffer.z)[:ticks] > 0).any(axis=1).mean())
-        return 0.0
+        law, z = buffer.process.law, buffer.z
+        hit = law.limited(z, buffer.f[:-1], np.array(np.inf)) if law.bounds else law.depths(z) > 0
+        return float(hit[:ticks].any(axis=1).mean())
 
 
 def challenges(
@@ -238,16 +234,14 @@ def _pair(rng: np.random.Generator, stiffest: float = 9000.0) -> tuple[Loop, Spr
     return Loop(1.2e-3, theta, (0, 0), theta, (1.0, 1.0), network), SpringDamper(K, B)
 
 
-def _free(m: int) -> tuple[Array, Array]:
-    return np.full(m, np.inf), np.zeros(m)
+_FREE = np.full(2, np.inf), np.zeros(2)  # limits of the actuators and steps of the encoders that do nothing
 
 
 def _limits(rng: np.random.Generator, factor: float) -> _Case:
     loop, coupling = _pair(rng)
     rho = limiter_lag(loop.delta, loop.T, BETA)
     needed = limiter(loop.sent(coupling), loop, rho).requirement.required
-    limit = limited(loop.network, coupling, loop.theta, loop.psi, loop.T, (2.0, 1.0), rho)
-    process = Process(limit.open, *_free(2), limit)
+    process = Process(loop.law(coupling, (2.0, 1.0), rho), *_FREE)
     return _Case(lambda nsim, ticks: process, factor * np.array(needed), loop.T, 1e-3)
 
 
@@ -268,8 +262,7 @@ def _anywhere(rng: np.random.Generator, factor: float) -> _Case:
     needed = asked(worst)
     walls = Wall(("a", GROUND), 3000.0, 2.0, 1e-3), Wall(("m", "b"), 2000.0, 1.0, 0.0)
     network = Network(loop.network.contacts, loop.network.springs, loop.network.masses, walls)
-    limit = limited(network, coupling, loop.theta, loop.psi, loop.T, (2.0, 1.0), (0.0, 0.0))
-    process = Process(limit.open, *_free(2), limit)
+    process = Process(loop.at(network).law(coupling, (2.0, 1.0), (0.0, 0.0)), *_FREE)
     return _Case(lambda nsim, ticks: process, factor * needed, loop.T, 1e-3)
 
 
@@ -280,7 +273,7 @@ def _budget(rng: np.random.Generator, factor: float) -> _Case:
     simulation = assemble(_scenario(loop, delta), coupling)
 
     def process(nsim: int, ticks: int) -> Process:
-        made = netted(simulation, coupling, EnergyNet(_GIVEN), ticks).process
+        made = netted(simulation, EnergyNet(_GIVEN), ticks).process
         return replace(made, force_limit=np.full(2, np.inf))
 
     return _Case(process, factor * delta, loop.T, 1e-3, given=_GIVEN)
@@ -306,7 +299,7 @@ def _friction(rng: np.random.Generator, factor: float) -> _Case:
     loop, coupling = _pair(rng)
     F, step = loop.F(coupling), 1e-5
     needed = np.array(this_environment(F, loop).required)
-    process = Process(F, np.full(2, np.inf), np.full(2, step))
+    process = Process(loop.law(coupling), np.full(2, np.inf), np.full(2, step))
     pays = factor * encoder_friction(F, [step] * 2)
     damping = needed * (1 + 1e-9)
     return _Case(lambda nsim, ticks: process, damping, loop.T, step / 4, pays, start=step / 2, push=0.001)

@@ -29,7 +29,7 @@ _TOO_CLOSE = 1e-4  # of the damping: a proof needs some room
 _HANDS = Population()
 
 
-def random_network(rng: np.random.Generator) -> Network:
+def _random_network(rng: np.random.Generator) -> Network:
     """One to three contacts, up to three nodes between: springs, dampers or both anywhere, masses, ground, or none."""
     tips = [f"tip {i}" for i in range(rng.integers(1, 4))]
     names = tips + [f"node {i}" for i in range(rng.integers(0, 4))]
@@ -47,7 +47,7 @@ def _delayed(rng: np.random.Generator) -> Loop:
     """A random network behind random delays, its devices' damping left at 1 N s/m."""
     while True:
         try:
-            network = random_network(rng)
+            network = _random_network(rng)
             m = len(network.contacts)
             theta, psi = (tuple(rng.integers(0, 1 + n, m).tolist()) for n in (3, rng.random() < 0.3))
             return Loop(1e-3, theta, psi, theta, (1.0,) * m, network)

@@ -39,7 +39,7 @@ _BLACK, _LIGHT = (0, 0, 0), (205, 205, 205)
 _PROBE = "from mujoco.{} import GLContext; c = GLContext(8, 8); c.make_current(); c.free()"
 
 
-def painter(draw: str, scene: Scene, force_limit: Array) -> tuple[Flat | Offscreen, str, list[str]]:
+def painter(draw: str, scene: Scene, force_limit: Array) -> tuple[Flat | _Offscreen, str, list[str]]:
     """The painter ("auto", "gl" or "flat"), its name, and the reason where OpenGL is not used.
 
     Raises InputError where it is not there and "gl" asks for it.
@@ -48,21 +48,22 @@ def painter(draw: str, scene: Scene, force_limit: Array) -> tuple[Flat | Offscre
         return Flat(scene, force_limit), draw, []
     try:
         name = backend()
-    except NoOffscreen as error:
+    except _NoOffscreen as error:
         if draw == "gl":
             raise InputError(f"--draw gl: {error}") from None
         return Flat(scene, force_limit), "flat", [f"{error}: the bodies are drawn flat"]
-    return Offscreen(drawn.ShownScene(scene, force_limit), name), name, []
+    return _Offscreen(drawn.ShownScene(scene, force_limit), name), name, []
 
 
-class NoOffscreen(Exception):
+class _NoOffscreen(Exception):
     """There is no OpenGL without a display here; the message says what was tried."""
 
 
 def backend() -> str:
     """The name of a way to render without a display: what MUJOCO_GL asks for if it is one, else the first that works.
 
-    Each is tried in a process of its own, because a failed one leaves OpenGL unusable for the next. Raises NoOffscreen.
+    Each is tried in a process of its own, because a failed one leaves OpenGL unusable for the next.
+    Raises _NoOffscreen.
     """
     tried = (asked(),) if asked() in _BACKENDS else _BACKENDS
     reasons = []
@@ -71,10 +72,10 @@ def backend() -> str:
         if reason is None:
             return name
         reasons.append(f"{name}: {reason}")
-    raise NoOffscreen(f"no OpenGL without a display here ({'; '.join(reasons)})")
+    raise _NoOffscreen(f"no OpenGL without a display here ({'; '.join(reasons)})")
 
 
-class Offscreen:
+class _Offscreen:
     """Renders frames of a stage."""
 
     def __init__(self, stage: drawn.ShownScene, name: str) -> None:

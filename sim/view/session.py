@@ -36,7 +36,7 @@ STIFFNESS, DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand: as firm a
 
 
 @dataclass
-class Pace:
+class _Pace:
     """Ticks of T seconds against a clock that is read from outside and began at 0."""
 
     T: float  # [s]
@@ -81,7 +81,7 @@ class Grip:
         return self.pull - STIFFNESS * float(s[joint]) - DAMPING * float(s[n + joint])
 
 
-def gripped(scene: Scene, channel: int, T: float) -> HeldPlant:
+def _gripped(scene: Scene, channel: int, T: float) -> HeldPlant:
     """The plant with the hand's spring and damper on a handle, its end at rest."""
     free, joint, n = scene.plant, scene.handles[channel], scene.model.nq
     A, at_handle = free.A.copy(), free.B[:, scene.tapped[channel]]
@@ -122,7 +122,7 @@ class LiveLoop:
         Raises what `changed` raises where an event of the script is impossible.
         """
         self.prepared = prepared
-        self.pace = Pace(prepared.scenario.T, patience)
+        self.pace = _Pace(prepared.scenario.T, patience)
         self.keys: SimpleQueue[Event] = SimpleQueue()
         self.clipped = 0  # ticks, since the start
         self.log: list[tuple[float, str, PreparedLoop]] = [
@@ -259,7 +259,7 @@ class LiveLoop:
         outside = prepared.simulation.plant.B.shape[1] - process.channels
         buffer = StepBuffer(process, _STRETCH, s.size, outside)
         buffer.s[0, :, 0] = s
-        buffer.z[0, :, 0] = process.at_rest(s[: process.channels])
+        buffer.z[0, :, 0] = process.ticked.at_rest(s[: process.channels])
         self.prepared, self._buffer = prepared, buffer
         self._start_engine()
 
@@ -272,7 +272,7 @@ class LiveLoop:
     def _start_engine(self) -> None:
         """The engine of the plant, with the mouse's hand where there is one, on the present buffer."""
         simulation, held = self.prepared.simulation, self._grip
-        plant = gripped(simulation.scene, held.channel, simulation.scenario.T) if held else simulation.plant
+        plant = _gripped(simulation.scene, held.channel, simulation.scenario.T) if held else simulation.plant
         self._engine = ExactEngine(plant)
         self._engine.start(self._buffer)
 

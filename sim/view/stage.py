@@ -152,7 +152,7 @@ class ShownScene:
 
     def __init__(self, scene: Scene, force_limit: Array, size: tuple[int, int] = SIZE) -> None:
         self.scene, self.force_limit = scene, force_limit
-        self.model = dressed(scene, size)
+        self.model = _dressed(scene, size)
         self.data = mujoco.MjData(self.model)
         self.channel = channels(scene)  # joint -> channel; bodies and joints have the same order
 
@@ -205,7 +205,7 @@ class ShownScene:
         camera.azimuth, camera.elevation = 90.0, -35.0
 
 
-def dressed(scene: Scene, size: tuple[int, int] = SIZE) -> mujoco.MjModel:
+def _dressed(scene: Scene, size: tuple[int, int] = SIZE) -> mujoco.MjModel:
     """The scene's model with shapes, places, a camera's distance and colours, but the same dynamics."""
     spec = mujoco.MjSpec.from_string(scene.xml)
     _undress(spec)

@@ -24,7 +24,7 @@ import numpy as np
 from controller.budget import EnergyBounding, EnergyBudget, PassivityControl, Shell
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.delay import delay
-from controller.environment import environment, environment_of
+from controller.environment import Networks, environment
 from controller.lti import Array, Lti
 from design import design_coupling
 from models.hold import HeldPlant, hold
@@ -200,7 +200,7 @@ def main() -> None:
     print("\na mass with -4 N s/m behind the spring-damper for any environment")
     M, D, K = network.matrices()
     D[2, 2] -= 4.0
-    active, spring_damper = environment_of((M, D, K), 2, T), made["spring-damper, any environment"]
+    active, spring_damper = Networks(network.contacts, (M, D, K)).E(T), made["spring-damper, any environment"]
     assert isinstance(spring_damper, SpringDamper)
     V = spring_damper.compliance(T)
     for name, force in (

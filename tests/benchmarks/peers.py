@@ -25,7 +25,7 @@ from models.scene import actuation, tendon_jacobian
 from sim.mujoco_engines import EXPONENTIAL
 from sim.run import Simulation, assemble, make_engine, outside_forces, run
 from sim.scenario import load
-from sim.stability import MARGINAL, close, dominant_mode, measured_growth
+from sim.stability import MARGINAL, _measured_growth, close, dominant_mode
 from sim.trace import Trace
 
 States = tuple[Array, Array, Array]  # process states (N, order), plant states (N, 2n), forces (N, m)
@@ -192,7 +192,7 @@ def main() -> None:
         t, x, unknown = loop.T * np.arange(len(s)), s[:, :m], np.full_like(f, np.nan)
         trace = Trace(t, x, f, unknown, unknown, w, z=z, s=s)
         error = np.sqrt(np.mean((s[:, :m] - exact[:, :m]) ** 2) / np.mean(exact[:, :m] ** 2))
-        growth, _ = measured_growth(loop, trace, simulation.process.force_limit)
+        growth, _ = _measured_growth(loop, trace, simulation.process.force_limit)
         right = (growth > MARGINAL) == (mode.growth > MARGINAL)
         cost = np.median(used[name])
         print(

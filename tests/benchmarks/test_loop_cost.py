@@ -52,6 +52,6 @@ def test_what_the_limiter_costs_while_no_force_is_limited(benchmark, engine, mon
     scenario = load()
     weak = scenario.replace(device=tuple(replace(device, force_limit=0.5) for device in scenario.device))
     tight = assemble(weak, coupling, (11.4167, 11.4167))
-    slips = tight.process.limiter.slips(run(tight, engine).z).any(axis=1).sum()
+    slips = tight.process.law.slips(run(tight, engine).z).any(axis=1).sum()
     assert slips > 0
     assert len(solved) - slips in (0, 1)  # the slip of the last tick is in no record

@@ -17,7 +17,7 @@ import sys
 import time
 from collections import defaultdict
 
-from cli.checks.faults import lively
+from cli.checks.faults import _lively
 from hw.control import certified_couplings
 from hw.emulator import Emulator, Terminal
 from hw.haptic_device import SerialDevice
@@ -37,7 +37,7 @@ class _Bench(SerialPort):
     """A port at whose other end a device ticks whenever the host waits."""
 
     def __init__(self) -> None:
-        self.scenario = lively(load())
+        self.scenario = _lively(load())
         self.far, self._emulator = Terminal(), Emulator(self.scenario)
         super().__init__(self.far.path, None)
         self.made = certified_couplings(self.scenario, "I", None, None, 1, spare=0)

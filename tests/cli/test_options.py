@@ -22,7 +22,7 @@ def parser():
     made.add_argument("--K", type=options.several(float, 0, 1e3, "N/m"))
     made.add_argument("--theta", type=options.several(int))
     made.add_argument("--mark", type=options.pair, action="append")
-    made.add_argument("--varying-delay", type=options.delay_ranges)
+    made.add_argument("--varying-delay", type=options._delay_ranges)
     options.add_condition_option(made)
     return made
 
@@ -56,7 +56,7 @@ def test_good_words():
     assert args.mark == [(5000.0, 0.0), (1.0, 2.0)]
     assert options.per_channel("--theta", args.theta, 3) == (0, 0, 0)
     assert options.delay_range(args.varying_delay, 2, 9) == DelayRange((1, 0), (2, 3))
-    assert options.delay_range(options.delay_ranges("1,2"), 2, 9) == DelayRange((1, 1), (2, 2))
+    assert options.delay_range(options._delay_ranges("1,2"), 2, 9) == DelayRange((1, 1), (2, 2))
     with pytest.raises(InputError, match="--K has 2 entries, expected 3"):
         options.per_channel("--K", args.K, 3)
 

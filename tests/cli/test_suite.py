@@ -92,10 +92,10 @@ def test_a_check_that_cannot_run_is_no_success(tmp_path, monkeypatch, capsys):
 
 
 def test_a_session_of_seconds_and_some_hands_end_as_they_must_with_flat_memory():
-    session = endurance.endure(lambda mark: endurance.long_session(mark, 10.0), 4.0)
+    session = endurance._endure(lambda mark: endurance._long_session(mark, 10.0), 4.0)
     assert session.holds, session
     assert re.fullmatch(r"finished \(asked to\) after \d{4,5} ticks", session.result)
-    hands = endurance.endure(lambda mark: endurance.many_hands(mark, 1250), 8.0)
+    hands = endurance._endure(lambda mark: endurance._many_hands(mark, 1250), 8.0)
     assert hands.holds, hands
     assert hands.result == "0 of 1250 unstable"
 
@@ -110,16 +110,16 @@ def test_memory_that_grows_and_work_that_goes_wrong_do_not_hold():
             kept.append(bytearray(2**20))
         return True, "done"
 
-    row = endurance.endure(hoards, 8.0)
+    row = endurance._endure(hoards, 8.0)
     assert row.end_mib - row.tenth_mib >= 8
     assert not row.holds
-    assert not endurance.endure(lambda mark: (mark(0.5), (False, "lost"))[1], 8.0).holds
+    assert not endurance._endure(lambda mark: (mark(0.5), (False, "lost"))[1], 8.0).holds
 
 
 def test_long_work_is_done_by_a_process_of_its_own(monkeypatch):
     """One that dies is a row that does not hold."""
     monkeypatch.setattr(
-        endurance, "_LONG", (("dies", os.abort, 8.0), ("runs", partial(endurance.many_hands, count=125), 8.0))
+        endurance, "_LONG", (("dies", os.abort, 8.0), ("runs", partial(endurance._many_hands, count=125), 8.0))
     )
     died, ran = endurance.endurance(1)
     assert (died.result, died.holds) == ("broke off", False)

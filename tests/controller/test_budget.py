@@ -7,7 +7,7 @@ from scipy.linalg import expm
 
 from controller.budget import EnergyBounding, EnergyBudget, PassivityControl, Shell
 from controller.coupling import SpringDamper
-from controller.environment import FIGURE_4, Network, Spring, environment, environment_of
+from controller.environment import FIGURE_4, Network, Networks, Spring, environment
 from controller.lti import Lti
 from design import design_coupling
 from models.hold import hold as hold_input
@@ -358,7 +358,7 @@ def test_budgets_that_cannot_be(changed, message):
 def active_environment():
     """The default network with -4 N s/m between its mass and ground."""
     M, D, K = FIGURE_4.matrices()
-    return environment_of((M, D - 4.0 * np.diag([0, 0, 1.0]), K), 2, T)
+    return Networks(FIGURE_4.contacts, (M, D - 4.0 * np.diag([0, 0, 1.0]), K)).E(T)
 
 
 def test_the_shell_makes_a_mass_with_negative_damping_passive():

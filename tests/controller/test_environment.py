@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from controller.environment import FIGURE_4, GROUND, Network, Spring, environment, environment_of, sampled_environment
+from controller.environment import FIGURE_4, GROUND, Network, Networks, Spring, environment
 
 T = 1.2e-3
 W = np.geomspace(1e-3, np.pi, 80)
@@ -60,7 +60,8 @@ def test_many_networks_are_each_as_alone():
     networks = [FIGURE_4, Network(FIGURE_4.contacts, other, FIGURE_4.masses)]
     matrices = tuple(np.stack(parts) for parts in zip(*(network.matrices() for network in networks), strict=True))
     z = np.stack([Z, Z[::-1]])
-    sampled, stack = sampled_environment(matrices, 2, z, T), environment_of(matrices, 2, T)
+    many = Networks(FIGURE_4.contacts, matrices)
+    sampled, stack = many.sampled(z, T), many.E(T)
     assert stack.count == 2
     for i, network in enumerate(networks):
         alone = environment(network, T).at(z[i])

@@ -2,16 +2,14 @@
 
 import numpy as np
 import pytest
-from worlds import STIFF, T
+from worlds import STIFF, T, loop_of
 
 from controller.complementarity import BoxProblem
 from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall, environment
-from controller.limiter import Limiter, limited
-from controller.loop import force_map
+from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall
+from controller.limiter import Limiter
 from controller.lti import Lti, SingularLoop
 from controller.tick import Process, StepBuffer
-from controller.walls import contact
 
 LIMITS = (12.0, 5.657)
 
@@ -26,13 +24,11 @@ def drive(process: Process, x: np.ndarray) -> StepBuffer:
 
 
 def closed(limiter: Limiter) -> Process:
-    return Process(limiter.open, np.full(limiter.channels, np.inf), np.zeros(limiter.channels), limiter)
+    return Process(limiter, np.full(limiter.channels, np.inf), np.zeros(limiter.channels))
 
 
 def unlimited(network: Network, theta) -> Process:
-    walls = contact(network, STIFF, theta, (0, 0), T) if network.walls else None
-    F = walls.open if walls else force_map(environment(network, T), STIFF, theta, (0, 0))
-    return Process(F, np.full(2, np.inf), np.zeros(2), walls)
+    return Process(loop_of(network, theta, (0, 0)).law(STIFF), np.full(2, np.inf), np.zeros(2))
 
 
 def wander(ticks: int, channels: int, nsim: int, step: float = 1e-3, seed: int = 0) -> np.ndarray:
@@ -112,7 +108,7 @@ def test_a_matrix_with_a_negative_minor_is_refused():
 
 def test_a_spring_by_hand():
     """G = 1000, L = 1, rho = 20, theta = 0."""
-    limiter = Limiter(Lti.constant([[1000.0]], 1.0), (0,), np.ones(1), np.array([20.0]))
+    limiter = Limiter(Lti.constant([[1000.0]], 1.0), (0,), limit=np.ones(1), rho=np.array([20.0]))
     x = np.array([0, 0.0005, 0.002, 0.003, 0.002, 0.0005, 0, -0.002])
     f = drive(closed(limiter), x[:, None, None]).f[: x.size, 0, 0]
     np.testing.assert_allclose(f, [0, 0.5, 1, 1, 1, 0.520384, 0, -1], atol=5e-7)
@@ -124,7 +120,7 @@ def test_with_lag_a_limited_spring_can_give_energy():
     x = np.tile([-1.048, -0.998, 1.028, 1.049, 1.069, 0.996], 20)
     taken = []
     for rho in (0.05, 0.0):
-        limiter = Limiter(Lti.constant([[1.0]], 1.0), (0,), np.ones(1), np.array([rho]))
+        limiter = Limiter(Lti.constant([[1.0]], 1.0), (0,), limit=np.ones(1), rho=np.array([rho]))
         f = drive(closed(limiter), x[:, None, None]).f[: x.size, 0, 0]
         dx = np.diff(np.append(x, x[0]))
         taken.append((f * dx + 0.5 * dx**2)[-6:].sum())
@@ -142,7 +138,7 @@ WALLED = Network(
 @pytest.mark.parametrize("network", [FIGURE_4, WALLED], ids=["linear", "walls"])
 def test_out_of_reach_nothing_changes(network):
     x = wander(500, 2, 3)
-    limiter = limited(network, STIFF, (0, 2), (0, 0), T, (1e6, 1e6), (10.0, 20.0))
+    limiter = loop_of(network, (0, 2), (0, 0)).law(STIFF, (1e6, 1e6), (10.0, 20.0))
     limiting, without = drive(closed(limiter), x), drive(unlimited(network, (0, 2)), x)
     np.testing.assert_allclose(limiting.f[:500], without.f[:500], atol=1e-9)
     w = len(network.walls)
@@ -156,7 +152,7 @@ def test_out_of_reach_nothing_changes(network):
 def test_the_limited_loop_obeys_its_definition(network, theta):
     """f_e within the box and e in its normal cone; the linear loop driven by x - e sends f_e + rho (e - e_-)."""
     x, limit, rho = wander(600, 2, 4), np.array([3.0, 1.5]), np.array([11.0, 7.0])
-    limiter = limited(network, STIFF, theta, (0, 0), T, limit, rho)
+    limiter = loop_of(network, theta, (0, 0)).law(STIFF, limit, rho)
     buffer = drive(closed(limiter), x)
     e = limiter.slips(buffer.z)
     n = max(theta)
@@ -173,7 +169,7 @@ def test_the_limited_loop_obeys_its_definition(network, theta):
 
 def test_many_simulations_are_as_many_runs_of_one():
     x = wander(300, 2, 5)
-    process = closed(limited(WALLED, STIFF, (1, 0), (0, 0), T, (3.0, 1.5), (0.0, 0.0)))
+    process = closed(loop_of(WALLED, (1, 0), (0, 0)).law(STIFF, (3.0, 1.5), (0.0, 0.0)))
     together = drive(process, x).f[:300]
     alone = np.concatenate([drive(process, x[..., i : i + 1]).f[:300] for i in range(5)], axis=2)
     np.testing.assert_allclose(together, alone, atol=1e-9)
@@ -187,9 +183,9 @@ def test_the_short_tick_is_the_tick(channels, weakest):
     network = Network(names, tuple(Spring((name, GROUND), 900.0, 0.3) for name in names))
     coupling = SpringDamper([2000.0] * channels, [0.5] * channels)
     theta = tuple(i % 2 for i in range(channels))
-    limiter = limited(network, coupling, theta, (0,) * channels, T, limit, (5.0,) * channels)
+    limiter = loop_of(network, theta, (0,) * channels).law(coupling, limit, (5.0,) * channels)
     actuators = np.array([weakest] + [np.inf] * (channels - 1))  # the first one's may be weaker than its limiter
-    process = Process(limiter.open, actuators, np.zeros(channels), limiter)
+    process = Process(limiter, actuators, np.zeros(channels))
     phases = np.arange(400)[:, None] / 15 + np.arange(channels)
     slow = 5e-3 * np.sin(phases)
     x = np.stack([1e-3 * slow, slow], axis=-1)  # the first is never limited: who looks at it alone misses the second
@@ -210,7 +206,7 @@ def test_the_short_tick_is_the_tick(channels, weakest):
 def test_a_wall_and_every_limit_at_once(i):
     """All forces beyond their limits in the same tick, a wall pushing: each leaves with its limit."""
     network = Network(WALLED.contacts, WALLED.springs, WALLED.masses, WALLED.walls[i : i + 1])
-    limiter = limited(network, STIFF, (0, 0), (0, 0), T, (3.0, 1.5), (0.0, 0.0))
+    limiter = loop_of(network, (0, 0), (0, 0)).law(STIFF, (3.0, 1.5), (0.0, 0.0))
     signs = np.array([[1, 1, -1, -1], [1, -1, 1, -1]])
     buffer = drive(closed(limiter), np.repeat(0.05 * signs[None], 60, axis=0))
     assert (limiter.depths(buffer.z)[:60] > 0).any(axis=(0, 1)).sum() == 2
@@ -220,7 +216,7 @@ def test_a_wall_and_every_limit_at_once(i):
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("channel", [0, 1])
 def test_the_first_tick_that_a_limiter_bends_is_found(channel, sign):
-    limiter = limited(FIGURE_4, STIFF, (1, 2), (0, 0), T, LIMITS, (10.0, 10.0))
+    limiter = loop_of(FIGURE_4, (1, 2), (0, 0)).law(STIFF, LIMITS, (10.0, 10.0))
     buffer = StepBuffer(closed(limiter), 10, 2)
     sent, other = (buffer.after[:, limiter.sent_rows[i], 0] for i in (channel, 1 - channel))
     assert buffer.linear_until(10) == 10
@@ -238,7 +234,7 @@ def test_the_first_tick_that_a_limiter_bends_is_found(channel, sign):
 def test_limiter_and_environment_are_passive_without_lag():
     """sum f_e (u_k - u_{k-1}) with u = x - V f_e, walls and limits included, never falls below its start."""
     x = wander(2000, 2, 10)
-    f = drive(closed(limited(WALLED, NoCoupling(), (0, 0), (0, 0), T, (3.0, 1.5), (0.0, 0.0))), x).f[:2000]
+    f = drive(closed(loop_of(WALLED, (0, 0), (0, 0)).law(NoCoupling(), (3.0, 1.5), (0.0, 0.0))), x).f[:2000]
     energy = np.cumsum((f * np.diff(x, axis=0, prepend=0.0)).sum(axis=1), axis=0)
     assert energy.min() >= -1e-9
     assert energy.max() > 0.5
@@ -248,7 +244,7 @@ def test_a_clipped_cycle_gives_energy_however_slow_and_a_limited_one_does_not():
     """Two hands around a circle of 4 cm: clipping each force by itself gives 0.616 J a turn whatever the speed."""
     coupling, rho = SpringDamper([5832.0, 2545.0], [0.187, 1.386]), (11.4167, 11.4167)
     limit = np.array(LIMITS)[:, None]
-    linear = Process(force_map(environment(FIGURE_4, T), coupling, (1, 2), (0, 0)), np.full(2, np.inf), np.zeros(2))
+    linear = Process(loop_of(FIGURE_4, (1, 2), (0, 0)).law(coupling), np.full(2, np.inf), np.zeros(2))
     for turn_s, dissipated in ((5.0, 0.0173), (10.0, 0.00865)):
         ticks = round(turn_s / T)
         angle = 2 * np.pi * np.arange(2 * ticks) / ticks
@@ -257,7 +253,7 @@ def test_a_clipped_cycle_gives_energy_however_slow_and_a_limited_one_does_not():
         assert (1.37 * dx**2 / T).sum() == pytest.approx(dissipated, rel=1e-2)
         clipped = np.clip(drive(linear, x).f[: 2 * ticks], -limit, limit)
         assert (clipped[-ticks - 1 : -1] * dx).sum() == pytest.approx(-0.616, abs=0.005)
-        f = drive(closed(limited(FIGURE_4, coupling, (1, 2), (0, 0), T, LIMITS, rho)), x).f[: 2 * ticks]
+        f = drive(closed(loop_of(FIGURE_4, (1, 2), (0, 0)).law(coupling, LIMITS, rho)), x).f[: 2 * ticks]
         assert abs((f[-ticks - 1 : -1] * dx).sum()) < 0.1 * dissipated  # delay and friction of the environment
         assert (np.abs(f).max(axis=0) <= limit).all()
 
@@ -265,7 +261,7 @@ def test_a_clipped_cycle_gives_energy_however_slow_and_a_limited_one_does_not():
 @pytest.mark.parametrize("x", [(0.001, -0.002), (0.03, -0.02), (0.05, 0.05)])
 def test_at_rest_is_where_held_displacements_lead(x):
     """Within the limits the linear state; beyond them the slip that the loop itself settles to."""
-    limiter = limited(FIGURE_4, STIFF, (1, 2), (0, 0), T, LIMITS, (10.0, 10.0))
+    limiter = loop_of(FIGURE_4, (1, 2), (0, 0)).law(STIFF, LIMITS, (10.0, 10.0))
     z, held = limiter.at_rest(np.array(x)), StepBuffer(closed(limiter), 6000, 2)
     held.x[:, :, 0] = x
     held.z[0, :, 0] = z
@@ -281,14 +277,14 @@ def test_at_rest_is_where_held_displacements_lead(x):
 def test_bad_limits_are_named():
     G = Lti.constant(np.eye(2), T)
     with pytest.raises(ValueError, match="rho has 1 entries for 2 channels"):
-        Limiter(G, (0, 0), np.ones(2), np.ones(1))
+        Limiter(G, (0, 0), limit=np.ones(2), rho=np.ones(1))
     with pytest.raises(ValueError, match="expected positive forces"):
-        Limiter(G, (0, 0), np.array([1.0, 0.0]), np.ones(2))
+        Limiter(G, (0, 0), limit=np.array([1.0, 0.0]), rho=np.ones(2))
     for rho in (-1.0, np.inf):
         with pytest.raises(ValueError, match="expected stiffnesses >= 0"):
-            Limiter(G, (0, 0), np.ones(2), np.array([1.0, rho]))
+            Limiter(G, (0, 0), limit=np.ones(2), rho=np.array([1.0, rho]))
     with pytest.raises(ValueError, match="a block of 2 x 2 cannot serve 3 channels"):
-        Limiter(G, (0, 0, 0), np.ones(3), np.ones(3))
+        Limiter(G, (0, 0, 0), limit=np.ones(3), rho=np.ones(3))
 
 
 def test_limits_have_room_between_them_on_every_axis():

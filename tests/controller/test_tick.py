@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from worlds import force_map, loop_of
 
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall, environment
-from controller.loop import force_map
+from controller.law import Law
 from controller.lti import Lti
 from controller.tick import Process, StepBuffer
-from controller.walls import contact
 
 T = 1e-3
 NONE = np.zeros(1)
@@ -28,7 +28,7 @@ def wall(K: float, B: float = 0.0) -> Lti:
 
 
 def process(F: Lti, limit=np.inf, step=0.0) -> Process:
-    return Process(F, np.full(F.inputs, limit), np.full(F.inputs, step))
+    return Process(Law(F), np.full(F.inputs, limit), np.full(F.inputs, step))
 
 
 def test_three_ticks_by_hand():
@@ -110,7 +110,7 @@ def test_encoders_round_to_whole_steps():
 
 
 def test_an_encoder_of_one_channel_rounds_that_one():
-    each = Process(Lti.constant(1000 * np.eye(2), T), np.full(2, np.inf), np.array([1e-3, 0.0]))
+    each = Process(Law(Lti.constant(1000 * np.eye(2), T)), np.full(2, np.inf), np.array([1e-3, 0.0]))
     np.testing.assert_allclose(drive(each, np.full((1, 2), 0.6e-3)), [[1.0, 0.6]], atol=1e-12)
 
 
@@ -130,9 +130,9 @@ def test_encoders_do_not_move_the_device():
         (lambda: SpringDamper([0.0], [1.0]), "expected positive stiffnesses"),
         (lambda: SpringDamper([1.0], [-1.0]), "expected dampings >= 0"),
         (lambda: Compliance(Lti.constant([[1.0]], T)).around(environment(FIGURE_4, T)), "has 2 contacts"),
-        (lambda: Process(wall(1.0), np.array([0.0]), NONE), "expected positive forces"),
-        (lambda: Process(wall(1.0), np.array([1.0]), np.array([-1.0])), "expected steps >= 0"),
-        (lambda: Process(wall(1.0), np.array([1.0, 1.0]), NONE), "2 entries for 1 channels"),
+        (lambda: Process(Law(wall(1.0)), np.array([0.0]), NONE), "expected positive forces"),
+        (lambda: Process(Law(wall(1.0)), np.array([1.0]), np.array([-1.0])), "expected steps >= 0"),
+        (lambda: Process(Law(wall(1.0)), np.array([1.0, 1.0]), NONE), "2 entries for 1 channels"),
         (lambda: StepBuffer(process(wall(1.0)), 1, 0), "must be the positions"),
     ],
 )
@@ -144,9 +144,9 @@ def test_what_cannot_be_built(build, message):
 def test_delays_are_of_every_channel():
     F, free = Lti.constant(np.eye(2), 1e-3), (np.full(2, np.inf), np.zeros(2))
     delays = np.ones((5, 2, 1), dtype=int)
-    assert Process(F, *free, delays=delays).delays.shape == (5, 2, 1)
+    assert Process(Law(F), *free, delays=delays).delays.shape == (5, 2, 1)
     with pytest.raises(ValueError, match="delays have 1 channels, expected 2"):
-        Process(F, *free, delays=delays[:, :1])
+        Process(Law(F), *free, delays=delays[:, :1])
 
 
 def test_a_step_of_an_encoder_is_finite():
@@ -169,7 +169,7 @@ def test_a_net_and_a_line_hear_the_tick_of_the_whole_run():
     delays = np.zeros((100, 1, 1), dtype=int)
     delays[:50] = 1  # a packet that is sent at another tick is late
     F = wall(1000.0)
-    buffer = StepBuffer(Process(F, np.array([np.inf]), NONE, delays=delays, net=lambda nsim: Net()), 3, 1)
+    buffer = StepBuffer(Process(Law(F), np.array([np.inf]), NONE, delays=delays, net=lambda nsim: Net()), 3, 1)
     buffer.first = 50
     buffer.x[:3, 0, 0] = 1e-3 * np.arange(1, 4)
     for k in range(3):
@@ -180,6 +180,6 @@ def test_a_net_and_a_line_hear_the_tick_of_the_whole_run():
 
 def test_a_process_knows_its_walls():
     network = Network(("a",), walls=(Wall(("a", GROUND), 1000.0),))
-    joined = contact(network, NoCoupling(), (0,), (0,), T)
-    assert Process(joined.open, np.array([np.inf]), NONE, joined).walls == network.walls != ()
+    joined = loop_of(network, (0,), (0,), T).law(NoCoupling())
+    assert Process(joined, np.array([np.inf]), NONE).walls == network.walls != ()
     assert process(wall(1000.0)).walls == ()

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from worlds import force_map
 
 from controller.coupling import SpringDamper
 from controller.delay import LOST, HeldLine, VaryingDelay, ages, newest, packet_delays, realising
 from controller.environment import FIGURE_4, environment
-from controller.loop import force_map
+from controller.law import Law
 from controller.tick import Process, StepBuffer
 
 T = 1.2e-3
@@ -57,7 +58,7 @@ def test_a_constant_delay_is_the_linear_block():
     G, F = (force_map(E, COUPLING, theta, (0, 0)) for theta in ((0, 0), (1, 2)))
     constant = np.tile(np.array([1, 2])[None, :, None], (200, 1, 1))
     forces = []
-    for process in (Process(G, NO_LIMIT, IDEAL, delays=constant), Process(F, NO_LIMIT, IDEAL)):
+    for process in (Process(Law(G), NO_LIMIT, IDEAL, delays=constant), Process(Law(F), NO_LIMIT, IDEAL)):
         buffer = StepBuffer(process, 50, 2)
         for first in range(0, 200, 50):  # stretches: the line goes on where it was
             for k in range(50):
@@ -141,8 +142,8 @@ def test_patterns_that_depend_on_the_loop_ask_for_its_delays(pattern):
 def test_a_process_refuses_delays_that_do_not_fit():
     G = force_map(environment(FIGURE_4, T), COUPLING, (0, 0), (0, 0))
     with pytest.raises(ValueError, match="1 channels, expected 2"):
-        Process(G, NO_LIMIT, IDEAL, delays=np.zeros((5, 1, 1)))
-    buffer = StepBuffer(Process(G, NO_LIMIT, IDEAL, delays=np.zeros((1, 2, 1))), 2, 2)
+        Process(Law(G), NO_LIMIT, IDEAL, delays=np.zeros((5, 1, 1)))
+    buffer = StepBuffer(Process(Law(G), NO_LIMIT, IDEAL, delays=np.zeros((1, 2, 1))), 2, 2)
     buffer.tick(0)
     with pytest.raises(ValueError, match="given for 1 ticks"):
         buffer.tick(1)

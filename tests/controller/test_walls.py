@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 from asked import this_environment
 from scipy.optimize import brentq
-from worlds import SOFT
+from worlds import SOFT, force_map, loop_of
 
 from cli.accuracy import main as accuracy
 from cli.run import main
 from controller.complementarity import Complementarity
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
-from controller.loop import force_map
+from controller.law import Law
 from controller.lti import Lti, SingularLoop
 from controller.tick import Process, StepBuffer
-from controller.walls import Contact, contact
 from design.audit import audit, requirement
 from design.certificate import assess, prove
 from design.guarantees import MAKING
@@ -40,8 +39,8 @@ def one(stiffness=1000.0, damping=0.0, gap=0.0) -> Network:
 
 
 def walled(network: Network, coupling, theta, psi) -> Process:
-    walls = contact(network, coupling, theta, psi, T)
-    return Process(walls.open, np.full(walls.channels, np.inf), np.zeros(walls.channels), walls)
+    walls = loop_of(network, theta, psi, T).law(coupling)
+    return Process(walls, np.full(walls.channels, np.inf), np.zeros(walls.channels))
 
 
 def drive(process: Process, x: np.ndarray) -> StepBuffer:
@@ -93,8 +92,8 @@ def test_wall_forces_that_are_not_determined_are_refused():
         Complementarity(np.array([[1.0, 0.0], [0.0, -1.0]]))
     with pytest.raises(SingularLoop, match=r"forces of walls \[1, 2\] are not determined"):
         Complementarity(np.ones((2, 2)))
-    with pytest.raises(ValueError, match="a block of 2 inputs cannot serve 2 walls"):
-        Contact(Lti.constant(np.ones((1, 2)), T), (Wall(("a", GROUND), 1.0),) * 2)
+    with pytest.raises(ValueError, match="a block of 1 x 2 cannot serve 0 channels and 2 walls"):
+        Law(Lti.constant(np.ones((1, 2)), T), (), (Wall(("a", GROUND), 1.0),) * 2)
 
 
 def test_a_wall_behind_a_coupling_against_a_root_finder():
@@ -137,13 +136,13 @@ def test_a_wall_that_always_touches_is_the_linear_spring_damper(coupling, psi):
     x = wander(300, 2, 2)
     f = drive(walled(network, coupling, (1, 2), psi), x).f[:300]
     F = force_map(environment(held(network), T), coupling, (1, 2), psi)
-    linear = drive(Process(F, np.full(2, np.inf), np.zeros(2)), x).f[:300]
+    linear = drive(Process(Law(F), np.full(2, np.inf), np.zeros(2)), x).f[:300]
     assert np.abs(f - linear).max() > 100  # the gaps' constant forces
     np.testing.assert_allclose(f[..., 0] - f[..., 1], linear[..., 0] - linear[..., 1], atol=1e-7)  # 1e-10 of the forces
 
 
 def test_frozen_states_are_the_environments_with_springs():
-    walls = contact(BOXED, SOFT, (1, 2), (0, 0), T)
+    walls = loop_of(BOXED, (1, 2), (0, 0), T).law(SOFT)
     z = np.exp(1j * np.array([0.02, 0.5, 3.0]))
     states = walls.frozen()
     assert len(states) == 8
@@ -167,7 +166,7 @@ def test_walls_between_nodes_keep_the_whole_environment_passive():
     buffer = drive(process, x)
     energy = np.cumsum((buffer.f[1:3000] * np.diff(x, axis=0)).sum(axis=1), axis=0)
     assert energy.min() > -1e-12 * energy.max()
-    depths = process.contact.depths(buffer.z) > 0
+    depths = process.law.depths(buffer.z) > 0
     assert ((depths[1:] & ~depths[:-1]).sum(axis=(0, 2)) > 50).all()  # every wall is hit
 
 
@@ -201,7 +200,7 @@ def test_random_hands_on_walls_come_to_rest_under_any_environment(name, humans, 
 
     def look(buffer, first, count):
         nonlocal strongest
-        touching = loop.process.contact.depths(buffer.z) > 0
+        touching = loop.process.law.depths(buffer.z) > 0
         i = min(4 * first // ticks, 3)
         made[min(i, 1)] += (touching[1:] & ~touching[:-1]).sum(axis=(0, 1))
         speed[i] += (buffer.s[:count, n:] ** 2).sum(axis=(0, 1))
@@ -218,7 +217,7 @@ def test_both_engines_see_the_same_contacts():
     """RK4 x 4 against the exact hold on a bouncing trace: 1e-6 of the motion, and the same number of contacts."""
     loop = assemble(load("one-wall").replace(duration=2.0), SpringDamper([900.0], [0.4]))
     exact, own = run(loop, "exact"), run(loop, "mujoco")
-    depths = [loop.process.contact.depths(record.z) > 0 for record in (exact, own)]
+    depths = [loop.process.law.depths(record.z) > 0 for record in (exact, own)]
     np.testing.assert_array_equal(*depths)
     assert depths[0].shape == (len(exact.z) - 1, 1)
     assert (depths[0][1:] & ~depths[0][:-1]).sum() >= 1

@@ -12,19 +12,18 @@ import pytest
 from asked import any_environment, this_environment
 from driven import driven
 from scipy.signal import dlsim, lfilter
-from worlds import SOFT, STIFF
+from worlds import SOFT, STIFF, force_map
 
 from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
-from controller.limiter import limited
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.lti import Lti
 from design.lmi import Infeasible, Shaping, least_multiplier
 from design.multipliers import limiter_lag
 from design.spring_damper import step
 from models.device import RigidDevice
 from models.human import Human, Link, Population
-from sim.report import PRINTED_TAU_DB
+from sim.report import _PRINTED_TAU_DB
 from sim.run import assemble, make_engine, run
 from sim.scenario import load
 from sim.stability import close, dominant_mode
@@ -212,7 +211,7 @@ def test_no_reading_of_figure_4_gives_the_printed_index():
         for case, loop in LOOPS.items():
             peak = np.linalg.norm(mismatch_at(z, response, *loop), 2, axis=(1, 2)).max()
             tau_db = 20 * np.log10(peak / max(singular, 1e-12))
-            assert tau_db > PRINTED_TAU_DB[case] + 60
+            assert tau_db > _PRINTED_TAU_DB[case] + 60
             least = min(least, tau_db)
     assert readings == 66
     assert 60 < least < 73
@@ -390,7 +389,7 @@ def test_saturation_is_outside_every_certificate():
     assert np.abs(late(unlimited)).max() < 0.01
     for beta in (0.0, 0.01):  # the limiter in the place of clipping: every start comes to rest
         rho = limiter_lag((DELTA, DELTA), T, beta)
-        limits = limited(base.environment, STIFF, base.theta, base.psi, T, (12.0, 5.657), rho)
+        limits = base.loop("I").law(STIFF, (12.0, 5.657), rho)
         limiting = replace(simulation, process=replace(simulation.process, F=limits.open, contact=limits))
         assert np.abs(late(limiting)).max() < 0.01
 

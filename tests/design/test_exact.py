@@ -1,14 +1,15 @@
 """Laws of the exact arithmetic: against numpy, against the floating-point blocks, and symmetry at z = 1."""
 
+import random
 from fractions import Fraction
 
 import numpy as np
 import pytest
+from worlds import force_map
 
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.delay import delay, moving_sum
 from controller.environment import FIGURE_4, Network, Spring, environment
-from controller.loop import force_map
 from controller.lti import Lti, SingularLoop, inverse, numbers, rational
 from design import exact
 from design.exact import Matrix, block_diag, definiteness, find_storage, prove_positive_real, reached, strictly_positive
@@ -273,6 +274,19 @@ def test_numbers_beyond_floating_point_are_left_to_exact_arithmetic(recwarn):
 def test_a_model_of_more_states_than_are_tried_is_told_so():
     assert exact.too_large(exact.LARGEST) is None
     assert exact.too_large(exact.LARGEST + 1) == "a proof over 301 states takes long: up to 300 are tried"
+
+
+@pytest.mark.parametrize(("bits", "others"), [(3, 3), (16, 15), (192, 57), (31, 500)])
+def test_products_are_those_of_pythons_integers(bits, others):
+    """Among them the largest sums that can be, of either sign."""
+    draw = random.Random(bits)
+    left, right = (
+        np.array([[draw.randint(-(2**b), 2**b) for _ in range(columns)] for _ in range(rows)], dtype=object)
+        for b, rows, columns in ((bits, 25, 30), (others, 30, 20))
+    )
+    left[0], left[1], left[2], right[:, 0], right[:, 1] = 2**bits, -(2**bits), 0, 2**others, 1 - 2**others
+    assert left.size * right.shape[1] > exact._FEW
+    assert (exact._product(left, right) == left @ right).all()
 
 
 def test_products_are_in_lowest_terms():

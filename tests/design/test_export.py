@@ -9,13 +9,14 @@ import sys
 
 import numpy as np
 import pytest
-from worlds import PAIR, SOFT, T
+from worlds import PAIR, SOFT, T, force_map
 
 from cli.export import main
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.coupling import SpringDamper as Gains
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
-from controller.loop import Loop, force_map
+from controller.law import Law
+from controller.loop import Loop
 from controller.lti import Lti
 from controller.tick import Process, StepBuffer
 from design.certificate import prove, prove_limiter
@@ -108,7 +109,7 @@ def test_limited_forces_are_those_of_the_simulator(limited_files, name, limit):
     stored = limited_files[1][name]
     block = process_block(stored, force_limit=limit)
     test, m = trial(block), len(limit)
-    process = Process(block.limiter.open, np.full(m, np.inf), np.zeros(m), block.limiter)
+    process = Process(block.limiter, np.full(m, np.inf), np.zeros(m))
     buffer = StepBuffer(process, len(test.inputs), m)
     for k, x in enumerate(test.inputs):
         buffer.x[k, :, 0] = x
@@ -134,10 +135,10 @@ def test_force_limits_that_no_certificate_covers_are_refused(place, limited_file
     folder = limited_files[0]
     with pytest.raises(InputError, match="its certificate covers no limited forces"):
         main([str(place / "full.json"), "--process", "--force-limit", "3", "--out", str(place / "x.c")])
-    with pytest.raises(InputError, match="--force-limit is for --process"):
+    with pytest.raises(InputError, match="--force-limit is only with --process"):
         main([str(folder / "pair.json"), "--force-limit", "3", "--out", str(place / "x.c")])
     control = ["--process", "--format", "control", "--force-limit", "3", "--out", str(place / "x.py")]
-    with pytest.raises(InputError, match="--format control: that is linear"):
+    with pytest.raises(InputError, match="without --format control: that is linear"):
         main([str(folder / "pair.json"), *control])
 
 
@@ -147,7 +148,7 @@ def test_the_process_of_the_simulator_differs_by_rounding_alone(data):
     block = process_block(Stored.of(PAIR, data))
     test, G = trial(block), block.system
     limits = np.full(2, np.inf)
-    buffer = StepBuffer(Process(G, limits, np.zeros(2)), len(test.inputs), plant_states=2)
+    buffer = StepBuffer(Process(Law(G), limits, np.zeros(2)), len(test.inputs), plant_states=2)
     for k, x in enumerate(test.inputs):
         buffer.x[k, :, 0] = x
         buffer.tick(k)
@@ -304,7 +305,7 @@ def test_a_hostile_name_stays_inside_the_comments(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["{gains}", "--without-theta"], "without --process"),
+        (["{gains}", "--without-theta"], "--without-theta is only with --process"),
         (["{gains}", "--out", "{gains}"], "name another file"),
         (["{gains}", "--out", "{place}"], "is a folder"),
         (["{gains}", "--seed", "-1"], "from 0"),

@@ -106,7 +106,7 @@ def test_the_coupling_designed_with_the_block():
         assert required(BUILT, tuple((float(v),) for v in c)) == pytest.approx(expected, abs=5e-6)
     refused = limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG, ((1.0,), (1.0,))).requirement
     assert not refused.certified
-    assert "no proof found with the limiter" in str(refused.reason)
+    assert "no limiter is proved for this coupling" in str(refused.reason)
 
 
 @pytest.mark.parametrize(

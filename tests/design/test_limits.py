@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from asked import this_environment
+from worlds import force_map
 
 from cli import compare as command
 from cli.compare import main
 from controller.coupling import CASE_I
 from controller.environment import environment
-from controller.loop import force_map
 from design import compare as limit_curve
 from design.compare import AXES, LADDERS, SHORT, Point, Sweep, ladder_row, measured, optimum, points_along, remembered
 from design.program import LADDER, Options
@@ -179,7 +179,7 @@ def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
         (["--over", "--band", "8"], "--band is '8', expected two numbers"),
         (["--over", "--case", "none"], "--case none has no coupling to design"),
         (["--ladder", "--over", "order"], "--over with --ladder: give one of them"),
-        (["--ladder", "--seconds", "3"], "--seconds is for --over, not for --ladder"),
+        (["--ladder", "--seconds", "3"], "--seconds is only with --over"),
         (["--ladder", "--case", "II"], "--ladder shows both cases"),
         (["--ladder", "long"], "argument --ladder: invalid choice: 'long'"),
         (["--over", "order=1:500"], "--over order=1:500: the range 1:500 is none between 1 and 5 rungs"),

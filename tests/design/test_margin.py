@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from asked import any_environment, any_environment_per_channel, delayed_demand, this_environment
 from scipy.linalg import eig, eigh
-from worlds import STIFF
+from worlds import STIFF, force_map
 
 from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
-from controller.loop import force_map
 from controller.lti import Lti
 from design.conditions import least_multiple, regular_part
 from design.frequency import frequencies, hermitian, on_circle, supremum

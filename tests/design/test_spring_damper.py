@@ -8,12 +8,12 @@ import pytest
 from analysis import analysis, solve
 from asked import any_environment, this_environment
 from scipy.optimize import brentq
-from worlds import DELTA, SOFT_NETWORK, T
+from worlds import DELTA, SOFT_NETWORK, T, force_map
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring, environment
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.lti import Lti
 from design import gain_search, spring_damper
 from design.api import instead, transparency_of

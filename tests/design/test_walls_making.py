@@ -13,7 +13,6 @@ from controller.environment import GROUND, Network, Spring, Wall
 from controller.loop import Loop
 from controller.lti import Lti
 from controller.ranges import Ranges
-from controller.walls import contact
 from design.certificate import assess, prove, verify
 from design.coupling_file import Stored, sealed
 from design.designs import design_by_kind
@@ -124,7 +123,7 @@ def test_every_step_of_the_proof(loop):
     delta = 1.01 * need * np.array(loop.delta)
     G, P, S, g = steps_of(loop, BOTH, delta.tolist())
     stiff, b, gap, slope = walls_by_hand(loop)
-    tick, m, w = contact(loop.environment, BOTH, loop.theta, loop.psi, loop.T).transition(), 2, len(stiff)
+    tick, m, w = loop.law(BOTH).transition(), 2, len(stiff)
 
     def stored(xi, x, p):
         X = np.concatenate([x, p])
@@ -267,7 +266,7 @@ def swinging(loop, coupling, damping, seed=11):
     A = np.zeros((HANDS, 3, 3))
     A[:, 0, 1] = 1
     A[:, 1, 0], A[:, 1, 1], A[:, 1, 2] = -stiff / mass, -damping / mass, -1 / mass
-    step, tick = expm(A * loop.T), contact(loop.environment, coupling, loop.theta, loop.psi, loop.T).transition()
+    step, tick = expm(A * loop.T), loop.law(coupling).transition()
     plant = rng.standard_normal((HANDS, 2)) * (1e-2, 0.1)
     before, after = np.zeros((2, loop.walled(coupling).order + 2, HANDS))
     made, touching, fastest = 0, np.zeros(HANDS, dtype=bool), 0.0

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cli.checks.faults import lively
+from cli.checks.faults import _lively
 from hw.control import certified_couplings
 from sim.scenario import load as scenario_of
 
@@ -10,7 +10,7 @@ from sim.scenario import load as scenario_of
 @pytest.fixture(scope="session")
 def scenario():
     """People who move soon after arming, at full amplitude."""
-    return lively(scenario_of())
+    return _lively(scenario_of())
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from cli import bridge
-from cli.checks.faults import CASES, rehearse_case
+from cli.checks.faults import CASES, _rehearse_case
 from hw.monitor import LinkSettings
 from hw.transport import SerialPort, _no_collections
 
@@ -33,7 +33,7 @@ def test_the_table_of_faults_shows_what_the_rehearsal_gives(row, scenario, rungs
     fault, ends, cause, zero = row
     shown = [re.search(r"[\d.]+", part)[0] for part in zero.split(";")]
     names = CALLED.get(fault, (fault,))
-    outcomes = [rehearse_case(next(c for c in CASES if c.name == name), scenario, rungs)[1] for name in names]
+    outcomes = [_rehearse_case(next(c for c in CASES if c.name == name), scenario, rungs)[1] for name in names]
     times = [f"{outcome.zero_force_ms:.1f}" for outcome in outcomes]
     assert times == (shown if len(shown) == len(times) else shown * len(times))
     for outcome in outcomes:
@@ -45,7 +45,7 @@ def test_the_table_of_faults_shows_what_the_rehearsal_gives(row, scenario, rungs
 def test_a_dead_encoder_or_channel_is_found_as_soon_as_the_page_says(scenario, rungs):
     names = ("encoder dies", "encoder 2 dies", "a channel of encoder 1 dies", "a channel of encoder 2 dies")
     times = [
-        rehearse_case(next(c for c in CASES if c.name == name), scenario, rungs)[1].zero_force_ms for name in names
+        _rehearse_case(next(c for c in CASES if c.name == name), scenario, rungs)[1].zero_force_ms for name in names
     ]
     assert f"forces are zero {min(times):.1f} to {max(times):.1f} ms after an encoder died" in PAGE
 

@@ -249,7 +249,7 @@ def test_a_record_with_gaps_gives_no_bound():
         (["--band", "3,1000"], "within 0.5 to 333 Hz"),
         (["--force", "20"], "--force is 20, allowed are 0.05 to 6"),
         (["--coulomb", "-1"], "--coulomb is -1"),
-        (["--hand", "0.1"], "--hand is for --rehearse"),
+        (["--hand", "0.1"], "--hand is only with --rehearse"),
         (["--sittings", "0"], "--sittings is 0, allowed are 1 to 20"),
     ],
 )

@@ -351,7 +351,7 @@ def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
     [
         ([], "either --port PATH or --emulate"),
         (["--emulate", "--port", "x"], "either --port PATH or --emulate"),
-        (["--port", "/dev/null", "--fault", "drop"], "--fault is for --emulate"),
+        (["--port", "/dev/null", "--fault", "drop"], "--fault is only with --emulate"),
         (["--port", "/nowhere", "--arm"], "--port /nowhere"),
         (["--emulate", "--case", "none"], "no coupling"),
         (["--emulate", "--baud", "5"], "--baud is 5, allowed are"),

@@ -9,7 +9,8 @@ from sessions import AT_REST, FAST, rehearsal_of, session_with
 from worlds import FakePort
 
 from cli import bridge
-from cli.checks.faults import CASES, Fault, at, person, rehearse_case
+from cli.checks.faults import CASES, Fault, _rehearse_case, at, person
+from controller.law import Law
 from design.coupling_file import Stored
 from design.coupling_file import save as save_coupling
 from hw.control import HostController, certified_coupling, certified_couplings, link_delay
@@ -31,14 +32,14 @@ from sim.scenario import InputError
 
 def test_a_session_whose_device_is_deaf_to_stop_has_not_finished(scenario, rungs):
     """Nothing at this end of the line can take the force away; it can be said, and the exit code not be 0."""
-    planned = rehearse_case(
+    planned = _rehearse_case(
         Fault("planned", Stage.FINISHED, faults=at("stuck"), action=person("stop")), scenario, rungs
     )[0]
     session = planned.session
     assert session.stage == Stage.STOPPED
     assert session.cause.endswith("cut its power")
     assert [event.stage for event in session.log[-2:]] == [Stage.FINISHED, Stage.STOPPED]
-    fault = rehearse_case(Fault("fault", Stage.STOPPED, faults=at("stuck jump=5")), scenario, rungs)[0].session
+    fault = _rehearse_case(Fault("fault", Stage.STOPPED, faults=at("stuck jump=5")), scenario, rungs)[0].session
     assert fault.stage == Stage.STOPPED
     assert [event.cause[:7] for event in fault.log[-2:]] == ["encoder", "told to"]
 
@@ -46,7 +47,7 @@ def test_a_session_whose_device_is_deaf_to_stop_has_not_finished(scenario, rungs
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_every_fault_ends_where_it_must(case, scenario, rungs):
     """Stage, cause, time to zero force, counters, no force above the cap, no second arming."""
-    assert rehearse_case(case, scenario, rungs)[1].wrong == ()
+    assert _rehearse_case(case, scenario, rungs)[1].wrong == ()
 
 
 def test_there_are_enough_faults():
@@ -185,7 +186,7 @@ def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
     simulation = assemble(scenario, rungs[0].chosen.coupling)
     held = hold(plant(simulation.scene.model), scenario.T)
     n = len(recorder) - first
-    w, law = outside_forces(scenario, simulation.scene, 0, n), HostController(simulation.F)
+    w, law = outside_forces(scenario, simulation.scene, 0, n), HostController(Law(simulation.F))
     s, counts, applied = np.zeros(held.A.shape[0]), [], []
     for k in range(n):
         x = np.round(s[:2] / 1e-6)
@@ -281,7 +282,7 @@ def test_an_optimal_coupling_has_another_for_one_tick_more_in_reserve(optimal_ru
     assert fast.requirements["this-environment"].certified
     assert soft.requirements["this-environment"].certified
     assert soft.scenario.theta == (2, 2)
-    bridge.print_certificate(Ages((130,) * 100), 1, optimal_rungs, (2.0, 2.0), Console(width=160))
+    bridge._print_certificate(Ages((130,) * 100), 1, optimal_rungs, (2.0, 2.0), Console(width=160))
     table = capsys.readouterr().out
     assert re.search(r"│ optimal, theta = 1, 2 .*rational.*this environment", table)
     assert re.search(r"│ optimal, theta = 2, 2 .*rational.*this environment", table)
@@ -360,7 +361,7 @@ def test_forces_at_the_cap_are_limited_under_the_guarantee_and_replay(scenario, 
     session.record = recorder
     Rehearsal(session, Emulator(scenario), lambda ages: rungs).run_until_armed(2.0)
     report = outcome("I", session, recorder, 0)
-    assert report.program["limiter"]["words"].startswith("proved, also while forces are limited to 0.3, 0.2 N")
+    assert report.program.limiter.words.startswith("proved, also while forces are limited to 0.3, 0.2 N")
     asked = np.abs(recorder.link()["asked"])
     assert (asked <= (0.3, 0.2)).all()
     assert (asked == (0.3, 0.2)).any(axis=1).mean() > 1 / 3

@@ -10,7 +10,7 @@ from cli.accuracy import main
 from controller.coupling import NoCoupling
 from models.device import RigidDevice
 from sim import accuracy as yardstick
-from sim.accuracy import Row, credible, with_front
+from sim.accuracy import Row, _with_front, credible
 from sim.run import assemble, run
 from sim.scenario import InputError, load
 
@@ -48,7 +48,7 @@ def test_the_front_is_what_nothing_beats():
     values = [("a", 1, 1, 1, True), ("a", 2, 0.5, -0.5, True), ("a", 3, 0.5, -0.6, True), ("b", 9, 9, 9, True)]
     cycle, values = (None,) * 4, (*values, ("a", 0.5, 2, 2, False))
     rows = [Row(kind, None, None, p, g, right, *cycle, wall) for kind, wall, p, g, right in values]
-    assert [row.pareto for row in with_front(rows)] == [True, True, False, True, False]
+    assert [row.pareto for row in _with_front(rows)] == [True, True, False, True, False]
 
 
 def test_bad_duration():

@@ -13,12 +13,12 @@ from cli.suite import main as suite
 from cli.suite_report import tightness
 from cli.validate import main
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
-from design.conditions import this_environment as real
+from design.environments import ThisEnvironment
 from models.device import RigidDevice
 from models.hold import hold
 from models.scene import build, plant
 from sim import adversary
-from sim.adversary import DESTABILISED, attempts, search, shortages
+from sim.adversary import _DESTABILISED, attempts, search, shortages
 from sim.run import assemble
 from sim.scenario import load
 from sim.stability import close, dominant_mode
@@ -38,7 +38,7 @@ def test_nobody_destabilises_a_loop_with_the_damping_it_requires():
     rows = attempts(LOOPS, np.array([-1e-3]), generations=12)
     assert not any(row.worst.destabilises for row in rows)
     # lossless hands come to the edge: 0 from below, to the rounding of the eigenvalues
-    assert all(abs(row.worst.growth) < DESTABILISED for row in rows)
+    assert all(abs(row.worst.growth) < _DESTABILISED for row in rows)
 
 
 def test_where_the_condition_binds_slowly_it_is_tight():
@@ -142,10 +142,11 @@ def test_the_rate_by_shortage():
 def test_a_human_who_destabilises_a_loop_with_enough_damping_fails_the_check(tmp_path, monkeypatch):
     """Were the condition wrong, the suite would say so: here it is told that a third of the damping is enough."""
 
-    def third(F, loop):
-        return replace(real(F, loop), required=(0.5, 0.5))
+    class Third(ThisEnvironment):
+        def required(self, loop, coupling, multiplier=None):
+            return replace(super().required(loop, coupling), required=(0.5, 0.5))
 
-    monkeypatch.setattr("sim.adversary.this_environment", third)
+    monkeypatch.setattr("sim.adversary.THIS_ENVIRONMENT", Third())
     check = Check(
         "tightness", "How tight?", shortages(("none",), (0,), 5), tightness, lambda plots: plots.plot_tightness
     )

@@ -17,7 +17,7 @@ distributed = pytest.importorskip("distributed", reason="Dask is not installed (
 
 from controller.coupling import CASE_I  # noqa: E402
 from sim import shards  # noqa: E402
-from sim.crowds import BATCH, MIXED, Findings, Validation  # noqa: E402
+from sim.crowds import _BATCH, MIXED, Findings, Validation  # noqa: E402
 from sim.scenario import (  # noqa: E402
     InputError,
     load,
@@ -25,7 +25,7 @@ from sim.scenario import (  # noqa: E402
 from sim.shards import Table, validate, validate_on_cluster  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
-QUESTION = Validation(load(), CASE_I, 0, 4 * BATCH, MIXED, "both", 0.25)  # 0.25 s: just enough for growth rates
+QUESTION = Validation(load(), CASE_I, 0, 4 * _BATCH, MIXED, "both", 0.25)  # 0.25 s: just enough for growth rates
 
 
 class Cluster:
@@ -96,7 +96,7 @@ def test_a_killed_worker_changes_nothing(cluster):
     alone = validate(QUESTION)
     for field in fields(Findings):
         np.testing.assert_array_equal(getattr(alone, field.name), getattr(shared, field.name), err_msg=field.name)
-    np.testing.assert_array_equal(shared.index, np.arange(4 * BATCH))
+    np.testing.assert_array_equal(shared.index, np.arange(4 * _BATCH))
     assert np.isfinite(shared.trace).any()
 
 
@@ -124,7 +124,7 @@ def test_wrong_addresses(address, message):
 def test_a_lost_scheduler_leaves_what_is_done(cluster, tmp_path):
     """The rest is done by the same question without a cluster, which ends with the single run's result."""
     cluster.add_worker("alone")
-    question, table = replace(QUESTION, humans=12 * BATCH), Table(replace(QUESTION, humans=12 * BATCH), tmp_path)
+    question, table = replace(QUESTION, humans=12 * _BATCH), Table(replace(QUESTION, humans=12 * _BATCH), tmp_path)
 
     def kill(done: int, total: int) -> None:
         if done == 2:
@@ -132,9 +132,9 @@ def test_a_lost_scheduler_leaves_what_is_done(cluster, tmp_path):
 
     found = validate_on_cluster(question, cluster.address, kill, table, patience=60)
     assert "the cluster was lost before all batches were done" in found.lost
-    assert 2 * BATCH <= found.index.size < 12 * BATCH
+    assert 2 * _BATCH <= found.index.size < 12 * _BATCH
     whole = validate(question, table=Table(question, tmp_path, resume=True))
-    assert whole.index.size == 12 * BATCH
+    assert whole.index.size == 12 * _BATCH
     assert not whole.lost
 
 
@@ -143,12 +143,12 @@ def test_a_cluster_whose_workers_are_all_lost_is_given_up(cluster, tmp_path, mon
     monkeypatch.setattr(shards, "_LOOK", 0.1)
     monkeypatch.setattr(shards, "_DESERTED", 0.3)
     cluster.add_worker("alone")
-    question = replace(QUESTION, humans=12 * BATCH)
+    question = replace(QUESTION, humans=12 * _BATCH)
 
     def kill(done: int, total: int) -> None:
         cluster.workers["alone"].kill()
 
     found = validate_on_cluster(question, cluster.address, kill, Table(question, tmp_path), patience=60)
     assert found.lost == f"--dask {cluster.address}: the cluster has had no workers for 0.3 s"
-    assert BATCH <= found.index.size < 12 * BATCH
-    assert len(Table(question, tmp_path, resume=True).missing()) == 12 - found.index.size // BATCH
+    assert _BATCH <= found.index.size < 12 * _BATCH
+    assert len(Table(question, tmp_path, resume=True).missing()) == 12 - found.index.size // _BATCH

@@ -12,7 +12,7 @@ from controller.coupling import CASE_I, NoCoupling
 from design.certificate import assess
 from models.device import CompliantDevice
 from models.human import Human, Link
-from sim.accuracy import limit_cycle
+from sim.accuracy import _limit_cycle
 from sim.checks.hard import cases, devices, measure, nominal
 from sim.mujoco_engines import EXPONENTIAL
 from sim.run import assemble, make_engine, outside_forces, run, run_blocks
@@ -54,7 +54,7 @@ def test_the_limit_cycle_of_saturation():
     """Uncoupled, channel 2 over the last 4.8 of 15 s: 83.85 Hz and 9.63 N in RK4 x 4 too; Euler x 1 has none."""
     loop = assemble(load(), NoCoupling())
     cycles = [
-        limit_cycle(run(loop, make_engine(loop, *setting)), 1)
+        _limit_cycle(run(loop, make_engine(loop, *setting)), 1)
         for setting in (("exact",), ("mujoco", "RK4", 4), ("mujoco", "Euler", 1))
     ]
     for name, (amplitude, frequency) in zip(("exact", "RK4 x 4", "Euler x 1"), cycles, strict=True):

@@ -67,8 +67,8 @@ def test_both_engines_agree_on_limited_forces(coupling, rho):
     np.testing.assert_allclose(own.x, exact.x, atol=3e-11)
     assert (np.abs(exact.f) <= limits).all()
     assert 0.2 < exact.clipped(limits).mean() < 0.95
-    assert simulation.process.limiter is not None
-    assert np.abs(simulation.process.limiter.slips(exact.z)).max() > 1e-4
+    assert simulation.process.law.bounds
+    assert np.abs(simulation.process.law.slips(exact.z)).max() > 1e-4
 
 
 @pytest.mark.parametrize(("engine", "apart"), [("exact", 1e-12), ("exponential", 1e-12), ("RK4", 0.0)])
@@ -84,6 +84,12 @@ def test_ticks_in_stretches_are_ticks_one_by_one(engine, apart, limit):
     for name in ("s", "z", "f", "w"):
         rows = getattr(expected, name)
         np.testing.assert_allclose(getattr(found, name), rows, rtol=0, atol=apart * np.abs(rows).max())
+
+
+def test_a_run_within_one_stretch_feels_every_outside_force():
+    simulation = assemble(weak(1e3, 1e3).replace(duration=0.1), BUILT, (11.4167, 11.4167))
+    found, expected = run(simulation, "exact"), run(simulation, tick_by_tick(make_engine(simulation, "exact")))
+    np.testing.assert_allclose(found.s, expected.s, rtol=0, atol=1e-12 * np.abs(expected.s).max())
 
 
 def test_limited_and_clipped_runs_agree_while_no_force_is_at_its_limit():
@@ -126,4 +132,4 @@ def test_the_report_says_which_guarantee_holds(tmp_path):
     assert usual["words"].startswith("proved, also while forces are limited to 12 N")
     uncovered = report("--case", "I", "--coupling", "optimal")["limiter"]
     assert uncovered["rho"] is None
-    assert "no proof found with the limiter" in uncovered["words"]
+    assert "no limiter is proved for this coupling" in uncovered["words"]

@@ -7,7 +7,7 @@ import pytest
 
 from controller.coupling import Coupling, NoCoupling
 from models.scene import Crowd, Variants, variants
-from sim.adversary import DESTABILISED, search
+from sim.adversary import _DESTABILISED, search
 from sim.couplings import choose
 from sim.crowds import draw
 from sim.run import assemble
@@ -59,7 +59,7 @@ def test_hundreds_of_hands_are_stable(scenario, lossless):
     """Exact eigenvalues. A lossless hand's own slow modes stand on the circle, to the rounding of the eigenvalues."""
     growth = exact_growth(scenario, lossless)
     assert growth.size == HUMANS
-    assert growth.max() < DESTABILISED
+    assert growth.max() < _DESTABILISED
     if not lossless:
         assert growth.max() < 0
         assert not unstable(growth).any()
@@ -72,7 +72,7 @@ def test_the_same_hands_upset_the_loop_without_coupling(scenario):
     upset = {}
     for lossless in (False, True):
         growth = dominant_mode(exact_loops(held(scenario, lossless), F)).growth
-        upset[lossless] = int((growth > DESTABILISED).sum())
+        upset[lossless] = int((growth > _DESTABILISED).sum())
     compliant = scenario == "omega-pair"
     assert upset[False] > 0.8 * HUMANS if compliant else upset[False] == 0
     assert upset[True] > (0.9 if compliant else 0.02) * HUMANS
@@ -84,7 +84,7 @@ def test_mujoco_says_the_same(scenario, lossless):
     """The eigenvalues of MuJoCo's own one-period map, for all of them."""
     simulation = assemble(load(scenario), optimal())
     mujoco = dominant_mode(mujoco_loops(held(scenario, lossless), simulation.process)).growth
-    assert mujoco.max() < DESTABILISED
+    assert mujoco.max() < _DESTABILISED
     assert not disagree(exact_growth(scenario, lossless), mujoco).any()
 
 

@@ -19,7 +19,7 @@ from sim import load, simulate, validate
 from sim.adversary import search_population
 from sim.crowds import Validation
 from sim.run import assemble, make_engine, run
-from sim.scenario import InputError, load_humans
+from sim.scenario import InputError, _load_humans
 from sim.stability import close, dominant_mode
 
 AGREE = 1e-6  # RK4 at 0.2 rad of the fastest mode in a step: 0.2^5/120 in each, of which most decays
@@ -276,7 +276,7 @@ def test_a_measured_hand_and_a_population_from_files(tmp_path):
     space = "[[human]]\nmass = 0.2\nA = [[-30.0]]\nB = [[1.0]]\nC = [[{C}]]\nD = [[2.0]]\n"
     chain = "[[human]]\nlinks = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]\n"
     file.write_text(space.format(C=200.0) + chain)
-    people = load_humans(file, 2).human
+    people = _load_humans(file, 2).human
     assert people[0].port().impedance.order == 1
     run = simulate(SCENARIO.replace(human=people, duration=0.5), CASE_I, engine="exact")
     assert run.meta["stability"]["exact_verdict"] == "stable"
@@ -287,12 +287,12 @@ def test_a_measured_hand_and_a_population_from_files(tmp_path):
     ]:
         file.write_text(text)
         with pytest.raises(InputError) as caught:
-            load_humans(file, 2)
+            _load_humans(file, 2)
         assert message in str(caught.value)
     python = tmp_path / "who.py"
     drawn = "from models.human import Human, Link\nclass Draw:\n    def draw(self, rng, n):\n        return {}\n"
     python.write_text(drawn.format("[Human((Link(0.3, 3.0, 200.0),))] * n") + "population = Draw()\n")
-    assert len(load_humans(python, 2).population.draw(None, 3)) == 3
+    assert len(_load_humans(python, 2).population.draw(None, 3)) == 3
     for text, message in [
         (drawn.format("[]") + "population = Draw()\n", "population.draw(rng, 2) gives not two humans"),
         (drawn.format("[1] * n") + "population = Draw()\n", "human #1 is 1, expected a Human"),
@@ -300,7 +300,7 @@ def test_a_measured_hand_and_a_population_from_files(tmp_path):
     ]:
         python.write_text(text)
         with pytest.raises(InputError) as caught:
-            load_humans(python, 2)
+            _load_humans(python, 2)
         assert message in str(caught.value)
 
 
@@ -322,7 +322,7 @@ def test_a_population_on_a_wall():
     simulation = assemble(scenario, coupling.coupling)
     crowd = Validation(scenario, coupling.coupling, 0, 20, 1, "exact", 0.0).crowd(7)
     plant = hold(variants(scenario.device, crowd).plants(), scenario.T)
-    states = simulation.process.frozen().values()
+    states = simulation.process.law.frozen().values()
     growth = max(float(dominant_mode(close(plant, F)).growth[0]) for F in states)
     assert found.exact[7] == pytest.approx(growth, rel=1e-9)
     assert (validate(scenario, None, humans=20, duration=0.0).exact > 0).any()

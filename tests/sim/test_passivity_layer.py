@@ -15,7 +15,6 @@ from design import design_coupling
 from sim import load, simulate
 from sim.passivity_layer import BASELINES, Classic, EnergyNet, Plugged, netted
 from sim.run import assemble, run
-from sim.switching import with_delays
 
 SHORT = load().replace(duration=1.5)
 
@@ -62,8 +61,8 @@ def test_no_hand_is_given_more_than_the_budget_by_a_hostile_loop(start, vary):
         delays = np.where(rng.random(delays.shape) < 0.05, -1, delays)
         delays[500:530] = -1  # a gap that the device must not hold through
         simulation = replace(assemble(scenario, coupling), scenario=scenario)
-        simulation = with_delays(simulation, coupling, packet_delays(delays[:, :, None]))
-    guarded = netted(simulation, coupling, EnergyNet(start))
+        simulation = replace(simulation, process=replace(simulation.process, delays=packet_delays(delays[:, :, None])))
+    guarded = netted(simulation, EnergyNet(start))
     trace = run(guarded, "exact")
     part = trace.net.part()
     assert part["limited_ticks"] > 100
@@ -80,8 +79,7 @@ def test_walls_stand_behind_a_budget_too():
     scenario = load("one-wall").replace(duration=1.5)
     simulation = assemble(scenario, NoCoupling())
     alone, rich, poor = (
-        run(one, "exact")
-        for one in (simulation, *(netted(simulation, NoCoupling(), EnergyNet(W0)) for W0 in (1e3, 0.0)))
+        run(one, "exact") for one in (simulation, *(netted(simulation, EnergyNet(W0)) for W0 in (1e3, 0.0)))
     )
     assert np.abs(alone.f).max() > 0.1
     assert np.abs(rich.f - alone.f).max() < 1e-9
@@ -105,14 +103,14 @@ def test_the_shell_bounds_what_an_environment_of_ones_own_gives():
 
     for start in (0.002, 1e9):
         simulation = assemble(SHORT, coupling)
-        trace = run(netted(simulation, coupling, Plugged(thief(), start)), "exact")
+        trace = run(netted(simulation, Plugged(thief(), start)), "exact")
         energies[start] = given(simulation, trace)
         assert trace.net.part()["limited_ticks"] > 100 or start > 1
     assert V is not None
     assert energies[0.002] <= 0.002
     assert energies[1e9] > 10 * 0.002
     with pytest.raises(ValueError, match="needs a coupling"):
-        netted(assemble(SHORT, NoCoupling()), NoCoupling(), Plugged(lambda u: u))
+        netted(assemble(SHORT, NoCoupling()), Plugged(lambda u: u))
 
 
 @pytest.mark.parametrize("name", BASELINES)
@@ -139,7 +137,7 @@ def test_a_classic_acts_in_the_loop_and_is_marked_as_a_baseline(name, tmp_path):
 
 def test_energy_bounding_sends_what_its_law_says():
     simulation = assemble(SHORT, NoCoupling())
-    trace = run(netted(simulation, NoCoupling(), Classic("eba")), "exact")
+    trace = run(netted(simulation, Classic("eba")), "exact")
     sent = np.stack([trace.f[n : len(trace.f) - 2 + n, i] for i, n in enumerate((1, 2))], axis=1)
     dx = np.diff(trace.x, axis=0)
     c1 = 2 * np.array(SHORT.delta) / SHORT.T
@@ -185,7 +183,7 @@ def test_no_hand_is_given_more_than_the_budget_in_uneven_periods():
     scenario = stiffer(load().replace(duration=4.0, period={"min": 0.4e-3, "max": 1.6e-3}), 20)
     simulation = assemble(scenario, NoCoupling())
     for start in (0.0, 0.01):
-        trace = run(netted(simulation, NoCoupling(), EnergyNet(start)), "exact")
+        trace = run(netted(simulation, EnergyNet(start)), "exact")
         dx, ticks = np.diff(trace.s[:, :2], axis=0), simulation.timing.period[: len(trace.t) - 1]
         lost = (dx**2 * np.array(scenario.delta)).sum(axis=1) / ticks
         taken = np.cumsum(-(trace.f[:-1] * dx).sum(axis=1) - lost)

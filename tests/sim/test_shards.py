@@ -17,13 +17,13 @@ import pytest
 from cli.validate import main
 from controller.coupling import CASE_I
 from sim import shards
-from sim.crowds import BATCH, MIXED, Findings, Validation
+from sim.crowds import _BATCH, MIXED, Findings, Validation
 from sim.scenario import InputError, load
 from sim.shards import Table, validate
 
 ROOT = Path(__file__).parents[2]
-QUESTION = Validation(load(), CASE_I, 0, 3 * BATCH + 10, MIXED, "exact", 0.0)
-OPTIONS = ["--humans", str(3 * BATCH), "--engine", "exact", "--duration", "0", "--no-plot"]
+QUESTION = Validation(load(), CASE_I, 0, 3 * _BATCH + 10, MIXED, "exact", 0.0)
+OPTIONS = ["--humans", str(3 * _BATCH), "--engine", "exact", "--duration", "0", "--no-plot"]
 
 
 def same(one: Findings, other: Findings) -> None:
@@ -65,7 +65,7 @@ def test_workers_that_die_again_and_again_leave_what_is_done(tmp_path, monkeypat
     monkeypatch.setattr(shards, "as_worker", die)
     found = validate(QUESTION, 2, table=table)
     assert found.lost == "worker processes died 3 times in a row"
-    np.testing.assert_array_equal(found.index, np.arange(BATCH, 2 * BATCH))
+    np.testing.assert_array_equal(found.index, np.arange(_BATCH, 2 * _BATCH))
     monkeypatch.undo()
     again, examined = Table(QUESTION, tmp_path, resume=True), []
     real = shards.examine
@@ -90,14 +90,14 @@ def test_the_command_says_what_is_missing(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(shards, "examine", fails)
     assert main([*OPTIONS, "--out", str(tmp_path)]) == 3
-    assert f"memory ran out; {BATCH} humans that were finished are kept" in " ".join(
+    assert f"memory ran out; {_BATCH} humans that were finished are kept" in " ".join(
         capsys.readouterr().out.replace("│", " ").split()
     )
     report = json.loads((tmp_path / "report.json").read_text())
-    assert (report["humans"], report["unfinished"], report["interrupted"]) == (BATCH, "memory ran out", False)
+    assert (report["humans"], report["unfinished"], report["interrupted"]) == (_BATCH, "memory ran out", False)
     monkeypatch.undo()
     assert main([*OPTIONS, "--out", str(tmp_path), "--resume"]) == 0
-    assert json.loads((tmp_path / "report.json").read_text())["humans"] == 3 * BATCH
+    assert json.loads((tmp_path / "report.json").read_text())["humans"] == 3 * _BATCH
     with pytest.raises(InputError, match=r"--resume: .* holds nothing unfinished of these humans and this loop"):
         main([*OPTIONS, "--out", str(tmp_path), "--resume"])
 

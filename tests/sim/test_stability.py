@@ -6,7 +6,7 @@ import pytest
 from controller.coupling import CASE_I, CASE_II, NoCoupling
 from sim.run import assemble, run
 from sim.scenario import load
-from sim.stability import NOT_EXCITED, Mode, close, dominant_mode, left_eigenvector, measured_growth, verdict
+from sim.stability import NOT_EXCITED, Mode, _left_eigenvector, _measured_growth, close, dominant_mode, verdict
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,7 @@ def test_exact_and_measured_growth(coupling, growth, frequency):
     mode = dominant_mode(loop)
     assert mode.growth == pytest.approx(growth, abs=1e-3)
     assert mode.frequency_hz == pytest.approx(frequency, abs=1e-2)
-    measured, reason = measured_growth(loop, run(simulation), simulation.process.force_limit)
+    measured, reason = _measured_growth(loop, run(simulation), simulation.process.force_limit)
     assert reason is None
     assert measured == pytest.approx(mode.growth, abs=1e-3)
 
@@ -38,7 +38,7 @@ def test_the_this_environment_matrix_is_the_loop():
 def test_left_eigenvector():
     simulation = assemble(load(), NoCoupling())
     loop = close(simulation.plant, simulation.F)
-    left = left_eigenvector(loop).conj()
+    left = _left_eigenvector(loop).conj()
     np.testing.assert_allclose(left @ loop.A, dominant_mode(loop).eigenvalue * left, atol=1e-9)
 
 
@@ -46,11 +46,11 @@ def test_a_trace_that_says_nothing_gives_a_reason():
     simulation = assemble(load().replace(duration=0.1), CASE_I)
     loop = close(simulation.plant, simulation.F)
     limit = simulation.process.force_limit
-    growth, reason = measured_growth(loop, run(simulation), limit)
+    growth, reason = _measured_growth(loop, run(simulation), limit)
     assert growth is None
     assert "only 82 ticks" in reason
     still = run(simulation, "exact", lambda first, ticks: np.zeros((ticks, simulation.scene.outside)), 300)
-    assert measured_growth(loop, still, limit) == (None, NOT_EXCITED)
+    assert _measured_growth(loop, still, limit) == (None, NOT_EXCITED)
 
 
 def test_verdicts():

@@ -15,7 +15,7 @@ from sim.run import assemble, make_engine, run
 from sim.scenario import SCENARIOS, InputError, load
 from sim.stability import exact_growth
 from sim.step_choice import (
-    PlantSpeed,
+    _PlantSpeed,
     check_substeps,
     default_substeps,
     measured_hold,
@@ -41,7 +41,7 @@ def test_pace_of_known_matrices():
     A[3, 4] = 1
     assert pace(A).mode == pytest.approx(3.0)
     assert pace(A).rate == pytest.approx(50.0)
-    assert pace(np.zeros((2, 2))) == PlantSpeed(0.0, 0.0)
+    assert pace(np.zeros((2, 2))) == _PlantSpeed(0.0, 0.0)
 
 
 def test_the_default_scenario_needs_no_more_than_four(simulation):

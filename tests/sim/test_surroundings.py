@@ -12,7 +12,6 @@ from cli import zwidth
 from cli.options import BAD_INPUT, DONE, execute
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring
-from controller.limiter import limited
 from controller.tick import Process, StepBuffer
 from design.frequency import on_circle
 from design.optimal import design
@@ -84,15 +83,15 @@ def test_forces_leave_through_the_limiter_of_the_coupling_in_every_environment()
     for stiffness, process in zip(K, sweep.processes(np.array(K), np.ones(2), devices), strict=True):
         springs = tuple(msgspec.structs.replace(s, stiffness=stiffness, damping=1.0) for s in PAIR.environment.springs)
         network = Network(PAIR.environment.contacts, springs, PAIR.environment.masses)
-        alone = limited(network, coupling, PAIR.theta, PAIR.psi, PAIR.T, limit, lag)
-        found, expected = (StepBuffer(p, 60, 2) for p in (process, Process(alone.open, limit, np.zeros(2), alone)))
+        alone = PAIR.loop("I").at(network).law(coupling, limit, lag)
+        found, expected = (StepBuffer(p, 60, 2) for p in (process, Process(alone, limit, np.zeros(2))))
         for buffer in (found, expected):
             buffer.x[:60] = 2e-3 * np.sin(0.1 * np.arange(60))[:, None, None] * np.array([[1.0], [-1.0]])
             for k in range(60):
                 buffer.tick(k)
         np.testing.assert_allclose(found.f[:60], expected.f[:60], atol=1e-9)
         assert (np.abs(found.f[:60]) == 0.3).mean() > 0.2
-    assert replace(sweep, lag=None).processes(np.array(K), np.ones(2), devices)[0].limiter is None
+    assert replace(sweep, lag=None).processes(np.array(K), np.ones(2), devices)[0].law.bounds == []
 
 
 def test_the_model_of_a_pair_may_stay_behind():
@@ -168,10 +167,10 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--coupling", "optimal", "--rigid"], "--rigid with --coupling optimal: it is about a map of spring-dampers"),
-        (["--coupling", "none", "--velocity-filter", "50"], "--velocity-filter with --coupling none"),
+        (["--coupling", "optimal", "--rigid"], "--rigid is only for a map of spring-dampers"),
+        (["--coupling", "none", "--velocity-filter", "50"], "--velocity-filter is only for a map of spring-dampers"),
         (["--coupling", "optimal", "--condition", "any-environment"], "for optimal allowed are this-environment"),
-        (["--condition", "any-environment"], "--condition any-environment: without --coupling nothing is designed"),
+        (["--condition", "any-environment"], "--condition is only with --coupling"),
         (["--coupling", "optimal", "--scenario", "one-wall"], "an optimal coupling holds a linear model"),
         (["--coupling", "published", "--scenario", "one-wall"], "the paper prints gains for 2 channels"),
     ],

@@ -20,18 +20,21 @@ from sim.engines import ExactEngine
 from sim.run import assemble
 from sim.run import run as close_loop
 from sim.scenario import SCENARIOS, InputError, load, parse
-from sim.stability import impulse_growth, unlimited
+from sim.stability import impulse_growth
 from sim.switching import (
-    greedy_ages,
-    mode_matrix,
+    _greedy_ages,
+    _mode_matrix,
+    _worst_switching,
     switched_crowd,
     switching,
-    with_delays,
-    without_theta,
-    worst_switching,
 )
 
 ASSEMBLY = assemble(load(), STIFF)
+
+
+def with_delays(simulation, delays):
+    """The same loop with packets that take these delays in place of the constant theta."""
+    return replace(simulation, process=replace(simulation.process, delays=delays))
 
 
 def one(held: HeldPlant) -> HeldPlant:
@@ -52,10 +55,10 @@ def test_the_product_of_mode_matrices_is_the_simulated_map():
     wanted = np.tile(depth, (ticks, 1))
     for k in range(4, ticks):
         wanted[k] = rng.integers([1, 0], np.minimum(wanted[k - 1] + 1, depth), endpoint=True)
-    G = without_theta(ASSEMBLY, STIFF)
-    moved = with_delays(ASSEMBLY, STIFF, realising(wanted)[:, :, None])
+    G = ASSEMBLY.process.law.sent
+    moved = with_delays(ASSEMBLY, realising(wanted)[:, :, None])
     states = moved.plant.A.shape[0]
-    buffer = StepBuffer(unlimited(moved.process), ticks, states, moved.scene.outside)
+    buffer = StepBuffer(moved.process.unlimited, ticks, states, moved.scene.outside)
     buffer.s[0, :, 0] = rng.normal(size=states)
     engine = ExactEngine(moved.plant)
     engine.start(buffer)
@@ -67,7 +70,7 @@ def test_the_product_of_mode_matrices_is_the_simulated_map():
     xi[:states] = buffer.s[0, :, 0]
     held = own_hold()
     for row in wanted:
-        xi = mode_matrix(held, G, depth, row) @ xi
+        xi = _mode_matrix(held, G, depth, row) @ xi
     size = np.abs(buffer.s[:, :, 0]).max()
     # both are products of the same 60 matrices up to rounding, 1e-16 each, of numbers up to `size`
     np.testing.assert_allclose(xi[:states], buffer.s[ticks, :, 0], atol=1e-11 * size)
@@ -76,20 +79,20 @@ def test_the_product_of_mode_matrices_is_the_simulated_map():
 
 def test_constant_delays_give_the_trace_of_the_constant_loop():
     delays = np.tile(np.array([1, 2])[None, :, None], (300, 1, 1))
-    varying = close_loop(with_delays(ASSEMBLY, STIFF, delays), "exact", ticks=300)
+    varying = close_loop(with_delays(ASSEMBLY, delays), "exact", ticks=300)
     constant = close_loop(ASSEMBLY, "exact", ticks=300)
     np.testing.assert_allclose(varying.s, constant.s, rtol=0, atol=1e-12 * np.abs(constant.s).max())
 
 
 def test_the_worst_period_grows_more_than_any_constant_delay():
     """(1, 2) is certified; switching within 1 to 2 makes the loop with its ordinary humans grow, exactly."""
-    worst = worst_switching(ASSEMBLY, STIFF, VaryingDelay((1, 1), (2, 2), "adversarial"))
+    worst = _worst_switching(ASSEMBLY, VaryingDelay((1, 1), (2, 2), "adversarial"))
     assert worst.growth > 1.5  # found by a search: 2.05 1/s at the time of writing
     assert set(np.unique(worst.ages)) <= {1, 2}
     period, held = len(worst.ages), own_hold()
-    G, product = without_theta(ASSEMBLY, STIFF), None
+    G, product = ASSEMBLY.process.law.sent, None
     for row in worst.ages:
-        A = mode_matrix(held, G, (2, 2), row)
+        A = _mode_matrix(held, G, (2, 2), row)
         product = A if product is None else A @ product
     radius = np.abs(np.linalg.eigvals(product)).max()
     # eigenvalues of a product of 134 matrices: their rounding adds up
@@ -97,7 +100,7 @@ def test_the_worst_period_grows_more_than_any_constant_delay():
     met = ages(np.tile(worst.delays, (3, 1))[:, :, None])[2 * period :, :, 0]
     np.testing.assert_array_equal(met, worst.ages)
     growth = {
-        ages: np.log(np.abs(np.linalg.eigvals(mode_matrix(held, G, (2, 2), ages))).max()) / G.T
+        ages: np.log(np.abs(np.linalg.eigvals(_mode_matrix(held, G, (2, 2), ages))).max()) / G.T
         for ages in ((1, 1), (1, 2), (2, 1), (2, 2))
     }
     assert growth[1, 2] < 0
@@ -106,13 +109,13 @@ def test_the_worst_period_grows_more_than_any_constant_delay():
 
 def test_greedy_ages_repeat_the_trajectory_that_chose_them():
     """The growth under the packet delays of greedy ages is positive, and random delays do not reach it."""
-    G, varying_delay, ticks = without_theta(ASSEMBLY, STIFF), VaryingDelay((1, 1), (2, 2)), 1600
-    process, held = replace(ASSEMBLY.process, F=G), one(ASSEMBLY.plant)
-    delays = realising(greedy_ages(process, held, ASSEMBLY.scene, varying_delay, ticks))
+    varying_delay, ticks = VaryingDelay((1, 1), (2, 2)), 1600
+    process, held = ASSEMBLY.process, one(ASSEMBLY.plant)
+    delays = realising(_greedy_ages(process, held, ASSEMBLY.scene, varying_delay, ticks))
     drawn = varying_delay.draw(np.random.default_rng(0), ticks)[:, :, None]
     rates = []
     for each in (delays, drawn):
-        free = replace(unlimited(process), delays=each)
+        free = replace(process.unlimited, delays=each)
         engine = ExactEngine(held)
         rates.append(impulse_growth(free, engine, ASSEMBLY.scene, held.A.shape[1], ticks)[0][0])
     assert rates[0] > 0 > rates[1]
@@ -121,7 +124,7 @@ def test_greedy_ages_repeat_the_trajectory_that_chose_them():
 def test_switching_depends_on_the_seed_only():
     scenario = load().replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
     loop = assemble(scenario, STIFF)
-    first, again, other = (switching(loop, STIFF, seed, 50)[0].process.delays for seed in (1, 1, 2))
+    first, again, other = (switching(loop, seed, 50)[0].process.delays for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
 
@@ -253,7 +256,7 @@ def test_both_engines_see_the_population_grow_alike():
     loop = assemble(scenario, STIFF)
     links = np.stack([draw(scenario.population, 2, 0, i, 1) for i in range(4)])
     held_by = variants(scenario.device, Crowd(links))
-    seen = switched_crowd(loop, STIFF, held_by, np.arange(4), 0, 2.0, mujoco=True, threads=1)
+    seen = switched_crowd(loop, held_by, np.arange(4), 0, 2.0, mujoco=True, threads=1)
     kept = ~np.isnan(seen.mujoco)
     assert kept.any()
     np.testing.assert_allclose(seen.mujoco[kept], seen.exact[kept], atol=1e-2)
@@ -261,7 +264,7 @@ def test_both_engines_see_the_population_grow_alike():
 
 def test_the_mismatch_that_a_run_reports_is_that_of_the_constant_delays():
     """The process of a loop that switches holds G without Theta; what is felt is still F."""
-    moved = with_delays(ASSEMBLY, STIFF, np.ones((5, 2, 1), dtype=int))
+    moved = with_delays(ASSEMBLY, np.ones((5, 2, 1), dtype=int))
     z = np.exp(1j * np.linspace(0.001, 3, 50))
     theta = z[:, None, None] ** -np.array(ASSEMBLY.scenario.theta, dtype=float)[:, None]
-    np.testing.assert_allclose(moved.felt.at(z), theta * without_theta(ASSEMBLY, STIFF).at(z), rtol=1e-9)
+    np.testing.assert_allclose(moved.felt.at(z), theta * ASSEMBLY.process.law.sent.at(z), rtol=1e-9)

@@ -22,7 +22,7 @@ from models.scene import Crowd, build, plant, variants
 from sim import crowds as examine_module
 from sim import shards
 from sim.couplings import choose
-from sim.crowds import BATCH, MIXED, Findings, Validation, crowds, draw
+from sim.crowds import _BATCH, MIXED, Findings, Validation, crowds, draw
 from sim.engines import ExactEngine
 from sim.run import assemble, run
 from sim.scenario import InputError, load
@@ -169,7 +169,7 @@ def test_a_human_depends_on_seed_and_index_only():
 
 def test_shards_repeat_the_single_run_bit_for_bit():
     """Verdicts and MuJoCo's traces, long enough for a growth rate on each."""
-    question = Validation(SCENARIO, CASE_I, 0, 2 * BATCH + 10, MIXED, "both", 0.3)
+    question = Validation(SCENARIO, CASE_I, 0, 2 * _BATCH + 10, MIXED, "both", 0.3)
     assert len(question.batches()) > 2
     alone, shared = validate(question), validate(question, shards=2)
     for field in fields(Findings):
@@ -268,7 +268,7 @@ def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
     assert main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 130
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["interrupted"]
-    assert report["humans"] == examine_module.BATCH
+    assert report["humans"] == examine_module._BATCH
 
 
 def test_ctrl_c_ends_the_batches_that_run_in_other_processes():

@@ -26,8 +26,8 @@ from sim.stability import close, dominant_mode
 from sim.view import film
 from sim.view.events import GIVEN, KEYS, Delay, Menu, Push, Restart, changed, first_loop, parse_script, words
 from sim.view.film import Flat
-from sim.view.session import DAMPING, STIFFNESS, Grip, LiveLoop, Pace, gripped
-from sim.view.stage import COLUMNS, ShownScene, apart, channels, dressed, envelope, keys_help, overlay, places, scale
+from sim.view.session import DAMPING, STIFFNESS, Grip, LiveLoop, _gripped, _Pace
+from sim.view.stage import COLUMNS, ShownScene, _dressed, apart, channels, envelope, keys_help, overlay, places, scale
 from sim.view.window import loop, typed
 
 SCENARIO = load()
@@ -107,7 +107,7 @@ def test_frames_tell_the_forces_since_the_last_one(none):
 def test_rest_is_where_a_held_position_leads(published):
     """z = A z + B x, and the force is F(1) x; F(1) from the transfer function itself."""
     F, x = published.simulation.F, np.array([0.01, -0.004])
-    z = published.simulation.process.at_rest(x)
+    z = published.simulation.process.law.at_rest(x)
     assert np.allclose(F.A @ z + F.B @ x, z, atol=1e-12)
     # rounding: forces of 10 N as differences of numbers about 1e4 larger
     assert np.allclose(F.C @ z + F.D @ x, F.at(1.0 + 0j).real @ x, atol=1e-8)
@@ -216,7 +216,7 @@ def test_restart_begins_from_rest(none):
 
 @given(st.lists(st.floats(0, 0.5), min_size=1, max_size=30))
 def test_every_tick_is_made_or_counted_as_lost(steps):
-    pace, now = Pace(1e-3, patience=0.1), 0.0
+    pace, now = _Pace(1e-3, patience=0.1), 0.0
     for step in steps:
         now += step
         assert 0 <= pace.due(now) <= 100
@@ -226,7 +226,7 @@ def test_every_tick_is_made_or_counted_as_lost(steps):
 
 
 def test_what_is_too_late_is_lost_and_said():
-    pace = Pace(1e-3, patience=0.1)
+    pace = _Pace(1e-3, patience=0.1)
     assert pace.due(0.05) == 50
     assert pace.due(1.05) == 100
     assert (pace.overruns, pace.lost) == (1, pytest.approx(0.9))
@@ -241,7 +241,7 @@ def test_the_mouse_is_one_more_passive_hand(none):
     human = SCENARIO.human[0].links[0]
     firmer = Human((Link(human.mass, human.damping + DAMPING, human.stiffness + STIFFNESS),))
     scene = build(SCENARIO.device, (firmer, SCENARIO.human[1]))
-    expected, held = hold(plant(scene.model), SCENARIO.T), gripped(none.simulation.scene, 0, SCENARIO.T)
+    expected, held = hold(plant(scene.model), SCENARIO.T), _gripped(none.simulation.scene, 0, SCENARIO.T)
     # both are one matrix exponential of the same matrix, whose entries reach 1e5
     assert np.allclose(held.A, expected.A, rtol=0, atol=1e-10)
     assert np.allclose(held.B, expected.B, rtol=0, atol=1e-12)
@@ -249,7 +249,7 @@ def test_the_mouse_is_one_more_passive_hand(none):
 
 def test_the_mouse_draws_the_handle_and_lets_it_go():
     soft = replace_theta(first_loop(Menu("I"), SCENARIO, "published"), (0, 0))
-    assert dominant_mode(close(gripped(soft.simulation.scene, 1, SCENARIO.T), soft.simulation.F)).growth < 0
+    assert dominant_mode(close(_gripped(soft.simulation.scene, 1, SCENARIO.T), soft.simulation.F)).growth < 0
     running, quiet = session(soft), session(soft)
     handle = soft.simulation.scene.handles[1]
     for k in range(1, 30):
@@ -282,7 +282,7 @@ def test_shapes_change_nothing_that_moves(name):
     scenario = load(name)
     arms = [Human((*human.links, Link(0.5, 2.0, 300.0))) for human in scenario.human]
     scene = build(scenario.device, arms)
-    bare, shown = scene.model, dressed(scene)
+    bare, shown = scene.model, _dressed(scene)
     assert bare.ngeom == 0
     assert shown.ngeom == bare.njnt + scene.channels  # a shape per body, a rail per device
     assert [shown.joint(j).name for j in range(shown.njnt)] == [bare.joint(j).name for j in range(bare.njnt)]
@@ -311,7 +311,7 @@ def test_a_person_s_body_stands_behind_both_arms():
     scene = build(SCENARIO.device, [arm, SCENARIO.human[1]], [Person((1, 2), 30.0, 80.0, 900.0)])
     body = scene.model.joint("body_1").id
     assert (channels(scene)[body], places(scene)[body]) == (0, 2)
-    assert np.array_equal(plant(dressed(scene)).A, plant(scene.model).A)
+    assert np.array_equal(plant(_dressed(scene)).A, plant(scene.model).A)
 
 
 def test_the_overlay_says_growth_and_certificates(none, published):
@@ -471,14 +471,14 @@ def test_flat_pictures_show_where_things_are(none):
 def backend():
     try:
         return film.backend()
-    except film.NoOffscreen as error:
+    except film._NoOffscreen as error:
         pytest.skip(str(error))
 
 
 def test_pictures_by_opengl(backend, none):
     """The scene above, the forces below; the handles move with the positions."""
     stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
-    painter = film.Offscreen(stage, backend)
+    painter = film._Offscreen(stage, backend)
     try:
         frame = session(none).frame(0.05)
         one, again = painter.picture(frame), painter.picture(frame)
@@ -507,7 +507,7 @@ def test_without_opengl_there_are_flat_pictures_and_a_line(tmp_path, monkeypatch
 def test_a_driver_that_fails_says_why(monkeypatch):
     monkeypatch.setattr(film, "_PROBE", "import sys; sys.exit('no such driver: {}')")
     monkeypatch.setenv("MUJOCO_GL", "osmesa")  # asked for: nothing else is tried
-    with pytest.raises(film.NoOffscreen, match=r"here \(osmesa: no such driver: osmesa\)"):
+    with pytest.raises(film._NoOffscreen, match=r"here \(osmesa: no such driver: osmesa\)"):
         film.backend()
 
 

@@ -7,19 +7,19 @@ import msgspec
 import mujoco
 import numpy as np
 import pytest
+from worlds import force_map, loop_of
 
 from cli import zwidth
 from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall, environment
-from controller.loop import Loop, force_map
+from controller.law import Law
+from controller.loop import Loop
 from controller.tick import Process, StepBuffer
-from controller.walls import contact
 from design.frequency import on_circle, suprema
 from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Link
 from models.scene import build, variants
-from sim import limit_cycles
 from sim import zwidth as zwidth_map
 from sim.crowds import crowds
 from sim.limit_cycles import Effects, HeldDevices, Plan
@@ -244,7 +244,7 @@ def test_what_counts_as_an_oscillation():
 def walled(count):
     walls = tuple(Wall(("tip", GROUND), 900.0 * (i + 1), 0.7, 1e-4 * i) for i in range(count))
     network = Network(("tip",), (Spring(("tip", GROUND), 1.0),), walls=walls)
-    return contact(network, SpringDamper([2000.0], [0.5]), (1,), (0,), T)
+    return loop_of(network, (1,), (0,), T).law(SpringDamper([2000.0], [0.5]))
 
 
 @pytest.mark.parametrize("walls", [0, 1, 2, "limited"])
@@ -257,12 +257,13 @@ def test_many_processes_are_each_as_alone(walls):
         processes = sweep.processes(np.array([500.0, 900.0]), np.array([0.2, 0.3]), devices)
     elif walls:
         contacts = [walled(walls), walled(walls)]
-        processes = [Process(c.open, limit, step, c) for c in contacts]
+        processes = [Process(c, limit, step) for c in contacts]
     else:
         (stack,) = rigid(1).force_maps(np.array([500.0, 900.0]), np.array([0.2, 1.0]))
-        processes = [Process(stack[i], limit, step) for i in range(2)]
+        processes = [Process(Law(stack[i]), limit, step) for i in range(2)]
     x = rng.normal(scale=1e-3, size=(20, 2))
-    together = limit_cycles._ManyProcesses(processes, 20, 2, 0)
+    made = processes[0].law.together([process.law for process in processes])
+    together = StepBuffer(processes[0], 20, 2, 0, len(processes), made)
     alone = [StepBuffer(process, 20, 2) for process in processes]
     for k in range(20):
         together.s[k, 0] = x[k]
@@ -330,13 +331,13 @@ def test_motors_that_saturate_have_the_limiter_where_a_guarantee_covers_it():
     sweep, devices = rigid(1), Effects(saturation=True).on(rigid(1).devices)
     one, two, three = sweep.processes(np.array([600.0, 600.0, 2500.0]), np.array([0.1, 0.3, 0.2]), devices)
     for process, limit in ((one, 12.0), (two, 12.0), (three, np.inf)):
-        assert process.limiter.limit == limit
+        assert process.law.limit == limit
         assert process.force_limit == 12.0
-    assert one.limiter.rho == 0.0
+    assert one.law.rho == 0.0
     held = points(sweep, [300.0, 600.0], [0.0, 0.3], Effects(saturation=True), press=20.0)
     assert not held.oscillates.any()
     (walled,) = rigid(1, one_sided=True).processes(np.array([600.0]), np.array([0.1]), devices)
-    assert (walled.limiter.limit, walled.limiter.rho, len(walled.walls)) == (12.0, 0.0, 1)
+    assert (walled.law.limit, walled.law.rho, len(walled.walls)) == (12.0, 0.0, 1)
 
 
 def test_a_coarse_encoder_makes_a_stable_loop_oscillate_by_its_steps():
@@ -352,13 +353,13 @@ def test_a_one_sided_wall_is_simulated_with_the_coupling_in_front_of_it():
     """Under any-environment contact made and broken comes to rest: an unstable pulling spring is what oscillates."""
     sweep = rigid(0, one_sided=True)
     (process,) = sweep.processes(np.array([2000.0]), np.array([0.3]), Effects().on(sweep.devices))
-    assert process.contact is not None
+    assert process.walls
     pulled, pushed = (np.zeros((process.F.order + 1, 1)) for _ in range(2))
     pulled[-1], pushed[-1] = -1e-3, 1e-3
     after = np.empty((process.F.order + 1, 1))
-    process.transition()(pulled, after)
+    process.law.transition()(pulled, after)
     assert after[0, 0] == 0
-    process.transition()(pushed, after)
+    process.law.transition()(pushed, after)
     # from rest K x + B x/T, with the wall's 1e10 N/m in series
     assert after[0, 0] == pytest.approx((2000 + 0.3 / T) * 1e-3, rel=1e-6)
     found = points(sweep, [500.0, 1500.0], [0.0, 0.6])
