@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
@@ -166,7 +166,7 @@ def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: De
     if args.limiter is not False:
         limits = coverage.covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
     limits = limits.within([device.force_limit for device in scenario.device])
-    return Judged.of(args.coupling, design.coupling, loop, requirements, whole, limits)
+    return Judged.of(replace(design, kind=args.coupling), loop, requirements, whole, limits)
 
 
 def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judged, stored: Filed) -> _Report:
