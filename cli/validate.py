@@ -71,8 +71,7 @@ def _parser() -> options.Parser:
     options.add_coupling_options(parser, ", ".join(NAMES))
     options.add_human_option(parser, " and `population`, whose draw(rng, n) gives n hands,")
     options.add_limiter_option(parser)
-    count = "random humans per device (default 1000)"
-    add("--humans", type=whole(1, 1_000_000), default=1000, metavar="N", help=count)
+    add("--humans", type=whole(1, 1_000_000), default=1000, metavar="N", help="random humans per device (default 1000)")
     add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
     add("--engine", choices=ENGINES, default="both", help="who decides (default both)")
     seconds = "length of the traces (default 2; 0 for none)"
