@@ -9,11 +9,14 @@ from dataclasses import dataclass, field
 from rich.table import Table
 
 from cli import options, render
-from design.certificate import Verdict, lag, verify, violated_between
+from design.certificate import NotProved, Verdict, lag, prove, verify, violated_between
+from design.conditions import Condition
 from design.coupling_file import Stored, SwitchingProof
 from design.coverage import SearchFigures
 from design.environments import Searched, search_ranges
+from design.files import InputError
 from design.guarantees import HERE, RANGES, switching_guarantee
+from design.own import called, named
 from design.result import listed
 from sim.couplings import read_coupling
 
@@ -56,7 +59,7 @@ def main(argv: list[str]) -> int:
     begin = time.perf_counter()
     stored = read_coupling(args.coupling)
     with options.refused(f"{args.coupling}: "):
-        verdict = verify(stored)
+        stored, verdict = _by_own(stored, args.condition) if args.condition else (stored, verify(stored))
     searched = _searched(stored) if verdict.proved else None
     if searched and not searched.worst[0].ratio < 1:
         verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
@@ -69,8 +72,23 @@ def _parser() -> options.Parser:
     example = "python -m design.check coupling.json"
     parser = options.Parser("design.check", "Prove a stored coupling again, in exact arithmetic.", example)
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling")
+    own = "prove the coupling by a condition of your own (design.conditions.Condition), in place of the file's"
+    parser.add_argument("--condition", metavar="MODULE:CLASS", help=own)
     options.add_json_option(parser)
     return parser
+
+
+def _by_own(stored: Stored, name: str) -> tuple[Stored, Verdict]:
+    """The coupling with a certificate by the condition that `name` names, proved and verified. Raises InputError."""
+    condition = called(f"--condition {name}", named("--condition", name))
+    if not isinstance(condition, Condition):
+        raise InputError(f"--condition {name} makes {condition!r}, expected a design.conditions.Condition")
+    coupling = stored.built()
+    try:
+        proved = Stored.of(stored.loop, coupling, prove(stored.loop, coupling, condition))
+    except NotProved as error:
+        return Stored.of(stored.loop, coupling), Verdict(False, f"{condition.name}: {error}")
+    return proved, verify(proved, condition)
 
 
 def _searched(stored: Stored) -> Searched | None:

@@ -17,7 +17,7 @@ from design.api import Filed, proved, store
 from design.audit import LONGEST_DELAY
 from design.bound import BoundBeside
 from design.certificate import SAMPLES, assess, check_ranges
-from design.designs import KINDS, design_by_kind, usual_condition
+from design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
 from design.guarantees import ANY
@@ -56,7 +56,8 @@ def _parser() -> options.Parser:
     parser = options.Parser("design", "Design a coupling, prove its certificate and store both.", example)
     options.add_loop_options(parser)
     kind = parser.add_mutually_exclusive_group()
-    kind.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
+    kinds = f"{', '.join(KINDS)}, or package.module:function of your own (default spring-damper)"
+    kind.add_argument("--coupling", metavar="NAME", default="spring-damper", help=kinds)
     best = "the coupling of the least transparency error: --coupling optimal"
     kind.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
     around = "certify for every stiffness and mass this much more or less, as [ranges] of a scenario does"
@@ -107,7 +108,8 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
         with options.refused(f"--ranges {args.ranges:g}: "):
             loop = msgspec.structs.replace(loop, ranges=ranges_around(loop.network, args.ranges))
             loop.members()
-    args.condition = args.condition or usual_condition(loop, args.coupling)
+    if args.coupling in KINDS:
+        args.condition = args.condition or usual_condition(loop, args.coupling)
     if args.varying_delay is not None:
         if not _for_switching(args):
             raise InputError("--varying-delay is for --coupling optimal or --condition this-environment")
@@ -121,15 +123,15 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 
 def _for_switching(args: argparse.Namespace) -> bool:
     """Whether this design can be made for delays that vary; any other is only judged under them."""
-    condition = args.condition or KINDS[args.coupling].conditions[0]
-    return "switching" in KINDS[args.coupling].options and condition == "this-environment"
+    kind = kind_of(args.coupling)
+    return "switching" in kind.options and (args.condition or kind.conditions[0]) == "this-environment"
 
 
 def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     """The options of a design by the names of its arguments. Raises InputError for options of another coupling."""
     known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
     given = {name: value for name in known if options.given(value := getattr(args, name, None))}
-    if KINDS[kind].limited and args.limiter is not None:
+    if kind_of(kind).limited and args.limiter is not None:
         given["limiter"] = args.limiter
     for name in given:
         taking = [other for other, design in KINDS.items() if name in design.options]

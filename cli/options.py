@@ -294,7 +294,9 @@ def with_humans(args: argparse.Namespace, scenario: Scenario) -> Scenario:
 
 def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: str = "spring-damper") -> None:
     """Which coupling, and the condition that it is designed for or judged by."""
-    parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default {default})")
+    parser.add_argument(
+        "--coupling", metavar="NAME|FILE", help=f"{names}, FILE.json or package.module:function (default {default})"
+    )
     add_condition_option(parser)
 
 

@@ -10,7 +10,6 @@ No device is known but by its damping, and no human at all. It computes nothing 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Any
 
 import msgspec
@@ -206,8 +205,3 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
 
 #: What was built last over Fractions, and of what: a proof asks for it three times, and it is most of its work.
 _exactly: list[Any] = [(None,) * 4, None]
-
-
-def force_map(E: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:
-    """F = Theta (I + Psi E V)^-1 Psi E (6): displacements to forces, as the devices see them."""
-    return delay(theta, E.T) @ coupling.around(delay(psi, E.T) @ E)

@@ -111,7 +111,7 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[st
     """
     of_kind("loop", loop, Loop, _LOOP)
     phi = coupling.phi if isinstance(coupling, Design) else None
-    alone = _fitting(loop, coupling)
+    alone = fitting(loop, coupling)
     requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi))
     if whole := check_ranges(loop, alone, samples=0):
         _, worst = whole.worst if whole.proved else whole.worst_found
@@ -146,7 +146,7 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
     Raises TypeError and ValueError as `certify` does.
     """
     of_kind("loop", loop, Loop, _LOOP)
-    return transparency(loop.F(_fitting(loop, coupling)), loop.E(), loop.lam, band_hz)
+    return transparency(loop.F(fitting(loop, coupling)), loop.E(), loop.lam, band_hz)
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ def bare(coupling: Coupling | Design, expected: str = COUPLING) -> Coupling:
     return found
 
 
-def _fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:
+def fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:
     """The coupling alone. Raises ValueError where it is one of another number of channels."""
     alone = bare(coupling)
     Stored.of(loop, alone)

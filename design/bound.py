@@ -147,7 +147,7 @@ class _Dual:
         slope = np.concatenate([*slopes, packed(hermitian(self.further(w)))], axis=1)
         return Block(np.zeros((w.size, m * m)), np.ascontiguousarray(np.swapaxes(slope, 1, 2)))
 
-    def lacking(self, x: Array, w: Array, parts: Complex, further: Complex) -> Array:
+    def lacking(self, x: Array, parts: Complex, further: Complex) -> Array:
         """By how much D is not positive, (k,)."""
         m = self.loop.channels
         h, C = np.split(x, [m * m * len(self.target)])
@@ -187,7 +187,7 @@ class _Dual:
                     break
                 t *= _STEEPER
             x = scipy.linalg.solve_triangular(U, y)
-            lacking = self.lacking(x, swept, *parts)
+            lacking = self.lacking(x, *parts)
             charge = self.loop.channels * max(0.0, float(lacking.max()))
             value = nothing - program.value(y) - charge
             found = max(found, value)

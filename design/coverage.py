@@ -9,8 +9,7 @@ from typing import Any
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.environment import environment
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
 from design.conditions import this_environment
@@ -165,8 +164,8 @@ class OverRanges:
         """Members that no device feels have no mismatch."""
         ratios, figures = [], {}
         for member in members:
-            E = environment(member.network, loop.T)
-            F = force_map(E, coupling, loop.theta, loop.psi)
+            here = loop.at(member.network)
+            E, F = here.E(), here.F(coupling)
             ratios.append(this_environment(F, loop.delta, loop.T_max, loop.latency).ratio)
             if E.D.any():
                 figures[member.name] = transparency(F, E, loop.lam)

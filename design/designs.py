@@ -13,6 +13,7 @@ import msgspec
 from controller.loop import Loop
 from design.environments import THIS_ENVIRONMENT
 from design.lmi import LATE
+from design.own import called, named
 from design.result import Design, DesignFailed
 
 
@@ -50,6 +51,14 @@ KINDS = {
 }
 
 
+_OWN = Kind(("this-environment", "any-environment"), "", "")  # a function of a user's own, which takes a loop alone
+
+
+def kind_of(name: str) -> Kind:
+    """The kind of that name, or that of a user's own functions."""
+    return KINDS.get(name, _OWN)
+
+
 def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """The default condition of a design: a spring-damper is designed for this environment, which feels best.
 
@@ -57,7 +66,8 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     that vary. Other kinds for their own condition.
     """
     less = loop.environment.walls or loop.ranges or loop.varying_delay
-    return "any-environment" if less and "any-environment" in KINDS[kind].conditions else KINDS[kind].conditions[0]
+    conditions = kind_of(kind).conditions
+    return "any-environment" if less and "any-environment" in conditions else conditions[0]
 
 
 def design_by_kind(
@@ -75,8 +85,15 @@ def design_by_kind(
     Raises ValueError for a kind or condition that does not exist, Infeasible or DesignFailed (design.result) where
     there is nothing to return.
     """
+    if kind not in KINDS and ":" in kind:
+        found = own_coupling(kind, loop)
+        if not isinstance(found, Design):
+            raise ValueError(f"coupling {kind} is {found!r} for this loop, expected a design.result.Design")
+        if condition not in (None, found.condition):
+            raise ValueError(f"condition is {condition!r}, but {kind} is designed for {found.condition}")
+        return found
     if kind not in KINDS:
-        raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)}")
+        raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)} and package.module:function")
     condition = condition or usual_condition(loop, kind)
     chosen = KINDS[kind]
     if condition not in chosen.conditions:
@@ -92,6 +109,11 @@ def design_by_kind(
     if chosen.model or condition == "any-environment" or not (loop.latency or loop.environment.walls):
         return made(loop)
     return _with_less_damping(loop, made)
+
+
+def own_coupling(name: str, loop: Loop) -> Any:
+    """What a user's own function, named as `package.module:function`, makes of a loop. Raises InputError."""
+    return called(f"--coupling {name}", named("--coupling", name), loop)
 
 
 #: A design for forces that latch late, or for walls, leaves at most this share of the damping, and is sought so often.

@@ -14,7 +14,7 @@ import numpy as np
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.lti import Array, Sampled
 from design.conditions import even_damping, this_environment, this_environment_demand
 from design.frequency import frequencies, hermitian, on_circle
@@ -61,7 +61,10 @@ def polynomials(theta: int, w: Array) -> tuple[Array, Array]:
 
 
 class SampledLoop:
-    """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta), shape (2N,)."""
+    """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta, ..).
+
+    The gains are the first 2N entries; behind them are the unknowns of a condition's multiplier, where it has some.
+    """
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.loop, self.E = loop, loop.E()
@@ -80,8 +83,11 @@ class SampledLoop:
         self._known: dict[int, tuple[_Responses, Array, tuple[Complex, Array, Complex, Complex]]] = {}
 
     def coupling(self, x: Array) -> SpringDamper:
-        log_k, b = np.split(x, 2)
+        log_k, b = np.split(self._gains(x), 2)
         return SpringDamper(np.exp(log_k), np.maximum(b, 0.0) * self.delta)
+
+    def _gains(self, x: Array) -> Array:
+        return x[: 2 * self.loop.channels]
 
     def point(self, coupling: SpringDamper) -> Array:
         return np.concatenate([np.log(coupling.K), coupling.B / self.delta])
@@ -114,7 +120,7 @@ class SampledLoop:
 
     def force(self, x: Array, responses: _Responses) -> Complex:
         """F = Theta G (G + Psi E)^-1 Psi E with G = V^-1, (k, N, N)."""
-        by, b, _, right = self._solved(x, responses)
+        by, b, _, right = self._solved(self._gains(x), responses)
         g = by[0] + by[1] * b
         return np.diagonal(responses[2], axis1=1, axis2=2)[:, :, None] * g[:, :, None] * right
 
@@ -141,8 +147,8 @@ class SampledLoop:
 
     def square_mismatch_slope(self, x: Array) -> Array:
         """Its gradient by x; the unknowns behind the gains do not move it."""
-        gains, (_, E, theta) = x[: 2 * self.loop.channels], self.loop_in_band
-        by, _, S, right = self._solved(gains, self.loop_in_band)
+        _, E, theta = self.loop_in_band
+        by, _, S, right = self._solved(self._gains(x), self.loop_in_band)
         M, log_w = self.force(x, self.loop_in_band) - self.target, np.log(self.band)
         back = right @ M.conj().swapaxes(1, 2) @ theta @ E
         moved = 2 * (np.einsum("kij,kji->ki", back, S) * by).real
@@ -192,8 +198,8 @@ class SampledLoop:
 
     def stability(self, x: Array) -> float:
         """By how much more than CLOSEST_POLE the poles keep away from the circle."""
-        F = force_map(self.E, self.coupling(x), self.loop.theta, self.loop.psi)
-        return float(1 - _CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
+        poles = self.loop.F(self.coupling(x)).poles()
+        return float(1 - _CLOSEST_POLE - np.abs(poles).max(initial=0.0))
 
     def search(self, x: Array, most: int) -> OptimizeResult:
         """The local optimum from x, by so many steps."""
@@ -232,9 +238,6 @@ class SwitchingLoop(SampledLoop):
         self.active = np.flatnonzero(self.h)
         super().__init__(loop)
 
-    def coupling(self, x: Array) -> SpringDamper:
-        return super().coupling(self._gains(x))
-
     def point(self, coupling: SpringDamper) -> Array:
         """The gains with their best multiplier."""
         loop = self.loop
@@ -246,9 +249,6 @@ class SwitchingLoop(SampledLoop):
     def judged(self, x: Array) -> Requirement:
         sent = self.loop.sent(self.coupling(x))
         return switching_sweep(sent, *self.range, self.loop.delta, T_max=self.loop.T_max).requirement
-
-    def force(self, x: Array, responses: _Responses) -> Complex:
-        return super().force(self._gains(x), responses)
 
     def room(self, x: Array) -> Array:
         """1 - SAMPLED_RESERVE less the damping ratio at each sampled frequency, with the multiplier in x."""
@@ -266,9 +266,6 @@ class SwitchingLoop(SampledLoop):
     def search(self, x: Array, most: int) -> OptimizeResult:
         return self.minimised(x, most, [(np.log(_MULTIPLIERS[0]), np.log(_MULTIPLIERS[1]))] * self.active.size)
 
-    def _gains(self, x: Array) -> Array:
-        return x[: 2 * self.loop.channels]
-
 
 # ----------------------------------------------------------------------------------------------------
 # Spring-damper gains that are safe also while forces are limited: the same search with the limiter's block
@@ -283,9 +280,6 @@ class LimiterLoop(SampledLoop):
         self._undelayed: tuple[_Responses, _Responses] | None = None
         super().__init__(loop, band_hz)
 
-    def coupling(self, x: Array) -> SpringDamper:
-        return super().coupling(self._gains(x))
-
     def point(self, coupling: SpringDamper) -> Array:
         """The gains with a usual multiplier."""
         return np.append(super().point(coupling), np.full(self.loop.channels, _FIRST_WEIGHT))
@@ -293,9 +287,6 @@ class LimiterLoop(SampledLoop):
     def judged(self, x: Array) -> Requirement:
         loop, sent, c = self.loop, self.loop.sent(self.coupling(x)), self._weights(x).tolist()
         return limiter_proof(sent, loop.theta, loop.delta, self.rho, c, T_max=loop.T_max).requirement
-
-    def force(self, x: Array, responses: _Responses) -> Complex:
-        return super().force(self._gains(x), responses)
 
     def room(self, x: Array) -> Array:
         """The least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency."""
@@ -346,9 +337,6 @@ class LimiterLoop(SampledLoop):
     def _weights(self, x: Array) -> Array:
         """c, a row of one lag per channel."""
         return np.maximum(x[2 * self.loop.channels :, None], 0.0)
-
-    def _gains(self, x: Array) -> Array:
-        return x[: 2 * self.loop.channels]
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -14,8 +14,9 @@ what is measured all but times: exit code 1 where that is something else.
     ```text
     $ python -m sim.accuracy
 
-A toml block whose first line is `# NAME.toml` is a file for the commands after it; `<!-- picture: FROM TO -->` keeps a
-picture that a command has drawn; `<!-- source: FILE FUNCTION -->` before a python block puts that function there.
+A toml or python block whose first line is `# NAME.toml` or `# NAME.py` is a file for the commands after it;
+`<!-- picture: FROM TO -->` keeps a picture that a command has drawn; `<!-- source: FILE FUNCTION -->` before a python
+block puts that function there.
 tests/project/test_docs.py runs the same steps and compares, but for what is measured.
 """
 
@@ -67,9 +68,9 @@ class Step(NamedTuple):
 def steps(text: str) -> Iterator[Step]:
     """What a reader of the page does, in order."""
     for kind, body in BLOCK.findall(text):
-        if kind == "toml" and (name := re.match(r"# (\S+\.toml)\n", body)):
+        if name := re.match(r"# (\S+\.(?:toml|py))\n", body):
             yield Step("file", body, name[1])
-        elif kind == "python":
+        if kind == "python":
             yield Step("python", body)
         elif kind in ("sh", "console"):
             lines = (line.removeprefix("$ ") for line in body.splitlines())

@@ -9,12 +9,13 @@ from typing import Any
 
 from controller.coupling import PUBLISHED, Coupling, NoCoupling
 from controller.loop import DelayRange, Loop
-from design.api import COUPLING, bare
+from design.api import COUPLING, bare, fitting
 from design.certificate import assess, verify
 from design.coupling_file import Stored, load
 from design.coverage import Limits, covered_limits
-from design.designs import KINDS, design_by_kind, usual_condition
+from design.designs import KINDS, design_by_kind, own_coupling, usual_condition
 from design.guarantees import switching_guarantee
+from design.own import called
 from design.result import Chosen, Design, DesignFailed, Requirement
 from sim import design_cache
 from sim.scenario import InputError, Scenario
@@ -47,6 +48,12 @@ def choose(
         if scenario.channels != 2:
             raise InputError(f"--coupling published: the paper prints gains for 2 channels, not {scenario.channels}")
         return Chosen(PUBLISHED[case], condition or "any-environment", kind=name)
+    if name not in KINDS and ":" in name:
+        loop = scenario.loop(case)
+        found = own_coupling(name, loop)
+        called(f"--coupling {name}", fitting, loop, found)
+        own = given(found, name)
+        return replace(own, condition=condition or own.condition)
     if name in KINDS:
         try:
             loop = scenario.loop(case)
@@ -65,7 +72,9 @@ def choose(
             raise InputError(str(error)) from None
         return replace(design, kind=name, certificate=known, limiter=(known and known.limiter) or None)
     if Path(name).suffix != ".json":
-        raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)} or a FILE.json")
+        raise InputError(
+            f"--coupling is {name!r}, allowed are {', '.join(NAMES)}, a FILE.json or package.module:function"
+        )
     stored = read_coupling(name)
     coupling = fitted(stored, name, scenario.channels, scenario.T)
     made_for = stored.certificate.condition if stored.certificate else "this-environment"

@@ -38,7 +38,7 @@ def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:
     about_environment = report.fixed is not None
     of = " of the environment's contacts" if about_environment else ""
     axes.set(xscale=drawn.grid.scale, yscale=drawn.grid.scale, xlabel=f"B{of} [N s/m]", ylabel=f"K{of} [N/m]")
-    entries = [*_cells(axes, drawn, report), *_edges(axes, drawn, about_environment), *_points(axes, drawn, report)]
+    entries = [*_cells(axes, drawn, report), *_edges(axes, drawn, about_environment), *_points(axes, report)]
     for mark in report.marks or ():
         axes.plot(mark.B, mark.K, "*", color="black", markersize=14, clip_on=False, zorder=5)
         axes.annotate(f"{mark.K:g}, {mark.B:g}", (mark.B, mark.K), (9, 5), textcoords="offset points", zorder=5)
@@ -99,7 +99,7 @@ def _designed_for(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:
     return [Line2D([], [], label="the springs that the coupling was designed for", **style)]
 
 
-def _points(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:
+def _points(axes: Axes, report: MapReport) -> list[Line2D]:
     points = report.simulation.points
     if not points:
         return []

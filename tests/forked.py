@@ -55,7 +55,7 @@ def _remembering(folder: Path, make):
     def remembered(loop, *asked, **options):
         try:
             loop_and_asked = digest(loop), make.__name__, _asked(make, loop, *asked, **options)
-        except TypeError:  # an environment of a test's own class
+        except TypeError:  # an environment or a design of a test's own
             return make(loop, *asked, **options)
         file = folder / hashlib.sha256(repr(loop_and_asked).encode()).hexdigest()
         with file.with_suffix(".lock").open("w") as lock:
@@ -80,6 +80,8 @@ def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
     call.apply_defaults()
     words = {name: x for name, x in call.arguments.items() if name != "loop" and not callable(x)}
     if make.__name__ == "design_by_kind":
+        if ":" in words["kind"]:
+            raise TypeError("a design of a user's own")
         words["condition"] = words["condition"] or usual_condition(loop, words["kind"])
         words |= (vars(DEFAULT) if words["kind"] == "optimal" else {}) | words.pop("options")
     return sorted((name, digest(x.form()) if hasattr(x, "form") else repr(x)) for name, x in words.items())

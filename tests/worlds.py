@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from controller.coupling import ForceFilter, InternalModel, SpringDamper
+from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring
 from controller.loop import Loop
 
@@ -35,6 +36,11 @@ DIAGONAL = (
     (-0.000183213977119, 0.000179575913546),
 )
 VERTICES_ONLY = InternalModel(POLES, np.array([np.diag(pair) for pair in DIAGONAL]))
+
+
+def force_map(E, coupling, theta, psi):
+    """F = Theta (I + Psi E V)^-1 Psi E (6), of an environment E(z)."""
+    return delay(theta, E.T) @ coupling.around(delay(psi, E.T) @ E)
 
 
 def loop_of(network, theta, psi, period: float = T) -> Loop:

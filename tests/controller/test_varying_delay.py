@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from worlds import force_map
 
 from controller.coupling import SpringDamper
 from controller.delay import LOST, HeldLine, VaryingDelay, ages, newest, packet_delays, realising
 from controller.environment import FIGURE_4, environment
 from controller.law import Law
-from controller.loop import force_map
 from controller.tick import Process, StepBuffer
 
 T = 1.2e-3

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from worlds import SOFT, loop_of
+from worlds import SOFT, force_map, loop_of
 
 from cli.accuracy import main as accuracy
 from cli.run import main
@@ -14,7 +14,6 @@ from controller.complementarity import Complementarity
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
 from controller.law import Law
-from controller.loop import force_map
 from controller.lti import Lti, SingularLoop
 from controller.tick import Process, StepBuffer
 from design.audit import audit, requirement

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from worlds import DELTA, SOFT_NETWORK, T
+from worlds import DELTA, SOFT_NETWORK, T, force_map
 
 from controller.coupling import SpringDamper
 from controller.environment import FIGURE_4
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.lti import Lti
 from design import fixed_order as ccl
 from design import spring_damper

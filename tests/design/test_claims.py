@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from driven import driven
 from scipy.signal import dlsim, lfilter
-from worlds import SOFT, STIFF
+from worlds import SOFT, STIFF, force_map
 
 from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.lti import Lti
 from design.conditions import any_environment, this_environment
 from design.lmi import Infeasible, Shaping, least_multiplier

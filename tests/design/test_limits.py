@@ -6,12 +6,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from worlds import force_map
 
 from cli import compare as command
 from cli.compare import main
 from controller.coupling import CASE_I
 from controller.environment import environment
-from controller.loop import force_map
 from design import compare as limit_curve
 from design.compare import AXES, LADDERS, SHORT, Point, Sweep, ladder_row, measured, optimum, points_along, remembered
 from design.conditions import this_environment

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 from scipy.linalg import eig, eigh
-from worlds import STIFF
+from worlds import STIFF, force_map
 
 from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
-from controller.loop import force_map
 from controller.lti import Lti
 from design.conditions import (
     any_environment,

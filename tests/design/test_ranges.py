@@ -7,7 +7,7 @@ from itertools import combinations, pairwise, product
 import msgspec
 import numpy as np
 import pytest
-from worlds import environment_by_hand, filter_by_hand
+from worlds import environment_by_hand, filter_by_hand, force_map
 
 from cli.audit import main as audit_main
 from cli.check import main as check_main
@@ -18,7 +18,7 @@ from controller.coupling import SpringDamper
 from controller.coupling import SpringDamper as StoredSpringDamper
 from controller.delay import VaryingDelay
 from controller.environment import FIGURE_4, Network, Spring, environment
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices
 from design import optimal
 from design.certificate import check_ranges, prove, verify

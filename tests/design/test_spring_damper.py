@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from analysis import analysis, solve
 from scipy.optimize import brentq
-from worlds import DELTA, SOFT_NETWORK, T
+from worlds import DELTA, SOFT_NETWORK, T, force_map
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring, environment
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.lti import Lti
 from design import gain_search, spring_damper
 from design.api import instead, transparency_of

@@ -6,7 +6,7 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
-from worlds import DELTA, PAIR, SOFT, STIFF, T
+from worlds import DELTA, PAIR, SOFT, STIFF, T, force_map
 
 from cli.audit import main as audit_main
 from cli.check import main as check_main
@@ -17,7 +17,7 @@ from controller import coupling as built
 from controller.coupling import SpringDamper
 from controller.delay import LOST, VaryingDelay, ages
 from controller.environment import FIGURE_4, environment
-from controller.loop import DelayRange, Loop, force_map
+from controller.loop import DelayRange, Loop
 from controller.lti import Sampled
 from controller.ranges import Ranges, UncertainSpring
 from design import certify

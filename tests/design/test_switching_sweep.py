@@ -6,12 +6,12 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from analysis import solve
-from worlds import DELTA, SOFT, STIFF, T
+from worlds import DELTA, SOFT, STIFF, T, force_map
 
 from cli.audit import main
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
-from controller.loop import DelayRange, Loop, force_map
+from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
 from design.certificate import prove_switching, storage, switching_requirement
 from design.conditions import this_environment

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from worlds import SOFT, STIFF
+from worlds import SOFT, STIFF, force_map
 
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
-from controller.loop import force_map
 from controller.lti import Lti
 from design.frequency import integral
 from design.transparency import decibels, transparency

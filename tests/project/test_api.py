@@ -6,9 +6,6 @@ import subprocess
 import sys
 from dataclasses import fields
 from inspect import signature
-from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,8 +20,8 @@ from cli.run import main as run_command
 from cli.validate import main as validate_command
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import Spring
-from design import DesignOptions, certify, coupling_file, design_coupling, guarantee, transparency_of
-from design.designs import KINDS, Kind
+from design import DesignOptions, certify, design_coupling, guarantee, transparency_of
+from design.designs import KINDS
 from hw import rehearse
 from models.device import RigidDevice
 from sim import InputError, Scenario, Trace, load, parse, simulate, validate
@@ -80,7 +77,6 @@ def test_the_options_are_those_that_the_designs_take():
 
 
 def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
-    from cli.design import main as design_command
 
     loop = load().loop("I")
     found = design_coupling(loop)
@@ -262,34 +258,10 @@ def test_help_waits_for_no_library_that_it_does_not_need():
     assert done.stdout == "[]\n"
 
 
-def test_a_design_of_ones_own_is_one_function_and_one_row(monkeypatch, tmp_path):
-    """The page's own example: designed by name, certified, proved and stored by the command as any other."""
-    page = (Path(__file__).parents[2] / "docs" / "architecture.md").read_text()
-    snippet = page.split("**A design.**")[1].split("```python\n")[1].split("```")[0]
-    row = page.split("the row\n`")[1].split("` in")[0]
-    own: Any = ModuleType("design.half_stiff")
-    exec("loop = __import__('sim').load('omega-pair').loop('I')\n" + snippet, own.__dict__)
-    own.design = own.half_stiff
-    monkeypatch.setitem(sys.modules, own.__name__, own)
-    name, kind = row.split(": ", 1)
-    monkeypatch.setitem(KINDS, name.strip('"'), eval(kind, {"Kind": Kind}))
-    assert design_command(["--coupling", "half-stiff", "--out", str(tmp_path / "own.json")]) == 0
-    certificate = coupling_file.load(tmp_path / "own.json").certificate
-    assert certificate
-    assert certificate.matrices
-
-
-class _Inerter(Spring, frozen=True):
-    inertance: float = 0.0  # [kg]
-
-    def amounts(self, number):
-        return number(self.inertance), number(self.damping), number(self.stiffness)
-
-
-def test_an_element_of_ones_own_is_designed_for_and_proved_but_in_no_file(tmp_path):
-    """An inerter to ground is a mass at its node: the same needs, proved; a file of it could not be read."""
+def test_an_inerter_to_ground_is_a_mass_at_its_node():
+    """The same needs, proved."""
     loop = load("omega-pair").loop("I")
-    own = (*loop.network.springs, _Inerter(("mass", "ground"), 1.0, inertance=0.25))
+    own = (*loop.network.springs, Spring(("mass", "ground"), 1.0, inertance=0.25))
     same = (*loop.network.springs, Spring(("mass", "ground"), 1.0))
     inert, massive = (
         loop.at(replace(loop.network, springs=springs, masses={"mass": mass}))
@@ -298,6 +270,3 @@ def test_an_element_of_ones_own_is_designed_for_and_proved_but_in_no_file(tmp_pa
     here, there = (certify(each, SOFT)["this-environment"] for each in (inert, massive))
     assert here.required == pytest.approx(there.required, rel=1e-9)
     assert here.proof == "rational"
-    with pytest.raises(InputError, match="_Inerter"):
-        coupling_file.save(coupling_file.Stored.of(inert, SOFT), tmp_path / "own.json")
-    assert not any(tmp_path.iterdir())

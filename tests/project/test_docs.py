@@ -97,6 +97,7 @@ def test_measured_output_is_of_a_command_that_exists(page, command, pattern, sho
 def test_every_snippet_runs(page, place, monkeypatch):
     """All Python blocks of a page, in order, in one namespace."""
     monkeypatch.chdir(place)
+    monkeypatch.syspath_prepend(place)
     namespace = {"__name__": "snippet"}
     with contextlib.redirect_stdout(io.StringIO()):
         for number, snippet in enumerate(SNIPPETS[page], start=1):

@@ -91,28 +91,11 @@ def place(tmp_path_factory):
     return folder
 
 
-def test_an_engine_by_its_name(place):
-    """The trapezoidal rule is near the exact solution, and beside another engine its loop has the same verdict."""
-    done = run(f"{RUN} --engine mine:Trapezoidal --cross-check", place)
-    assert done.returncode == 0, done.stderr
-    assert "(mine:Trapezoidal)" in done.stdout
-    assert "same verdict" in done.stdout
-
-
 @pytest.mark.parametrize(("scenario", "covered"), [("hard", "any-environment"), ("gel", "this-environment")])
 def test_an_element_and_an_environment_in_a_scenario(scenario, covered, place):
-    """Run, designed, proved and stored, and proved again from the file alone, which asks for no class."""
-    for command, said in (
-        (f"python -m design --scenario {scenario}.toml --condition {covered} --out {scenario}.json", "certified"),
-        (f"{RUN} --scenario {scenario}.toml --coupling {scenario}.json --no-limiter", "stable"),
-        (
-            f"python -m sim.validate --scenario {scenario}.toml --coupling none --humans 5 --duration 0 --no-plot",
-            "unsta",
-        ),
-    ):
-        done = run(command, place)
-        assert done.returncode in (0, 1), done.stderr
-        assert said in done.stdout
+    """Designed, proved and stored, and proved again from the file alone, which asks for no class."""
+    done = run(f"python -m design --scenario {scenario}.toml --condition {covered} --out {scenario}.json", place)
+    assert done.returncode == 0, done.stderr
     (place / "elsewhere").mkdir(exist_ok=True)
     done = run(f"python -m design.check ../{scenario}.json", place / "elsewhere")
     assert "proved, in exact arithmetic" in done.stdout

@@ -7,14 +7,14 @@ import msgspec
 import mujoco
 import numpy as np
 import pytest
-from worlds import loop_of
+from worlds import force_map, loop_of
 
 from cli import zwidth
 from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall, environment
 from controller.law import Law
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.tick import Process, StepBuffer
 from design.frequency import on_circle, suprema
 from models.device import CompliantDevice, RigidDevice
