@@ -26,7 +26,7 @@ check: .venv/ready
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m pyright $$($(PY) tests/touched.py sources)
-	CHECK_SECONDS=35 $(PY) -m pytest -rs $(PARALLEL) $$($(PY) tests/touched.py)
+	CHECK_SECONDS=30 $(PY) -m pytest -rs $(PARALLEL) $$($(PY) tests/touched.py)
 
 validate: .venv/ready
 	$(PY) -m sim.suite --out out/validate

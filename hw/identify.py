@@ -23,7 +23,6 @@ from hw.control import Controller
 from hw.friction import Friction, friction
 from hw.recording import Recorder
 from hw.session import Session
-from models.device import RigidDevice
 from sim.scenario import Scenario
 
 _APART = 1  # [counts] that noise may move an encoder at rest: it reads two neighbours in turn
@@ -465,10 +464,9 @@ def estimate(
     estimates = []
     for i, device in enumerate(scenario.device):
         progress(i, scenario.channels, f"estimating axis {i + 1}")
-        rigid = isinstance(device, RigidDevice)
-        x, force = link["x"][:, i], applied[:, i] * units.force_step[i]
+        x, force, step = link["x"][:, i], applied[:, i] * units.force_step[i], units.encoder_step[i]
         try:
-            estimates.append(identify(x, force, link["received"], scenario.T, units.encoder_step[i], rigid))
+            estimates.append(identify(x, force, link["received"], scenario.T, step, device.transmission is None))
         except ValueError as error:
             raise ValueError(f"axis {i + 1}: {error}") from None
     return estimates

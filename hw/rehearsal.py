@@ -8,8 +8,9 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -72,7 +73,7 @@ class Rehearsal:
     def __post_init__(self) -> None:
         self._up = Line("up", self.faults, self.seed, self.latency_us)
         self._down = Line("down", self.faults, self.seed, self.latency_us)
-        self._queue: list[tuple[float, int, str, Any]] = []
+        self._queue: list[tuple[float, int, Callable[[], object]]] = []
         self._number = count()
         self._done: set[int] = set()
         self._now, self._read, self._gone = 0.0, b"", False  # [us]; what has come in
@@ -80,7 +81,7 @@ class Rehearsal:
         self._period = 1e6 * self.session.scenario.T * self.clock
         device = SerialDevice(self, lambda: 1e-6 * self._now)
         self._driver = Driver(self.session, device, self.plan, lambda: round(self._now))
-        self._at(0, "tick", 0)
+        self._at(0, self._tick)
 
     def run(self, seconds: float) -> Session:
         """Until `seconds` of virtual time are over. Returns the session."""
@@ -152,7 +153,7 @@ class Rehearsal:
         since = self.emulator.since_armed(round(self._now))
         for frame in filter(None, data.split(b"\0")):
             for when, part in self._down.send(frame + b"\0", self._now + self.latency_us / 6, since):
-                self._at(when, "device", part)
+                self._at(when, partial(self._deliver, part))
         return len(data)
 
     def discard(self) -> None:
@@ -161,15 +162,15 @@ class Rehearsal:
     def _frozen_for(self) -> float:
         """[us] for which the host does nothing."""
         since = self.emulator.since_armed(round(self._now))
-        ends = [
-            start + lasts for start, lasts in self.host_stalls if since is not None and start <= since < start + lasts
-        ]
-        return 1e6 * (max(ends) - (since or 0.0)) + 1 if ends else 0.0
+        if since is None:
+            return 0.0
+        left = [start + lasts - since for start, lasts in self.host_stalls if start <= since < start + lasts]
+        return 1e6 * max(left) + 1 if left else 0.0
 
     # what happens in time
 
-    def _at(self, when: float, what: str, data: Any) -> None:
-        heapq.heappush(self._queue, (when, next(self._number), what, data))
+    def _at(self, when: float, what: Callable[[], object]) -> None:
+        heapq.heappush(self._queue, (when, next(self._number), what))
 
     def _pass(self, us: float) -> None:
         until = self._now + us
@@ -178,32 +179,32 @@ class Rehearsal:
         self._now = until
 
     def _next(self) -> None:
-        self._now, _, what, data = heapq.heappop(self._queue)
-        getattr(self, f"_on_{what}")(self._now, data)
+        self._now, _, what = heapq.heappop(self._queue)
+        what()
 
-    def _on_tick(self, now: float, due: float) -> None:
-        emulator, clock = self.emulator, round(now)
+    def _tick(self) -> None:
+        emulator, now, clock = self.emulator, self._now, round(self._now)
         if clock < emulator.stalled_until:  # late once, and then in step again: no catching up
-            return self._at(emulator.stalled_until, "tick", None)
+            return self._at(emulator.stalled_until, self._tick)
         data = emulator.tick(clock)
         emulator.advance()
         if self.keep:
             self.moments.append(_Moment(clock, emulator.device.phase, emulator.applied))
-        self._at(now + self._period * emulator.stretch, "tick", None)
+        self._at(now + self._period * emulator.stretch, self._tick)
         if emulator.unplugged and not self._gone:
-            self._at(now + self.latency_us, "gone", None)
+            self._at(now + self.latency_us, self._unplug)
         for when, part in self._up.send(data, now, emulator.since_armed(clock)) if data else []:
-            self._at(when, "host", part)
+            self._at(when, partial(self._hear, part))
         return None
 
-    def _on_host(self, now: float, data: bytes) -> None:
+    def _hear(self, data: bytes) -> None:
         self._read += data
 
-    def _on_gone(self, now: float, _: None) -> None:
+    def _unplug(self) -> None:
         self._gone = True
 
-    def _on_device(self, now: float, data: bytes) -> None:
-        self.emulator.receive(data, round(now))
+    def _deliver(self, data: bytes) -> None:
+        self.emulator.receive(data, round(self._now))
 
     # what came of it
 

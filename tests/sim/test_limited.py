@@ -86,6 +86,12 @@ def test_ticks_in_stretches_are_ticks_one_by_one(engine, apart, limit):
         np.testing.assert_allclose(getattr(found, name), rows, rtol=0, atol=apart * np.abs(rows).max())
 
 
+def test_a_run_within_one_stretch_feels_every_outside_force():
+    simulation = assemble(weak(1e3, 1e3).replace(duration=0.1), BUILT, (11.4167, 11.4167))
+    found, expected = run(simulation, "exact"), run(simulation, tick_by_tick(make_engine(simulation, "exact")))
+    np.testing.assert_allclose(found.s, expected.s, rtol=0, atol=1e-12 * np.abs(expected.s).max())
+
+
 def test_limited_and_clipped_runs_agree_while_no_force_is_at_its_limit():
     scenario = weak(1e3, 1e3)
     limited, clipped = (run(assemble(scenario, BUILT, lag), "exact") for lag in ((11.4167, 11.4167), None))
