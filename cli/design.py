@@ -171,10 +171,11 @@ def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: De
 def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judged, stored: Filed) -> _Report:
     band, best, nearby = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None, Nearby()
     switching = coverage.Switching.of(loop, design.coupling) if loop.varying_delay else None
+    asked = Options(**asked_of(args, "optimal")) if best else DEFAULT
     with render.progress("working out robustness and its price, and the bound"):
         if design.condition == "this-environment":
-            nearby = Nearby.of(loop, design.coupling, Options(**asked_of(args, "optimal")) if best else DEFAULT)
-        limit = best and BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band)
+            nearby = Nearby.of(loop, design.coupling, asked)
+        limit = best and BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, asked)
     return _Report(
         case=args.case,
         seed=args.seed,
@@ -229,9 +230,7 @@ class _Best:
     ladder: Sequence[Any]
 
     def rows(self) -> render.Rows:
-        if limit := self.bound:
-            bounded = f"no linear coupling can be better than {limit.rms_mismatch_db or 0:.2f} dB rms"
-            yield "bound", limit.reason or f"{bounded}: {limit.gap_db:.2f} dB left"
+        yield "bound", self.bound and self.bound.words
         yield "rendered stiffness", f"{self.rendered_stiffness:.3f} of the environment's"
         yield "ladder [dB]", ", ".join(f"{rung.mismatch_db:.2f}" for rung in self.ladder) or None
 
