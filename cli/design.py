@@ -83,8 +83,7 @@ def _parser() -> options.Parser:
 
 def add_optimal_options(group: argparse._ActionsContainer) -> None:
     """The options of an optimal coupling; None where not given."""
-    error = "which transparency error is minimised (default rms)"
-    group.add_argument("--objective", choices=OBJECTIVES, help=error)
+    group.add_argument("--objective", choices=OBJECTIVES, help="which transparency error is minimised (default rms)")
     options.add_band_option(group)
     gain = "limit of |F|/|E| above 100 Hz (default none: the force there is kept low, not limited)"
     group.add_argument("--high-gain", type=options.number(), metavar="G", help=gain)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cli import options, render
-from cli.judged import judge
+from cli.judged import chosen_by, judge
 from cli.judged import rows as judged_rows
 from controller.environment import GROUND
 from controller.loop import Loop
@@ -88,8 +88,7 @@ def _parser() -> options.Parser:
 def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
     """The coupling that was asked for. A baseline has none, and a note names its authors. Raises InputError."""
     if args.coupling not in layer.BASELINES:
-        with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
-            return choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
+        return chosen_by(args, scenario)
     if args.energy_budget:
         raise InputError(f"--energy-budget with --coupling {args.coupling}: give one of them")
     note = f"baseline, without a guarantee here: {layer.BASELINES[args.coupling]}; no coupling besides."
