@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
@@ -83,8 +83,7 @@ def _parser() -> options.Parser:
 
 def add_optimal_options(group: argparse._ActionsContainer) -> None:
     """The options of an optimal coupling; None where not given."""
-    error = "which transparency error is minimised (default rms)"
-    group.add_argument("--objective", choices=OBJECTIVES, help=error)
+    group.add_argument("--objective", choices=OBJECTIVES, help="which transparency error is minimised (default rms)")
     options.add_band_option(group)
     gain = "limit of |F|/|E| above 100 Hz (default none: the force there is kept low, not limited)"
     group.add_argument("--high-gain", type=options.number(), metavar="G", help=gain)
@@ -166,16 +165,17 @@ def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: De
     if args.limiter is not False:
         limits = coverage.covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
     limits = limits.within([device.force_limit for device in scenario.device])
-    return Judged.of(args.coupling, design.coupling, loop, requirements, whole, limits)
+    return Judged.of(replace(design, kind=args.coupling), loop, requirements, whole, limits)
 
 
 def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judged, stored: Filed) -> _Report:
     band, best, nearby = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None, Nearby()
     switching = coverage.Switching.of(loop, design.coupling) if loop.varying_delay else None
+    asked = Options(**asked_of(args, "optimal")) if best else DEFAULT
     with render.progress("working out robustness and its price, and the bound"):
         if design.condition == "this-environment":
-            nearby = Nearby.of(loop, design.coupling, Options(**asked_of(args, "optimal")) if best else DEFAULT)
-        limit = best and BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band)
+            nearby = Nearby.of(loop, design.coupling, asked)
+        limit = best and BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, asked)
     return _Report(
         case=args.case,
         seed=args.seed,
@@ -230,9 +230,7 @@ class _Best:
     ladder: Sequence[Any]
 
     def rows(self) -> render.Rows:
-        if limit := self.bound:
-            bounded = f"no linear coupling can be better than {limit.rms_mismatch_db or 0:.2f} dB rms"
-            yield "bound", limit.reason or f"{bounded}: {limit.gap_db:.2f} dB left"
+        yield "bound", self.bound and self.bound.words
         yield "rendered stiffness", f"{self.rendered_stiffness:.3f} of the environment's"
         yield "ladder [dB]", ", ".join(f"{rung.mismatch_db:.2f}" for rung in self.ladder) or None
 

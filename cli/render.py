@@ -288,7 +288,10 @@ def robustness_rows(nearby: Nearby) -> Rows:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
         yield "robustness", f"{words}, the worst within {there.percent:g} %"
     if price := nearby.designed_for_it:
-        yield "designed for that", f"{price.price_db:.2f} dB worse over a small basis (--ranges)"
+        costs = f"at most {price.price_db:.2f} dB worse" if math.isfinite(price.price_db) else "not exact"
+        proved = f"proved in {price.proved} of {price.environments} environments"
+        rest = ", swept in the others" if price.proved < price.environments else ""
+        yield "designed for that", f"{price.mismatch_db:.2f} dB, {costs}: {proved}{rest}"
 
 
 def verdict(word: str | None) -> str:

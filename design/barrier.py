@@ -10,6 +10,7 @@ directions S^-1/2 dS S^-1/2, and the best length of a step follows from their ei
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +49,13 @@ class Block:
         """The same of y where x = U^-1 y."""
         slope = scipy.linalg.solve_triangular(U, self.slope.reshape(-1, len(U)).T, trans=1).T
         return Block(self.constant, np.ascontiguousarray(slope).reshape(self.slope.shape))
+
+
+def joined(blocks: Sequence[Block]) -> tuple[Block, ...]:
+    """The same inequalities as one block for each size of matrices."""
+    sizes = dict.fromkeys(block.constant.shape[1] for block in blocks)
+    alike = [[block for block in blocks if block.constant.shape[1] == size] for size in sizes]
+    return tuple(Block(np.concatenate([b.constant for b in s]), np.concatenate([b.slope for b in s])) for s in alike)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,12 +167,21 @@ def _eigenvalues(block: Block, x: Array, step: Array) -> Array:
 
 def _directions(block: Block, x: Array) -> tuple[Array, Array]:
     """(rows, ones): the vectors of S^-1/2 slope_a S^-1/2 as columns, (k r^2, n), and that of the identity."""
-    W = _inverse_root(block.at(x))[:, None]
-    r = W.shape[-1]
-    units = _unpacked(np.eye(r * r))
-    turned = np.swapaxes(packed(W @ units @ np.conj(np.swapaxes(W, 2, 3))), 1, 2)  # (k, r^2, r^2)
-    rows = turned @ block.slope
+    rows = _turned(_inverse_root(block.at(x))) @ block.slope
+    r = math.isqrt(rows.shape[1])
     return rows.reshape(-1, rows.shape[2]), np.tile(packed(np.eye(r, dtype=complex)), len(rows))
+
+
+def _turned(W: Complex) -> Array:
+    """H -> W H W* of `packed` matrices, (k, r^2, r^2): its entry a, b is the sum of W_ac conj(W_bd) H_cd."""
+    r = W.shape[-1]
+    c, d = np.triu_indices(r, 1)
+    a, b = np.append(np.arange(r), c), np.append(np.arange(r), d)
+    left, right = W[:, a, :], np.conj(W[:, b, :])
+    one, other = left[..., c] * right[..., d], left[..., d] * right[..., c]
+    through = np.concatenate([left * right, (one + other) / np.sqrt(2), 1j * (one - other) / np.sqrt(2)], axis=-1)
+    off = np.sqrt(2) * through[:, r:]
+    return np.concatenate([through[:, :r].real, off.real, off.imag], axis=1)
 
 
 def packed(H: Complex) -> Array:

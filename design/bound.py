@@ -20,6 +20,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 import scipy  # its parts load when they are used
 
@@ -27,8 +28,10 @@ from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti
 from design.barrier import Block, Program, centre, packed, towards
+from design.conditions import even_damping
 from design.files import unseen
 from design.frequency import frequencies, hermitian, on_circle
+from design.program import Options
 from design.result import Design
 from design.transparency import BAND_HZ, decibels
 
@@ -61,8 +64,13 @@ class _Bound:
 
 
 def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> _Bound:
-    """The least rms mismatch over the band of any coupling certified this-environment; for up to MOST channels."""
+    """The least rms mismatch over the band of any coupling certified this-environment; for up to MOST channels.
+
+    Periods up to T_max count as less damping, as in the condition.
+    """
     started = time.perf_counter()
+    even = tuple(even_damping(loop.delta, loop.T, loop.T_max).tolist())
+    loop = msgspec.structs.replace(loop, delta=even, T_max=None)
     dual = _Dual.of(loop, band_hz, knots or _KNOTS[loop.channels])
     square = dual.best()
     return _Bound(float(np.sqrt(max(square - _QUADRATURE, 0.0))), time.perf_counter() - started)
@@ -283,14 +291,21 @@ def _worst(lacking: Array, w: Array) -> Array:
 
 @dataclass(frozen=True)
 class BoundBeside:
-    """What no linear coupling can be better than, and by how much the best one is worse; or why there is no bound."""
+    """What no linear coupling can be better than, and by how much the best one is worse; or why there is no bound.
+
+    A gap is given where the bound is of all that was asked: what is asked beside this-environment only adds to it.
+    """
 
     rms_mismatch_db: float | None = None
     gap_db: float | None = unseen("given", None)
     reason: str | None = unseen("given", None)
+    even_without: tuple[str, ...] = ()  # what was asked and the bound does not know
+    relative_mismatch_db: float | None = unseen("given", None)  # of the supremum, where that was minimised
 
     @classmethod
-    def of(cls, loop: Loop, best: Design, reached_db: float, band_hz: tuple[float, float]) -> BoundBeside:
+    def of(
+        cls, loop: Loop, best: Design, reached_db: float, band_hz: tuple[float, float], asked: Options
+    ) -> BoundBeside:
         if loop.channels > MOST:
             return cls(reason=NO_BOUND)
         if best.objective == 0:
@@ -298,4 +313,26 @@ class BoundBeside:
         least = bound(loop, band_hz)
         if not least.rms:
             return cls(reason="the bound is zero: nothing is known to be lost")
-        return cls(least.rms_db, reached_db - least.rms_db)
+        more = {
+            "latency": any(map(any, loop.latency or ())),
+            "switching delays": loop.varying_delay is not None,
+            "ranges": loop.ranges is not None,
+            "the limiter": asked.limiter,
+            "the cap above 100 Hz": asked.high_gain is not None,
+        }
+        without = tuple(name for name, given in more.items() if given)
+        if asked.objective == "sup":  # |M|_F <= sqrt(m) |M|, and |E|_F >= |E|
+            return cls(
+                least.rms_db, even_without=without, relative_mismatch_db=least.rms_db - decibels(loop.channels) / 2
+            )
+        return cls(least.rms_db, None if without else reached_db - least.rms_db, even_without=without)
+
+    @property
+    def words(self) -> str:
+        """In one line."""
+        if self.reason or self.rms_mismatch_db is None:
+            return self.reason or ""
+        sup = f", nor than {self.relative_mismatch_db:.2f} dB at most" if self.relative_mismatch_db is not None else ""
+        without = f", even without {' and '.join(self.even_without)}" if self.even_without else ""
+        left = f": {self.gap_db:.2f} dB left" if self.gap_db is not None else ""
+        return f"no linear coupling can be better than {self.rms_mismatch_db:.2f} dB rms{sup}{without}{left}"

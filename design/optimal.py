@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
-from controller.environment import Network
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design import program
@@ -24,13 +24,13 @@ from design.conditions import this_environment as requirement_of
 from design.coupling_file import Certificate, LimiterCertificate
 from design.environments import Searched, in_each, ratio_in, search_ranges, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
-from design.result import Design, DesignFailed, NotProved
-from design.robustness import Robustness, at, robustness, robustness_nearby, vertices
+from design.result import Design, DesignFailed, NotProved, from_ratio
+from design.robustness import Robustness, at, robustness_nearby, vertices
 from design.spring_damper import design as design_spring_damper
 from design.transparency import Transparency, decibels, transparency
 
-_MINIMISED = {"rms": "rms_mismatch", "sup": "relative_mismatch"}
-_FEW = 3  # devices for which the price of a range is worked out
+_PRICED = 15.0  # [s] of the processor: what the price of a range may take, a third of it for proofs
+_PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
 _SETTLED_DB = 0.05  # a rung that gains less ends the climb
 _FEWEST_RUNGS = 3
 _KEPT_STIFFNESS = 0.5  # of the static stiffness of the best rung so far: a rung that renders less is not taken
@@ -143,20 +143,6 @@ def design(
     return replace(best, ladder=tuple(rungs), sdps=len(rungs), wall_s=climb.elapsed, hurried=hurried)
 
 
-def _compromise(loop: Loop, around: Sequence[Network], options: program.Options) -> tuple[Optimal, Optimal]:
-    """(the design for the loop's environment, the one that keeps the condition in these, too), over one small basis.
-
-    By sweeps, without proofs: what it costs, not a coupling to run. Raises DesignFailed where there is none.
-    """
-    taps, poles = options.ladder[: 2 if loop.channels <= 2 else 1][-1]
-    climb = _Climb.of(loop.at(loop.environment), options)
-    others = [at(loop, network) for network in around]
-    more = tuple(program.Case(there, there.E(), (program.this_environment(there),), 0.0) for there in others)
-    climbs = (climb, replace(climb, cases=climb.cases + more))
-    alone, wide = (each.solved(taps, poles, None, each.slips(None)[0], proved=False) for each in climbs)
-    return alone, wide
-
-
 @dataclass(frozen=True, eq=False)
 class _Climb:
     """The loop and what is asked of it, with the clock."""
@@ -263,9 +249,7 @@ class _Climb:
         found = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
         return found, _Rung(taps, poles, found.states, self.decibels(found), found.g, found.reason, self.elapsed)
 
-    def solved(
-        self, taps: int, poles: int, before: Optimal | None, slip: program.Slip | None, proved: bool = True
-    ) -> Optimal:
+    def solved(self, taps: int, poles: int, before: Optimal | None, slip: program.Slip | None) -> Optimal:
         share = self.mismatch(before) if before else 1.0
         span, cases = self.span(taps, poles), self.asked(slip)
         active = [0]
@@ -284,9 +268,31 @@ class _Climb:
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
             found = self._assessed(scaled, scaled.g)
-            if not proved or self.loop.ranges or (found := self._proved(found, slip)).proved:
+            if self.loop.ranges or (found := self._proved(found, slip)).proved:
                 break
         return found
+
+    def fitted(self, coupling: ForceFilter, slip: program.Slip | None, limit: float) -> tuple[Optimal, list[float]]:
+        """(the coupling scaled until no environment needs more than `limit` of the damping, what each needs then)."""
+        needs = [ratio_in(case.loop, coupling) for case in self.cases]
+        if slip:
+            needs[0] = max(needs[0], limiter_requirement(self.loop, coupling, slip.beta).requirement.ratio)
+        scale = min(1.0, limit / max(needs))
+        scaled = _scaled(coupling, scale)
+        return self._assessed(scaled, scaled.g), [scale * need for need in needs]
+
+    def proofs(self, found: Optimal, needs: Sequence[float], slip: program.Slip | None, until: float) -> int:
+        """In how many environments it is proved until this time, the worst first. Raises NotProved."""
+        here = self._proved(found, slip)
+        if not here.proved:
+            raise NotProved(str(here.reason))
+        worst_first = sorted(range(1, len(needs)), key=lambda i: -needs[i])
+        for done, i in enumerate(worst_first, start=1):
+            if time.thread_time() > until:
+                return done
+            swept = from_ratio("this-environment", needs[i], self.loop.delta, 0.0)
+            prove(self.cases[i].loop, found.coupling, "this-environment", swept=swept)
+        return len(needs)
 
     def between(self, found: Optimal) -> Optimal:
         """The coupling for ranges after the search between the vertices, and proved at each of them.
@@ -383,27 +389,57 @@ def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
 
 
 # ----------------------------------------------------------------------------------------------------
-# What designs for more than one environment cost, and which ranges can be proved.
+# What a design for more than one environment costs.
 
 
 @dataclass(frozen=True)
 class Spread:
-    """The price of keeping the condition over `vertices`, too: two designs over one small basis."""
+    """A design that keeps the condition over `vertices`, too: what it costs at most, for it is made in a short time."""
 
-    mismatch_db: float  # of the design for the vertices, in the nominal environment
-    price_db: float  # beside the design for the nominal environment alone
+    mismatch_db: float  # of this design in the nominal environment
+    price_db: float  # beside the nominal design
     g: float
     worst: float  # times the damping that there is, over the vertices
+    states: int  # of the loop
+    environments: int  # with the nominal one
+    proved: int  # of these, in exact arithmetic; the others by the refined sweep, when the time for proofs was over
 
 
-def spread(loop: Loop, options: program.Options = program.DEFAULT, percent: float = 10.0) -> Spread | None:
-    """The design for `vertices` beside the nominal one, by sweeps: a price, not a coupling to run. None without one."""
-    try:
-        alone, wide = _compromise(loop, list(vertices(loop.network, percent).values()), options)
-    except DesignFailed:
-        return None
-    mismatch, before = (decibels(getattr(one.figures, _MINIMISED[options.objective])) for one in (wide, alone))
-    return Spread(mismatch, mismatch - before, wide.g, robustness(loop, wide.coupling, percent).required_over_available)
+def spread(
+    loop: Loop,
+    nominal: ForceFilter | NoCoupling,
+    options: program.Options = program.DEFAULT,
+    percent: float = 10.0,
+    seconds: float = _PRICED,
+) -> Spread:
+    """The better of a design over a small basis and the nominal one scaled down, both safe over `vertices`.
+
+    Each rung's own frequencies are those of the nominal environment; the vertices are imposed at few, and where sweeps
+    find that they are missed.
+    """
+    until = time.thread_time() + seconds
+    climb = _Climb.of(loop.at(loop.environment), options)
+    if isinstance(nominal, NoCoupling):
+        nominal = ForceFilter([], [], [np.eye(loop.channels).tolist()])
+    before = climb.decibels(climb._assessed(nominal, nominal.g))
+    others = [at(loop, network) for network in vertices(loop.network, percent).values()]
+    more = tuple(program.Case(there, there.E(), (program.this_environment(there),), 0.0) for there in others)
+    climb, slip = replace(climb, cases=climb.cases + more), climb.slips(None)[0]
+    taps, poles = next(basis for most, basis in _PRICED_BY.items() if loop.channels <= most)
+    problem = program.Problem(
+        climb.span(taps, poles), climb.asked(slip), options, program.SOFT[0] * program.SOFT[1], True
+    )
+    tried = [nominal]
+    with suppress(DesignFailed):
+        tried.append(problem.span.filter(problem.solve(climb._start(problem), _TOLERATED, until - seconds / 3)))
+    proved = 0
+    for limit in (1 - program.MARGIN, 1 - 2.5 * program.MARGIN):
+        found, needs = min((climb.fitted(one, slip, limit) for one in tried), key=lambda one: climb.merit(one[0]))
+        with suppress(NotProved):
+            proved = climb.proofs(found, needs, slip, until)
+            break
+    db = climb.decibels(found)
+    return Spread(db, db - before, found.g, max(needs[1:], default=needs[0]), found.states, len(needs), proved)
 
 
 @dataclass(frozen=True)
@@ -415,10 +451,10 @@ class Nearby:
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, options: program.Options = program.DEFAULT) -> Nearby:
-        """Without the design before walls, with ranges, for a coupling that is no force filter, and for more than _FEW
-        devices, where it takes far longer than the coupling's own.
+        """Without the design before walls, with ranges, for an environment that is no network of springs, and for a
+        coupling that is no optimal one.
         """
-        known = loop.ranges or loop.environment.walls or loop.environment.one_period
-        alone = isinstance(coupling, ForceFilter) and not known
-        price = spread(loop, options) if alone and loop.channels <= _FEW else None
-        return cls(robustness_nearby(loop, coupling), price)
+        known, there = robustness_nearby(loop, coupling), loop.environment
+        if known is None or loop.ranges or there.one_period or not isinstance(coupling, ForceFilter | NoCoupling):
+            return cls(known)
+        return cls(known, spread(loop, coupling, options))

@@ -7,6 +7,8 @@ sweep adds the frequencies at which it is missed.
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,7 +24,7 @@ from controller.delay import delay
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Complex, Lti, Sampled, as_like
 from design.arguments import number, one_of
-from design.barrier import Block, Program, centre, towards
+from design.barrier import Block, Program, centre, joined, towards
 from design.conditions import Demand, even_damping, this_environment_demand
 from design.frequency import frequencies, hermitian, on_circle, peaks
 from design.multipliers import SPARE, limiter_demand, limiter_lag, switching_block
@@ -48,6 +50,7 @@ _DECIMALS = 10
 _GAPS = (0.05, 0.01)  # of the objective, or of what it gains over no force: gaps at which the inequalities are swept
 _FORGIVEN = 5e-4  # by which an inequality may fail between its frequencies: scaling makes up for it
 _MOST_SWEEPS = 6
+_FEW = 12  # frequencies of a sparse grid beside the modes
 _STEEPER = 3.0  # factor between one centre of the barrier and the next
 _SMALLEST = 1e-5  # least frequency of an inequality [rad/sample]: below it nothing changes
 
@@ -314,6 +317,7 @@ class Problem:
     cases: tuple[Case, ...]
     options: Options
     soft: float  # weight of the force above 100 Hz
+    sparse: bool = False  # few frequencies at first where only constraints count
 
     @property
     def own(self) -> list[tuple[int, int]]:
@@ -419,6 +423,10 @@ class Problem:
 
     def grid(self, case: Case, constraint: _Constraint) -> Array:
         """The frequencies at which a constraint is imposed first."""
+        if self.sparse and not case.weight:
+            modes = case.E.poles()
+            w = np.union1d(np.geomspace(_SMALLEST, np.pi, _FEW), np.angle(modes[modes.imag > 1e-6]))
+            return w[(w >= constraint.low) & (w <= constraint.high)]
         even = np.linspace(constraint.low, constraint.high, 50)
         rising = np.geomspace(max(constraint.low, _SMALLEST), constraint.high, 60)
         modes = np.concatenate([case.E.poles(), self.span.chain(case.E.T).poles()])
@@ -452,21 +460,24 @@ class Problem:
                 worst = max(worst, float(fails(found[-1]).max(initial=0.0)))
         return found, worst
 
-    def solve(self, start: Array) -> Array:
-        """The optimum, from a strictly feasible start: on a dense sweep it fails by no more than FORGIVEN."""
+    def solve(self, start: Array, forgiven: float = _FORGIVEN, until: float = math.inf) -> Array:
+        """The optimum, from a strictly feasible start: on a dense sweep it fails by no more than `forgiven`.
+
+        What is found at `until`, of time.thread_time, may fail by more.
+        """
         asked = [(case, constraint) for case in self.cases for constraint in case.constraints]
         imposed = [self.grid(case, constraint) for case, constraint in asked]
         A, b, c = self.objective()
         _, R = np.linalg.qr(np.column_stack([A, b]))
         A, b = R[:, :-1], R[:, -1]
-        x, t, gaps = start, None, list(_GAPS)
+        x, t, gaps = start, None, list(_GAPS[:1] if self.sparse else _GAPS)
         inner = start
         nothing = float(b @ b) + float(c.any())  # without any force; a supremum is 1 then
         demanding = any(len(case.constraints) > 1 for case in self.cases)  # else scaling, which is exact, does the rest
         back = _STEEPER**4 if demanding else _STEEPER
         for _ in range(_MOST_SWEEPS):
             parts = [self.block(*one, own, w) for one, own, w in zip(asked, self.own, imposed, strict=True)]
-            program = Program(A, b, c, (*parts, self.positive()))
+            program = Program(A, b, c, joined([*parts, self.positive()]))
             x = towards(start, x, program)
             program, U = program.conditioned(x)
             y = U @ x
@@ -475,13 +486,13 @@ class Problem:
             inner = scipy.linalg.solve_triangular(U, y)
             while True:
                 value = program.value(y)
-                if program.degree / t <= gaps[0] * max(min(value, nothing - value), 1e-9):
+                if time.thread_time() > until or program.degree / t <= gaps[0] * max(min(value, nothing - value), 1e-9):
                     break
                 t *= _STEEPER
                 y = centre(program, y, t)
             x = scipy.linalg.solve_triangular(U, y)
             more, worst = self.missed(x)
-            if worst < _FORGIVEN and len(gaps) == 1:
+            if (worst < forgiven and len(gaps) == 1) or time.thread_time() > until:
                 break
             gaps = gaps[-1:]
             imposed = [np.union1d(w, extra) for w, extra in zip(imposed, more, strict=True)]

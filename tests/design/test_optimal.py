@@ -19,14 +19,15 @@ from controller.environment import Network, Spring
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
 from design.barrier import Block, Program, centre
-from design.bound import _causal, bound
+from design.bound import BoundBeside, _causal, bound
 from design.certificate import verify
 from design.coupling_file import Stored, save
 from design.coupling_file import load as load_file
 from design.environments import ratio_in
 from design.frequency import hermitian, on_circle
 from design.optimal import design, spread
-from design.program import MARGIN, Options, Span, span_of, static_weight
+from design.program import MARGIN, Options, Problem, Span, span_of, static_weight
+from design.result import DesignFailed
 from design.robustness import ranges_around, robustness, vertices
 from design.transparency import transparency
 from sim.scenario import load
@@ -286,11 +287,50 @@ def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
     assert nominal.figures.rms_mismatch < found.figures.rms_mismatch < 10 ** (1 / 20) * nominal.figures.rms_mismatch
 
 
-@pytest.mark.parametrize("objective", ["rms", "sup"])
-def test_the_price_of_a_range_is_that_of_the_figure_that_is_minimised(objective):
-    found = spread(loop_of("n3"), Options(objective=objective, ladder=((4, 3),)))
-    assert 0 < found.price_db < 1.5
-    assert found.worst < 1
+@pytest.mark.parametrize(("name", "objective"), [("n3", "rms"), ("n3", "sup"), ("n2", "rms")])
+def test_a_design_for_every_spring_and_mass_is_proved_at_each_and_costs_little(name, objective):
+    loop = loop_of(name)
+    found = spread(loop, best(name).coupling, replace(SHORT, objective=objective))
+    assert found.proved == found.environments == 1 + len(vertices(loop.network))
+    assert 0.99 < found.worst < 1
+    assert found.mismatch_db < (-0.3 if objective == "sup" else -4.0)
+    assert found.price_db < 2.5
+
+
+def test_the_price_of_a_range_is_at_most_that_of_the_nominal_design_scaled_down(monkeypatch):
+    def nothing(*args):
+        raise DesignFailed(None, (), "no time")
+
+    loop, nominal = loop_of("n3"), best("n3")
+    monkeypatch.setattr(Problem, "solve", nothing)
+    found = spread(loop, nominal.coupling, SHORT)
+    worst = robustness(loop, nominal.coupling).required_over_available
+    assert found.g == pytest.approx(nominal.g / worst, rel=0.01)
+    assert found.proved == found.environments
+
+
+def test_a_bound_says_what_it_does_not_know():
+    loop = loop_of("n3")
+    T_max = msgspec.structs.replace(loop, T_max=0.0012)
+    weaker = msgspec.structs.replace(loop, delta=tuple(d / 1.2 for d in loop.delta))
+    assert bound(T_max, knots=8).rms == bound(weaker, knots=8).rms > bound(loop, knots=8).rms
+    band = (0.5, 80.0)
+    assert BoundBeside.of(loop, best("n3"), -5.0, band, SHORT).gap_db > 0
+    late = msgspec.structs.replace(loop, latency=((0.0, 1e-4),))
+    limited = BoundBeside.of(late, best("n3"), -5.0, band, replace(SHORT, limiter=True))
+    assert limited.gap_db is None
+    assert limited.words.endswith("dB rms, even without latency and the limiter")
+
+
+def test_the_rms_bound_is_one_of_the_largest_error_too():
+    """|M|_F <= sqrt(m) |M| and |E|_F >= |E|, so rms <= sqrt(m) sup."""
+    for name in ("n0", "n2", "n4"):
+        figures = best(name).figures
+        assert figures.rms_mismatch <= np.sqrt(2) * figures.relative_mismatch
+    found = BoundBeside.of(loop_of("n3"), best("n3"), -5.0, (0.5, 80.0), replace(SHORT, objective="sup"))
+    assert found.gap_db is None
+    assert found.relative_mismatch_db == found.rms_mismatch_db
+    assert "nor than" in found.words
 
 
 def test_requests_that_make_no_sense_are_refused():
