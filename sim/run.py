@@ -37,7 +37,7 @@ ENGINES = ("mujoco", "exact")
 AnyEngine = str | Engine | Callable[["Simulation"], Engine]  # a name, one of a user's own, or what makes it
 
 Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the hands (ticks, outside) [N]
-_Done = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
+_AfterBlock = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
 Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 
 _COPIES = 4  # of a trace, at most, from the run to its report
@@ -215,10 +215,10 @@ def run_blocks(
     outside: Outside,
     ticks: int,
     start: Array,
-    each_block: _Done,
+    each_block: _AfterBlock,
     block: int = 32,
 ) -> None:
-    """Close the loop for `ticks` periods from the plant states `start`, (states, nsim), and call `each_block` after every block.
+    """Close the loop for `ticks` periods from the plant states `start`, (states, nsim); `each_block` sees each block.
 
     Row 0 of the buffer is the block's first tick. So few ticks in a block that it stays in the processor's cache.
     """
