@@ -6,9 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from cli import options, render
+from cli.judged import chosen_by
 from controller.coupling import NoCoupling
 from sim.accuracy import Row, measure_all
-from sim.couplings import NAMES, choose, limits_of
+from sim.couplings import NAMES, limits_of
 from sim.mujoco_engines import EXPONENTIAL
 from sim.run import assemble
 from sim.scenario import InputError, require_even_ticks, require_linear
@@ -45,8 +46,7 @@ def main(argv: list[str]) -> int:
     if args.duration is not None:
         scenario = scenario.replace(duration=args.duration)
     out = options.out_folder(args, "accuracy")
-    with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
-        chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
+    chosen = chosen_by(args, scenario)
     lag = limits_of(scenario, chosen, limiter=args.limiter).rho
     coupled, uncoupled = assemble(scenario, chosen.coupling, lag), assemble(scenario, NoCoupling())
     default = max(default_substeps(loop, "RK4") for loop in (coupled, uncoupled))

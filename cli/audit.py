@@ -227,9 +227,9 @@ _ROWS: dict[str, Callable[[ConditionAudit], str]] = {
     "margin": lambda c: render.optional(c.requirement.margin, "{:.5g}"),
     "binds at": lambda c: render.optional(c.requirement.frequency_hz, "{:.5g} Hz"),
     "stiffest K here": lambda c: _stiffest(c.stiffest.K),
-    "delta may be less by": lambda c: _percent(c.sensitivity.delta_error),
-    "T may be longer by": lambda c: _percent(c.sensitivity.T_error),
-    "delay may be longer by": lambda c: render.optional(c.sensitivity.extra_samples, "{:.5g} samples"),
+    "delta less by": lambda c: _percent(c.sensitivity.delta_error),
+    "T longer by": lambda c: _percent(c.sensitivity.T_error),
+    "delay longer by": lambda c: render.optional(c.sensitivity.extra_samples, "{:.5g} samples"),
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
@@ -83,8 +83,7 @@ def _parser() -> options.Parser:
 
 def add_optimal_options(group: argparse._ActionsContainer) -> None:
     """The options of an optimal coupling; None where not given."""
-    error = "which transparency error is minimised (default rms)"
-    group.add_argument("--objective", choices=OBJECTIVES, help=error)
+    group.add_argument("--objective", choices=OBJECTIVES, help="which transparency error is minimised (default rms)")
     options.add_band_option(group)
     gain = "limit of |F|/|E| above 100 Hz (default none: the force there is kept low, not limited)"
     group.add_argument("--high-gain", type=options.number(), metavar="G", help=gain)
@@ -166,7 +165,7 @@ def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: De
     if args.limiter is not False:
         limits = coverage.covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
     limits = limits.within([device.force_limit for device in scenario.device])
-    return Judged.of(args.coupling, design.coupling, loop, requirements, whole, limits)
+    return Judged.of(replace(design, kind=args.coupling), loop, requirements, whole, limits)
 
 
 def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judged, stored: Filed) -> _Report:

@@ -1,4 +1,4 @@
-"""A coupling in its loop before anything runs, as commands ask for it and show it."""
+"""The coupling that a command is asked for, and what is said of it before anything runs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,15 @@ import argparse
 from cli import render
 from design.result import Chosen
 from sim import judged
+from sim.couplings import choose
 from sim.judged import Judged
 from sim.scenario import Scenario
+
+
+def chosen_by(args: argparse.Namespace, scenario: Scenario) -> Chosen:
+    """The coupling of --coupling for --condition and --no-limiter, designed where it is asked for by name."""
+    with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
+        return choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
 
 
 def judge(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, met: Scenario | None = None) -> Judged:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cli import options, render
-from cli.judged import judge
+from cli.judged import chosen_by, judge
 from cli.judged import rows as judged_rows
 from controller.environment import GROUND
 from controller.loop import Loop
@@ -42,12 +42,10 @@ def main(argv: list[str]) -> int:
     environment, simulated = _environment(args, scenario)
     chosen = _chosen(args, scenario)  # V, Q or R
     judged = judge(args, scenario, chosen, simulated)  # what each condition asks of the devices, and what is proved
-    done = _run(args, simulated, chosen, engine, judged.limiter.rho)  # sample, compute, limit, hold, advance
-    same = args.limiter is None and not scenario.ranges and args.case != "none"
-    others = _alternatives(args, scenario, done, (chosen, judged.requirements, judged.limiter) if same else None)
-    nearby = _nearby(chosen, scenario.loop(args.case), judged)
-    asked = {"seed": args.seed, "band_hz": args.band_hz or BAND_HZ, "check": args.cross_check}
-    report = run_report(scenario, args.case, chosen, judged, done, environment, others, nearby, **asked)
+    done = _run(args, simulated, judged, engine)  # sample, compute, limit, hold, advance
+    others, nearby = _alternatives(args, scenario, done, judged), _nearby(scenario.loop(args.case), judged)
+    report = run_report(scenario, args.case, judged, done, environment, args.band_hz or BAND_HZ, args.cross_check)
+    report = replace(report, alternatives=others, nearby=nearby)
     files = _save(args, out, done, report)
     if args.side_by_side:
         files.append(_side_by_side(others, out / "couplings.png", scenario.environment.contacts))
@@ -90,8 +88,7 @@ def _parser() -> options.Parser:
 def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
     """The coupling that was asked for. A baseline has none, and a note names its authors. Raises InputError."""
     if args.coupling not in layer.BASELINES:
-        with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
-            return choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
+        return chosen_by(args, scenario)
     if args.energy_budget:
         raise InputError(f"--energy-budget with --coupling {args.coupling}: give one of them")
     note = f"baseline, without a guarantee here: {layer.BASELINES[args.coupling]}; no coupling besides."
@@ -119,9 +116,7 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
 # The run and what it came to.
 
 
-def _run(
-    args: argparse.Namespace, scenario: Scenario, chosen: Chosen, engine: AnyEngine, lag: tuple[float, ...] | None
-) -> ScenarioRun:
+def _run(args: argparse.Namespace, scenario: Scenario, judged: Judged, engine: AnyEngine) -> ScenarioRun:
     """Close the loop as the options say. Raises InputError for settings that cannot be."""
     net: layer.Wanted | None = None
     if args.coupling in layer.BASELINES:
@@ -129,15 +124,17 @@ def _run(
     elif args.energy_budget:
         net = layer.EnergyNet(*args.energy_budget)
     asked = {name: getattr(args, name) for name in ("integrator", "substeps", "error", "seed")}
+    coupling, lag = judged.chosen.coupling, judged.limiter.rho
     with render.progress("simulating") as move:
-        return run_scenario(scenario, chosen.coupling, lag, engine=engine, **asked, net=net, progress=move)
+        return run_scenario(scenario, coupling, lag, engine=engine, **asked, net=net, progress=move)
 
 
-def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun, own: Any) -> list[Alternative]:
+def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun, judged: Judged) -> list[Alternative]:
     """The run repeated with other couplings. Raises InputError where --side-by-side would have nothing to draw."""
     skipped = args.no_alternatives or run.trace.interrupted or args.vertex > 0
+    same = args.limiter is None and not scenario.ranges and args.case != "none"
     with render.progress("other couplings") as move:
-        made = [] if skipped else alternatives(scenario, args.case, move, own)
+        made = [] if skipped else alternatives(scenario, args.case, move, judged if same else None)
     if args.side_by_side and not any(other.trace is not None for other in made):
         raise InputError("--side-by-side is for runs without walls, friction, varying delays and --no-alternatives")
     return made
@@ -163,8 +160,9 @@ def _panel_title(other: Alternative) -> str:
     return f"{'no coupling' if other.coupling == 'none' else other.name + kind}\n{felt}; {guarantee}"
 
 
-def _nearby(chosen: Chosen, loop: Loop, judged: Judged) -> Nearby:
+def _nearby(loop: Loop, judged: Judged) -> Nearby:
     """The damping needed where the environment is not as modelled; empty where no guarantee depends on that."""
+    chosen = judged.chosen
     alone = chosen.condition == "this-environment" and judged.certificates[chosen.condition].certified
     if not alone or judged.guarantee == ANY:
         return Nearby()

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from cli import options, render
-from cli.judged import judge
+from cli.judged import chosen_by, judge
 from controller.ranges import Member
 from design.certificate import RangesCheck
 from design.conditions import this_environment
@@ -21,7 +21,7 @@ from design.result import Chosen
 from models.human import Human, Population
 from sim import verdicts
 from sim.adversary import Worst, search, search_population
-from sim.couplings import NAMES, choose
+from sim.couplings import NAMES
 from sim.crowds import ENGINES, MIXED, Findings, Validation
 from sim.judged import Judged
 from sim.report import DelaySpan, UnevenTicks, VaryingDelays
@@ -39,8 +39,7 @@ def main(argv: list[str]) -> int:
     """Test random humans. 0: what is claimed holds, 1: it does not, 3: workers were lost, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
-    with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
-        chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
+    chosen = chosen_by(args, scenario)
     judged = judge(args, scenario, chosen)
     question = _question(args, scenario, chosen, judged)
     findings, wall = _findings(args, question, Table(question, out, args.resume))
@@ -72,8 +71,7 @@ def _parser() -> options.Parser:
     options.add_coupling_options(parser, ", ".join(NAMES))
     options.add_human_option(parser, " and `population`, whose draw(rng, n) gives n hands,")
     options.add_limiter_option(parser)
-    count = "random humans per device (default 1000)"
-    add("--humans", type=whole(1, 1_000_000), default=1000, metavar="N", help=count)
+    add("--humans", type=whole(1, 1_000_000), default=1000, metavar="N", help="random humans per device (default 1000)")
     add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
     add("--engine", choices=ENGINES, default="both", help="who decides (default both)")
     seconds = "length of the traces (default 2; 0 for none)"

@@ -153,8 +153,7 @@ def _parser() -> options.Parser:
     add("--video", metavar="FILE", help="a film: .gif, or .mp4 where ffmpeg is installed")
     rate = "pictures per second (default 10); for a .gif what divides 100"
     add("--fps", type=options.whole(1, 100), default=10, metavar="N", help=rate)
-    drawn = "by OpenGL, or flat without it (default: by what works)"
-    add("--draw", choices=_DRAWN, default="auto", help=drawn)
+    add("--draw", choices=_DRAWN, default="auto", help="by OpenGL, or flat without it (default: by what works)")
     parser.only("with --video", lambda args: args.video, "fps", "draw")
     return parser
 

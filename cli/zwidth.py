@@ -12,11 +12,11 @@ from dataclasses import replace
 import msgspec
 
 from cli import options, render
-from cli.judged import judge
+from cli.judged import chosen_by, judge
 from controller.lti import Array
 from design.result import CONDITIONS, Chosen, Requirement
 from sim import zwidth
-from sim.couplings import NAMES, choose
+from sim.couplings import NAMES
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from sim.scenario import InputError, Scenario, require_constant_delay
 from sim.trace import SUSTAINED
@@ -41,7 +41,7 @@ def main(argv: list[str]) -> int:
     if args.case == "none":
         instead = "use --case I, or --coupling none for a map over environments"
         raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
-    chosen = _chosen(args, scenario)
+    chosen = chosen_by(args, scenario) if args.coupling else None  # over the whole map the same
     sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
         fixed = FixedCoupling.of(judge(args, scenario, chosen), scenario.loop(args.case).network, chosen.notes)
@@ -125,14 +125,6 @@ def _mark(text: str) -> tuple[float, float]:
     if not (1e-3 <= K <= 1e9 and 0 <= B <= 1e6):
         raise argparse.ArgumentTypeError(f"is {K:g},{B:g}, allowed are K 1e-3 to 1e9 N/m, B 0 to 1e6 N s/m")
     return K, B
-
-
-def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
-    """The coupling of a map over environments; None where the axes are the gains of the coupling."""
-    if args.coupling is None:
-        return None
-    with render.designing() as heard:
-        return choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
 
 
 def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) -> zwidth.Sweep:

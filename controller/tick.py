@@ -250,7 +250,9 @@ class StepBuffer:
         # a single simulation spends its time in calls: its forces are looked at without numpy, of two channels by name
         linear, force, clips, limited = process.linear.dot, self.force, self.clips, process.law.bounds
         first = self._width - process.channels
-        asked = [(self._memory[first + i :: self._width, 0].data, -limit, limit) for i, limit in self._bounds]
+        asked: list[tuple[Any, float, float]] = [
+            (self._memory[first + i :: self._width, 0].data, -limit, limit) for i, limit in self._bounds
+        ]
         (one, low, high), (other, lowest, highest), *others = asked if len(asked) > 1 else 2 * asked
 
         def tick(k: int) -> None:

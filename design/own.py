@@ -7,12 +7,14 @@ import sys
 import traceback
 from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 from typing import Any, TypeVar
 
 from design.files import InputError
 
 _Made = TypeVar("_Made")
-_FILES: set[str] = set()  # that hold such code
+_HOME, _WORLDS = Path(__file__).parents[1], ("models", "controller", "design", "sim", "hw", "cli")
+_OTHERS = ("<", *(f"{place}{os.sep}" for place in (sys.prefix, sys.base_prefix, *(_HOME / w for w in _WORLDS))))
 
 
 def named(option: str, text: str) -> Any:
@@ -20,8 +22,7 @@ def named(option: str, text: str) -> Any:
     module, _, name = text.partition(":")
     if not all(part.isidentifier() for part in (*module.split("."), name)):
         raise InputError(f"{option} is {text!r}, expected package.module:Name")
-    if (place := os.getcwd()) not in sys.path:
-        sys.path.insert(0, place)  # as `python -m` does, and a console script does not
+    place = reach_working_directory()
     try:
         found = import_module(module)
     except ModuleNotFoundError as error:
@@ -31,14 +32,17 @@ def named(option: str, text: str) -> Any:
         raise InputError(f"{option} is {text!r}: {absent}") from None
     except SyntaxError as error:
         raise InputError(f"{option} is {text!r}: {error.filename}, line {error.lineno}: {error.msg}") from None
-    finally:
-        family = module.partition(".")[0]
-        kin = (m for n, m in list(sys.modules.items()) if n.partition(".")[0] == family)
-        _FILES.update(file for m in kin if (file := getattr(m, "__file__", None)))
     if not hasattr(found, name):
         there = ", ".join(n for n, value in vars(found).items() if getattr(value, "__module__", "") == module)
         raise InputError(f"{option} is {text!r}: {module} has no {name}, but {there or 'no class and no function'}")
     return getattr(found, name)
+
+
+def reach_working_directory() -> str:
+    """Let modules be found in it, as under `python -m`, and as a console script does not."""
+    if (place := os.getcwd()) not in sys.path:
+        sys.path.insert(0, place)
+    return place
 
 
 def called(what: str, make: Callable[..., _Made], *given: Any, **named: Any) -> _Made:
@@ -52,12 +56,10 @@ def called(what: str, make: Callable[..., _Made], *given: Any, **named: Any) -> 
         raise InputError(f"{what}: {kind}{error}") from error
 
 
-def holds_own_code(path: str) -> None:
-    """Errors in this file are the user's."""
-    _FILES.add(path)
-
-
 def place_of(error: BaseException) -> str | None:
-    """The innermost place in a user's own code that an error came through, `FILE, line N`; None where there is none."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in _FILES]
+    """The innermost place in a user's own code that an error came through, `FILE, line N`; None where there is none.
+
+    That is every file but ours and what is installed.
+    """
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_OTHERS)]
     return f"{frames[-1].filename}, line {frames[-1].lineno}" if frames else None

@@ -14,13 +14,13 @@ from dataclasses import dataclass, field, replace
 
 from controller.lti import Array
 from design.certificate import assess
-from design.coverage import Limits
 from design.files import unseen
 from design.guarantees import guarantee_of
 from design.result import Chosen, Requirement, finite
 from design.transparency import decibels, transparency
 from sim.accuracy import credible, force_error
 from sim.couplings import choose, limits_of
+from sim.judged import Judged
 from sim.run import assemble, run
 from sim.scenario import Scenario, load
 from sim.stability import exact_growth, unstable
@@ -71,14 +71,11 @@ class Alternative:
         return finite(max(float(n) / float(a) if a else math.inf for n, a in pairs))
 
 
-_Own = tuple[Chosen, dict[str, Requirement], Limits]
-
-
 def alternatives(
     scenario: Scenario,
     case: str,
     progress: Callable[[int, int], None] = lambda done, of: None,
-    own: _Own | None = None,
+    own: Judged | None = None,
 ) -> list[Alternative]:
     """Every coupling that can stand in the place of the run's own; none where the delays switch.
 
@@ -88,7 +85,7 @@ def alternatives(
     if scenario.switches:
         return []
     case = "I" if case == "none" else case
-    present = (own[0].kind, own[0].condition) if own else None
+    present = (own.chosen.kind, own.chosen.condition) if own else None
     rows = [row for row in _ROWS if row == present or _possible(scenario, case, *row)]
     made = []
     for i, row in enumerate(rows):
@@ -108,15 +105,15 @@ def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -
 
 
 def _alternative(
-    scenario: Scenario, case: str, kind: str, condition: str | None, own: _Own | None = None
+    scenario: Scenario, case: str, kind: str, condition: str | None, own: Judged | None = None
 ) -> Alternative:
     loop = scenario.loop(case)
     try:
-        chosen = own[0] if own else choose(scenario, case, kind, condition)
+        chosen = own.chosen if own else choose(scenario, case, kind, condition)
     except ValueError as error:
         return Alternative(kind, condition, reason=str(error))
-    requirements = own[1] if own else assess(loop, chosen.coupling, chosen.phi, chosen.certificate)
-    simulation = assemble(scenario, chosen.coupling, own[2].rho if own else _lag(scenario, chosen, requirements))
+    requirements = own.requirements if own else assess(loop, chosen.coupling, chosen.phi, chosen.certificate)
+    simulation = assemble(scenario, chosen.coupling, own.limiter.rho if own else _lag(scenario, chosen, requirements))
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
     made = Alternative(

@@ -45,6 +45,7 @@ class ScenarioRun:
     remarks: list[str]  # on a number of substeps that was asked for
     trace: Trace
     wall_s: float
+    seed: int
 
     @cached_property
     def exact(self) -> Trace | None:
@@ -88,7 +89,7 @@ def run_scenario(
     begin = time.perf_counter()
     trace = run(ran, stepped, progress=progress)
     wall = time.perf_counter() - begin
-    return ScenarioRun(simulation, ran, period, choices, engine, integrator, substeps, remarks, trace, wall)
+    return ScenarioRun(simulation, ran, period, choices, engine, integrator, substeps, remarks, trace, wall, seed)
 
 
 def simulate(

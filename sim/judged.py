@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from controller.coupling import Coupling
 from controller.loop import Loop
 from controller.older import CONDITIONS, with_older
 from design.certificate import RangesCheck, assess, check_ranges
@@ -22,6 +21,7 @@ from sim.scenario import Scenario
 class Judged:
     """The parts that every report of a coupling begins with."""
 
+    chosen: Chosen = unseen("no")
     whole: RangesCheck | None = unseen("no")
     coupling: CouplingFigures = unseen()
     certificates: dict[str, Requirement] = unseen()  # by condition, also under the names that they had before
@@ -32,17 +32,17 @@ class Judged:
     @classmethod
     def of(
         cls,
-        kind: str,
-        coupling: Coupling,
+        chosen: Chosen,
         loop: Loop,
         requirements: dict[str, Requirement],
         whole: RangesCheck | None,
         limits: Limits,
     ) -> Judged:
-        """The verdicts on a coupling of this kind in a loop."""
+        """The verdicts on a coupling in a loop."""
         return cls(
+            chosen,
             whole,
-            CouplingFigures.of(kind, coupling, loop.T),
+            CouplingFigures.of(chosen.kind, chosen.coupling, loop.T),
             with_older(requirements, CONDITIONS),
             guarantee_of(requirements, loop, bool(whole and whole.proved)),
             whole and RangesFigures.of(whole),
@@ -73,4 +73,4 @@ def judge(
     whole = check_ranges(scenario.loop(case), chosen.coupling, seed, progress=progress)
     requirements = assess(met.loop(case), chosen.coupling, chosen.phi, chosen.certificate)
     limits = limits_of(met, chosen, requirements, limiter)
-    return Judged.of(chosen.kind, chosen.coupling, met.loop(case), requirements, whole, limits)
+    return Judged.of(chosen, met.loop(case), requirements, whole, limits)

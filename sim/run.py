@@ -266,8 +266,16 @@ def outside_forces(
     t = beginnings(scenario.T, timing, first, ticks)
     w = np.zeros((ticks, scene.outside))
     if voluntary:
-        for human, column in zip(scenario.human, scene.pushed, strict=True):
-            w[:, column] += human.voluntary_force(t)
+        for i, (human, column) in enumerate(zip(scenario.human, scene.pushed, strict=True), start=1):
+            force = np.asarray(human.voluntary_force(t))
+            if force.shape != t.shape:
+                raise InputError(f"human #{i}.voluntary_force(t) has the shape {force.shape} for {t.size} times")
+            if not (finite := np.isfinite(force)).all():
+                k = int(np.argmin(finite))
+                raise InputError(
+                    f"human #{i}.voluntary_force(t) is {force[k]} at {t[k]:g} s, expected a finite force in N"
+                )
+            w[:, column] += force
     if tap := scenario.tap:
         places = np.round(t / scenario.T, 9) if timing else range(first, first + ticks)
         ends = [bisect_left(places, round(time / scenario.T, 9)) for time in (tap.start, tap.start + tap.duration)]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from controller.lti import Array
 from design.files import unseen
 from design.guarantees import ANY, CAVEATS, MAKING, EncoderSteps
 from design.optimal import Nearby
-from design.result import Chosen, Requirement, listed
+from design.result import Requirement, listed
 from design.transparency import Transparency, transparency
 from sim import accuracy
 from sim.alternatives import Alternative
@@ -73,8 +73,8 @@ class RunReport:
     ideal_force: accuracy.ForceError
     energy_budget: dict[str, Any] | None
     baseline: dict[str, Any] | None
-    nearby: Nearby = unseen("beside")
-    alternatives: list[Alternative]
+    nearby: Nearby = unseen("beside", default=Nearby())
+    alternatives: list[Alternative] = field(default_factory=list)
     reproducibility: tuple[PaperRow, ...]
     remarks: tuple[str, ...]
 
@@ -117,19 +117,14 @@ class RunReport:
 def run_report(
     scenario: Scenario,
     case: str,
-    chosen: Chosen,
     judged: Judged,
     run: ScenarioRun,
     environment: str,
-    others: list[Alternative],
-    nearby: Nearby,
-    *,
-    seed: int,
     band_hz: tuple[float, float],
     check: bool,
 ) -> RunReport:
-    """The report of a run; `check` runs another integrator beside it."""
-    simulation, trace, loop = run.simulation, run.trace, scenario.loop(case)
+    """The report of a run in the environment of this name; `check` runs another integrator beside it."""
+    simulation, trace, loop, chosen = run.simulation, run.trace, scenario.loop(case), judged.chosen
     covered = any(requirement.certified for requirement in judged.requirements.values())
     delays, grows = None, None
     if simulation.scenario.varying_delay:
@@ -151,21 +146,19 @@ def run_report(
         transparency=felt,
         stability=stability,
         varying_delay=delays,
-        run=_ran(run, loop.lam, environment, seed, check),
+        run=_ran(run, loop.lam, environment, check),
         error=accuracy.position_error(trace, run.exact, simulation, grows),
         credible=accuracy.credible(simulation, trace),
         ideal_force=accuracy.force_error(run.ran, trace, loop.lam),
         energy_budget=budget and budget | {"idle": idle(simulation, any_environment, budget)},
         baseline=None if budget else net,
-        nearby=nearby,
-        alternatives=others,
         reproducibility=beside_the_paper(simulation.scenario, case, stability, judged.coupling),
         remarks=(*run.remarks, *chosen.notes),
     )
     return replace(found, remarks=(*found.remarks, *found.notes()))
 
 
-def _ran(run: ScenarioRun, lam: tuple[int, ...], environment: str, seed: int, check: bool) -> Ran:
+def _ran(run: ScenarioRun, lam: tuple[int, ...], environment: str, check: bool) -> Ran:
     simulation, trace, steps = run.simulation, run.trace, (run.engine, run.integrator, run.substeps)
     scenario, process, samples = simulation.scenario, simulation.process, trace.t.size
     duration = float(beginnings(scenario.T, simulation.timing, samples, 1)[0])
@@ -182,7 +175,7 @@ def _ran(run: ScenarioRun, lam: tuple[int, ...], environment: str, seed: int, ch
         lam=lam,
         T_s=scenario.T,
         timing=simulation.timing and UnevenTicks.of(simulation.timing, scenario),
-        seed=seed,
+        seed=run.seed,
         engines=run.choices or None,
         cross_check=accuracy.cross_check(run.ran, trace, *steps) if check else None,
         interrupted=trace.interrupted,

@@ -29,7 +29,7 @@ from controller.older import named_first, named_today
 from controller.ranges import Ranges, UncertainSpring
 from controller.timing import Periods, Timing, drawn
 from design.files import InputError, counted, printable, read_text, toml, write
-from design.own import called, holds_own_code, named, place_of
+from design.own import called, named, place_of, reach_working_directory
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
 from models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
@@ -370,8 +370,8 @@ def _run_file(path: str | Path) -> _HumanFile:
     heard: Any = StringIO()
     heard.close = lambda: None
     try:
+        reach_working_directory()
         with redirect_stdout(heard):  # where a report may be written to
-            holds_own_code(str(path))
             names = runpy.run_path(str(path))
         sys.stderr.write(printable(heard.getvalue()))
         hands, persons = _kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ()))

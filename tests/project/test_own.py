@@ -131,6 +131,31 @@ def test_what_is_wrong_with_them_is_said_in_a_line(environment, message, place):
 
 
 @pytest.mark.parametrize(
+    ("force", "message"),
+    [
+        (
+            "np.where(t < 0.15, 0.0, np.nan)",
+            "human #1.voluntary_force(t) is nan at 0.15 s, expected a finite force in N",
+        ),
+        (
+            "0 * t if t[-1] < 0.2 else 1 / 0",
+            "friends.py, line 10, which is your own: ZeroDivisionError: division by zero",
+        ),
+    ],
+)
+def test_a_hand_that_fails_after_a_while(force, message, place):
+    """In a module that the file of hands imports."""
+    hand = "import numpy as np\nfrom models.human import Port\n\n\nclass Hand:\n    def port(self):\n"
+    hand += "        return Port([0.3], [[-1, 1]], [4.0], [500.0])\n\n"
+    hand += f"    def voluntary_force(self, t):\n        return {force}\n"
+    (place / "friends.py").write_text(hand)
+    (place / "held.py").write_text("from friends import Hand\n\nhumans = (Hand(), Hand())\n")
+    done = run(f"{RUN} --human held.py", place)
+    assert done.returncode == 2
+    assert message in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         ("--engine mine:Untroubled", "engine mine:Untroubled has no troubled: expected what has start(buffer), adv"),
