@@ -152,7 +152,8 @@ def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, ju
         for seek in (search, search_population)[: 1 if isinstance(scenario.population, Population) else 2]:
             with render.progress("searching the worst human") as move:
                 frozen = assemble(scenario, chosen.coupling).process.law.frozen().values()
-                F = max(frozen, key=lambda F: this_environment(F, scenario.delta).ratio)  # the state that asks most
+                loop = scenario.loop(args.case)
+                F = max(frozen, key=lambda F: this_environment(F, loop).ratio)  # the state that asks most
                 found.append(seek(scenario, F, args.seed, args.generations or 150, progress=move))
     except KeyboardInterrupt:
         return _Searched(*found, ratio=ratio, interrupted=True)

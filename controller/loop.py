@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from controller.coupling import Coupling, Strict
 from controller.delay import delay
-from controller.environment import Environment, Network, RigidWall, walled_environment
+from controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_environment
 from controller.law import Law
 from controller.limiter import Limiter
 from controller.lti import Complex, Lti, Number, Sampled, rational
@@ -187,6 +187,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
     def at(self, network: Environment) -> Loop:
         """The loop around this environment, known exactly."""
         return msgspec.structs.replace(self, environment=network, ranges=None)
+
+    def channel(self, i: int) -> Loop:
+        """Device i alone, at a rigid wall: any-environment is of the same gains whatever is behind them."""
+        return Loop(self.T, self.theta[i : i + 1], (0,), (0,), self.delta[i : i + 1], RIGID_WALL, T_max=self.T_max)
 
     def delayed(self, theta: Steps) -> Loop:
         """The loop whose forces have these delays, constant ones."""

@@ -145,16 +145,17 @@ def _stiffest_for_any_environment(loop: Loop, dampers: Sequence[float]) -> _Stif
     if loop.latency:
         return _Stiffest((None,) * loop.channels, LATE)
     stiffest, reasons = [], []
-    for B, theta, delta in zip(dampers, loop.theta, loop.delta, strict=True):
+    for i, (B, delta) in enumerate(zip(dampers, loop.delta, strict=True)):
         if delta <= B:
             stiffest.append(None)
             reasons.append(f"B = {B:g} N s/m alone uses up delta = {delta:g} N s/m")
             continue
+        one = loop.channel(i)
 
         @cache
-        def ratio(K: float, B: float = B, theta: int = theta, delta: float = delta) -> float:
+        def ratio(K: float, B: float = B, alone: Loop = one) -> float:
             V = SpringDamper([K], [B]).compliance(loop.T)
-            return any_environment(V, [theta], [delta], loop.T_max).ratio
+            return any_environment(V, alone).ratio
 
         bound = 2 * (delta - B) / loop.T
         stiffest.append(edge(ratio, 1e-9 * bound, bound))

@@ -133,7 +133,7 @@ def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> L
     G = loop.sent(coupling, exact=True)
     if reason := too_large(G.order + sum(span.hi)):  # splitting it takes long too
         raise ValueError(reason)
-    block, F1 = multipliers.switching_block(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
+    block, F1 = multipliers.switching_block(G, loop, alpha)
     static = Matrix.of(F1)
     if not static.equals(static.T) or not definiteness(static).semidefinite:
         raise ValueError("G(1) is not exactly symmetric and positive semidefinite")
@@ -175,7 +175,7 @@ def _limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: mult
     try:
         G = loop.sent(coupling, exact=True)
         require_size(G.order + 2 * loop.channels + sum(max(n, len(row)) for n, row in zip(loop.theta, c, strict=True)))
-        demand = multipliers.limiter_demand(G, loop.theta, loop.delta, rho, c, loop.T_max)
+        demand = multipliers.limiter_demand(G, loop, rho, c)
     except (SingularLoop, ValueError) as error:
         raise NotProved(f"limiter: {error}") from None
     return _block(demand)

@@ -71,25 +71,19 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Demands:
     F = loop.F(coupling)
     phi = _multiplier(loop, coupling) if phi is None and any(loop.psi) else phi
     requirements = {
-        "this-environment": conditions.this_environment(F, loop.delta, loop.T_max, loop.latency),
+        "this-environment": conditions.this_environment(F, loop),
         "any-environment": ANY_ENVIRONMENT.required(loop, coupling, phi),
     }
     demands: dict[str, Response | None] = dict.fromkeys(requirements)
     if np.isfinite(requirements["this-environment"].ratio):
-        demands["this-environment"] = partial(
-            conditions.least_scale, conditions.this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
-        )
+        demands["this-environment"] = partial(conditions.least_scale, conditions.this_environment_demand(F, loop))
     V = coupling.compliance(loop.T)
     if V is not None and np.isfinite(requirements["any-environment"].ratio):
         if any(loop.psi):
             assert phi is not None  # a finite figure had a multiplier
-            demands["any-environment"] = conditions.delayed_demand(
-                V, loop.theta, conditions.even_damping(loop.delta, loop.T, loop.T_max), phi
-            )
+            demands["any-environment"] = conditions.delayed_demand(V, loop, phi)
         else:
-            demands["any-environment"] = partial(
-                conditions.least_scale, conditions.any_environment_demand(V, loop.theta, loop.delta, loop.T_max)
-            )
+            demands["any-environment"] = partial(conditions.least_scale, conditions.any_environment_demand(V, loop))
     return Demands(F, requirements, demands)
 
 
@@ -261,7 +255,7 @@ def measured(point: Point, kind: str, condition: ConditionName | None, options: 
     figures: dict[str, Any] = dict.fromkeys(names)
     bare: tuple[float | None, ...] = (None,) * len(loop.delta)
     try:
-        bare = _damping(conditions.this_environment(loop.F(NoCoupling()), loop.delta, loop.T_max, loop.latency))
+        bare = _damping(conditions.this_environment(loop.F(NoCoupling()), loop))
         design = design_by_kind(loop, kind, condition, **options)
     except ValueError as error:  # no such design, or a loop that cannot be
         figures["reason"] = str(error)
@@ -272,7 +266,7 @@ def measured(point: Point, kind: str, condition: ConditionName | None, options: 
             "states": F.order,
             "rms_mismatch_db": finite(decibels(transparent.rms_mismatch)),
             "relative_mismatch_db": finite(decibels(transparent.relative_mismatch)),
-            "required_damping": _damping(conditions.this_environment(F, loop.delta, loop.T_max, loop.latency)),
+            "required_damping": _damping(conditions.this_environment(F, loop)),
             "dc_ratio": finite(transparent.dc_ratio),
         } | _proof(loop, design)
     wall = time.perf_counter() - begin
@@ -455,7 +449,7 @@ def ladder_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:
         )
     wall = time.perf_counter() - begin
     F = loop.F(coupling)
-    requirement = conditions.this_environment(F, loop.delta, loop.T_max, loop.latency)
+    requirement = conditions.this_environment(F, loop)
     figures = transparency(F, loop.E(), loop.lam)
     begin, proof, reason = time.perf_counter(), None, requirement.reason
     if design or requirement.certified:

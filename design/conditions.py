@@ -74,35 +74,31 @@ class Demand(Generic[Block]):
     semidefinite: tuple[str, ...] = ()
 
 
-def even_damping(delta: Sequence[Any], T: Number, T_max: float | None = None) -> Any:
+def even_damping(loop: Loop, T: Number | None = None) -> Any:
     """Delta_D T/T_max [N s/m], (m,): the damping that does in even periods T what delta does in periods up to T_max.
 
     The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. Nothing else
     in the energy balance depends on T: the force map is the same at every tick, however long the tick is.
     """
-    damping = numbers(delta, T)
-    return damping if T_max is None else damping * (T / numbers(T_max, T))
+    T = loop.T if T is None else T
+    damping = numbers(loop.delta, T)
+    return damping if loop.T_max is None else damping * (T / numbers(loop.T_max, T))
 
 
-Latency = Sequence[tuple[float, float]]  # (m,) t1 and t2 [s], 0 <= t1 <= t2 < T: how late after a tick forces latch
-
-
-def this_environment_demand(
-    F: Block, delta: Sequence[Any], T_max: float | None = None, latency: Latency | None = None
-) -> Demand[Block]:
-    """He[F/(z-1)] > -s Delta_D/T_max. F displaces devices to forces (6), in any arithmetic; delta (m,) [N s/m].
+def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
+    """He[F/(z-1)] > -s Delta_D/T_max. F displaces devices to forces (6), in any arithmetic.
 
     The energy that a device with a passive human can give back in a tick is at most the damping's, Delta_D dx^2/T, and
     what the force map gives is -F dx; with F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T. Forces that
     latch later than at the tick have a block of twice the size, see `latency_demand`.
     """
-    if latency is not None:
-        return latency_demand(F, delta, latency, T_max)
+    if loop.latency is not None:
+        return latency_demand(F, loop)
     F1, R = F.split_at_one()
-    return Demand(R - F1 / 2, constant_like(F, np.diag(even_damping(delta, F.T, T_max) / F.T)), {"F(1)": F1}, ("F(1)",))
+    return Demand(R - F1 / 2, constant_like(F, np.diag(even_damping(loop, F.T) / F.T)), {"F(1)": F1}, ("F(1)",))
 
 
-def latency_demand(F: Block, delta: Sequence[Any], latency: Latency, T_max: float | None = None) -> Demand[Block]:
+def latency_demand(F: Block, loop: Loop) -> Demand[Block]:
     """this-environment for forces that latch at kT + tau_k, with any tau_k in [t1, t2] at every tick and channel.
 
     Between kT and kT + tau_k the force of the tick before still acts: a device moves by a under f[k-1] and then by b
@@ -112,15 +108,15 @@ def latency_demand(F: Block, delta: Sequence[Any], latency: Latency, T_max: floa
     whose pole at z = 1 has F(1) in all four entries. A channel with t2 = 0 has no row of the first kind. The shortest
     period must be longer than t2.
     """
-    T, m = F.T, F.D.shape[-1] if isinstance(F, Lti) else F.G.shape[-1]
-    longest = T if T_max is None else numbers(T_max, T)
-    first, last = (numbers([row[i] for row in latency], T) for i in (0, 1))
+    T, m = F.T, loop.channels
+    longest = T if loop.T_max is None else numbers(loop.T_max, T)
+    first, last = (numbers([row[i] for row in loop.latency or ()], T) for i in (0, 1))
     late = [i for i in range(m) if last[i]]
     one = np.eye(m, dtype=int)
     before = one[late] @ delay((1,) * m, T)
     both = as_like(F, vstack(before, Lti.constant(one, T))) @ F @ np.hstack([one[:, late], one])
     E1, R = both.split_at_one()
-    damping = numbers(delta, T)
+    damping = numbers(loop.delta, T)
     gain = np.concatenate([damping[late] / last[late], damping / (longest - first)])
     return Demand(R - E1 / 2, constant_like(F, np.diag(gain)), {"F(1)": E1[..., len(late) :, len(late) :]}, ("F(1)",))
 
@@ -142,15 +138,13 @@ def v_hat(H: Block) -> tuple[Array, Block]:
     return H1, H1 / 2 - R
 
 
-def any_environment_demand(
-    V: Block, theta: Sequence[int], delta: Sequence[Any], T_max: float | None = None
-) -> Demand[Block]:
+def any_environment_demand(V: Block, loop: Loop) -> Demand[Block]:
     """Theorem 4 without psi: He V-hat >= 0, whose Theta-hat is that of the damping s Delta_D; times s.
 
     He[(1 - 1/z) V/T] >= diag(|1 - z^-n_i|^2 / (4 s delta_i)), n = theta + 1.
     """
     (V1, gain) = v_hat(V)
-    _, taken = v_hat(as_like(V, theta_hat(theta, even_damping(delta, V.T, T_max), V.T)))
+    _, taken = v_hat(as_like(V, theta_hat(loop.theta, even_damping(loop, V.T), V.T)))
     return Demand(-taken, gain, {"V(1)": V1})
 
 
@@ -170,20 +164,18 @@ _STRICT = Fraction(1, 10**9)
 _UNLIMITED = 10**6
 
 
-def delayed_coupling_demand(
-    V: Lti, theta: Sequence[int], phi: Sequence[Any], delta: Sequence[Any], T_max: float | None = None
-) -> Demand[Lti]:
+def delayed_coupling_demand(V: Lti, loop: Loop, phi: Sequence[Any]) -> Demand[Lti]:
     """The excess of V-hat, exactly, for the multiplier phi and the damping itself.
 
     V-hat must be Delta_V-OSP with Delta_V^-1 = S < Phi^-1 - Delta_D^-1 (14). Divided by |1 - 1/z|^2, as `v_hat` is,
     T He v_hat(H) > H* S^-1 H: by a Schur complement the Hermitian part of [[T v_hat(H), 0], [2 H, S]]. Raises
     ValueError for a phi that is not a multiplier.
     """
-    T, m = V.T, len(delta)
-    damping = even_damping(delta, T, T_max)
+    T, m = V.T, loop.channels
+    damping = even_damping(loop, T)
     if len(phi) != m or not all(0 <= p < d for p, d in zip(phi, damping, strict=True)):
         raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
-    H = V - theta_hat(theta, damping, T)
+    H = V - theta_hat(loop.theta, damping, T)
     H1, regular = v_hat(H)
     excess = [(1 / p - 1 / d) * (1 - _STRICT) if p else _UNLIMITED / d for p, d in zip(phi, damping, strict=True)]
     zero = np.zeros((2 * m, m), dtype=object)
@@ -313,17 +305,10 @@ def least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], del
     return from_ratio(name, max(ratio, 0.0), available, w / (2 * np.pi * system.T))
 
 
-def this_environment(
-    F: Lti, delta: Sequence[float], T_max: float | None = None, latency: Latency | None = None
-) -> Requirement:
-    """The damping that this-environment asks for the force map F, with device dampings `delta` [N s/m].
-
-    For periods up to T_max [s] (T without it), and forces that latch late by `latency` (m,) [s] (at the tick without).
-    """
-    available = dampings(delta, F.inputs)
-    return least_damping(
-        "this-environment", F, lambda: this_environment_demand(F, available, T_max, latency), available
-    )
+def this_environment(F: Lti, loop: Loop) -> Requirement:
+    """The damping that this-environment asks for the force map F, whatever the loop's own environment."""
+    dampings(loop.delta, F.inputs)
+    return least_damping("this-environment", F, lambda: this_environment_demand(F, loop), loop.delta)
 
 
 _W_ZERO = 1e-10  # [rad/sample] stands for F(1) of many, whose real part is even: sampled, a network may be 0/0 there
@@ -342,11 +327,9 @@ def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array
     return np.abs(F1 - turned).max(axis=(-2, -1)) / scale, least / scale
 
 
-def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float], T_max: float | None = None) -> Requirement:
+def any_environment(V: Lti, loop: Loop) -> Requirement:
     """The damping that any-environment asks for psi = 0 and V, whatever passive environment is behind it."""
-    available = dampings(delta, V.inputs)
-    if len(theta) != V.inputs:
-        raise ValueError(f"theta has {len(theta)} entries for {V.inputs} channels")
+    available = dampings(loop.delta, V.inputs)
 
     def refused(reason: str) -> Requirement:
         return refusal("any-environment", available, reason)
@@ -357,7 +340,7 @@ def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float], T_max:
         return refused(reason)
     if not V.is_stable():
         return refused("the coupling V has a pole on or outside the unit circle")
-    demand = any_environment_demand(V, theta, available, T_max)
+    demand = any_environment_demand(V, loop)
     V1 = demand.static["V(1)"]
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
@@ -389,11 +372,9 @@ def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
     return least_multiple(free, gain + np.conj(np.swapaxes(right, -1, -2)) @ (idle[..., None] * right))
 
 
-def any_environment_per_channel(
-    V: Sequence[Lti], theta: Sequence[int], delta: Sequence[float], T_max: float | None = None
-) -> Requirement:
+def any_environment_per_channel(V: Sequence[Lti], loop: Loop) -> Requirement:
     """any-environment for a diagonal coupling, given its channels: each device's own figure."""
-    each = [any_environment(v, [n], [d], T_max) for v, n, d in zip(V, theta, delta, strict=True)]
+    each = [any_environment(v, loop.channel(i)) for i, v in enumerate(V)]
     worst = max(each, key=lambda r: r.ratio)
     required = tuple(r.required[0] for r in each)
     available = tuple(r.available[0] for r in each)
@@ -473,21 +454,13 @@ def encoder_friction(F: Lti, steps: Sequence[float]) -> Array:
 _ROUNDING = 1e-6
 
 
-def any_environment_delayed(
-    V: Lti,
-    environment: Lti,
-    theta: Sequence[int],
-    psi: Sequence[int],
-    delta: Sequence[float],
-    phi: Array,
-    T_max: float | None = None,
-) -> Requirement:
+def any_environment_delayed(V: Lti, loop: Loop, phi: Array) -> Requirement:
     """Theorem 4 for the coupling V with the diagonal multiplier phi (N,) [N s/m]; phi = 0 is `any_environment`.
 
     The ratio s is the least for which s Delta_D satisfies, at every frequency, He v_hat(H) >= H* Delta_V H with
     H = V - Theta-hat/s and Delta_V = Phi + Phi (s Delta_D - Phi)^-1 Phi.
     """
-    available = dampings(delta, V.inputs)
+    available, environment = dampings(loop.delta, V.inputs), loop.E()
 
     def refused(reason: str) -> Requirement:
         return refusal("any-environment", available, reason)
@@ -499,10 +472,9 @@ def any_environment_delayed(
     V1 = V.dc()
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
-    damping = even_damping(available, V.T, T_max)
-    if uncovered(environment, psi, np.diag(phi)) > _ROUNDING * max(damping):
+    if uncovered(environment, loop.psi, np.diag(phi)) > _ROUNDING * max(even_damping(loop)):
         return refused("E-hat + Phi is not passive for this multiplier")
-    needed = delayed_demand(V, theta, damping, np.asarray(phi))
+    needed = delayed_demand(V, loop, phi)
     ratio, w = supremum(needed, np.concatenate([[0.0], frequencies(V)]))
     if np.isinf(ratio):
         return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz for this multiplier")
@@ -520,10 +492,10 @@ def uncovered(environment: Lti, psi: Sequence[int], Phi: Array) -> float:
     return supremum(short, np.concatenate([[0.0], frequencies(delayed)]))[0]
 
 
-def delayed_demand(V: Lti, theta: Sequence[int], delta: Array, phi: Array) -> Response:
+def delayed_demand(V: Lti, loop: Loop, phi: Sequence[float] | Array) -> Response:
     """w (k,) -> the least s of `any_environment_delayed` at each frequency."""
-    response = _delayed_response(V, theta)
-    return lambda w: _delayed_scale(response.at(on_circle(w)), delta, phi)
+    response = _delayed_response(V, loop.theta)
+    return lambda w: _delayed_scale(response.at(on_circle(w)), even_damping(loop), np.asarray(phi))
 
 
 def _delayed_response(V: Block, theta: Sequence[int]) -> Block:
@@ -553,41 +525,33 @@ def _delayed_scale(response: Complex, delta: Array, phi: Array) -> Array:
 _Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses there, a row for each system
 
 
-def this_environment_ratios(
-    at: _Responses,
-    poles: Complex,
-    delta: Sequence[float],
-    delay: int,
-    T_max: float | None = None,
-    latency: Latency | None = None,
-) -> Array:
+def this_environment_ratios(at: _Responses, poles: Complex, loop: Loop) -> Array:
     """Required over available damping, (n,), of n loops; inf where no damping is enough.
 
-    `at` gives the responses of their force maps, `poles` (n, p) are these maps' own, and `delay` [samples] is the
-    longest way through the loop, which makes so many lobes.
+    `at` gives the responses of their force maps, `poles` (n, p) are these maps' own; the longest way through the loop
+    makes so many lobes.
     """
     here, opposite = (np.full((len(poles), 1), w) for w in (_W_ZERO, np.pi))
     skew, least = _static_errors(at(on_circle(here)).G[:, 0].real, at(on_circle(opposite)).G[:, 0])
     sound = (np.abs(poles).max(axis=1, initial=0.0) < 1) & (skew <= _STATIC) & (least >= -_STATIC)
 
     def needed(w: Array) -> Array:
-        return _least_scales(this_environment_demand(at(on_circle(w)), delta, T_max, latency))
+        return _least_scales(this_environment_demand(at(on_circle(w)), loop))
 
-    return np.where(sound, np.maximum(suprema(needed, *frequencies_of_many(poles, delay)), 0.0), np.inf)
+    longest = max(n + p for n, p in zip(loop.theta, loop.psi, strict=True))
+    return np.where(sound, np.maximum(suprema(needed, *frequencies_of_many(poles, longest)), 0.0), np.inf)
 
 
-def any_environment_ratios(
-    V: _Responses, count: int, theta: Sequence[int], delta: Sequence[float], phi: Sequence[float] | None = None
-) -> Array:
+def any_environment_ratios(V: _Responses, count: int, loop: Loop, phi: Sequence[float] | None = None) -> Array:
     """The same of any-environment for `count` couplings; phi (m,) [N s/m] is the multiplier that psi >= 1 needs."""
 
     def needed(w: Array) -> Array:
         response = V(on_circle(w))
         if phi is None:
-            return _least_scales(any_environment_demand(response, theta, delta))
-        return _delayed_scale(_delayed_response(response, theta).G, np.asarray(delta), np.asarray(phi))
+            return _least_scales(any_environment_demand(response, loop))
+        return _delayed_scale(_delayed_response(response, loop.theta).G, even_damping(loop), np.asarray(phi))
 
-    return suprema(needed, *frequencies_of_many(np.zeros((count, 0), dtype=np.complex128), max(theta)))
+    return suprema(needed, *frequencies_of_many(np.zeros((count, 0), dtype=np.complex128), max(loop.theta)))
 
 
 def _least_scales(demand: Demand[Sampled]) -> Array:

@@ -131,7 +131,7 @@ class Switching:
         if found.requirement.reason:
             return cls(found.requirement, span.lo, span.hi)
         G = loop.sent(coupling)
-        buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available, loop.T_max)
+        buffered = this_environment(delay(span.hi, G.T) @ G, loop)
         playout = _Playout(span.hi, buffered.required, buffered.certified)
         return cls(found.requirement, span.lo, span.hi, tuple(found.alpha), playout, _NOT_COVERED)
 
@@ -166,7 +166,7 @@ class OverRanges:
         for member in members:
             here = loop.at(member.network)
             E, F = here.E(), here.F(coupling)
-            ratios.append(this_environment(F, loop.delta, loop.T_max, loop.latency).ratio)
+            ratios.append(this_environment(F, loop).ratio)
             if E.D.any():
                 figures[member.name] = transparency(F, E, loop.lam)
         nominal, worst = figures[members[0].name], max(figures, key=lambda member: figures[member].rms_mismatch)

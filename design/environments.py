@@ -43,7 +43,7 @@ class ThisEnvironment(Condition):
         F = loop.F(coupling, exact)
         if exact:
             require_size(F.order)
-        return this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
+        return this_environment_demand(F, loop)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """The most that any member asks."""
@@ -53,7 +53,7 @@ class ThisEnvironment(Condition):
             except NotProved as error:
                 return refusal(self.name, loop.delta, str(error))
         if loop.ranges is None:
-            return this_environment(loop.F(coupling), loop.delta, loop.T_max, loop.latency)
+            return this_environment(loop.F(coupling), loop)
         requirements = in_each(loop, coupling, loop.members())
         return requirements[worst(requirements)]
 
@@ -66,7 +66,7 @@ class ThisEnvironment(Condition):
     def _walls(self, loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Demand[Lti]:
         G = loop.walled(coupling, exact=True)
         require_size(G.order)
-        return walls_demand(G, loop.delta, [wall.slope(G.T) for wall in loop.environment.walls], g, None, loop.T_max)
+        return walls_demand(G, loop, g)
 
     def multiplier(self, loop: Loop, coupling: Coupling, given: Sequence[float] | None) -> Sequence[float] | None:
         return walls_of(loop, coupling).g if loop.environment.walls else None
@@ -100,22 +100,15 @@ def _required(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
         F = loop.at(member.network).F(coupling)
     except SingularLoop as error:
         return refusal("this-environment", loop.delta, str(error))
-    return this_environment(F, loop.delta, loop.T_max, loop.latency)
+    return this_environment(F, loop)
 
 
 # ----------------------------------------------------------------------------------------------------
 # Walls that make and break contact: this-environment with a multiplier for each.
 
 
-def walls_demand(
-    G: Block,
-    delta: Sequence[Any],
-    slopes: Sequence[Any],
-    g: Any,
-    lam: Sequence[Any] | None = None,
-    T_max: float | None = None,
-) -> Demand[Block]:
-    """this-environment for walls of any stiffness and damping with k + 2 b/T up to `slopes` (w,) [N/m], and any gap.
+def walls_demand(G: Block, loop: Loop, g: Any, lam: Sequence[Any] | None = None) -> Demand[Block]:
+    """this-environment for walls of any stiffness and damping with k + 2 b/T up to that of the loop's, and any gap.
 
     G takes [x; p] to [f; y], displacements (m,) and wall forces to the forces of the devices and the ways into the
     walls, [[F, J], [H, Y]]. With a multiplier g >= 0 and a weight lam > 0 for each wall (1 if not given) and
@@ -123,7 +116,8 @@ def walls_demand(
         [[F, J], [-lam M H, -lam M Y]]/(z-1) + diag(s Delta_D/T, lam g/slopes),
     whose static part must be symmetric, J(1) = H(1)' lam and lam Y(1) = Y(1)' lam, with F(1) >= 0 >= lam Y(1).
     """
-    T, m, w = G.T, len(delta), len(slopes)
+    T, m, w = G.T, loop.channels, len(loop.environment.walls)
+    slopes: Any = [wall.slope(T) for wall in loop.environment.walls]
     gains, one = numbers(g, T), numbers(np.eye(m + w), T)
     weights = numbers([1] * w if lam is None else lam, T)
     weigh = np.diag(np.concatenate([numbers([1] * m, T), weights]))
@@ -131,7 +125,7 @@ def walls_demand(
     steep = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
     limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(slopes, T)])
     free = np.hstack([one, -steep]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
-    damping = np.concatenate([even_damping(delta, T, T_max) / T, numbers([0] * w, T)])
+    damping = np.concatenate([even_damping(loop, T) / T, numbers([0] * w, T)])
     F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
     static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
     return Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
@@ -152,19 +146,13 @@ class _WallsProof:
     g: tuple[float, ...]  # (w,) the multiplier that shows it
 
 
-def walls_proof(
-    G: Lti,
-    delta: Sequence[float],
-    slopes: Sequence[float],
-    g: Sequence[float] | None = None,
-    T_max: float | None = None,
-) -> _WallsProof:
+def walls_proof(G: Lti, loop: Loop, g: Sequence[float] | None = None) -> _WallsProof:
     """The damping that `walls_demand` asks with the best multiplier found, or with g (w,) where it is given.
 
     G takes [x; p] to [f; y] while no wall touches.
     """
-    m, w = len(delta), len(slopes)
-    available = dampings(delta, m)
+    m, w = loop.channels, len(loop.environment.walls)
+    available = dampings(loop.delta, m)
 
     def refused(reason: str) -> _WallsProof:
         return _WallsProof(refusal("this-environment", available, reason), tuple(g or (1.0,) * w))
@@ -189,11 +177,11 @@ def walls_proof(
     sampled = Sampled(z[None], G.at(z)[None], G.T)
 
     def needed(values: Array) -> float:
-        demand = walls_demand(sampled, available, slopes, values, None, T_max)
+        demand = walls_demand(sampled, loop, values)
         return float(least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G)).max())
 
     found = _best_g(needed, w) if g is None else np.asarray(g, dtype=float)
-    demand = walls_demand(G, available, slopes, found, None, T_max)
+    demand = walls_demand(G, loop, found)
     ratio, at = supremum(lambda w: least_scale(demand, w), grid)
     if np.isinf(ratio):
         return refused("no multiplier was found with which the walls are covered, whatever the damping")
@@ -243,13 +231,12 @@ def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None
         G = loop.walled(coupling)
     except (SingularLoop, ValueError) as error:
         raise NotProved(str(error)) from None
-    slopes = [float(wall.slope(loop.T)) for wall in walls]
     values = None if g is None else [float(value) for value in g]
     if values is not None and (len(values) != len(walls) or min(values) < 0):
         raise NotProved(f"{_WALL_MULTIPLIER} is {values}, expected a number >= 0 for each of {len(walls)} walls")
     try:
         with sweeping():
-            return walls_proof(G, loop.delta, slopes, values, loop.T_max)
+            return walls_proof(G, loop, values)
     except TooLong as error:
         raise NotProved(str(error)) from None
 
@@ -425,7 +412,7 @@ def ratio_in(loop: Loop, coupling: Coupling) -> float:
     def needed(w: Array) -> Array:
         z = on_circle(w)[None]
         F = Sampled.of(late, z) @ coupling.around(Sampled.of(delayed, z))
-        demand = this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
+        demand = this_environment_demand(F, loop)
         return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
 
     return supremum(needed, frequencies(E, chain, low=_LOWEST))[0]

@@ -14,7 +14,7 @@ import numpy as np
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
-from controller.loop import Loop
+from controller.loop import DelayRange, Loop
 from controller.lti import Array, Sampled
 from design.conditions import even_damping, this_environment, this_environment_demand
 from design.frequency import frequencies, hermitian, on_circle
@@ -77,7 +77,7 @@ class SampledLoop:
         E = self.E.at(on_circle(self.band))
         self.size2 = (np.abs(E) ** 2).sum(axis=(1, 2))
         self.target = delay(loop.lam, loop.T).at(on_circle(self.band)) @ E
-        self.delta = even_damping(loop.delta, loop.T, loop.T_max)
+        self.delta = even_damping(loop)
         self.root = np.sqrt(loop.T / self.delta)
         self._last: tuple[_Responses, Array, Array, Complex] | None = None
         self._known: dict[int, tuple[_Responses, Array, tuple[Complex, Array, Complex, Complex]]] = {}
@@ -94,7 +94,7 @@ class SampledLoop:
 
     def judged(self, x: Array) -> Requirement:
         """What the refined sweep of its condition says of the gains at x."""
-        return this_environment(self.loop.F(self.coupling(x)), self.loop.delta, self.loop.T_max)
+        return this_environment(self.loop.F(self.coupling(x)), self.loop)
 
     def add(self, w: float) -> None:
         """Impose the condition at the frequency w [rad/sample] too."""
@@ -110,7 +110,7 @@ class SampledLoop:
         F = Sampled(
             on_circle(self.conditions)[None], np.ones((1, self.conditions.size, 1, 1), dtype=np.complex128), self.loop.T
         )
-        return this_environment_demand(F, [1.0]).free.G[0, :, 0, 0]
+        return this_environment_demand(F, self.loop.channel(0)).free.G[0, :, 0, 0]
 
     def _responses(self, w: Array) -> _Responses:
         """(z-1)/(Tz), Psi E and Theta at exp(jw)."""
@@ -234,21 +234,21 @@ class SwitchingLoop(SampledLoop):
     """As SampledLoop, with x = (log K, B/delta, log alpha T/delta of the channels whose delay varies)."""
 
     def __init__(self, loop: Loop, lo: Sequence[int], hi: Sequence[int]) -> None:
-        self.range, self.h = (lo, hi), half_widths(lo, hi)
+        self.h, loop = half_widths(lo, hi), loop.switching(DelayRange(tuple(lo), tuple(hi)))
         self.active = np.flatnonzero(self.h)
         super().__init__(loop)
 
     def point(self, coupling: SpringDamper) -> Array:
         """The gains with their best multiplier."""
         loop = self.loop
-        found = switching_sweep(loop.sent(coupling), *self.range, loop.delta, T_max=loop.T_max)
+        found = switching_sweep(loop.sent(coupling), loop)
         a = np.array(found.alpha)[self.active] * loop.T / self.delta[self.active]
         a = np.clip(np.where(np.isfinite(a), a, _FIRST), *_MULTIPLIERS)
         return np.concatenate([super().point(coupling), np.log(a)])
 
     def judged(self, x: Array) -> Requirement:
         sent = self.loop.sent(self.coupling(x))
-        return switching_sweep(sent, *self.range, self.loop.delta, T_max=self.loop.T_max).requirement
+        return switching_sweep(sent, self.loop).requirement
 
     def room(self, x: Array) -> Array:
         """1 - SAMPLED_RESERVE less the damping ratio at each sampled frequency, with the multiplier in x."""
@@ -257,7 +257,7 @@ class SwitchingLoop(SampledLoop):
         D, E, _ = self.loop_at_conditions
         now = np.broadcast_to(np.eye(m, dtype=complex), E.shape)
         G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], loop.T)
-        block = hermitian(switching_block(G, *self.range, loop.delta, alpha, loop.T_max)[0].G[0])
+        block = hermitian(switching_block(G, loop, alpha)[0].G[0])
         error = block[:, m:, :m]
         schur = block[:, :m, :m] - np.conj(np.swapaxes(error, 1, 2)) @ (error / (2 * alpha[self.active])[:, None])
         room = (np.linalg.eigvalsh(self.root[:, None] * schur * self.root)[:, 0] - _SAMPLED_RESERVE).astype(float)
@@ -286,7 +286,7 @@ class LimiterLoop(SampledLoop):
 
     def judged(self, x: Array) -> Requirement:
         loop, sent, c = self.loop, self.loop.sent(self.coupling(x)), self._weights(x).tolist()
-        return limiter_proof(sent, loop.theta, loop.delta, self.rho, c, T_max=loop.T_max).requirement
+        return limiter_proof(sent, loop, self.rho, c).requirement
 
     def room(self, x: Array) -> Array:
         """The least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency."""
@@ -325,7 +325,7 @@ class LimiterLoop(SampledLoop):
     def _block(self, x: Array) -> Complex:
         loop = self.loop
         G = Sampled(on_circle(self.conditions)[None], self.force(x, self._now())[None], loop.T)
-        demand = limiter_demand(G, loop.theta, loop.delta, self.rho, self._weights(x).tolist(), loop.T_max)
+        demand = limiter_demand(G, loop, self.rho, self._weights(x).tolist())
         return hermitian(demand.free.G[0] + (1 - _SAMPLED_RESERVE) * demand.gain.G[0])
 
     def search(self, x: Array, most: int) -> OptimizeResult:

@@ -39,7 +39,7 @@ def usable(loop: Loop) -> Array:
     """(m,) the damping that a design may spend [N s/m], in even periods. Raises ValueError where there is none."""
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
-    return (1 - RESERVE) * even_damping(loop.delta, loop.T, loop.T_max)
+    return (1 - RESERVE) * even_damping(loop)
 
 
 def _low_pass(channels: int, T: float, f0: float = 80.0) -> Lti:
@@ -233,7 +233,7 @@ def least_phi(loop: Loop) -> Array | None:
     """`least_multiplier`, verified on a refined sweep; None where psi = 0, since a passive environment needs none."""
     if not any(loop.psi):
         return None
-    phi = least_multiplier(loop) + _ROOM * even_damping(loop.delta, loop.T, loop.T_max)
+    phi = least_multiplier(loop) + _ROOM * even_damping(loop)
     short = uncovered(loop.E(), loop.psi, np.diag(phi))
     if short > 0:
         raise DesignFailed(None, (), f"the multiplier Phi = {phi.tolist()} leaves {short:.2e} N s/m uncovered")
@@ -248,7 +248,7 @@ def least_multiplier(loop: Loop) -> Array:
 
     Raises Infeasible, with the damping that would be needed, where even a full Phi is not below Delta_D.
     """
-    delta = even_damping(loop.delta, loop.T, loop.T_max)
+    delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
     least = uncovered(unit, loop.psi, np.zeros((loop.channels,) * 2))  # of a full Phi, and of least on every channel
     if least >= 1:
@@ -301,7 +301,7 @@ class AnyEnvironment(Condition):
         assert V is not None  # where it is None, `required` refuses
         if exact:
             require_size(V.order + sum(loop.theta))
-        return conditions.any_environment_demand(V, loop.theta, loop.delta, loop.T_max)
+        return conditions.any_environment_demand(V, loop)
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
         """The least Phi, None where none is needed; and why it says nothing of the loop, whatever the coupling."""
@@ -330,14 +330,14 @@ class AnyEnvironment(Condition):
             return refusal(self.name, loop.delta, reason or self._without(coupling))
         if not any(loop.psi):
             if channels := coupling.channels(loop.T):
-                return conditions.any_environment_per_channel(channels, loop.theta, loop.delta, loop.T_max)
-            return conditions.any_environment(V, loop.theta, loop.delta, loop.T_max)
+                return conditions.any_environment_per_channel(channels, loop)
+            return conditions.any_environment(V, loop)
         if multiplier is None:
             multiplier, reason = self.least_multiplier(loop)
         if multiplier is None:
             return refusal(self.name, loop.delta, str(reason))
         phi = np.array([float(p) for p in multiplier])
-        return conditions.any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi, loop.T_max)
+        return conditions.any_environment_delayed(V, loop, phi)
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         if not any(loop.psi):
@@ -348,7 +348,7 @@ class AnyEnvironment(Condition):
         require_size(V.order + sum(loop.theta))
         delayed = delay(loop.psi, T) @ loop.E(exact=True)
         return {
-            "P": conditions.delayed_coupling_demand(V, loop.theta, multiplier, loop.delta, loop.T_max),
+            "P": conditions.delayed_coupling_demand(V, loop, multiplier),
             "P_E": conditions.delayed_environment_demand(delayed, multiplier),
         }
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.loop import Loop
+from controller.loop import DelayRange, Loop
 from controller.lti import (
     Array,
     Block,
@@ -39,14 +39,7 @@ from design.result import DesignFailed, Requirement, from_ratio, refusal
 Lags = Sequence[Sequence[Any]]
 
 
-def switching_block(
-    G: Block,
-    lo: Sequence[int],
-    hi: Sequence[int],
-    delta: Any,
-    alpha: Any,
-    T_max: float | None = None,
-) -> tuple[Block, Array]:
+def switching_block(G: Block, loop: Loop, alpha: Any) -> tuple[Block, Array]:
     """[[this-environment - diag(alpha)/2, 0], [2 h G, 2 diag(alpha)]], which must be positive real; and F(1).
 
     F = Theta_nom G with Theta_nom = (z^-lo + z^-hi)/2 and 2 h = hi - lo; G are the forces as they leave,
@@ -56,7 +49,8 @@ def switching_block(
     A force that is late by n in [lo, hi] differs from the nominal one by at most h times the sum of the steps in
     between; the multiplier weighs that error against the displacement (an S-procedure, channel by channel).
     """
-    T, widths = G.T, [b - a for a, b in zip(lo, hi, strict=True)]
+    T, lo, hi = G.T, loop.delays.lo, loop.delays.hi
+    widths = [b - a for a, b in zip(lo, hi, strict=True)]
     varying = [i for i, width in enumerate(widths) if width]
     a = numbers(alpha, T)
     half = Lti.diag(*(taps(_halves(p, q), T) for p, q in zip(lo, hi, strict=True)))
@@ -65,9 +59,9 @@ def switching_block(
     )
     both: Any = as_like(G, vstack(half, spread)) @ G
     m = len(lo)
-    linear = conditions.this_environment_demand(both.rows(slice(None, m)), delta, T_max)
+    linear = conditions.this_environment_demand(both.rows(slice(None, m)), loop)
     F1 = linear.static["F(1)"]
-    upper = linear.free + np.diag(conditions.even_damping(delta, T, T_max) / T - a / 2)
+    upper = linear.free + np.diag(conditions.even_damping(loop, T) / T - a / 2)
     if not varying:
         return upper, F1
     lower = np.zeros((m + len(varying), len(varying)), dtype=object)
@@ -79,9 +73,7 @@ def _halves(lo: int, hi: int) -> list[Number]:
     return [Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)]
 
 
-def limiter_demand(
-    G: Block, theta: Sequence[int], delta: Any, rho: Sequence[Any], c: Lags, T_max: float | None = None
-) -> conditions.Demand[Block]:
+def limiter_demand(G: Block, loop: Loop, rho: Sequence[Any], c: Lags) -> conditions.Demand[Block]:
     """The limiter's block on (dx - de, de), the steps of what the environment follows and of the slip.
 
     G are the forces as they leave without the limiter, rho (m,) [N/m] its lag, fixed numbers that the damping does
@@ -89,8 +81,8 @@ def limiter_demand(
     block is [Theta/(z-1); N] df_e + s Delta_D/T [1, 0; 2, 1], where
     N_i = -(1 + .. + z^-theta_i) - sum_j c_ij (j + (j-1)/z + .. + z^-(j-1)).
     """
-    m, T = len(theta), G.T
-    damping = np.diag(conditions.even_damping(delta, T, T_max) / T)
+    theta, m, T = loop.theta, loop.channels, G.T
+    damping = np.diag(conditions.even_damping(loop, T) / T)
     lines = Lti.diag(*(_delay_and_weights(n, row, T) for n, row in zip(theta, c, strict=True)))
     lines = lines.rows([*range(0, 2 * m, 2), *range(1, 2 * m, 2)])
     difference = Lti.diag(*(taps([1, -1], T) for _ in theta))
@@ -143,27 +135,18 @@ class SwitchingSweep:
     bound: float  # no multiplier shows less than this times the available damping (on the frequencies looked at)
 
 
-def switching_sweep(
-    G: Lti,
-    lo: Sequence[int],
-    hi: Sequence[int],
-    delta: Sequence[float],
-    alpha: Sequence[float] | None = None,
-    T_max: float | None = None,
-) -> SwitchingSweep:
+def switching_sweep(G: Lti, loop: Loop, alpha: Sequence[float] | None = None) -> SwitchingSweep:
     """The least common factor on `delta` [N s/m] with which some multiplier satisfies the condition, and which does.
 
     G is the force map without Theta. The factor is that of the refined sweep (design.frequency.sweep) at the multiplier
     found, or at `alpha` (m,) [N/m] where it is given, positive where lo < hi; `bound` is then that factor.
     """
-    available, h = conditions.dampings(delta, G.inputs), half_widths(lo, hi)
-    if len(h) != G.inputs:
-        raise ValueError(f"delays are given for {len(h)} channels, expected {G.inputs}")
-    constant = conditions.this_environment(nominal(lo, hi, G.T) @ G, delta, T_max)
+    available, span = conditions.dampings(loop.delta, G.inputs), loop.delays
+    h = half_widths(span.lo, span.hi)
+    constant = conditions.this_environment(_nominal(span, G.T) @ G, loop)
     if not np.isfinite(constant.ratio):
         return _refused(available, constant.reason or "no constant delay is safe")
-    damping = conditions.even_damping(available, G.T, T_max)
-    search, unit = _Search(G, lo, hi, damping), damping / G.T
+    search, unit = _Search(G, loop), conditions.even_damping(loop) / G.T
     given = None if alpha is None else (np.asarray(alpha) / unit)[search.active]
     a, ratio, w, bound = search.least() if given is None else search.only(given)
     multiplier = np.zeros(h.size)
@@ -187,10 +170,10 @@ class _Search:
     this-environment's block of F = Theta_nom G, Y = h W G W.
     """
 
-    def __init__(self, G: Lti, lo: Sequence[int], hi: Sequence[int], delta: Array) -> None:
-        F = nominal(lo, hi, G.T) @ G
-        self._G, self._demand = G, conditions.this_environment_demand(F, delta.tolist())
-        self._weight, self._h = np.sqrt(G.T / delta), half_widths(lo, hi)
+    def __init__(self, G: Lti, loop: Loop) -> None:
+        span = loop.delays
+        self._G, self._demand = G, conditions.this_environment_demand(_nominal(span, G.T) @ G, loop)
+        self._weight, self._h = np.sqrt(G.T / conditions.even_damping(loop)), half_widths(span.lo, span.hi)
         self.active = np.flatnonzero(self._h)
         self._grid = np.concatenate([[0.0], frequencies(G)])
         none = np.zeros((0, self.active.size))
@@ -311,32 +294,24 @@ def limiter_lag(delta: Sequence[float], T: float, beta: float) -> tuple[float, .
     return tuple(float(f"{beta * d / T:.6g}") for d in delta)
 
 
-def limiter(
-    G: Lti,
-    theta: Sequence[int],
-    delta: Sequence[float],
-    rho: Sequence[float],
-    c: Lags | None = None,
-    lags: int = 1,
-    T_max: float | None = None,
-) -> _LimiterProof:
+def limiter(G: Lti, loop: Loop, rho: Sequence[float], c: Lags | None = None, lags: int = 1) -> _LimiterProof:
     """The least common factor on `delta` [N s/m] with which the limiter's block is positive real, at the best c.
 
     G is the force map without Theta, rho (m,) [N/m] the limiter's lag. With `c` given its figure is that of the
     refined sweep at this multiplier; otherwise the best with so many lags per channel is searched.
     """
-    available, m = conditions.dampings(delta, G.inputs), G.inputs
-    if len(theta) != m or len(rho) != m or (c is not None and len(c) != m):
-        raise ValueError(f"theta, rho and c need one entry for each of {m} channels")
+    available, m = conditions.dampings(loop.delta, G.inputs), G.inputs
+    if len(rho) != m or (c is not None and len(c) != m):
+        raise ValueError(f"rho and c need one entry for each of {m} channels")
     if not all(0 <= r < np.inf for r in rho) or any(not 0 <= v < np.inf for row in c or () for v in row):
         raise ValueError(f"rho is {list(rho)} and c is {c}, expected numbers >= 0")
-    none = tuple((0.0,) * lags for _ in theta) if c is None else tuple(tuple(float(v) for v in row) for row in c)
+    none = tuple((0.0,) * lags for _ in rho) if c is None else tuple(tuple(float(v) for v in row) for row in c)
     # the slip at rest: its rows are among the block's
-    linear = conditions.this_environment(delay(theta, G.T) @ G, available, T_max)
+    linear = conditions.this_environment(delay(loop.theta, G.T) @ G, loop)
     if not np.isfinite(linear.ratio):
         reason = linear.reason or "the loop without limiter is not covered"
         return _LimiterProof(refusal("limiter", available, reason), tuple(rho), none, np.inf)
-    search = _LimiterSearch(G, theta, available, rho, lags, T_max)
+    search = _LimiterSearch(G, loop, rho, lags)
     if c is not None:
         ratio, w = search.swept(none)
         return _LimiterProof(search.requirement(ratio, w), tuple(rho), none, ratio)
@@ -347,29 +322,19 @@ def limiter(
 class _LimiterSearch:
     """s(c) by the refined sweep, and its least over c >= 0."""
 
-    def __init__(
-        self,
-        G: Lti,
-        theta: Sequence[int],
-        delta: tuple[float, ...],
-        rho: Sequence[float],
-        lags: int,
-        T_max: float | None = None,
-    ) -> None:
-        self._T_max = T_max
-        self._loop, self._delta, self._shape = (G, theta, delta, rho), delta, (len(theta), lags)
+    def __init__(self, G: Lti, loop: Loop, rho: Sequence[float], lags: int) -> None:
+        self._G, self._loop, self._rho, self._shape = G, loop, rho, (loop.channels, lags)
         self._grid, self._lag = np.concatenate([[0.0], frequencies(G)]), np.diag([*rho, *rho])
 
     def requirement(self, ratio: float, w: float) -> Requirement:
-        T = self._loop[0].T
+        T, delta = self._loop.T, self._loop.delta
         if np.isinf(ratio):
             reason = "no limiter is proved for this coupling"
-            return refusal("limiter", self._delta, reason)
-        return from_ratio("limiter", max(ratio, 0.0), self._delta, w / (2 * np.pi * T))
+            return refusal("limiter", delta, reason)
+        return from_ratio("limiter", max(ratio, 0.0), delta, w / (2 * np.pi * T))
 
     def demand(self, c: Lags) -> conditions.Demand[Lti]:
-        G, theta, delta, rho = self._loop
-        return limiter_demand(G, theta, delta, rho, c, self._T_max)
+        return limiter_demand(self._G, self._loop, self._rho, c)
 
     def swept(self, c: Lags, spare: float = 0.0) -> tuple[float, float]:
         """(s(c), w [rad/sample]) by a sweep that is refined between its samples, with a reserve of rho."""
@@ -407,7 +372,7 @@ class _LimiterSearch:
 
     def _block(self, w: Array, unknowns: Sequence[int]) -> cone.Inequality:
         """free(c) + s gain at w (k,) with something to spare, in units of Delta_D/T."""
-        z, root = on_circle(w), np.tile(np.sqrt(self._loop[0].T / np.array(self._delta)), 2)
+        z, root = on_circle(w), np.tile(np.sqrt(self._loop.T / np.array(self._loop.delta)), 2)
         none = self.demand(self._rows(np.zeros(len(unknowns) - 1)))
         free, gain = hermitian(none.free.at(z)), hermitian(none.gain.at(z))
         slopes = [hermitian(self.demand(self._rows(unit)).free.at(z)) - free for unit in np.eye(len(unknowns) - 1)]
@@ -422,17 +387,16 @@ def half_widths(lo: Sequence[int], hi: Sequence[int]) -> Array:
     return (np.asarray(hi) - np.asarray(lo)) / 2
 
 
-def nominal(lo: Sequence[int], hi: Sequence[int], T: float) -> Lti:
+def _nominal(span: DelayRange, T: float) -> Lti:
     """Theta_nom = (z^-lo + z^-hi)/2, diagonal."""
-    return Lti.diag(*(taps(_halves(p, q), T) for p, q in zip(lo, hi, strict=True)))
+    return Lti.diag(*(taps(_halves(p, q), T) for p, q in zip(span.lo, span.hi, strict=True)))
 
 
 def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) -> SwitchingSweep:
     """What switching within the loop's range asks, by a sweep; with the multiplier `alpha` [N/m] where it is given."""
-    span = loop.delays
     try:
         with sweeping():
-            return switching_sweep(loop.sent(coupling), span.lo, span.hi, loop.delta, alpha, loop.T_max)
+            return switching_sweep(loop.sent(coupling), loop, alpha)
     except (SingularLoop, TooLong) as error:
         return _refused(loop.delta, str(error))
 
@@ -473,7 +437,7 @@ def limiter_requirement(loop: Loop, coupling: Coupling, beta: float = BETA, c: L
     try:
         if reason is None:
             with sweeping():
-                return limiter(loop.sent(coupling), loop.theta, loop.delta, rho, c, T_max=loop.T_max)
+                return limiter(loop.sent(coupling), loop, rho, c)
     except (SingularLoop, TooLong) as error:
         reason = str(error)
     return _LimiterProof(refusal("limiter", loop.delta, reason), rho, ((),) * loop.channels, math.inf)

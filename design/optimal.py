@@ -349,7 +349,7 @@ class _Climb:
         """The coupling with its figures, and what a sweep of it alone asks for."""
         loop, members = self.loop, self.loop.members()
         F = loop.F(coupling)
-        requirements = [requirement_of(F, loop.delta, loop.T_max, loop.latency), *in_each(loop, coupling, members[1:])]
+        requirements = [requirement_of(F, loop), *in_each(loop, coupling, members[1:])]
         requirement = requirements[worst(requirements)]
         figures = transparency(F, self.cases[0].E, loop.lam, self.options.band_hz)
         objective = self.options.objective

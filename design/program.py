@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 import scipy  # its parts load when they are used
 from numpy.typing import NDArray
@@ -114,19 +115,19 @@ def this_environment(loop: Loop) -> _Constraint:
 
 
 def _demand(loop: Loop, F: Any) -> Demand[Any]:
-    return this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
+    return this_environment_demand(F, loop)
 
 
 def switching(loop: Loop, span: DelayRange) -> _Constraint:
     """design.multipliers.switching_block for delays that switch within the span; alpha T/Delta are its unknowns."""
-    scale = even_damping(loop.delta, loop.T, loop.T_max) / loop.T
+    scale = even_damping(loop) / loop.T
+    usable = msgspec.structs.replace(loop, delta=tuple((1 - MARGIN) * d for d in loop.delta), varying_delay=span)
     moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
 
     def block(G: Sampled, own: Array) -> Sampled:
         alpha = np.zeros(scale.size)
         alpha[moves] = own * scale[moves]
-        usable = [(1 - MARGIN) * d for d in loop.delta]
-        return switching_block(G, span.lo, span.hi, usable, alpha.tolist(), loop.T_max)[0]
+        return switching_block(G, usable, alpha.tolist())[0]
 
     unit = 1 / np.sqrt(np.concatenate([scale, scale[moves]]))
     return _Constraint("switching delays", block, unit, start=(0.5,) * moves.size, cost=(0.0,) * moves.size)
@@ -150,10 +151,10 @@ def limiter(loop: Loop, slip: Slip) -> _Constraint:
     spare = np.diag([*rho, *rho]) * SPARE
 
     def block(G: Sampled, own: Array) -> Sampled:
-        demand = limiter_demand(G, loop.theta, loop.delta, rho, slip.c, loop.T_max)
+        demand = limiter_demand(G, loop, rho, slip.c)
         return demand.free + demand.gain * (1 - MARGIN) - spare
 
-    return _Constraint("limiter", block, np.tile(1 / np.sqrt(even_damping(loop.delta, loop.T, loop.T_max) / loop.T), 2))
+    return _Constraint("limiter", block, np.tile(1 / np.sqrt(even_damping(loop) / loop.T), 2))
 
 
 def most_gain(loop: Loop, cap: float) -> _Constraint:

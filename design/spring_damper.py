@@ -320,7 +320,7 @@ def _for_this_environment(
     coupling = _short(SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B)))
     if many:
         rms = transparency(loop.F(coupling), loop.E(), loop.lam, band).rms_mismatch
-    requirement = this_environment(loop.F(coupling), loop.delta, loop.T_max)
+    requirement = this_environment(loop.F(coupling), loop)
     wall_s = time.perf_counter() - started
     return Design(coupling, "this-environment", "rms", rms, requirement, searches, wall_s, c=c if many else None)
 
@@ -361,7 +361,7 @@ def moving_average(loop: Loop) -> Design:
     """
     started = time.perf_counter()
     phi = least_phi(loop)
-    weight, terms = loop.T / (2 * even_damping(loop.delta, loop.T, loop.T_max)), np.array(loop.theta) + 1
+    weight, terms = loop.T / (2 * even_damping(loop)), np.array(loop.theta) + 1
     coupling = MovingAverage(weight, terms.tolist(), RESERVE / (1 - RESERVE) * terms**2 * weight)
     requirement = _verified(loop, coupling, phi)
     total = float(coupling.stiffness.sum())

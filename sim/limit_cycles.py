@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
 from controller.timing import Timing
-from design.conditions import Latency
 from models.device import Device
 from models.hold import HeldPlant, hold
 from models.human import Population
@@ -60,7 +59,7 @@ class HeldDevices:
         seed: int,
         humans: int,
         links: int | None = None,
-        latency: Latency | None = None,
+        latency: Sequence[tuple[float, float]] | None = None,
     ) -> HeldDevices:
         """Random humans with the devices; of so many links each, by default as their population says.
 

@@ -402,11 +402,11 @@ def impulse_test(
     audit = _Audit(process, scene, loops, balance, ticks)
     push = partial(impulse_forces, scene, loops.T, size=_TO_THE_WALL if process.walls else 1.0)
 
-    def look(buffer: StepBuffer, first: int, count: int) -> None:
+    def each_block(buffer: StepBuffer, first: int, count: int) -> None:
         audit.see(buffer, first, count)
         tick_done(count)
 
-    run_blocks(process, engine, push, ticks, np.zeros((states, nsim)), look)
+    run_blocks(process, engine, push, ticks, np.zeros((states, nsim)), each_block)
     return audit.result(ticks * loops.T * nsim)
 
 
@@ -423,11 +423,11 @@ def impulse_growth(
     T, quarter, limit = process.F.T, ticks // 4, process.force_limit[:, None]
     speeds, clipped = _Speeds(scene, nsim, (quarter, 2 * quarter), (ticks - quarter, ticks)), np.zeros(nsim, dtype=bool)
 
-    def look(buffer: StepBuffer, first: int, count: int) -> None:
+    def each_block(buffer: StepBuffer, first: int, count: int) -> None:
         clipped[...] |= (np.abs(buffer.f[:count]) >= limit).any(axis=(0, 1))
         speeds.see(buffer, first, count)
 
-    run_blocks(process, engine, partial(impulse_forces, scene, T), ticks, np.zeros((states, nsim)), look)
+    run_blocks(process, engine, partial(impulse_forces, scene, T), ticks, np.zeros((states, nsim)), each_block)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         rate = np.log(speeds.late / speeds.early) / 2 / ((ticks - 2 * quarter) * T)
     return np.where(speeds.late == 0, -np.inf, np.where(np.isnan(rate), np.inf, rate)), clipped

@@ -64,8 +64,7 @@ class _Sweep:
             G = loop.sent_at(coupling, z)
             return as_like(G, theta) @ G
 
-        poles, longest = loop.F(coupling).poles(), max(n + p for n, p in zip(loop.theta, loop.psi, strict=True))
-        return conditions.this_environment_ratios(at, poles, loop.delta, longest, loop.T_max, loop.latency)
+        return conditions.this_environment_ratios(at, loop.F(coupling).poles(), loop)
 
     def _limits(self, devices: Sequence[Device]) -> tuple[Array, Array]:
         """Force limits [N] and encoder steps [m], (m,) each."""
@@ -149,13 +148,13 @@ class CouplingSweep(_Sweep):
         if reason:
             return np.full(K.size, np.inf)
         one, none = self._couplings(K, B, 1), [None] * self.loop.channels
-        damping = conditions.even_damping(self.loop.delta, self.loop.T, self.loop.T_max).tolist()
-        channels = set(zip(self.loop.theta, damping, none if phi is None else phi.tolist(), strict=True))
+        alone = map(self.loop.channel, range(self.loop.channels))
+        channels = set(zip(alone, none if phi is None else phi.tolist(), strict=True))
         each = [
             conditions.any_environment_ratios(
-                lambda z: one.sampled(z, self.loop.T), K.size, [n], [d], None if p is None else [p]
+                lambda z: one.sampled(z, self.loop.T), K.size, loop, None if p is None else [p]
             )
-            for n, d, p in channels
+            for loop, p in channels
         ]
         return np.max(each, axis=0)
 
@@ -164,9 +163,7 @@ class CouplingSweep(_Sweep):
         loop = self.loop
         coupling = self._coupling(K, B)
         if condition == "this-environment":
-            states = [
-                conditions.this_environment(s.F(coupling), loop.delta, loop.T_max, loop.latency) for s in self._states
-            ]
+            states = [conditions.this_environment(s.F(coupling), loop) for s in self._states]
             return max(states, key=lambda requirement: requirement.ratio)
         return ANY_ENVIRONMENT.required(loop, coupling, self.multiplier[0])
 
@@ -267,7 +264,7 @@ class EnvironmentSweep(_Sweep):
             return self._any_environment
         try:
             F = self._at(np.array([K]), np.array([B])).F(self._facing(condition))[0]
-            return conditions.this_environment(F, self.loop.delta, self.loop.T_max, self.loop.latency)
+            return conditions.this_environment(F, self.loop)
         except SingularLoop as error:
             return refusal("this-environment", self.loop.delta, str(error))
 

@@ -177,7 +177,7 @@ def _let_go(case: _Case, mass: Array, stiff: Array, speed: Array, seconds: float
     D, (first, last) = case.delta[:, None] / case.T, np.zeros((2, hands))
     balance, flow, least = np.zeros(hands), np.zeros(hands), np.zeros(hands)
 
-    def look(buffer: StepBuffer, begin: int, count: int) -> None:
+    def each_block(buffer: StepBuffer, begin: int, count: int) -> None:
         nonlocal balance, flow, least
         dx, f = np.diff(buffer.x[: count + 1], axis=0), buffer.f[:count]
         work, spent = (f * dx).sum(axis=1), (D * dx**2 + friction * np.abs(dx)).sum(axis=1)
@@ -191,7 +191,7 @@ def _let_go(case: _Case, mass: Array, stiff: Array, speed: Array, seconds: float
 
     engine = _Rubbing(plants, friction) if rubs else ExactEngine(plants)
     outside = plants.B.shape[-1] - m
-    run_blocks(process, engine, lambda begin, count: np.zeros((count, outside)), ticks, start, look)
+    run_blocks(process, engine, lambda begin, count: np.zeros((count, outside)), ticks, start, each_block)
     with np.errstate(invalid="ignore", over="ignore"):
         return np.nan_to_num(np.sqrt(last / first), nan=np.inf), np.nan_to_num(least, nan=-np.inf)
 
@@ -240,7 +240,7 @@ _FREE = np.full(2, np.inf), np.zeros(2)  # limits of the actuators and steps of 
 def _limits(rng: np.random.Generator, factor: float) -> _Case:
     loop, coupling = _pair(rng)
     rho = limiter_lag(loop.delta, loop.T, BETA)
-    needed = limiter(loop.sent(coupling), loop.theta, loop.delta, rho).requirement.required
+    needed = limiter(loop.sent(coupling), loop, rho).requirement.required
     process = Process(loop.law(coupling, (2.0, 1.0), rho), *_FREE)
     return _Case(lambda nsim, ticks: process, factor * np.array(needed), loop.T, 1e-3)
 
@@ -253,10 +253,10 @@ def _anywhere(rng: np.random.Generator, factor: float) -> _Case:
 
     def asked(pair: tuple[Loop, SpringDamper]) -> Array:
         loop, coupling = pair
-        return np.array(any_environment(coupling.compliance(loop.T), loop.theta, loop.delta).required)
+        return np.array(any_environment(coupling.compliance(loop.T), loop).required)
 
     def share(pair: tuple[Loop, SpringDamper]) -> float:
-        return float((this_environment(pair[0].F(pair[1]), (1.0, 1.0)).required / asked(pair)).min())
+        return float((this_environment(pair[0].F(pair[1]), pair[0]).required / asked(pair)).min())
 
     loop, coupling = worst = max((_pair(rng) for _ in range(8)), key=share)
     needed = asked(worst)
@@ -269,7 +269,7 @@ def _anywhere(rng: np.random.Generator, factor: float) -> _Case:
 def _budget(rng: np.random.Generator, factor: float) -> _Case:
     """The budget guards a loop that needs two to four times the available damping."""
     loop, coupling = _pair(rng)
-    delta = np.array(this_environment(loop.F(coupling), loop.delta).required) / rng.uniform(2, 4)
+    delta = np.array(this_environment(loop.F(coupling), loop).required) / rng.uniform(2, 4)
     simulation = assemble(_scenario(loop, delta), coupling)
 
     def process(nsim: int, ticks: int) -> Process:
@@ -298,7 +298,7 @@ def _friction(rng: np.random.Generator, factor: float) -> _Case:
     Hands are let go at a millimetre a second and less, where steps matter."""
     loop, coupling = _pair(rng)
     F, step = loop.F(coupling), 1e-5
-    needed = np.array(this_environment(F, loop.delta).required)
+    needed = np.array(this_environment(F, loop).required)
     process = Process(loop.law(coupling), np.full(2, np.inf), np.full(2, step))
     pays = factor * encoder_friction(F, [step] * 2)
     damping = needed * (1 + 1e-9)

@@ -7,10 +7,10 @@ import time
 
 import numpy as np
 import pytest
+from asked import this_environment
 
 from controller.coupling import CASE_I, NoCoupling
 from controller.tick import StepBuffer
-from design.conditions import this_environment
 from models.hold import hold
 from models.scene import Variants, variants
 from sim.adversary import attempts

@@ -5,6 +5,7 @@ import json
 import msgspec
 import numpy as np
 import pytest
+from asked import this_environment
 from scipy.optimize import brentq
 from worlds import SOFT, force_map, loop_of
 
@@ -18,7 +19,6 @@ from controller.lti import Lti, SingularLoop
 from controller.tick import Process, StepBuffer
 from design.audit import audit, requirement
 from design.certificate import assess, prove
-from design.conditions import this_environment
 from design.guarantees import MAKING
 from models.device import CompliantDevice
 from models.hold import hold

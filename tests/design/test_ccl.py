@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from asked import any_environment, this_environment
 from worlds import DELTA, SOFT_NETWORK, T, force_map
 
 from controller.coupling import SpringDamper
@@ -10,7 +11,6 @@ from controller.loop import Loop
 from controller.lti import Lti
 from design import fixed_order as ccl
 from design import spring_damper
-from design.conditions import any_environment, this_environment
 from design.fixed_order import FixedOrder, FixedPoles, descend
 from design.lmi import RESERVE, Shaping, v_hat_ports
 

@@ -6,6 +6,7 @@ from fractions import Fraction
 import msgspec
 import numpy as np
 import pytest
+from asked import this_environment
 from worlds import PAIR, SOFT, SOFT_NETWORK, STIFF
 
 from controller import coupling as controller_coupling
@@ -16,7 +17,6 @@ from controller.lti import Lti, SingularLoop, rational
 from design import certificate as design_certificate
 from design import environments, exact, spring_damper
 from design.certificate import Verdict, prove, required_damping, verify
-from design.conditions import this_environment
 from design.coupling_file import Stored, digest, load, save, sealed
 from design.environments import THIS_ENVIRONMENT
 from design.files import InputError

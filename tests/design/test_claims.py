@@ -9,6 +9,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from asked import any_environment, this_environment
 from driven import driven
 from scipy.signal import dlsim, lfilter
 from worlds import SOFT, STIFF, force_map
@@ -17,7 +18,6 @@ from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import Loop
 from controller.lti import Lti
-from design.conditions import any_environment, this_environment
 from design.lmi import Infeasible, Shaping, least_multiplier
 from design.multipliers import limiter_lag
 from design.spring_damper import step

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from asked import this_environment
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.environment import FIGURE_4
 from controller.loop import Loop
 from controller.lti import Lti, taps
-from design.conditions import encoder_friction, l1_gain, this_environment
+from design.conditions import encoder_friction, l1_gain
 
 T, STEP = 1.2e-3, 1e-5
 LOOP = Loop(T, (0, 1), (0, 0), (0, 1), (1.37, 1.37), FIGURE_4)

@@ -11,6 +11,14 @@ from fractions import Fraction
 import msgspec
 import numpy as np
 import pytest
+from asked import (
+    any_environment_demand,
+    delayed_coupling_demand,
+    limiter_demand,
+    switching_block,
+    this_environment_demand,
+    walls_demand,
+)
 from scipy.optimize import minimize_scalar
 from worlds import SOFT, STIFF, T
 
@@ -21,16 +29,10 @@ from controller.lti import Lti, rational
 from controller.ranges import Ranges, UncertainSpring
 from design import certificate
 from design.certificate import condition_block, prove, verify
-from design.conditions import (
-    any_environment_demand,
-    delayed_coupling_demand,
-    delayed_environment_demand,
-    this_environment_demand,
-)
+from design.conditions import delayed_environment_demand
 from design.coupling_file import Stored, digest, sealed
-from design.environments import walls_demand
 from design.exact import find_storage, prove_positive_real
-from design.multipliers import SwitchingSweep, limiter_demand, switching_block
+from design.multipliers import SwitchingSweep
 from design.result import NotProved, from_ratio
 
 CLOSE = 1e-6  # relative, on either side of a limit

@@ -3,6 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
+from asked import latency_demand, this_environment, this_environment_demand
 from scipy.linalg import expm
 
 from controller.coupling import SpringDamper
@@ -12,7 +13,7 @@ from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled, hstack, numbers, vstack
 from design.api import design_coupling, transparency_of
 from design.certificate import assess, prove, required_damping, verify
-from design.conditions import Condition, Demand, latency_demand, least_scale, this_environment, this_environment_demand
+from design.conditions import Condition, Demand, least_scale
 from design.coupling_file import Stored, load, save, sealed
 from design.environments import THIS_ENVIRONMENT, ThisEnvironment
 from design.frequency import frequencies, hermitian, on_circle

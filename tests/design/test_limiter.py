@@ -5,6 +5,7 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
+from asked import limiter, limiter_demand, this_environment
 from worlds import DELTA, PAIR, STIFF, T
 
 from cli.design import main as design_main
@@ -15,10 +16,10 @@ from controller.lti import Lti, Sampled, taps
 from controller.ranges import Ranges
 from design import multipliers
 from design.certificate import lag, prove, prove_limiter, verify
-from design.conditions import least_multiple, this_environment
+from design.conditions import least_multiple
 from design.coupling_file import Certificate, LimiterCertificate, Stored, load, save, sealed
 from design.frequency import hermitian, on_circle
-from design.multipliers import limiter, limiter_demand, limiter_lag, limiter_requirement
+from design.multipliers import limiter_lag, limiter_requirement
 from design.result import NotProved
 from design.spring_damper import design
 from design.transparency import transparency
@@ -157,7 +158,7 @@ def test_unequal_weights_need_enough_lag():
 def test_bad_requests_are_named():
     G = PAIR.sent(BUILT)
     with pytest.raises(ValueError, match="one entry for each of 2 channels"):
-        limiter(G, (1,), DELTA, LAG)
+        limiter(G, (1, 2), DELTA, LAG[:1])
     with pytest.raises(ValueError, match="expected numbers >= 0"):
         limiter(G, (1, 2), DELTA, LAG, ((-0.1,), (0.0,)))
     swinging = limiter(PAIR.sent(SpringDamper((1e6, 1e6), (50.0, 50.0))), (9, 9), DELTA, LAG).requirement

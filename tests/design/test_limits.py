@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from asked import this_environment
 from worlds import force_map
 
 from cli import compare as command
@@ -14,7 +15,6 @@ from controller.coupling import CASE_I
 from controller.environment import environment
 from design import compare as limit_curve
 from design.compare import AXES, LADDERS, SHORT, Point, Sweep, ladder_row, measured, optimum, points_along, remembered
-from design.conditions import this_environment
 from design.program import LADDER, Options
 from sim.compare_report import Here, Limits
 from sim.plots import plot_limits

@@ -2,20 +2,14 @@
 
 import numpy as np
 import pytest
+from asked import any_environment, any_environment_per_channel, delayed_demand, this_environment
 from scipy.linalg import eig, eigh
 from worlds import STIFF, force_map
 
 from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
-from design.conditions import (
-    any_environment,
-    any_environment_per_channel,
-    delayed_demand,
-    least_multiple,
-    regular_part,
-    this_environment,
-)
+from design.conditions import least_multiple, regular_part
 from design.frequency import frequencies, hermitian, on_circle, supremum
 
 T, THETA, DELTA = 1.2e-3, (1, 2), (1.37, 1.37)

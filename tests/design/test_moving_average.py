@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from asked import any_environment
 
 from controller.coupling import MovingAverage, SpringDamper
 from controller.lti import Lti, taps
 from design import certify, design_coupling, transparency_of
 from design.certificate import prove, verify
-from design.conditions import any_environment
 from design.coupling_file import Stored, load, save
 from design.transparency import decibels
 from sim import load as scenario_of

@@ -10,6 +10,7 @@ import cvxpy as cp
 import msgspec
 import numpy as np
 import pytest
+from asked import this_environment
 from scipy.optimize import minimize_scalar
 
 from cli.design import main
@@ -20,7 +21,6 @@ from controller.lti import Lti, Sampled
 from design.barrier import Block, Program, centre
 from design.bound import BoundBeside, _causal, bound
 from design.certificate import verify
-from design.conditions import this_environment
 from design.coupling_file import Stored, save
 from design.coupling_file import load as load_file
 from design.environments import ratio_in

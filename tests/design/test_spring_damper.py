@@ -6,6 +6,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from analysis import analysis, solve
+from asked import any_environment, this_environment
 from scipy.optimize import brentq
 from worlds import DELTA, SOFT_NETWORK, T, force_map
 
@@ -16,7 +17,7 @@ from controller.loop import Loop
 from controller.lti import Lti
 from design import gain_search, spring_damper
 from design.api import instead, transparency_of
-from design.conditions import any_environment, any_environment_delayed, this_environment
+from design.conditions import any_environment_delayed
 from design.designs import design_by_kind
 from design.gain_search import LimiterLoop, SampledLoop
 from design.lmi import RESERVE, Shaping, check_passive

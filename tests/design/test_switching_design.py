@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from asked import switching_sweep
 
 from cli.design import main
 from controller.coupling import SpringDamper
 from controller.delay import VaryingDelay
 from design.coupling_file import load as load_stored
-from design.multipliers import switching_sweep
 from design.optimal import design_with
 from design.result import DesignFailed
 from design.spring_damper import design

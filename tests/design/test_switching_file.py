@@ -6,6 +6,7 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
+from asked import switching_block, switching_sweep, this_environment
 from worlds import DELTA, PAIR, SOFT, STIFF, T, force_map
 
 from cli.audit import main as audit_main
@@ -23,12 +24,10 @@ from controller.ranges import Ranges, UncertainSpring
 from design import certify
 from design import exact as positive_real
 from design.certificate import condition_block, prove, refuted, verify
-from design.conditions import this_environment
 from design.coupling_file import Certificate, Stored, digest, load, save, sealed
 from design.exact import Matrix
 from design.files import InputError
 from design.frequency import hermitian
-from design.multipliers import switching_block, switching_sweep
 from design.result import NotProved
 from hw.control import certified_couplings
 from sim.scenario import load as scenario_of

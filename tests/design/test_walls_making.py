@@ -5,6 +5,7 @@ import itertools
 import msgspec
 import numpy as np
 import pytest
+from asked import any_environment, this_environment, walls_demand, walls_proof
 from scipy.linalg import expm
 
 from controller.coupling import Compliance, InternalModel, SpringDamper
@@ -13,10 +14,9 @@ from controller.loop import Loop
 from controller.lti import Lti
 from controller.ranges import Ranges
 from design.certificate import assess, prove, verify
-from design.conditions import any_environment, this_environment
 from design.coupling_file import Stored, sealed
 from design.designs import design_by_kind
-from design.environments import walls_demand, walls_of, walls_proof
+from design.environments import walls_of
 from design.exact import find_storage
 from design.guarantees import MAKING, guarantee_of, making_covered
 from design.result import NotProved

@@ -1,0 +1,77 @@
+"""The conditions of any block, whatever loop it may come from: dampings, delays and periods are those given here."""
+
+from __future__ import annotations
+
+from controller.environment import GROUND, Network, Spring, Wall
+from controller.loop import DelayRange, Loop
+from design import conditions, environments, multipliers
+
+
+def loop(T, delta, theta=None, walls=(), psi=None, environment=None, **further) -> Loop:
+    """A loop with these; its environment is springs to ground, unless it is given."""
+    m = len(delta)
+    contacts = tuple(f"contact {i}" for i in range(m))
+    springs = tuple(Spring((contact, GROUND), 1.0) for contact in contacts)
+    network = environment or Network(contacts, springs, walls=tuple(Wall((contacts[0], GROUND), k) for k in walls))
+    none = (0,) * m
+    return Loop(float(T), tuple(theta or none), tuple(psi or none), none, tuple(delta), network, **further)
+
+
+def this_environment_demand(F, delta, T_max=None, latency=None):
+    return conditions.this_environment_demand(F, loop(F.T, delta, T_max=T_max, latency=latency))
+
+
+def latency_demand(F, delta, latency, T_max=None):
+    return conditions.latency_demand(F, loop(F.T, delta, T_max=T_max, latency=latency))
+
+
+def this_environment(F, delta, T_max=None, latency=None):
+    return conditions.this_environment(F, loop(F.T, delta, T_max=T_max, latency=latency))
+
+
+def any_environment_demand(V, theta, delta, T_max=None):
+    return conditions.any_environment_demand(V, loop(V.T, delta, theta, T_max=T_max))
+
+
+def any_environment(V, theta, delta, T_max=None):
+    return conditions.any_environment(V, loop(V.T, delta, theta, T_max=T_max))
+
+
+def any_environment_per_channel(V, theta, delta):
+    return conditions.any_environment_per_channel(V, loop(V[0].T, delta, theta))
+
+
+def delayed_demand(V, theta, delta, phi):
+    return conditions.delayed_demand(V, loop(V.T, delta, theta), phi)
+
+
+def delayed_coupling_demand(V, theta, phi, delta):
+    return conditions.delayed_coupling_demand(V, loop(V.T, delta, theta), phi)
+
+
+def walls_demand(G, delta, slopes, g, lam=None):
+    return environments.walls_demand(G, loop(G.T, delta, walls=slopes), g, lam)
+
+
+def walls_proof(G, delta, slopes, g=None):
+    return environments.walls_proof(G, loop(G.T, delta, walls=slopes), g)
+
+
+def _switching(G, lo, hi, delta, T_max=None):
+    return loop(G.T, delta, lo, T_max=T_max, varying_delay=DelayRange(tuple(lo), tuple(hi)))
+
+
+def switching_block(G, lo, hi, delta, alpha, T_max=None):
+    return multipliers.switching_block(G, _switching(G, lo, hi, delta, T_max), alpha)
+
+
+def switching_sweep(G, lo, hi, delta, alpha=None, T_max=None):
+    return multipliers.switching_sweep(G, _switching(G, lo, hi, delta, T_max), alpha)
+
+
+def limiter_demand(G, theta, delta, rho, c, T_max=None):
+    return multipliers.limiter_demand(G, loop(G.T, delta, theta, T_max=T_max), rho, c)
+
+
+def limiter(G, theta, delta, rho, c=None, lags=1, T_max=None):
+    return multipliers.limiter(G, loop(G.T, delta, theta, T_max=T_max), rho, c, lags)
