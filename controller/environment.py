@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.lti import Array, Complex, Lti, Number, Sampled, as_like, inverse, numbers, rational
+from controller.lti import Array, Complex, Lti, Number, Sampled, as_like, inverse, numbers, rational, times
 
 GROUND = "ground"
 
@@ -416,16 +416,16 @@ def _realise(
     for group in adrift:
         q_old[group[0]] = 0
     vx = (x - x_old) / T
-    push = Mii / T @ v_old - Kii @ q_old - Dic @ vx - Kic @ x
+    push = times(Mii / T, v_old) - times(Kii, q_old) - times(Dic, vx) - times(Kic, x)
     if joined := (Mci != 0).any():
-        push = push - Mic @ (vx - vx_old) / T
+        push = push - times(Mic, vx - vx_old) / T
     if across is not None:
         push = push - across[:, c:].T @ p
-    v = solve @ push
+    v = times(solve, push)
     q = q_old + T * v
-    force = Mcc @ (vx - vx_old) / T + Dcc @ vx + Kcc @ x + Dci @ v + Kci @ q
+    force = times(Mcc, vx - vx_old) / T + times(Dcc, vx) + times(Kcc, x) + times(Dci, v) + times(Kci, q)
     if joined:
-        force = force + Mci @ (v - v_old) / T
+        force = force + times(Mci, v - v_old) / T
     if across is not None:
         force = np.vstack([force + across[:, :c].T @ p, across[:, :c] @ x + across[:, c:] @ q])
 
