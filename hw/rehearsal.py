@@ -121,7 +121,7 @@ class Rehearsal:
                 self._done.add(i)
                 self._driver.do(call(session, now))
         if self.operator:
-            self._driver.do(self.operator.look(session, now))
+            self._driver.do(self.operator.decide(session, now))
         elif session.stage == Stage.DISARMED and self.arm and session.program is session.programs[0]:
             self._driver.do(session.arm(now))
         self.glance(session)

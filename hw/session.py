@@ -424,7 +424,7 @@ class Operator:
     _seen_at: int | None = None  # [us] when somebody showed up last
     _free_at: int = 0  # [us] before which it does not arm by itself
 
-    def look(self, session: Session, now: int) -> Said:
+    def decide(self, session: Session, now: int) -> Said:
         """The message that is due at `now` [us] in this stage."""
         if session.stage == Stage.DISARMED:
             self._armed_at = None

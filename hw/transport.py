@@ -204,7 +204,7 @@ class Live(Driver):
         session = self.session
         if self._typed():
             self._pressed()
-        if said := self._operator.look(session, now):
+        if said := self._operator.decide(session, now):
             self.do(said)
         if self.signals and signal.SIGUSR1 in self.signals:
             self.do(session.estop("SIGUSR1", now))

@@ -171,7 +171,7 @@ def _left_alone(simulation: Simulation) -> tuple[int, float]:
     ticks = round(SECONDS / scenario.T)
     last, fastest = ticks - round(1 / scenario.T), np.zeros(PAIRS)
 
-    def look(buffer: StepBuffer, first: int, count: int) -> bool:
+    def each_block(buffer: StepBuffer, first: int, count: int) -> bool:
         if first >= last:
             speed = np.abs(buffer.s[:count, states // 2 :]).max(axis=(0, 1))
             np.maximum(fastest, np.where(np.isfinite(speed), speed, np.inf), out=fastest)
@@ -179,5 +179,5 @@ def _left_alone(simulation: Simulation) -> tuple[int, float]:
 
     outside = plants.B.shape[-1] - m
     engine = ExactEngine(plants)
-    run_blocks(process, engine, lambda first, count: np.zeros((count, outside)), ticks, start, look)
+    run_blocks(process, engine, lambda first, count: np.zeros((count, outside)), ticks, start, each_block)
     return int((fastest > SLOW).sum()), float(fastest.max())

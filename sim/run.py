@@ -37,7 +37,7 @@ ENGINES = ("mujoco", "exact")
 AnyEngine = str | Engine | Callable[["Simulation"], Engine]  # a name, one of a user's own, or what makes it
 
 Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the hands (ticks, outside) [N]
-_Look = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
+_AfterBlock = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
 Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 
 _COPIES = 4  # of a trace, at most, from the run to its report
@@ -210,9 +210,15 @@ def _free_memory() -> float:
 
 
 def run_blocks(
-    process: Process, engine: Engine, outside: Outside, ticks: int, start: Array, look: _Look, block: int = 32
+    process: Process,
+    engine: Engine,
+    outside: Outside,
+    ticks: int,
+    start: Array,
+    each_block: _AfterBlock,
+    block: int = 32,
 ) -> None:
-    """Close the loop for `ticks` periods from the plant states `start`, (states, nsim), and look at it block by block.
+    """Close the loop for `ticks` periods from the plant states `start`, (states, nsim); `each_block` sees each block.
 
     Row 0 of the buffer is the block's first tick. So few ticks in a block that it stays in the processor's cache.
     """
@@ -230,7 +236,7 @@ def run_blocks(
                 ahead = outside(first, min(_AHEAD * block, ticks - first))
             buffer.w[:count], ahead = ahead[:count, :, None], ahead[block:]
             run_block(buffer, engine, count)
-            if look(buffer, first, count):
+            if each_block(buffer, first, count):
                 return
             buffer.rewind(count)
 

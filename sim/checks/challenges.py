@@ -177,7 +177,7 @@ def _let_go(case: _Case, mass: Array, stiff: Array, speed: Array, seconds: float
     D, (first, last) = case.delta[:, None] / case.T, np.zeros((2, hands))
     balance, flow, least = np.zeros(hands), np.zeros(hands), np.zeros(hands)
 
-    def look(buffer: StepBuffer, begin: int, count: int) -> None:
+    def each_block(buffer: StepBuffer, begin: int, count: int) -> None:
         nonlocal balance, flow, least
         dx, f = np.diff(buffer.x[: count + 1], axis=0), buffer.f[:count]
         work, spent = (f * dx).sum(axis=1), (D * dx**2 + friction * np.abs(dx)).sum(axis=1)
@@ -191,7 +191,7 @@ def _let_go(case: _Case, mass: Array, stiff: Array, speed: Array, seconds: float
 
     engine = _Rubbing(plants, friction) if rubs else ExactEngine(plants)
     outside = plants.B.shape[-1] - m
-    run_blocks(process, engine, lambda begin, count: np.zeros((count, outside)), ticks, start, look)
+    run_blocks(process, engine, lambda begin, count: np.zeros((count, outside)), ticks, start, each_block)
     with np.errstate(invalid="ignore", over="ignore"):
         return np.nan_to_num(np.sqrt(last / first), nan=np.inf), np.nan_to_num(least, nan=-np.inf)
 

@@ -171,8 +171,8 @@ def test_the_incident_log_tells_every_stage_and_every_second(scenario, rungs, tm
     log = IncidentLog(tmp_path / "log")
     rehearsal = rehearsal_of(scenario, rungs, Operator(True, 2.0))
     log.attach(rehearsal.session)
-    steer = rehearsal.operator.look
-    rehearsal.operator.look = lambda session, now: (log.glance(session), steer(session, now))[1]
+    steer = rehearsal.operator.decide
+    rehearsal.operator.decide = lambda session, now: (log.glance(session), steer(session, now))[1]
     session = rehearsal.run_until_armed(3.0)
     log.close()
     lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
