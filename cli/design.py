@@ -163,7 +163,7 @@ def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: De
         whole = check_ranges(loop, design.coupling, args.seed, samples, move, searched, held)
     limits = coverage.Limits(None, "as asked")
     if args.limiter is not False:
-        limits = coverage.covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
+        limits = coverage.covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None, held)
     limits = limits.within([device.force_limit for device in scenario.device])
     return Judged.of(replace(design, kind=args.coupling), loop, requirements, whole, limits)
 

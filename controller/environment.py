@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.lti import Array, Complex, Lti, Number, Sampled, as_like, inverse, numbers, rational
+from controller.lti import Array, Complex, Lti, Number, Sampled, as_like, inverse, numbers, rational, times
 
 GROUND = "ground"
 
@@ -113,9 +113,12 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return cls(A, B, C, D, E.T)
 
     def __post_init__(self) -> None:
+        n, m = len(self.A), len(self.D)
+        for name, (rows, columns) in {"A": (n, n), "B": (n, m), "C": (m, n), "D": (m, m)}.items():
+            part = getattr(self, name)
+            if not m or (columns and len(part) != rows) or any(len(row) != columns for row in part):
+                raise ValueError(f"block: {name} is {list(map(list, part))}, expected {rows} rows of {columns} numbers")
         E = self.at(self.T)
-        if E.inputs != E.outputs:
-            raise ValueError(f"block: it has {E.inputs} inputs and {E.outputs} outputs, expected as many")
         poles = np.linalg.eigvals(E.A) if E.order else np.zeros(0)
         if not np.abs(poles).max(initial=0.0) < 1:
             raise ValueError("block: not passive, A has an eigenvalue on or outside the unit circle")
@@ -138,10 +141,9 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """E(z) in the arithmetic of T. Raises ValueError for another period."""
         if float(T) != self.T:
             raise ValueError(f"block: its numbers are for T = {self.T:g} s, the loop has {float(T):g} s")
-        D = np.array(self.D, dtype=float).reshape(len(self.D), -1)
-        n, (outputs, inputs) = len(self.A), D.shape
-        shapes = {"A": (n, n), "B": (n, inputs), "C": (outputs, n)}
-        A, B, C = (np.array(getattr(self, name), dtype=float).reshape(shape) for name, shape in shapes.items())
+        n, m = len(self.A), len(self.D)
+        shapes = {"A": (n, n), "B": (n, m), "C": (m, n), "D": (m, m)}
+        A, B, C, D = (np.array(getattr(self, name), dtype=float).reshape(shape) for name, shape in shapes.items())
         return Lti(numbers(A, T), numbers(B, T), numbers(C, T), numbers(D, T), T)
 
 
@@ -414,16 +416,16 @@ def _realise(
     for group in adrift:
         q_old[group[0]] = 0
     vx = (x - x_old) / T
-    push = Mii / T @ v_old - Kii @ q_old - Dic @ vx - Kic @ x
+    push = times(Mii / T, v_old) - times(Kii, q_old) - times(Dic, vx) - times(Kic, x)
     if joined := (Mci != 0).any():
-        push = push - Mic @ (vx - vx_old) / T
+        push = push - times(Mic, vx - vx_old) / T
     if across is not None:
         push = push - across[:, c:].T @ p
-    v = solve @ push
+    v = times(solve, push)
     q = q_old + T * v
-    force = Mcc @ (vx - vx_old) / T + Dcc @ vx + Kcc @ x + Dci @ v + Kci @ q
+    force = times(Mcc, vx - vx_old) / T + times(Dcc, vx) + times(Kcc, x) + times(Dci, v) + times(Kci, q)
     if joined:
-        force = force + Mci @ (v - v_old) / T
+        force = force + times(Mci, v - v_old) / T
     if across is not None:
         force = np.vstack([force + across[:, :c].T @ p, across[:, :c] @ x + across[:, c:] @ q])
 

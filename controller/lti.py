@@ -12,8 +12,9 @@ and a stored float stands for its shortest decimal, the one that a person wrote:
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -105,7 +106,7 @@ class ReadOnly:
         self.__dict__.update(state)
 
 
-_ROWS, _POINTS = 32, 1024  # of a response at once: what stays in the processor's cache
+_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # of a response at once: what stays in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +153,8 @@ class Lti(ReadOnly):
     def diag(cls, *blocks: Lti) -> Self:
         """The blocks side by side, each with its own inputs and outputs."""
         A, B, C, D = (_block_diagonal([getattr(g, name) for g in blocks]) for name in "ABCD")
-        return cls(A, B, C, D, _common_period(*blocks))
+        whole = cls(A, B, C, D, _common_period(*blocks))
+        return _made(whole, lambda: tuple(map(_block_diagonal, zip(*(g._rest for g in blocks), strict=True))))
 
     @classmethod
     def stacked(cls, blocks: Sequence[Lti]) -> Self:
@@ -208,7 +210,8 @@ class Lti(ReadOnly):
             A, B, C, D = (getattr(self, name)[..., None, :, :] for name in "ABCD")
             return C @ np.linalg.solve(z[..., None, None] * one - A, B + 0j) + D
         points = z.ravel()
-        parts = [self._resolved(points[i : i + _POINTS]) for i in range(0, max(points.size, 1), _POINTS)]
+        step = min(_POINTS, max(_CELLS // max(self.inner_order * self.inputs, 1), 64))
+        parts = [self._resolved(points[i : i + step]) for i in range(0, max(points.size, 1), step)]
         G = np.concatenate(parts, axis=2) + self.D[:, :, None]
         return np.moveaxis(G, -1, 0).reshape(*z.shape, self.outputs, self.inputs)
 
@@ -275,7 +278,26 @@ class Lti(ReadOnly):
 
     def dc(self) -> Array:
         """G(1), shape (..., p, m)."""
-        return self.C @ _solve(_identity(self) - self.A, self.B) + self.D
+        return self._rest[0] if self.is_exact else self.C @ _solve(_identity(self) - self.A, self.B) + self.D
+
+    @cached_property
+    def _rest(self) -> tuple[Array, Array]:
+        """G(1) and C (I - A)^-1, (..., p, m) and (..., p, n): what constant inputs and pushes of states add up to.
+
+        Of an exact block that was made of others they are made of theirs: the states of a loop all feed each other, and
+        to eliminate them costs far more than to close the loop at z = 1. Raises SingularLoop where A has the
+        eigenvalue one.
+        """
+        if made := self.__dict__.get("_made"):
+            try:
+                return made()
+            except SingularLoop:  # of a part, perhaps not of the whole
+                pass
+        R = np.swapaxes(_solve(np.swapaxes(_identity(self) - self.A, -1, -2), np.swapaxes(self.C, -1, -2)), -1, -2)
+        return self.D + times(R, self.B), R
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ("A", "B", "C", "D", "T")}
 
     def poles(self) -> Complex:
         """Eigenvalues of A, shape (..., n); delays at the outputs have theirs at zero, exactly."""
@@ -294,8 +316,8 @@ class Lti(ReadOnly):
 
         Raises SingularLoop where A has the eigenvalue one.
         """
-        C = -np.swapaxes(_solve(np.swapaxes(_identity(self) - self.A, -1, -2), np.swapaxes(self.C, -1, -2)), -1, -2)
-        return self.D - _times(C, self.B), Lti(self.A, self.B, C, np.zeros_like(self.D), self.T)
+        static, R = self._rest
+        return static, Lti(self.A, self.B, -R, np.zeros_like(self.D), self.T)
 
     def quotient_at_one(self) -> Lti:
         """(G(z) - G(1))/(z - 1)."""
@@ -304,15 +326,22 @@ class Lti(ReadOnly):
     def __matmul__(self, other: Lti | Array) -> Lti:
         B, D = self.B, self.D
         if not isinstance(other, Lti):
-            return Lti(self.A, _times(B, other), self.C, _times(D, other), self.T)
+            whole = Lti(self.A, times(B, other), self.C, times(D, other), self.T)
+            return _made(whole, lambda: (times(self._rest[0], other), self._rest[1]))
         T = _common_period(self, other)
         zero = np.zeros((other.order, self.order), dtype=int)
-        A = _block([[other.A, zero], [_times(B, other.C), self.A]])
-        C = _block([[_times(D, other.C), self.C]])
-        return Lti(A, _block([[other.B], [_times(B, other.D)]]), C, _times(D, other.D), T)
+        A = _block([[other.A, zero], [times(B, other.C), self.A]])
+        C = _block([[times(D, other.C), self.C]])
+        whole = Lti(A, _block([[other.B], [times(B, other.D)]]), C, times(D, other.D), T)
+
+        def rest() -> tuple[Array, Array]:
+            (own, R), (static, S) = self._rest, other._rest
+            return times(own, static), _block([[times(own, S), R]])
+
+        return _made(whole, rest)
 
     def __rmatmul__(self, matrix: Array) -> Lti:
-        return Lti(self.A, self.B, _times(matrix, self.C), _times(matrix, self.D), self.T)
+        return Lti(self.A, self.B, times(matrix, self.C), times(matrix, self.D), self.T)
 
     def __add__(self, other: Lti | Array) -> Lti:
         if not isinstance(other, Lti):
@@ -339,7 +368,8 @@ class Lti(ReadOnly):
 
     def rows(self, which: Any) -> Lti:
         """Some of the outputs, with the same states."""
-        return Lti(self.A, self.B, self.C[..., which, :], self.D[..., which, :], self.T)
+        some = Lti(self.A, self.B, self.C[..., which, :], self.D[..., which, :], self.T)
+        return _made(some, lambda: tuple(part[..., which, :] for part in self._rest))
 
     def feedback(self, other: Lti) -> Lti:
         """(I + G H)^-1 G: this block with H = `other` in negative feedback around it.
@@ -347,20 +377,27 @@ class Lti(ReadOnly):
         Raises SingularLoop where I + D_G D_H cannot be inverted.
         """
         T = _common_period(self, other)
-        S = inverse(_eye(self.outputs, T) + _times(self.D, other.D))
+        S = inverse(_eye(self.outputs, T) + times(self.D, other.D))
         # y = S (C x - D_G C_H h + D_G u), and the feedback block is driven by y
-        y_u = _times(S, self.D)
-        y_x = _block([[_times(S, self.C), -_times(y_u, other.C)]])
-        u_x = _block([[np.zeros((self.inputs, self.order), dtype=int), -other.C]]) - _times(other.D, y_x)
-        u_u = _eye(self.inputs, T) - _times(other.D, y_u)
-        A = _block_diagonal([self.A, other.A]) + _block([[_times(self.B, u_x)], [_times(other.B, y_x)]])
-        return Lti(A, _block([[_times(self.B, u_u)], [_times(other.B, y_u)]]), y_x, y_u, T)
+        y_u = times(S, self.D)
+        y_x = _block([[times(S, self.C), -times(y_u, other.C)]])
+        u_x = _block([[np.zeros((self.inputs, self.order), dtype=int), -other.C]]) - times(other.D, y_x)
+        u_u = _eye(self.inputs, T) - times(other.D, y_u)
+        A = _block_diagonal([self.A, other.A]) + _block([[times(self.B, u_x)], [times(other.B, y_x)]])
+        whole = Lti(A, _block([[times(self.B, u_u)], [times(other.B, y_u)]]), y_x, y_u, T)
+
+        def rest() -> tuple[Array, Array]:
+            (own, R), (static, Q) = self._rest, other._rest
+            closed = inverse(_eye(self.outputs, T) + times(own, static))
+            return times(closed, own), times(closed, _block([[R, -times(own, Q)]]))
+
+        return _made(whole, rest)
 
     def inverse(self) -> Lti:
         """G^-1, where D has an inverse. Raises SingularLoop where it has none."""
         D = inverse(self.D)
-        B, C = _times(self.B, D), _times(D, self.C)
-        return Lti(self.A - _times(B, self.C), B, -C, D, self.T)
+        B, C = times(self.B, D), times(D, self.C)
+        return Lti(self.A - times(B, self.C), B, -C, D, self.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -476,7 +513,15 @@ def hstack(*blocks: Any) -> Any:
         return first._with(_block([[b.G for b in blocks]]))
     T = _common_period(*blocks)
     A, B = _block_diagonal([b.A for b in blocks]), _block_diagonal([b.B for b in blocks])
-    return Lti(A, B, _block([[b.C for b in blocks]]), _block([[b.D for b in blocks]]), T)
+    whole = Lti(A, B, _block([[b.C for b in blocks]]), _block([[b.D for b in blocks]]), T)
+    return _made(whole, lambda: tuple(_block([parts]) for parts in zip(*(b._rest for b in blocks), strict=True)))
+
+
+def _made(block: Any, rest: Callable[[], tuple[Array, ...]]) -> Any:
+    """The block, which knows how to make its `_rest` of its parts' where it is exact."""
+    if block.is_exact:
+        object.__setattr__(block, "_made", rest)
+    return block
 
 
 def as_like(block: Lti | Sampled, system: Lti) -> Any:
@@ -538,7 +583,8 @@ _ZERO, _ONE = Fraction(0), Fraction(1)
 def _exact(value: Any) -> Any:
     """A copy as Fractions."""
     array = np.asarray(value, dtype=object)
-    if isinstance(value, np.ndarray) and not value.flags.writeable and all(type(v) is Fraction for v in value.ravel()):
+    known = isinstance(value, np.ndarray) and value.dtype == object and not value.flags.writeable
+    if known and all(type(v) is Fraction for v in value.ravel()):
         return value
     out = np.empty(array.shape, dtype=object)
     out.ravel()[:] = [v if type(v) is Fraction else _ZERO if v == 0 else rational(v) for v in array.ravel()]
@@ -563,24 +609,40 @@ def inverse(M: Array) -> Array:
     return np.linalg.inv(M)
 
 
-def _times(left: Array, right: Array) -> Array:
-    """left @ right; of Fractions only the entries that are not zero are multiplied, since next to all are."""
+def times(left: Array, right: Array) -> Array:
+    """left @ right; of Fractions only the entries that are not zero are multiplied, since next to all are.
+
+    Rows of the left one and columns of the right one become integers over a common denominator each, so that a sum
+    needs no common divisors but one at its end.
+    """
     if left.ndim != 2 or right.ndim != 2 or object not in (left.dtype, right.dtype):
         return left @ right
     if left.shape[1] != right.shape[0]:
         raise ValueError(f"shapes {left.shape} and {right.shape} do not fit")
-    rows = [[(j, v) for j, v in enumerate(row) if v] for row in right.tolist()]
+    (lines, own), (columns, below) = _cleared(left), _cleared(right.T)
+    rows = [[(j, column[k]) for j, column in enumerate(columns) if column[k]] for k in range(right.shape[0])]
     result = np.full((left.shape[0], right.shape[1]), _ZERO, dtype=object)
-    for i, row in enumerate(left.tolist()):
+    for i, line in enumerate(lines):
         on_time()
-        total: dict[int, Any] = {}
-        for factor, entries in zip(row, rows, strict=True):
+        total = [0] * right.shape[1]
+        for factor, entries in zip(line, rows, strict=True):
             if factor:
                 for j, v in entries:
-                    total[j] = total.get(j, _ZERO) + factor * v
-        for j, v in total.items():
-            result[i, j] = v
+                    total[j] += factor * v
+        for j, v in enumerate(total):
+            if v:
+                result[i, j] = Fraction(v, own[i] * below[j])
     return result
+
+
+def _cleared(M: Array) -> tuple[list[list[int]], list[int]]:
+    """Every row as integers, and the common denominator of each."""
+    common = [math.lcm(*(v.denominator for v in row if v)) for row in M.tolist()]
+    whole = [
+        [v.numerator * (den // v.denominator) if v else 0 for v in row]
+        for row, den in zip(M.tolist(), common, strict=True)
+    ]
+    return whole, common
 
 
 def _solve(M: Array, right: Array) -> Array:

@@ -181,8 +181,13 @@ def _limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: mult
     return _block(demand)
 
 
-def check_limiter(loop: Loop, coupling: Coupling, proof: LimiterCertificate) -> Requirement:
-    """What the limiter on file asks of the devices, proved again. Raises NotProved where the file does not prove it."""
+def check_limiter(
+    loop: Loop, coupling: Coupling, proof: LimiterCertificate, known: Certificate | None = None
+) -> Requirement:
+    """What the limiter on file asks of the devices, proved again. Raises NotProved where the file does not prove it.
+
+    What `known`, a certificate that was proved in this process, contains is swept, and not proved again.
+    """
     if reason := multipliers.limiter_refusal(loop):
         raise NotProved(reason)
     if any(not (0 <= v < math.inf) for v in (*proof.rho, *(v for row in proof.c for v in row))):
@@ -192,6 +197,8 @@ def check_limiter(loop: Loop, coupling: Coupling, proof: LimiterCertificate) -> 
         raise NotProved(f"limiter: rho is {list(proof.rho)}, {expected}")
     found = multipliers.limiter_requirement(loop, coupling, proof.beta, proof.c).requirement
     reason = _other_figures(proof, found)
+    if not reason and known and known.limiter is proof and known.scenario == digest(loop, coupling.form()):
+        return replace(found, proof="rational")
     if reason := reason or refuted_rows("P", _limiter_block(loop, coupling, proof.rho, proof.c), proof.P):
         raise NotProved(f"limiter: {reason}")
     return replace(found, proof="rational")
@@ -480,20 +487,22 @@ def _multiplier(
 
 
 def assess(
-    loop: Loop, coupling: Coupling, phi: Array | None = None, known: Certificate | None = None
+    loop: Loop, coupling: Coupling, phi: Array | None = None, known: Certificate | None = None, more: bool = True
 ) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
     this-environment is about the nominal environment alone (design.coverage.RangesFigures asks for the rest of its
     ranges) and the constant theta (sim.switching.DelaysCovered asks for the rest of its range). What `known`, a
-    certificate just made, proves is not proved again.
+    certificate just made, proves is not proved again; without `more` nothing else is proved beside it.
     """
     loop = loop.at(loop.environment).switching(None)
     asked = ANY_ENVIRONMENT.required(loop, coupling, phi), THIS_ENVIRONMENT.required(loop, coupling)
     proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
 
     def judged(each: Requirement) -> Requirement:
-        return replace(each, proof="rational") if each.condition == proved else _proved(loop, coupling, each, phi)
+        if each.condition == proved:
+            return replace(each, proof="rational")
+        return _proved(loop, coupling, each, phi) if more or not proved else each
 
     with within(_LONGEST):  # both proofs together
         return {each.condition: judged(each) for each in asked}

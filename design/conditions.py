@@ -183,8 +183,14 @@ def delayed_coupling_demand(V: Lti, loop: Loop, phi: Sequence[Any]) -> Demand[Lt
     return Demand(free, Lti.constant(np.diag([0] * m + excess), T), {"H(1)": H1})
 
 
+_CELLS = 2**19  # entries of a response that are looked at together
+
+
 def least_scale(demand: Demand[Any], w: Array) -> Array:
     """The least s with He[free + s gain] >= 0 at each frequency w (k,) [rad/sample]; inf where no s is enough."""
+    step = max(_CELLS // demand.gain.outputs**2, 64)
+    if w.size > step:  # in pieces that stay near the processor
+        return np.concatenate([least_scale(demand, w[i : i + step]) for i in range(0, w.size, step)])
     z = on_circle(w)
     free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
     return least_multiple(free, gain)

@@ -13,7 +13,7 @@ from controller.loop import Loop
 from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
 from design.conditions import this_environment
-from design.coupling_file import LimiterCertificate
+from design.coupling_file import Certificate, LimiterCertificate
 from design.designs import KINDS, design_by_kind
 from design.environments import SEARCH, Searched, worst
 from design.files import unseen
@@ -63,12 +63,16 @@ class Limits:
 
 
 def covered_limits(
-    loop: Loop, coupling: Coupling, requirements: Mapping[str, Requirement], proof: LimiterCertificate | None = None
+    loop: Loop,
+    coupling: Coupling,
+    requirements: Mapping[str, Requirement],
+    proof: LimiterCertificate | None = None,
+    known: Certificate | None = None,
 ) -> Limits:
     """The limiter that a coupling may have: of no lag under any-environment, else that of its own condition.
 
     With `proof`, which the coupling comes with, it is the limiter of that proof; in a loop for which it is none, the
-    one of the same beta.
+    one of the same beta. What `known` contains is not proved again (design.certificate.check_limiter).
     """
     if loop.varying_delay:
         return Limits(None, str(limiter_refusal(loop)))
@@ -78,7 +82,7 @@ def covered_limits(
         return Limits(None, "no guarantee that it could extend")
     if proof:
         try:
-            requirement = check_limiter(loop, coupling, proof)
+            requirement = check_limiter(loop, coupling, proof, known)
             return Limits(proof.rho, _OWN_PROOF, requirement, proof.c, proof)
         except NotProved:  # made for another loop
             pass

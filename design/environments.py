@@ -398,14 +398,15 @@ def search_ranges(
     return search(parts, lambda member: ratio_in(loop.at(member.network), coupling), progress, seconds)
 
 
-def ratio_in(loop: Loop, coupling: Coupling) -> float:
+def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
     """The damping that this-environment requires over the available damping, by a refined sweep of a stable coupling.
 
-    Of one in series, a force filter, the responses of environment and filter are multiplied: the poles of their series
-    are defective and cost digits, and time.
+    With `thin` by every so-manieth frequency of its grid alone. Of one in series, a force filter, the responses of
+    environment and filter are multiplied: the poles of their series are defective and cost digits, and time.
     """
     if (chain := coupling.in_series(loop.T)) is None:
-        return _required(loop, coupling, Member("", loop.environment)).ratio
+        nominal = Member("", loop.environment)
+        return _thinly(loop, coupling, thin) if thin > 1 else _required(loop, coupling, nominal).ratio
     E = loop.E()
     late, delayed = delay(loop.theta, loop.T), delay(loop.psi, loop.T) @ E
 
@@ -415,4 +416,15 @@ def ratio_in(loop: Loop, coupling: Coupling) -> float:
         demand = this_environment_demand(F, loop)
         return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
 
-    return supremum(needed, frequencies(E, chain, low=_LOWEST))[0]
+    grid = frequencies(E, chain, low=_LOWEST)
+    return float(needed(grid[::thin]).max()) if thin > 1 else supremum(needed, grid)[0]
+
+
+def _thinly(loop: Loop, coupling: Coupling, thin: int) -> float:
+    """`ratio_in` at every so-manieth frequency."""
+    try:
+        F = loop.F(coupling)
+        demand = this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
+    except SingularLoop:
+        return np.inf
+    return float(least_scale(demand, frequencies(F)[::thin]).max()) if F.is_stable() else np.inf

@@ -169,13 +169,18 @@ class _Definiteness:
         return f"the leading minor of order {self.minor} is {sign}"
 
 
+_MANY_ROWS = 8
+
+
 def definiteness(S: Matrix) -> _Definiteness:
     """Whether the symmetric matrix S is positive (semi)definite, by fraction-free LDL' (Bareiss).
 
     The pivots of the elimination are the leading minors themselves. A zero pivot leaves a semidefinite
-    matrix only if its whole row of the Schur complement is zero; that row is then passed over.
-    Raises ValueError if S is not exactly symmetric.
+    matrix only if its whole row of the Schur complement is zero; that row is then passed over. A large matrix is tried
+    by `strictly_positive` first. Raises ValueError if S is not exactly symmetric.
     """
+    if S.shape[0] > _MANY_ROWS and strictly_positive(S):
+        return _Definiteness(True, True)
     work = S.reduced().num.copy()
     if not (work == work.T).all():
         raise ValueError(f"a {S.shape[0]} x {S.shape[1]} matrix is not exactly symmetric")
@@ -287,6 +292,7 @@ LARGEST = 300  # states of a model that a proof is tried for: 0.1 s at 50, 0.5 s
 _MOST_BITS = 4000  # of the common denominator of a stored P, a power of two of some hundred bits when we made it
 _STORED_BITS = 44  # of each entry of P, relative to its diagonal
 _UNIT = 2.0**-53  # of double precision
+_SAMPLES = 400  # frequencies at which states are looked at, about
 _LONG = 80  # states from which on one solution of the Riccati equation has not been enough
 
 
@@ -415,9 +421,10 @@ def _scaled(G: Lti) -> tuple[Lti, Array]:
 
 
 def _states(G: Lti) -> NDArray[np.complex128]:
-    """(zI - A)^-1 B on a pole-dense grid of the circle, shape (k, n, m)."""
+    """(zI - A)^-1 B on a grid of the circle that knows the poles, shape (k, n, m): for the size of things."""
     n, m = G.B.shape
-    return Lti(G.A, G.B, np.eye(n), np.zeros((n, m)), G.T).at(on_circle(frequencies(G)))
+    w = frequencies(G, points=100)
+    return Lti(G.A, G.B, np.eye(n), np.zeros((n, m)), G.T).at(on_circle(w[:: 1 + w.size // _SAMPLES]))
 
 
 def _least_eigenvalue(G: Lti) -> tuple[float, float]:

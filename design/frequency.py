@@ -197,7 +197,7 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
 
     The highest local maxima of the grid (32 at most, within 20 % of the largest) are bracketed by their
     neighbours, and the brackets narrowed by a factor of 8, ten times or until two rounds gain nothing: a smooth peak is
-    located to rounding.
+    located to rounding. A bracket whose peak cannot reach the largest any more is left.
     """
     values = response(grid)
     if not np.isfinite(values).all():
@@ -208,19 +208,20 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
     bracket = _brackets(values, grid, top - 0.2 * abs(top))
     settled = 0
     for _ in range(10):
-        value, w, bracket = _narrowed(response, *bracket)
+        value, w, bracket, reach = _narrowed(response, *bracket)
         settled = settled + 1 if value.max() <= top + 1e-13 * abs(top) else 0
         if value.max() > top:
             top, where = float(value.max()), float(w[np.argmax(value)])
-        if settled == 2:
+        bracket = bracket[0][reach >= top], bracket[1][reach >= top]
+        if settled == 2 or not bracket[0].size:
             break
     return top, where
 
 
 def peaks(response: Response, grid: Array, above: float) -> Array:
     """Where the 32 highest local maxima of `response` over [grid[0], grid[-1]] exceed `above`; (peaks,)."""
-    _, _, bracket = _narrowed(response, *_brackets(response(grid), grid, -np.inf))
-    value, w, _ = _narrowed(response, *bracket)
+    _, _, bracket, _ = _narrowed(response, *_brackets(response(grid), grid, -np.inf))
+    value, w, *_ = _narrowed(response, *bracket)
     return w[value > above]
 
 
@@ -233,13 +234,18 @@ def _brackets(values: Array, grid: Array, above: float) -> tuple[Array, Array]:
     return grid[np.maximum(at - 1, 0)], grid[np.minimum(at + 1, grid.size - 1)]
 
 
-def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Array, tuple[Array, Array]]:
-    """The best of 17 points in each bracket, where it is, and the bracket of its neighbours."""
+def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Array, tuple[Array, Array], Array]:
+    """The best of 17 points in each bracket, where it is, the bracket of its neighbours, and how far that may reach.
+
+    Between three points of a parabola it rises by at most a quarter of the drop to the lower neighbour; four times
+    that are allowed.
+    """
     trial = np.linspace(left, right, 17)
     found = response(trial.ravel()).reshape(trial.shape)
     at, column = np.argmax(found, axis=0), np.arange(left.size)
-    closer = trial[np.maximum(at - 1, 0), column], trial[np.minimum(at + 1, 16), column]
-    return found[at, column], trial[at, column], closer
+    below, above, best = np.maximum(at - 1, 0), np.minimum(at + 1, 16), found[at, column]
+    reach = 2 * best - np.minimum(found[below, column], found[above, column])
+    return best, trial[at, column], (trial[below, column], trial[above, column]), reach
 
 
 def on_circle(w: Array) -> NDArray[np.complex128]:

@@ -23,7 +23,6 @@ from design.multipliers import (
     BETA,
     Lags,
     half_widths,
-    limiter_demand,
     limiter_lag,
     switching_block,
     switching_sweep,
@@ -298,8 +297,7 @@ class LimiterLoop(SampledLoop):
         loop, (_, E, theta), v = self.loop, self.loop_at_conditions, self._least(x)[1]
         (by, _, S, right), z = self._solved(self._gains(x), self._now()), on_circle(self.conditions)[:, None]
         first, second = np.split(v, 2, axis=1)
-        N = -np.stack([polynomials(n, self.conditions)[0] for n in loop.theta], axis=1) - self._weights(x).T
-        late = np.diagonal(theta, axis1=1, axis2=2) * self.of_one[:, None]
+        N, late = self._lines(x), np.diagonal(theta, axis1=1, axis2=2) * self.of_one[:, None]
         into = np.einsum("ki,kij->kj", first.conj() * late + second.conj() * N, E @ S)
         turned = into * np.einsum("kij,kj->ki", right, first)
         steps = np.einsum("kij,kj->ki", self.force(x, self._now()), first) - (1 - 1 / z) * np.array(self.rho) * second
@@ -314,19 +312,33 @@ class LimiterLoop(SampledLoop):
             self._undelayed = (at, (D, E, now))
         return self._undelayed[1]
 
-    def _least_of(self, block: Complex) -> tuple[Array, Complex]:
-        """Of the Schur complement of the slip's own corner, which is diagonal and positive for any c >= 0."""
-        m = self.loop.channels
-        corner, cross = np.diagonal(block[:, m:, m:], axis1=1, axis2=2).real, block[:, m:, :m]
-        follows = -cross / corner[:, :, None]
-        least, v = super()._least_of(block[:, :m, :m] + np.conj(np.swapaxes(cross, 1, 2)) @ follows)
-        return least, np.concatenate([v, (follows @ v[:, :, None])[:, :, 0]], axis=1)
+    def _lines(self, x: Array) -> Array:
+        """N of `limiter_demand`, (k, m)."""
+        windows = [polynomials(n, self.conditions)[0] for n in self.loop.theta]
+        return -np.stack(windows, axis=1) - self._weights(x).T
 
-    def _block(self, x: Array) -> Complex:
-        loop = self.loop
-        G = Sampled(on_circle(self.conditions)[None], self.force(x, self._now())[None], loop.T)
-        demand = limiter_demand(G, loop, self.rho, self._weights(x).tolist())
-        return hermitian(demand.free.G[0] + (1 - _SAMPLED_RESERVE) * demand.gain.G[0])
+    def _least(self, x: Array) -> tuple[Array, Complex]:
+        """Of the Schur complement of the slip's own corner, which is diagonal and positive for any c >= 0."""
+        at = self.loop_at_conditions
+        if self._last is None or self._last[0] is not at or not np.array_equal(self._last[1], x):
+            first, cross, corner = self.parts(x)
+            follows = -cross / corner[:, :, None]
+            least, v = self._least_of(first + np.conj(np.swapaxes(cross, 1, 2)) @ follows)
+            self._last = (at, x.copy(), least, np.concatenate([v, (follows @ v[:, :, None])[:, :, 0]], axis=1))
+        return self._last[2], self._last[3]
+
+    def parts(self, x: Array) -> tuple[Complex, Complex, Array]:
+        """The Hermitian part of `limiter_demand` with what the reserve leaves of the damping.
+
+        Its first block (k, m, m), the one below that, and the diagonal (k, m) of its last one, which is diagonal: to
+        make it whole, as that function does of any G, takes four times as long.
+        """
+        z, theta = on_circle(self.conditions)[:, None], np.diagonal(self.loop_at_conditions[2], axis1=1, axis2=2)
+        G, N, one = self.force(x, self._now()), self._lines(x), np.eye(self.loop.channels)
+        damping, rho = (1 - _SAMPLED_RESERVE) * self.delta / self.loop.T, np.array(self.rho)
+        first = hermitian((theta * self.of_one[:, None])[:, :, None] * G) + damping * one
+        across = damping - np.conj(rho * theta / z) / 2
+        return first, N[:, :, None] * G / 2 + across[:, :, None] * one, damping - (N * (1 - 1 / z)).real * rho
 
     def search(self, x: Array, most: int) -> OptimizeResult:
         return self.minimised(x, most, [(0.0, _MOST_WEIGHT)] * self.loop.channels, self.room_slope)

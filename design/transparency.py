@@ -67,20 +67,29 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
     per_hz = 2 * np.pi * F.T
     low, high = band_hz[0] * per_hz, min(band_hz[1] * per_hz, np.pi)
 
-    def sigma(G: Lti, w: Array, which: int) -> Array:
-        return np.linalg.svd(G.at(on_circle(w)), compute_uv=False)[:, which]
-
     def mismatch(w: Array) -> NDArray[np.complex128]:
         z = on_circle(w)
         return F.at(z) - target.at(z)
 
-    def relative(w: Array) -> Array:
-        return np.linalg.norm(mismatch(w), 2, axis=(1, 2)) / sigma(environment, w, 0)
+    def sizes(w: Array) -> tuple[Array, Array, Array]:
+        """sigma_max(M), sigma_max(E) and sigma_min(E), (k,) each; those of the grid once."""
+        if w is grid and known:
+            return known[0]
+        E = np.linalg.svd(environment.at(on_circle(w)), compute_uv=False)
+        found = np.linalg.norm(mismatch(w), 2, axis=(1, 2)), E[:, 0], E[:, -1]
+        if w is grid:
+            known.append(found)
+        return found
 
-    grid = frequencies(F, environment, low=low, high=high)
-    full = frequencies(F, environment, low=low * 1e-3, high=high)
-    peak, _ = supremum(lambda w: np.linalg.norm(mismatch(w), 2, axis=(1, 2)), full)
-    least, _ = supremum(lambda w: -sigma(environment, w, -1), full)
+    def relative(w: Array) -> Array:
+        M, E, _ = sizes(w)
+        return np.where(w >= low, M / E, 0.0)
+
+    known: list[tuple[Array, Array, Array]] = []
+    grid = np.append(frequencies(F, environment, low=low * 1e-3, high=high), low)
+    grid.sort()
+    peak, _ = supremum(lambda w: sizes(w)[0], grid)
+    least, _ = supremum(lambda w: -sizes(w)[2], grid)
     static = np.linalg.svd(environment.dc(), compute_uv=False)
     rounding = 1e-9 * float(np.abs(environment.D).max())  # a stiffness of zero comes out of larger numbers
     least = 0.0 if static[-1] < 1e-9 * static[0] else min(-least, float(static[-1]))

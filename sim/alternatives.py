@@ -2,8 +2,8 @@
 
 A run is of one coupling. Beside it stand the loop without any, the paper's printed gains where the loop is the paper's,
 the spring-damper for any passive environment, the one for this environment, and the optimal coupling where it is quick
-to find. Every one is judged as the run's own is, and drives the same hands with the exact engine, its forces clipped
-where its proof is one without a limiter.
+to find. Every one is judged as the run's own is, with the one proof that it comes with, and drives the same hands with
+the exact engine, its forces clipped where its proof is one without a limiter.
 """
 
 from __future__ import annotations
@@ -112,7 +112,8 @@ def _alternative(
         chosen = own.chosen if own else choose(scenario, case, kind, condition)
     except ValueError as error:
         return Alternative(kind, condition, reason=str(error))
-    requirements = own.requirements if own else assess(loop, chosen.coupling, chosen.phi, chosen.certificate)
+    certificate = chosen.certificate
+    requirements = own.requirements if own else assess(loop, chosen.coupling, chosen.phi, certificate, more=False)
     simulation = assemble(scenario, chosen.coupling, own.limiter.rho if own else _lag(scenario, chosen, requirements))
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)

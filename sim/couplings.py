@@ -108,7 +108,7 @@ def limits_of(
     loop = scenario.loop("I")  # the reference does not matter
     coupling, proof = chosen.coupling, chosen.limiter
     asked = requirements or assess(loop, coupling, chosen.phi, chosen.certificate)
-    return covered_limits(loop, coupling, asked, proof).within(within)
+    return covered_limits(loop, coupling, asked, proof, chosen.certificate).within(within)
 
 
 def read_coupling(path: str | Path) -> Stored:

@@ -1,11 +1,13 @@
 """Identities of the block algebra, against dense frequency responses and python-control."""
 
+from fractions import Fraction
+
 import control
 import numpy as np
 import pytest
 
 from controller.delay import delay
-from controller.lti import Lti, Sampled, SingularLoop
+from controller.lti import Lti, Sampled, SingularLoop, hstack, times
 
 Z = np.exp(1j * np.linspace(0.01, 3.1, 60))
 
@@ -138,3 +140,60 @@ def test_a_block_is_built_without_writing_its_matrices_as_text():
     matrix = np.eye(2).view(Unwritable)
     block = Lti(matrix, matrix, matrix, matrix, 1e-3)
     assert (np.eye(2) == block.A).all()
+
+
+def exact(G):
+    """A block of Fractions near a floating-point one, with a denominator of its own in every row."""
+    T, rounded = Fraction(1, 1000), []
+    for name in "ABCD":
+        rows = [[Fraction(round(v * (97 + i)), 97 + i) for v in row] for i, row in enumerate(getattr(G, name).tolist())]
+        rounded.append(np.array(rows, dtype=object).reshape(getattr(G, name).shape))
+    return Lti(*rounded, T)
+
+
+def at_rest(G):
+    """G(1) and C (I - A)^-1 of Fractions by elimination of I - A, with no regard to what G was made of."""
+    n = G.order
+    rows = [
+        [*(Fraction(i == j) - a for j, a in enumerate(row)), *b]
+        for i, (row, b) in enumerate(zip(G.A, G.B, strict=True))
+    ]
+    for k in range(n):
+        pivot = next(i for i in range(k, n) if rows[i][k])
+        rows[k], rows[pivot] = rows[pivot], rows[k]
+        for i in range(n):
+            if i != k and rows[i][k]:
+                factor = rows[i][k] / rows[k][k]
+                rows[i] = [a - factor * b for a, b in zip(rows[i], rows[k], strict=True)]
+    X = [[v / rows[k][k] for v in rows[k][n:]] for k in range(n)]
+    return [[G.D[i, j] + sum(G.C[i, k] * X[k][j] for k in range(n)) for j in range(G.inputs)] for i in range(G.outputs)]
+
+
+def test_an_exact_block_at_rest_is_made_of_its_parts_at_rest(blocks):
+    G, H = map(exact, blocks)
+    late = hstack(G, delay((1, 2), G.T)) @ Lti.diag(H, 2 * H).rows([0, 3, 1, 2])
+    for whole in (G, G @ H, delay((2, 0), G.T) @ G.feedback(H), G @ np.array(H.D), late):
+        static, R = whole.split_at_one()
+        assert (static == np.array(at_rest(whole), dtype=object)).all()
+        assert (whole.dc() == static).all()
+        # (z - 1) R = G - G(1): C' (A - I) = C, without any division
+        assert (times(R.C, R.A) - R.C == whole.C).all()
+        assert (R.B == whole.B).all()
+        assert not R.D.any()
+
+
+def test_products_of_fractions_are_sums_of_products():
+    rng = np.random.default_rng(3)
+    over, below = rng.integers(-60, 60, (2, 5, 5)), rng.integers(1, 60, (2, 5, 5))
+    left, right = np.frompyfunc(lambda n, d: Fraction(int(n), int(d)), 2, 1)(over, below)
+    left[1] = left[:, 2] = Fraction(0)
+    assert (times(left, right) == left @ right).all()
+
+
+def test_an_exact_block_without_states_stays_exact():
+    """1/3 as a float would be 0.3333333333333333."""
+    third = Lti.constant([[Fraction(1, 3)]], Fraction(1, 1000))
+    closed = delay((1,), Fraction(1, 1000)).feedback(Lti(third.A, third.B, third.C, third.D, third.T))
+    assert closed.A[0, 0] == Fraction(-1, 3)
+    floats = Lti.constant([[0.25]], 1e-3)
+    assert all(getattr(Lti(floats.A, floats.B, floats.C, floats.D, third.T), name).dtype == object for name in "ABCD")

@@ -89,7 +89,7 @@ def test_a_block_is_the_network_whose_numbers_it_has():
         (Lti([[0.0]], [[1.0]], [[300.0]], [[0.0]], T), "not passive, its force feeds power in at"),  # a late spring
         (Lti.constant([[0.0, 1.0], [-1.0, 0.0]], T), "not passive"),
         (Lti([[1.0]], [[1.0]], [[1.0]], [[1.0]], T), "an eigenvalue on or outside the unit circle"),
-        (Lti.constant([[1.0, 0.0]], T), "it has 2 inputs and 1 outputs"),
+        (Lti.constant([[1.0, 0.0]], T), r"D is \[\[1.0, 0.0\]\], expected 1 rows of 1 numbers"),
     ],
 )
 def test_what_is_no_passive_block_is_refused(E, message):

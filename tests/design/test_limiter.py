@@ -19,6 +19,8 @@ from design.certificate import lag, prove, prove_limiter, verify
 from design.conditions import least_multiple
 from design.coupling_file import Certificate, LimiterCertificate, Stored, load, save, sealed
 from design.frequency import hermitian, on_circle
+from design.gain_search import LimiterLoop
+from design.lmi import RESERVE
 from design.multipliers import limiter_lag, limiter_requirement
 from design.result import NotProved
 from design.spring_damper import design
@@ -309,3 +311,19 @@ def test_the_best_multiplier_attains_its_bound_and_no_other_does_better():
     assert found.requirement.ratio <= found.bound * (1 + 1e-5)
     for c in np.random.default_rng(0).uniform(0, 1.5, (5, 2, 1)).tolist():
         assert limiter(G, loop.theta, loop.delta, rho, c).requirement.ratio > found.requirement.ratio * (1 - 1e-3)
+
+
+def test_the_parts_of_the_block_that_a_search_makes_are_those_of_the_block():
+    sampled = LimiterLoop(PAIR)
+    x = np.array([7.0, 6.5, 0.2, 0.9, 0.3, 0.6])
+    G = Sampled.of(PAIR.sent(sampled.coupling(x)), on_circle(sampled.conditions)[None])
+    rho = limiter_lag(DELTA, T, multipliers.BETA)
+    demand = multipliers.limiter_demand(G, PAIR, rho, [[0.3], [0.6]])
+    block = hermitian((demand.free + (1 - 1.5 * RESERVE) * demand.gain).G[0])
+    first, cross, corner = sampled.parts(x)
+    for made, part in (
+        (first, block[:, :2, :2]),
+        (cross, block[:, 2:, :2]),
+        (corner[:, :, None] * np.eye(2), block[:, 2:, 2:]),
+    ):
+        np.testing.assert_allclose(made, part, atol=1e-9 * np.abs(block).max())

@@ -14,7 +14,7 @@ from asked import this_environment
 from scipy.optimize import minimize_scalar
 
 from cli.design import main
-from controller.coupling import ForceFilter, NoCoupling, basis
+from controller.coupling import ForceFilter, NoCoupling, SpringDamper, basis
 from controller.environment import Network, Spring
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
@@ -285,6 +285,20 @@ def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
     for network in vertices(loop.environment).values():
         assert this_environment(loop.at(network).F(found.coupling), loop.delta).certified
     assert nominal.figures.rms_mismatch < found.figures.rms_mismatch < 10 ** (1 / 20) * nominal.figures.rms_mismatch
+
+
+def test_a_thinned_sweep_finds_the_environment_that_asks_the_most(monkeypatch):
+    network = Network(
+        ("a", "b", "c"),
+        tuple(Spring((end, "hub"), 300.0 + 40 * i, 0.2) for i, end in enumerate(("a", "b", "c", "ground"))),
+        {"hub": 0.8},
+    )
+    loop = Loop(1e-3, (0, 1, 2), (0,) * 3, (0, 1, 2), (0.8, 0.85, 0.9), network)
+    coupling = SpringDamper((9e3, 4e3, 2e3), (0.5, 0.9, 1.2))
+    worst = max(this_environment(loop.at(each).F(coupling), loop.delta).ratio for each in vertices(network).values())
+    for few in (0, 100):
+        monkeypatch.setattr("design.robustness._FEW", few)
+        assert robustness(loop, coupling).required_over_available == pytest.approx(worst, rel=1e-9)
 
 
 @pytest.mark.parametrize(("name", "objective"), [("n3", "rms"), ("n3", "sup"), ("n2", "rms")])
