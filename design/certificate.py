@@ -446,7 +446,7 @@ def _refuted_claims(loop: Loop, coupling: Coupling, condition: Condition, certif
     if certificate.available != loop.delta:
         return f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}"
     _require_limits(loop, coupling, condition)
-    requirement = required_damping(loop, coupling, condition, _multiplier(loop, coupling, condition, certificate))
+    requirement = required_damping(loop, coupling, condition, _multiplier(loop, condition, certificate))
     if reason := _other_figures(certificate, requirement):
         return reason
     if not requirement.certified:
@@ -456,7 +456,7 @@ def _refuted_claims(loop: Loop, coupling: Coupling, condition: Condition, certif
 
 def _refuted_proof(loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate) -> str | None:
     """Why the matrices prove nothing, or None if they prove the condition."""
-    blocks = _blocks(loop, coupling, condition, _multiplier(loop, coupling, condition, certificate))
+    blocks = _blocks(loop, coupling, condition, _multiplier(loop, condition, certificate))
     expected = {*blocks, *filter(None, [condition.multiplier_name(loop)])}
     if set(certificate.matrices) != expected:
         found = ", ".join(certificate.matrices) or "none"
@@ -471,9 +471,7 @@ def _refuted_proof(loop: Loop, coupling: Coupling, condition: Condition, certifi
     return refuted(loop, coupling, certificate.switching)
 
 
-def _multiplier(
-    loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate
-) -> Sequence[Fraction] | None:
+def _multiplier(loop: Loop, condition: Condition, certificate: Certificate) -> Sequence[Fraction] | None:
     """The stored multiplier, or None for a condition without. Raises NotProved where it is no row of rationals."""
     name = condition.multiplier_name(loop)
     if name is None:

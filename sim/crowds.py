@@ -32,9 +32,9 @@ from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine
 from sim.run import Simulation, assemble
 from sim.scenario import Scenario
 from sim.stability import (
+    Balance,
     ClosedLoop,
     ImpulseTest,
-    Latch,
     Mode,
     disagree,
     dominant_mode,
@@ -288,14 +288,13 @@ def _tests(
     In even periods, with forces that latch in the middle of their range: what their spread does is `switched_crowd`'s.
     """
     process, T = simulation.process, validation.scenario.T
-    settings = held_by.scene, loops, np.array(validation.scenario.delta), validation.ticks
     late = validation.scenario.usual_latency
-    latch = Latch.of(held_by, validation.scenario.loop("I"), late) if late else None
+    settings = held_by.scene, loops, Balance.of(held_by, simulation.loop, late), validation.ticks
     engine = ExactEngine(hold(held_by.plants(), T, late))
-    exact = impulse_test(process, engine, *settings, latch=latch)
+    exact = impulse_test(process, engine, *settings)
     if validation.engine == "exact":
         return exact, exact
     threads, n = validation.threads, len(held_by)
     timing = Timing(np.array([T]), np.array([late])) if late else None
     engine = MujocoBatchEngine(held_by.scene, T, EXPONENTIAL, 1, n, threads, held_by, timing)
-    return exact, impulse_test(process, engine, *settings, ticked, latch)
+    return exact, impulse_test(process, engine, *settings, ticked)

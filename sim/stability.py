@@ -339,19 +339,41 @@ class ImpulseTest:
 
 
 @dataclass(frozen=True, eq=False)
-class Latch:
-    """Forces that latch within a tick: where devices are then, and what pays for their steps before and after it."""
+class Balance:
+    """What each tick gives and takes where forces act at ticks: damping pays for every step."""
 
-    seen: Array  # (nsim, m, entries) of engines.at_the_latch
-    before: Array  # (m,) [N/m] delta/t2
-    after: Array  # (m,) [N/m] delta/(T - t1), T the longest period
+    damping: Array  # (m, 1) [N/m] delta/T
 
-    @classmethod
-    def of(cls, variants: Variants, loop: Loop, late: Sequence[float]) -> Latch:
-        """Of devices in the hands of `variants`, with forces that latch `late` (m,) [s], within the loop's latency."""
-        delta, spans = np.array(loop.delta), np.array(loop.latency)
+    @staticmethod
+    def of(variants: Variants, loop: Loop, late: Sequence[float] | None) -> Balance:
+        """Of devices in the hands of `variants`; forces latch `late` (m,) [s], within the latency, or at ticks."""
+        delta = np.array(loop.delta)[:, None]
+        if late is None:
+            return Balance(delta / loop.T)
+        spans = np.array(loop.latency)[:, :, None]
         before = np.divide(delta, spans[:, 1], out=np.zeros_like(delta), where=spans[:, 1] > 0)  # 0: no step before
-        return cls(at_the_latch(variants.plants(), late), before, delta / ((loop.T_max or loop.T) - spans[:, 0]))
+        after = delta / ((loop.T_max or loop.T) - spans[:, 0])
+        return _LateBalance(after, before, at_the_latch(variants.plants(), late))
+
+    def terms(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
+        """Work of the forces and the least that devices dissipate, of each tick and channel, (count, m, nsim)."""
+        moved = np.diff(buffer.x[: count + 1], axis=0)
+        return buffer.f[:count] * moved, self.damping * moved**2
+
+
+@dataclass(frozen=True, eq=False)
+class _LateBalance(Balance):
+    """The same of forces that latch within a tick: what pays for the steps before and, `damping`, after that."""
+
+    before: Array  # (m, 1) [N/m] delta/t2; after it delta/(T - t1), T the longest period
+    seen: Array  # (nsim, m, entries) of models.hold.at_the_latch: where devices are then
+
+    def terms(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
+        x, s, f = buffer.x[: count + 1], buffer.s[:count], buffer.f[:count]
+        middle = np.einsum("nme,ken->kmn", self.seen, np.concatenate([s, buffer.w[:count], f], axis=1), optimize=True)
+        first, then = middle - x[:-1], x[1:] - middle
+        spent = self.before * first**2 + self.damping * then**2
+        return s[:, s.shape[1] - f.shape[1] :] * first + f * then, spent
 
 
 def impulse_forces(scene: Scene, T: float, first: int, ticks: int, size: float = 1.0) -> Array:
@@ -368,19 +390,16 @@ def impulse_test(
     engine: Engine,
     scene: Scene,
     loops: ClosedLoop,
-    delta: Array,
+    balance: Balance,
     ticks: int,
     tick_done: Callable[[int], None] = lambda ticks: None,
-    latch: Latch | None = None,
 ) -> ImpulseTest:
     """Simulate `ticks` periods with every set of humans and measure them. `loops` are the exact ones.
-
-    Where forces latch within a tick, `latch` has the balance at that instant.
 
     Where there are walls the impulse is large enough to reach them, and no growth is read from the trace.
     """
     nsim, states = loops.A.shape[0], loops.A.shape[1] - process.F.order
-    audit = _Audit(process, scene, loops, delta, ticks, latch)
+    audit = _Audit(process, scene, loops, balance, ticks)
     push = partial(impulse_forces, scene, loops.T, size=_TO_THE_WALL if process.walls else 1.0)
 
     def each_block(buffer: StepBuffer, first: int, count: int) -> None:
@@ -449,13 +468,11 @@ class _Speeds:
 class _Audit:
     """What the impulse test measures, summed over the ticks seen so far."""
 
-    def __init__(
-        self, process: Process, scene: Scene, loops: ClosedLoop, delta: Array, ticks: int, latch: Latch | None
-    ) -> None:
-        nsim, self._latch = loops.A.shape[0], latch
+    def __init__(self, process: Process, scene: Scene, loops: ClosedLoop, balance: Balance, ticks: int) -> None:
+        nsim, self._balance = loops.A.shape[0], balance
         self._limit, self._law = process.force_limit[:, None], process.ticked
         self._made, self._touching = np.zeros(nsim, dtype=int), np.zeros((len(process.walls), nsim), dtype=bool)
-        self._B, self._T, self._damping = loops.B, loops.T, delta[:, None] / loops.T
+        self._B, self._T = loops.B, loops.T
         self._left = _left_eigenvector(loops)  # (nsim, n)
         self._speeds = _Speeds(scene, nsim, (ticks // 4, ticks // 2), (ticks - ticks // 4, ticks))
         self._linear = np.ones(nsim, dtype=bool)
@@ -478,7 +495,7 @@ class _Audit:
         self._linear = linear[-1]
 
         audited = np.ones_like(linear) if law.bounds else linear
-        work, spent = (np.where(audited[:, None], part, 0.0).sum(axis=1) for part in self._balance(buffer, count))
+        work, spent = (np.where(audited[:, None], part, 0.0).sum(axis=1) for part in self._balance.terms(buffer, count))
         energy = self._energy + np.cumsum(work + spent, axis=0)
         self._least = np.minimum(self._least, energy.min(axis=0))
         self._energy = energy[-1]
@@ -494,18 +511,6 @@ class _Audit:
         self._across += (y.conj() * after).sum(axis=0)
         self._weight += (np.abs(y) ** 2).sum(axis=0)
         self._whole += np.where(linear[:, None], xi[:-1] ** 2, 0.0).sum(axis=(0, 1))
-
-    def _balance(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
-        """Work of the forces and the least that devices dissipate, of each tick and channel, (count, m, nsim)."""
-        x, f, latch = buffer.x[: count + 1], buffer.f[:count], self._latch
-        if latch is None:
-            moved = np.diff(x, axis=0)
-            return f * moved, self._damping * moved**2
-        s, m = buffer.s[:count], f.shape[1]
-        middle = np.einsum("nme,ken->kmn", latch.seen, np.concatenate([s, buffer.w[:count], f], axis=1), optimize=True)
-        first, then = middle - x[:-1], x[1:] - middle
-        spent = latch.before[:, None] * first**2 + latch.after[:, None] * then**2
-        return s[:, s.shape[1] - m :] * first + f * then, spent
 
     def result(self, simulated: float) -> ImpulseTest:
         above_noise = (self._usable >= _SHORTEST_TRACE) & (self._weight > _NOISE_FLOOR**2 * self._whole)

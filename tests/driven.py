@@ -42,3 +42,41 @@ def tick_by_tick(engine):
 
     engine.start = begin
     return engine
+
+
+def drive(process: Process, x: np.ndarray) -> StepBuffer:
+    """The buffer after displacements (ticks, m, nsim)."""
+    buffer = StepBuffer(process, len(x), x.shape[1], nsim=x.shape[2])
+    for k, row in enumerate(x):
+        buffer.x[k] = row
+        buffer.tick(k)
+    return buffer
+
+
+def wander(ticks: int, channels: int, nsim: int, step: float = 1e-3, seed: int = 0) -> np.ndarray:
+    """Random displacements (ticks, channels, nsim)."""
+    return np.cumsum(np.random.default_rng(seed).normal(size=(ticks, channels, nsim)), axis=0) * step
+
+
+def growing(steps: np.ndarray, energy: np.ndarray, mean: int | None, rng: np.random.Generator, ticks: int) -> int:
+    """How many hands grow a hundredfold between a tenth of the ticks and the end.
+
+    Each tick is one of `steps` (kinds, hands, n, n), drawn anew after `mean` ticks on average; without `mean` it is the
+    one that gives the hand most energy, `energy` (hands, 2) times [x^2, v^2].
+    """
+    hands = len(energy)
+    z = 1e-3 * rng.standard_normal((hands, steps.shape[2], 1))
+    log, early, which = np.zeros(hands), np.zeros(hands), 0
+    for k in range(ticks):
+        if mean is None:
+            each = steps @ z
+            z = each[(energy * each[:, :, :2, 0] ** 2).sum(axis=2).argmax(axis=0), np.arange(hands)]
+        else:
+            which = rng.integers(len(steps)) if rng.random() < 1 / mean else which
+            z = steps[which] @ z
+        if k % 20 == 19:
+            size = np.abs(z[:, :2, 0] * (1, 0.01)).max(axis=1)
+            log, z = log + np.log(size), z / size[:, None, None]
+        if k == ticks // 10:
+            early = log.copy()
+    return int((log > early + np.log(100)).sum())

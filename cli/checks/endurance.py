@@ -74,7 +74,7 @@ _LONG: tuple[tuple[str, _Work, float], ...] = (
 )
 
 
-def endurance(seed: int) -> Iterator[_Endured]:
+def endurance(_seed: int) -> Iterator[_Endured]:
     """Whether memory stays flat over an hour of a session and 100,000 hands, each in a process of its own."""
     context = multiprocessing.get_context("spawn")  # a fork would begin with the memory of all checks before
     for what, work, allowed in _LONG:

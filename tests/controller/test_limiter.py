@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from driven import drive, wander
 from worlds import STIFF, T, loop_of
 
 from controller.complementarity import BoxProblem
@@ -14,25 +15,12 @@ from controller.tick import Process, StepBuffer
 LIMITS = (12.0, 5.657)
 
 
-def drive(process: Process, x: np.ndarray) -> StepBuffer:
-    """The buffer after displacements (ticks, m, nsim)."""
-    buffer = StepBuffer(process, len(x), x.shape[1], nsim=x.shape[2])
-    for k, row in enumerate(x):
-        buffer.x[k] = row
-        buffer.tick(k)
-    return buffer
-
-
 def closed(limiter: Limiter) -> Process:
     return Process(limiter, np.full(limiter.channels, np.inf), np.zeros(limiter.channels))
 
 
 def unlimited(network: Network, theta) -> Process:
     return Process(loop_of(network, theta, (0, 0)).law(STIFF), np.full(2, np.inf), np.zeros(2))
-
-
-def wander(ticks: int, channels: int, nsim: int, step: float = 1e-3, seed: int = 0) -> np.ndarray:
-    return np.cumsum(np.random.default_rng(seed).normal(size=(ticks, channels, nsim)), axis=0) * step
 
 
 def passive(n: int, rng: np.random.Generator) -> np.ndarray:

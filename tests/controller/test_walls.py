@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from asked import this_environment
+from driven import drive, wander
 from scipy.optimize import brentq
 from worlds import SOFT, force_map, loop_of
 
@@ -16,7 +17,7 @@ from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
 from controller.law import Law
 from controller.lti import Lti, SingularLoop
-from controller.tick import Process, StepBuffer
+from controller.tick import Process
 from design.audit import audit, requirement
 from design.certificate import assess, prove
 from design.guarantees import MAKING
@@ -41,19 +42,6 @@ def one(stiffness=1000.0, damping=0.0, gap=0.0) -> Network:
 def walled(network: Network, coupling, theta, psi) -> Process:
     walls = loop_of(network, theta, psi, T).law(coupling)
     return Process(walls, np.full(walls.channels, np.inf), np.zeros(walls.channels))
-
-
-def drive(process: Process, x: np.ndarray) -> StepBuffer:
-    """The buffer after displacements (ticks, m, nsim)."""
-    buffer = StepBuffer(process, len(x), x.shape[1], nsim=x.shape[2])
-    for k, row in enumerate(x):
-        buffer.x[k] = row
-        buffer.tick(k)
-    return buffer
-
-
-def wander(ticks: int, channels: int, nsim: int, seed: int = 0) -> np.ndarray:
-    return np.cumsum(np.random.default_rng(seed).normal(size=(ticks, channels, nsim)), axis=0) * 1e-3
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3, 50.0])

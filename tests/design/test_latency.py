@@ -4,6 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 from asked import latency_demand, this_environment, this_environment_demand
+from driven import growing
 from scipy.linalg import expm
 
 from controller.coupling import SpringDamper
@@ -117,7 +118,7 @@ HANDS, TICKS = 60, 20000
 WALL = Loop(T, (0,), (0,), (0,), (1.0,), Network(("tip",), (Spring(("tip", GROUND), K),)))
 
 
-def growing(damping, latencies, mean, seed=3):
+def grown(damping, latencies, mean, seed=3):
     """How many lossless hands grow a hundredfold between a tenth of the ticks and the end.
 
     tau is one of `latencies` [s], drawn anew after `mean` ticks, or where it is None the one that gives most energy.
@@ -133,21 +134,7 @@ def growing(damping, latencies, mean, seed=3):
     for tau in latencies:
         steps.append(expm(A * (T - tau)) @ (latch @ expm(A * tau) + force))
     steps, energy = np.stack(steps), np.stack([stiff, mass], axis=1)
-    z = 1e-3 * rng.standard_normal((HANDS, 3, 1))
-    log, early, which = np.zeros(HANDS), np.zeros(HANDS), 0
-    for k in range(TICKS):
-        if mean is None:
-            each = steps @ z
-            z = each[(energy * each[:, :, :2, 0] ** 2).sum(axis=2).argmax(axis=0), np.arange(HANDS)]
-        else:
-            which = rng.integers(len(steps)) if rng.random() < 1 / mean else which
-            z = steps[which] @ z
-        if k % 20 == 19:
-            size = np.abs(z[:, :2, 0] * (1, 0.01)).max(axis=1)
-            log, z = log + np.log(size), z / size[:, None, None]
-        if k == TICKS // 10:
-            early = log.copy()
-    return int((log > early + np.log(100)).sum())
+    return growing(steps, energy, mean, rng, TICKS)
 
 
 @pytest.mark.parametrize("mean", [1, 100, None])
@@ -157,8 +144,8 @@ def test_no_hand_grows_at_the_requirement_and_some_do_below(mean):
         change(WALL, latency=((0.0, TAU),)), SpringDamper([1e9], [0.0]), "this-environment"
     ).required[0]
     assert need == pytest.approx(0.841354, rel=1e-4)
-    assert growing(1.02 * need, latencies, mean) == 0
-    assert growing(0.6 * need, latencies, mean) > 0
+    assert grown(1.02 * need, latencies, mean) == 0
+    assert grown(0.6 * need, latencies, mean) > 0
 
 
 def test_a_design_for_late_forces_uses_the_damping_and_beats_a_whole_sample():

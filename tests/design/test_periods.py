@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from asked import any_environment, any_environment_demand, this_environment_demand
 from asked import loop as loop_of
+from driven import growing
 from scipy.linalg import expm
 
 from cli.design import main as cli_design
@@ -148,7 +149,7 @@ def tick(F, A, B, period):
     return np.concatenate([upper, np.broadcast_to(lower, (HANDS, *lower.shape))], axis=1)
 
 
-def growing(damping, mean, seed=7):
+def grown(damping, mean, seed=7):
     """How many hands grow a hundredfold between a tenth of the ticks and the end.
 
     Periods are drawn anew after `mean` ticks, or, where it is None, each is the one that gives the hand most energy.
@@ -158,27 +159,12 @@ def growing(damping, mean, seed=7):
     F = ONE.F(COUPLING)
     steps = np.stack([tick(F, A, B, period) for period in PERIODS])
     energy = np.stack([-A[:, 1, 0] / -B[:, 1, 0], -1 / B[:, 1, 0]], axis=1)  # twice: spring and mass
-    z = 1e-3 * rng.standard_normal((HANDS, steps.shape[2], 1))
-    log, early, which = np.zeros(HANDS), np.zeros(HANDS), 0
-    for k in range(TICKS):
-        if mean is None:
-            each = steps @ z
-            best = (energy * each[:, :, :2, 0] ** 2).sum(axis=2).argmax(axis=0)
-            z = each[best, np.arange(HANDS)]
-        else:
-            which = rng.integers(4) if rng.random() < 1 / mean else which
-            z = steps[which] @ z
-        if k % 20 == 19:
-            size = np.abs(z[:, :2, 0] * (1, 0.01)).max(axis=1)
-            log, z = log + np.log(size), z / size[:, None, None]
-        if k == TICKS // 10:
-            early = log.copy()
-    return int((log > early + np.log(100)).sum())
+    return growing(steps, energy, mean, rng, TICKS)
 
 
 @pytest.mark.parametrize("mean", [50, 1000, None])
 def test_no_hand_grows_at_the_requirement_of_the_longest_period_and_some_do_below(mean):
     need = required_damping(ONE, COUPLING, "this-environment").required[0]
     assert need == pytest.approx(1.244099, rel=1e-6)
-    assert growing(1.01 * 1.6 * need, mean) == 0
-    assert growing(0.6 * 1.6 * need, mean) > 0
+    assert grown(1.01 * 1.6 * need, mean) == 0
+    assert grown(0.6 * 1.6 * need, mean) > 0

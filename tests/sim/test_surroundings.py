@@ -9,7 +9,7 @@ import pytest
 from worlds import VERTICES_ONLY
 
 from cli import zwidth
-from cli.options import BAD_INPUT, DONE, execute
+from cli.options import DONE
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring
 from controller.tick import Process, StepBuffer
@@ -162,24 +162,3 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
     for words in ("guarantee: this environment", "for its environment alone"):
         assert words in " ".join(text.split())
     assert (tmp_path / "zwidth.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--coupling", "optimal", "--rigid"], "--rigid is only for a map of spring-dampers"),
-        (["--coupling", "none", "--velocity-filter", "50"], "--velocity-filter is only for a map of spring-dampers"),
-        (["--coupling", "optimal", "--condition", "any-environment"], "for optimal allowed are this-environment"),
-        (["--condition", "any-environment"], "--condition is only with --coupling"),
-        (["--coupling", "optimal", "--scenario", "one-wall"], "an optimal coupling holds a linear model"),
-        (["--coupling", "published", "--scenario", "one-wall"], "the paper prints gains for 2 channels"),
-    ],
-)
-def test_bad_input_is_one_line(options, message, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("sys.argv", ["zwidth", *options, "--out", str(tmp_path)])
-    with pytest.raises(SystemExit) as leaving:
-        execute(zwidth.main)
-    error = capsys.readouterr().err
-    assert leaving.value.code == BAD_INPUT
-    assert message in error
-    assert error.count("\n") == 1

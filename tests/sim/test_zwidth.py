@@ -509,6 +509,12 @@ def test_slices_cover_everything_once():
         (["--duration", "0.1"], "--duration is 0.1, allowed are 1.5 to 10000 s"),
         (["--theta", "200"], "theta is 200, 200, allowed are 0 to 100 samples"),
         (["--seed", "-1"], "--seed is -1"),
+        (["--coupling", "optimal", "--rigid"], "--rigid is only for a map of spring-dampers"),
+        (["--coupling", "none", "--velocity-filter", "50"], "--velocity-filter is only for a map of spring-dampers"),
+        (["--coupling", "optimal", "--condition", "any-environment"], "for optimal allowed are this-environment"),
+        (["--condition", "any-environment"], "--condition is only with --coupling"),
+        (["--coupling", "optimal", "--scenario", "one-wall"], "an optimal coupling holds a linear model"),
+        (["--coupling", "published", "--scenario", "one-wall"], "the paper prints gains for 2 channels"),
     ],
 )
 def test_bad_input_is_one_line(options, message, tmp_path, capsys, monkeypatch):
