@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from controller.coupling import Coupling
-from controller.delay import delay
 from controller.loop import Loop
 from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
@@ -134,8 +133,8 @@ class Switching:
         found, span = switching_requirement(loop, coupling), loop.delays
         if found.requirement.reason:
             return cls(found.requirement, span.lo, span.hi)
-        G = loop.sent(coupling)
-        buffered = this_environment(delay(span.hi, G.T) @ G, loop)
+        latest = loop.delayed(span.hi)
+        buffered = this_environment(latest.F(coupling), latest)
         playout = _Playout(span.hi, buffered.required, buffered.certified)
         return cls(found.requirement, span.lo, span.hi, tuple(found.alpha), playout, _NOT_COVERED)
 

@@ -292,6 +292,7 @@ LARGEST = 300  # states of a model that a proof is tried for: 0.1 s at 50, 0.5 s
 _MOST_BITS = 4000  # of the common denominator of a stored P, a power of two of some hundred bits when we made it
 _STORED_BITS = 44  # of each entry of P, relative to its diagonal
 _UNIT = 2.0**-53  # of double precision
+_BINARY = 120  # binary digits behind the point of a matrix that is multiplied without rounding
 _SAMPLES = 400  # frequencies at which states are looked at, about
 _LONG = 80  # states from which on one solution of the Riccati equation has not been enough
 
@@ -381,7 +382,9 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     P is over the states that an input reaches (`reached`).
     P solves the discrete algebraic Riccati equation of G pushed half-way into its margin: D is reduced by
     a part of mu = min over |z| = 1 of the least eigenvalue of He G, and the equation is driven by e I,
-    small enough that e |(zI - A)^-1 B|^2 leaves the rest of it.
+    small enough that e |(zI - A)^-1 B|^2 leaves the rest of it. Where P is so ill-conditioned that rounding its
+    entries loses the proof (delays of sixteen samples beside slow poles), it is kept as the exact product of the
+    solution in good coordinates and these coordinates, in entries of some 250 binary digits.
     """
     if not G.floats().is_stable():
         return None, "the block has a pole on or outside the unit circle"
@@ -393,13 +396,15 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     if G.order == 0:
         return Matrix.zeros(0, 0), prove_positive_real(G, Matrix.zeros(0, 0))
     reason: str | None = None
-    for share, again in ((0.5, False), (0.5, True), (0.9, True), (0.1, True))[G.order > _LONG :]:
+    rounded = ((0.5, False, False), (0.5, True, False), (0.9, True, False), (0.1, True, False))[G.order > _LONG :]
+    for share, again, whole in (*rounded, (0.5, True, True)):
         try:
-            P = _riccati(block, margin, share, again)
+            P, out = _riccati(block, margin, share, again)
         except (np.linalg.LinAlgError, ValueError) as error:
             reason = f"the Riccati equation has no solution: {error}"
             continue
-        stored = _rounded_positive_real(back[:, None] * P * back)
+        out = out * back
+        stored = _congruent(out, P) if whole else _rounded_positive_real(out.T @ P @ out)
         reason = prove_positive_real(G, stored)
         if reason is None:
             return stored, None
@@ -435,20 +440,33 @@ def _least_eigenvalue(G: Lti) -> tuple[float, float]:
     return 1 - value, w
 
 
-def _riccati(G: Lti, margin: float, share: float, again: bool) -> Array:
-    """P of the equation; `again` in coordinates where it is nearly I, which takes off what rounding has left."""
+def _riccati(G: Lti, margin: float, share: float, again: bool) -> tuple[Array, Array]:
+    """(P of the equation in coordinates x' = out x, out): `again` in those where it is nearly I, which takes off what
+    rounding has left.
+    """
     n, m = G.B.shape
     gain = np.linalg.norm(_states(G), 2, axis=(1, 2)).max() ** 2
     drive = (1 - share) * margin / max(gain, 1.0)  # the gain is at least one unless no input reaches any state
     R = G.D + G.D.T - 2 * share * margin * np.eye(m)
     P = -scipy.linalg.solve_discrete_are(G.A, G.B, -drive * np.eye(n), R, s=G.C.T)
     if not again:
-        return P
+        return P, np.eye(n)
     size, V = np.linalg.eigh(P)
     root = np.sqrt(np.maximum(size, size[-1] * 1e-16))
     into, out = V / root, (V * root).T
     better = -scipy.linalg.solve_discrete_are(out @ G.A @ into, out @ G.B, -drive * into.T @ into, R, s=(G.C @ into).T)
-    return out.T @ better @ out
+    return better, out
+
+
+def _congruent(out: Array, P: Array) -> Matrix:
+    """out' P out without rounding, P made symmetric."""
+    exact = Matrix(_binary(out), 1 << _BINARY)
+    return (exact.T @ Matrix(_binary((P + P.T) / 2), 1 << _BINARY) @ exact).reduced()
+
+
+def _binary(A: Array) -> _Integers:
+    """Floating-point numbers times 2^BINARY, which is whole unless they are less than 1e-20 or so."""
+    return np.vectorize(lambda v: int(Fraction(v) * (1 << _BINARY)), otypes=[object])(A)
 
 
 def _rounded_positive_real(P: Array) -> Matrix:

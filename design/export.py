@@ -12,7 +12,6 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from controller.complementarity import GROUNDED, PIVOT_ROUNDING
-from controller.delay import delay
 from controller.limiter import Limiter
 from controller.loop import Loop
 from controller.lti import Array, Lti
@@ -91,31 +90,29 @@ def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence
     With `force_limit` (m,) [N] they leave through the limiter of the certificate. Raises NothingToExport where that
     covers none.
     """
-    loop = stored.loop
-    theta = loop.theta if with_theta else (0,) * len(loop.theta)
+    loop, delays = stored.loop, _delays(stored.loop, with_theta)
+    if not with_theta:
+        loop = loop.delayed((0,) * loop.channels)
     if loop.environment.walls:
         raise NothingToExport("environment.walls: contact that makes and breaks is not a linear block")
     if force_limit is not None:
-        return _limited_block(stored, theta, force_limit, with_theta)
-    F = delay(theta, loop.T) @ loop.sent(stored.built())
+        return _limited_block(stored, loop, force_limit, delays)
     about = (
         "f = F x: the whole discrete process; the devices get -f, held for T. Forces are not limited here.",
-        _delays(loop, with_theta),
+        delays,
     )
-    return ExportedBlock("process", _with_a_state(F), _DISPLACEMENT, FORCE, about)
+    return ExportedBlock("process", _with_a_state(loop.F(stored.built())), _DISPLACEMENT, FORCE, about)
 
 
-def _limited_block(
-    stored: Stored, theta: Sequence[int], force_limit: Sequence[float], with_theta: bool
-) -> ExportedBlock:
-    loop, rho = stored.loop, lag(stored.loop, stored.certificate)
+def _limited_block(stored: Stored, loop: Loop, force_limit: Sequence[float], delays: str) -> ExportedBlock:
+    rho = lag(stored.loop, stored.certificate)
     if rho is None:
         raise NothingToExport("its certificate covers no limited forces: design it anew, or leave out --force-limit")
-    limiter = Limiter(loop.sent(stored.built()), theta, limit=force_limit, rho=rho)
+    limiter = Limiter(loop.sent(stored.built()), loop.theta, limit=force_limit, rho=rho)
     about = (
         "f: the whole discrete process with its limiter; the devices get -f, held for T. Forces never exceed "
         f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead, and the certificate holds there.",
-        _delays(loop, with_theta),
+        delays,
     )
     return ExportedBlock("process", limiter.open, _DISPLACEMENT, FORCE, about, limiter)
 

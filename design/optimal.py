@@ -33,7 +33,8 @@ _PRICED = 15.0  # [s] of the processor: what the price of a range may take, a th
 _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
 _SETTLED_DB = 0.05  # a rung that gains less ends the climb
 _FEWEST_RUNGS = 3
-_KEPT_STIFFNESS = 0.5  # of the static stiffness of the best rung so far: a rung that renders less is not taken
+_KEPT_STIFFNESS = 0.5  # of the most static stiffness of a rung that was best: one that renders less is not taken
+_HEAVIER = (1.0, 2.5, 6.0)  # times the weight of the static stiffness, tried in turn where it is too small
 _LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # (beta, c) of a limiter to begin with: without psi the first alone
 _HOPELESS = 0.9  # relative mismatch from which on the climb is compared with other couplings
 _TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
@@ -120,16 +121,16 @@ def design(
         return exactly
     best: Optimal | None = None
     rungs: list[_Rung] = []
-    hurried = False
+    hurried, floor = False, min(climb.simple, 1.0)
     for taps, poles in options.ladder:
         if rungs and not climb.room(taps, poles, max((r.states for r in rungs if r.reason is None), default=0)):
             continue
-        found, rung = climb.rung(taps, poles, best)
+        found, rung = climb.rung(taps, poles, best, floor)
         rungs.append(rung)
         progress(rung)
         gained = np.inf if rung.reason or best is None else decibels(climb.merit(best)) - decibels(climb.merit(found))
-        if rung.reason is None and (best is None or climb.better(found, best)):
-            best = found
+        if rung.reason is None and (best is None or (found.g >= floor and climb.merit(found) < climb.merit(best))):
+            best, floor = found, max(floor if best else 0.0, _KEPT_STIFFNESS * found.g)
         settled = gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS
         hurried = not settled and climb.elapsed > options.seconds
         if settled or hurried:
@@ -216,9 +217,10 @@ class _Climb:
         static = program.static_weight(self.loop) * (found.g - 1) if np.isfinite(found.g) else 0.0
         return float(np.hypot(self.mismatch(found), static))
 
-    def better(self, found: Optimal, best: Optimal) -> bool:
-        """Whether a rung is taken in place of the best one so far."""
-        return found.g >= _KEPT_STIFFNESS * best.g and self.merit(found) < self.merit(best)
+    @property
+    def simple(self) -> float:
+        """kappa for which this-environment holds of the environment scaled down, R = kappa I."""
+        return (1 - program.MARGIN) / self.bare if self.bare > 0 else 1.0
 
     def nothing(self) -> Optimal | None:
         """No coupling, where that is exact and safe."""
@@ -243,19 +245,29 @@ class _Climb:
         proofs = len(self.cases) * states**2.7  # what they take, in seconds
         return before < states <= _MOST_STATES and (m * span.unknowns) ** 2 <= _MOST_WORK and proofs <= _MOST_PROOFS
 
-    def rung(self, taps: int, poles: int, before: Optimal | None) -> tuple[Optimal, _Rung]:
-        """The optimum over a basis, scaled until every sweep passes, and proved where there are no ranges."""
-        tried = [self.solved(taps, poles, before, slip) for slip in self.slips(before)]
-        found = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
+    def rung(self, taps: int, poles: int, before: Optimal | None, floor: float) -> tuple[Optimal, _Rung]:
+        """The optimum over a basis, scaled until every sweep passes, and proved where there are no ranges.
+
+        Where it renders less than this share of the static stiffness, that counts more.
+        """
+        for heavier in _HEAVIER:
+            tried = [self.solved(taps, poles, before, slip, heavier) for slip in self.slips(before)]
+            found = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
+            if found.g >= floor or found.reason:
+                break
         return found, _Rung(taps, poles, found.states, self.decibels(found), found.g, found.reason, self.elapsed)
 
-    def solved(self, taps: int, poles: int, before: Optimal | None, slip: program.Slip | None) -> Optimal:
+    def solved(
+        self, taps: int, poles: int, before: Optimal | None, slip: program.Slip | None, heavier: float
+    ) -> Optimal:
         share = self.mismatch(before) if before else 1.0
         span, cases = self.span(taps, poles), self.asked(slip)
         active = [0]
         while True:
             chosen = tuple(cases[i] for i in active)
-            problem = program.Problem(span, chosen, self.options, program.SOFT[0] * min(share, program.SOFT[1]))
+            problem = program.Problem(
+                span, chosen, self.options, program.SOFT[0] * min(share, program.SOFT[1]), heavier=heavier
+            )
             coupling = span.filter(problem.solve(self._start(problem)))
             needs = [ratio_in(case.loop, coupling) for case in cases]
             missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + _TOLERATED and i not in active]
@@ -317,10 +329,9 @@ class _Climb:
     def scaled(self) -> Optimal:
         """The environment itself, scaled down until it is safe."""
         span = program.Span(np.zeros(0), NO_PAIRS, np.zeros((0, self.loop.channels, self.loop.channels), dtype=bool))
-        simple = (1 - program.MARGIN) / self.bare if self.bare > 0 else 1.0
         (slip, *_) = self.slips(None)
         problem = program.Problem(span, self.asked(slip), self.options, 0.0)
-        kappa = self._start(problem)[0] if self.constrained else min(1.0, simple)
+        kappa = self._start(problem)[0] if self.constrained else min(1.0, self.simple)
         kappa = np.floor(kappa * 1e6) / 1e6
         return self._proved(self._assessed(span.filter(np.array([kappa])), kappa), slip)
 
@@ -427,7 +438,7 @@ def spread(
     climb, slip = replace(climb, cases=climb.cases + more), climb.slips(None)[0]
     taps, poles = next(basis for most, basis in _PRICED_BY.items() if loop.channels <= most)
     problem = program.Problem(
-        climb.span(taps, poles), climb.asked(slip), options, program.SOFT[0] * program.SOFT[1], True
+        climb.span(taps, poles), climb.asked(slip), options, program.SOFT[0] * program.SOFT[1], sparse=True
     )
     tried = [nominal]
     with suppress(DesignFailed):

@@ -317,6 +317,7 @@ class Problem:
     cases: tuple[Case, ...]
     options: Options
     soft: float  # weight of the force above 100 Hz
+    heavier: float = 1.0  # times the weight of the static stiffness
     sparse: bool = False  # few frequencies at first where only constraints count
 
     @property
@@ -357,7 +358,7 @@ class Problem:
                 w = np.geomspace(edge, np.pi, 20)
                 self._force_rows(case, w, np.full(20, self.soft * np.sqrt(case.weight / 20)), None, rows, right)
         static = np.zeros((1, self.unknowns))
-        static[0, 0] = held = static_weight(self.cases[0].loop)
+        static[0, 0] = held = self.heavier * static_weight(self.cases[0].loop)
         cost = np.zeros(self.unknowns)
         cost[self.span.unknowns :] = [v for case in self.cases for c in case.constraints for v in c.cost]
         small = _SMALL * np.eye(self.span.unknowns, self.unknowns)

@@ -258,7 +258,7 @@ def test_states_that_no_input_reaches_are_left_out_and_those_that_cancel_do_no_h
 def test_a_riccati_equation_with_a_wrong_answer_proves_nothing(monkeypatch):
     G = Lti(*([[v]] for v in (0.5, 1, 0.5, 1)), Fraction(1))
     for wrong in (-1.0, 100.0):
-        monkeypatch.setattr(exact, "_riccati", lambda *words, p=wrong: np.array([[p]]))
+        monkeypatch.setattr(exact, "_riccati", lambda *words, p=wrong: (np.array([[p]]), np.eye(1)))
         P, reason = find_storage(G)
         assert P is None
         assert "negative direction" in reason

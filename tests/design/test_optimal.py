@@ -172,6 +172,19 @@ def test_every_rung_is_reported_as_it_is_finished():
     assert heard[0].seconds < heard[1].seconds <= found.wall_s
 
 
+def test_sixteen_samples_of_delay_beside_slow_poles_are_proved_and_keep_some_stiffness():
+    """P has a condition of 1e15 there, so that it is stored whole; without a heavier weight g would be .017."""
+    springs = [Spring(("a", "m"), 600.0, 0.3), Spring(("b", "m"), 600.0, 0.3), Spring(("m", "ground"), 300.0, 0.5)]
+    network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.4})
+    loop = Loop(0.0012, (16, 0), (0, 0), (16, 0), (0.5, 2.0), network)
+    found = design(loop, Options(ladder=((4, 3),)))
+    assert isinstance(found.coupling, ForceFilter)
+    assert found.proved
+    bare = this_environment(force(loop, NoCoupling()), loop.delta).ratio
+    assert found.g >= (1 - MARGIN) / bare
+    assert found.figures.rms_mismatch_db < -2.9
+
+
 def random_loop(seed: int) -> Loop:
     """One to three devices around one or two masses; light and heavy, stiff and soft, any small delays."""
     rng = np.random.default_rng(seed)
