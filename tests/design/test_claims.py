@@ -389,8 +389,8 @@ def test_saturation_is_outside_every_certificate():
     assert np.abs(late(unlimited)).max() < 0.01
     for beta in (0.0, 0.01):  # the limiter in the place of clipping: every start comes to rest
         rho = limiter_lag((DELTA, DELTA), T, beta)
-        limits = base.loop("I").law(STIFF, (12.0, 5.657), rho)
-        limiting = replace(simulation, process=replace(simulation.process, F=limits.open, contact=limits))
+        law = base.loop("I").law(STIFF, (12.0, 5.657), rho)
+        limiting = replace(simulation, process=replace(simulation.process, law=law))
         assert np.abs(late(limiting)).max() < 0.01
 
 
