@@ -69,7 +69,7 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
     Periods up to T_max count as less damping, as in the condition.
     """
     started = time.perf_counter()
-    even = tuple(even_damping(loop.delta, loop.T, loop.T_max).tolist())
+    even = tuple(even_damping(loop).tolist())
     loop = msgspec.structs.replace(loop, delta=even, T_max=None)
     dual = _Dual.of(loop, band_hz, knots or _KNOTS[loop.channels])
     square = dual.best()
