@@ -424,7 +424,7 @@ def _thinly(loop: Loop, coupling: Coupling, thin: int) -> float:
     """`ratio_in` at every so-manieth frequency."""
     try:
         F = loop.F(coupling)
-        demand = this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
+        demand = this_environment_demand(F, loop)
     except SingularLoop:
         return np.inf
     return float(least_scale(demand, frequencies(F)[::thin]).max()) if F.is_stable() else np.inf

@@ -1,14 +1,18 @@
 """What devices, delays, hands and seconds cost, beside what comes out: CPU seconds of one core.
 
-PYTHONPATH=. python tests/benchmarks/scale.py [devices|delays|hands|duration ..]
+PYTHONPATH=. python tests/benchmarks/scale.py [devices|commands|delays|hands|duration ..]
 """
 
 from __future__ import annotations
 
+import os
 import resource
+import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from controller.coupling import CASE_I, SpringDamper
@@ -18,12 +22,12 @@ from design.certificate import prove_limiter
 from design.result import Design, NotProved
 from sim.crowds import MIXED, Validation
 from sim.run import assemble, run
-from sim.scenario import Scenario, load, parse
+from sim.scenario import load, parse
 from sim.shards import validate
 from sim.stability import exact_growth
 
 
-def star(n: int) -> Scenario:
+def star(n: int) -> str:
     """So many unlike devices around one hub on a soft spring, with delays of 0, 1 and 2 samples in turn."""
     springs = [f'{{ between = ["c{i}", "hub"], stiffness = {300 + 20 * (i % 9)}, damping = 0.2 }}' for i in range(n)]
     device = '[[device]]\nkind = "rigid"\nmass = {}\ndamping = {}\n'
@@ -35,7 +39,7 @@ def star(n: int) -> Scenario:
         "springs = [" + ", ".join(springs) + ', { between = ["hub", "ground"], stiffness = 50.0, damping = 0.1 }]\n',
         "[tap]\nchannel = 1\nforce = 1.0\nstart = 0.1\nduration = 0.01\n",
     ]
-    return parse("".join(text))
+    return "".join(text)
 
 
 def limits(loop: Loop, design: Design) -> str:
@@ -55,7 +59,7 @@ def cpu(call: Callable[[], Any]) -> tuple[Any, float]:
 def devices() -> None:
     """The run is of 2 s; the audit is both conditions with their exact proofs, the designs are searches and sweeps."""
     for n in (2, 4, 8, 16, 32):
-        scenario = star(n)
+        scenario = parse(star(n))
         loop = scenario.loop("I")
         _, clipped = cpu(lambda loop=loop: design_coupling(loop, "spring-damper", "this-environment", limiter=False))
         design, designed = cpu(lambda loop=loop: design_coupling(loop, "spring-damper", "this-environment"))
@@ -67,6 +71,25 @@ def devices() -> None:
         ratio = needs["this-environment"].ratio
         seconds = " | ".join(f"{value:.2f}" for value in (ran, audited, clipped, designed, proved, soft))
         print(f"| {n} devices | {seconds} | needs {ratio:.4f}, limited {limited}, {trace.t.size} ticks |")
+
+
+def commands() -> None:
+    """Whole commands: a design without kept ones, a run at first, and one with its designs kept."""
+    with TemporaryDirectory() as place:
+        for n in (8, 16, 32):
+            scenario = Path(place, f"star{n}.toml")
+            scenario.write_text(star(n))
+            asked = ["--scenario", str(scenario), "--out"]
+            design = ["design", *asked, str(Path(place, "coupling.json"))]
+            run = ["sim.run", *asked, str(Path(place, "run"))]
+            seconds = []
+            for command, kept in ((design, {"HAPTIC_LOOP_CACHE": "off"}), (run, {}), (run, {})):
+                before = resource.getrusage(resource.RUSAGE_CHILDREN)
+                environment = os.environ | {"XDG_CACHE_HOME": place, "HAPTIC_LOOP_CACHE": ""} | kept
+                subprocess.run([sys.executable, "-m", *command], env=environment, check=True, capture_output=True)
+                after = resource.getrusage(resource.RUSAGE_CHILDREN)
+                seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+            print(f"| {n} devices | {' | '.join(f'{value:.1f}' for value in seconds)} |", flush=True)
 
 
 def delays() -> None:
@@ -99,6 +122,6 @@ def duration() -> None:
 
 
 if __name__ == "__main__":
-    known = {f.__name__: f for f in (devices, delays, hands, duration)}
+    known = {f.__name__: f for f in (devices, commands, delays, hands, duration)}
     for name in sys.argv[1:] or known:
         known[name]()
