@@ -34,7 +34,6 @@ _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over
 _SETTLED_DB = 0.05  # a rung that gains less ends the climb
 _FEWEST_RUNGS = 3
 _KEPT_STIFFNESS = 0.5  # of the most static stiffness of a rung that was best: one that renders less is not taken
-_HEAVIER = (1.0, 2.5, 6.0)  # times the weight of the static stiffness, tried in turn where it is too small
 _LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # (beta, c) of a limiter to begin with: without psi the first alone
 _HOPELESS = 0.9  # relative mismatch from which on the climb is compared with other couplings
 _TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
@@ -250,7 +249,7 @@ class _Search:
 
         Where it renders less than this share of the static stiffness, that counts more.
         """
-        for heavier in _HEAVIER:
+        for heavier in (1.0, 2.5, 6.0):  # times its weight
             tried = [self.solved(taps, poles, before, slip, heavier) for slip in self.slips(before)]
             found = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
             if found.g >= floor or found.reason:
