@@ -25,7 +25,7 @@ from design.program import Options
 from design.result import CONDITIONS, Chosen, DesignFailed, finite
 from design.robustness import Robustness
 from sim import baselines
-from sim.compare_report import ComparedCoupling, Comparison, ConditionCurve, Here, Limits
+from sim.compare_report import ComparedCoupling, Comparison, ConditionCurve, Here, LimitCurves
 from sim.couplings import NAMES, choose
 from sim.scenario import InputError, Scenario
 
@@ -310,7 +310,7 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     here = Here(loop.delta, loop.theta, loop.psi, loop.T)
     about = scenario.name, args.seed, args.case, asked.objective, args.keep, asked, here
     wall, gains = time.perf_counter() - begin, compare.gains(plan, sweeps, loop, asked)
-    report = Limits(*about, sweeps, gains, wall, interrupted)
+    report = LimitCurves(*about, sweeps, gains, wall, interrupted)
     points = [(name, row) for name, sweep in sweeps.items() for row in sweep.curves["optimal"]]
     files = render.pictures(args, report, out, {"limits.png": lambda plots: plots.plot_limits} if points else {})
     names = " and by ".join(args.beside)
@@ -338,7 +338,7 @@ def _plan(args: argparse.Namespace, loop: Loop, asked: Options) -> dict[str, lis
     return plan
 
 
-def _limit_table(report: Limits, name: str, beside: Sequence[str]) -> Table:
+def _limit_table(report: LimitCurves, name: str, beside: Sequence[str]) -> Table:
     sweep, designs = report.sweeps[name], ("optimal", *beside)
     rows = []
     for i, row in enumerate(sweep.curves["optimal"]):

@@ -6,7 +6,7 @@ G/(z - 1) into G(1)/(z - 1), whose Hermitian part on the circle is -G(1)/2, and 
 same expression is evaluated in floating point (a sweep: the required damping), over Fractions (an exact proof), over
 stacks and over sampled responses (maps and designs). docs/theory.md derives them.
 
-this-environment   `this_environment_demand`; of forces that latch a fraction of a sample late `latency_demand`
+this-environment   `this_environment_demand`; of forces that latch a fraction of a sample late `_latency_demand`
 any-environment    Lemma 4 of the paper for any passive environment under backward Euler: `v_hat`,
                    `any_environment_demand`, and where the environment holds delay `delayed_coupling_demand`
 
@@ -90,15 +90,15 @@ def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
 
     The energy that a device with a passive human can give back in a tick is at most the damping's, Delta_D dx^2/T, and
     what the force map gives is -F dx; with F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T. Forces that
-    latch later than at the tick have a block of twice the size, see `latency_demand`.
+    latch later than at the tick have a block of twice the size, see `_latency_demand`.
     """
     if loop.latency is not None:
-        return latency_demand(F, loop)
+        return _latency_demand(F, loop)
     F1, R = F.split_at_one()
     return Demand(R - F1 / 2, constant_like(F, np.diag(even_damping(loop, F.T) / F.T)), {"F(1)": F1}, ("F(1)",))
 
 
-def latency_demand(F: Block, loop: Loop) -> Demand[Block]:
+def _latency_demand(F: Block, loop: Loop) -> Demand[Block]:
     """this-environment for forces that latch at kT + tau_k, with any tau_k in [t1, t2] at every tick and channel.
 
     Between kT and kT + tau_k the force of the tick before still acts: a device moves by a under f[k-1] and then by b
@@ -251,7 +251,7 @@ class Condition(ABC):
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """The damping that it asks of the devices, from a refined sweep. Raises SingularLoop."""
         demand = self.demand(loop, coupling)
-        return least_damping(self.name, demand.free, lambda: demand, loop.delta)
+        return _least_damping(self.name, demand.free, lambda: demand, loop.delta)
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         """What is to be proved over the rationals, by the name of the matrix that proves it. Raises NotProved."""
@@ -274,7 +274,7 @@ class Condition(ABC):
         return "this environment"
 
 
-def least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], delta: Sequence[float]) -> Requirement:
+def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], delta: Sequence[float]) -> Requirement:
     """The damping that a demand asks of devices with `delta` [N s/m], by a refined sweep.
 
     `system` is the block whose poles it has, and whose size says what is rounding.
@@ -314,7 +314,7 @@ def least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], del
 def this_environment(F: Lti, loop: Loop) -> Requirement:
     """The damping that this-environment asks for the force map F, whatever the loop's own environment."""
     dampings(loop.delta, F.inputs)
-    return least_damping("this-environment", F, lambda: this_environment_demand(F, loop), loop.delta)
+    return _least_damping("this-environment", F, lambda: this_environment_demand(F, loop), loop.delta)
 
 
 _W_ZERO = 1e-10  # [rad/sample] stands for F(1) of many, whose real part is even: sampled, a network may be 0/0 there

@@ -288,7 +288,7 @@ def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
 LATE = "a latency of a fraction of a sample is derived for this environment only: count it as a whole sample of theta"
 
 
-class AnyEnvironment(Condition):
+class _AnyEnvironment(Condition):
     """Theorem 4 of the paper: safe around every passive environment; with psi >= 1 around this one.
 
     Its multiplier is then Phi (m,) [N s/m]. Walls are covered without delay in the environment, and refused with it.
@@ -366,7 +366,7 @@ class AnyEnvironment(Condition):
         return "this environment" if any(loop.psi) else "any passive environment"
 
 
-ANY_ENVIRONMENT = AnyEnvironment()
+ANY_ENVIRONMENT = _AnyEnvironment()
 
 
 # ----------------------------------------------------------------------------------------------------

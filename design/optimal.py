@@ -116,7 +116,7 @@ def design(
     """
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
-    climb = _Climb.of(loop, options)
+    climb = _Search.of(loop, options)
     if exactly := climb.nothing():
         return exactly
     best: Optimal | None = None
@@ -145,7 +145,7 @@ def design(
 
 
 @dataclass(frozen=True, eq=False)
-class _Climb:
+class _Search:
     """The loop and what is asked of it, with the clock."""
 
     loop: Loop
@@ -155,7 +155,7 @@ class _Climb:
     started: float
 
     @classmethod
-    def of(cls, loop: Loop, options: program.Options) -> _Climb:
+    def of(cls, loop: Loop, options: program.Options) -> _Search:
         started = time.perf_counter()
         if loop.environment.walls:
             raise ValueError("an optimal coupling holds a linear model of the environment: walls have none")
@@ -404,7 +404,7 @@ def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
 
 
 @dataclass(frozen=True)
-class Spread:
+class _Spread:
     """A design that keeps the condition over `vertices`, too: what it costs at most, for it is made in a short time."""
 
     mismatch_db: float  # of this design in the nominal environment
@@ -422,14 +422,14 @@ def spread(
     options: program.Options = program.DEFAULT,
     percent: float = 10.0,
     seconds: float = _PRICED,
-) -> Spread:
+) -> _Spread:
     """The better of a design over a small basis and the nominal one scaled down, both safe over `vertices`.
 
     Each rung's own frequencies are those of the nominal environment; the vertices are imposed at few, and where sweeps
     find that they are missed.
     """
     until = time.thread_time() + seconds
-    climb = _Climb.of(loop.at(loop.environment), options)
+    climb = _Search.of(loop.at(loop.environment), options)
     if isinstance(nominal, NoCoupling):
         nominal = ForceFilter([], [], [np.eye(loop.channels).tolist()])
     before = climb.decibels(climb._assessed(nominal, nominal.g))
@@ -450,7 +450,7 @@ def spread(
             proved = climb.proofs(found, needs, slip, until)
             break
     db = climb.decibels(found)
-    return Spread(db, db - before, found.g, max(needs[1:], default=needs[0]), found.states, len(needs), proved)
+    return _Spread(db, db - before, found.g, max(needs[1:], default=needs[0]), found.states, len(needs), proved)
 
 
 @dataclass(frozen=True)
@@ -458,7 +458,7 @@ class Nearby:
     """What a coupling for this environment needs in one that is 10 % off, and what a design for that would cost."""
 
     robustness: Robustness | None = None
-    designed_for_it: Spread | None = None
+    designed_for_it: _Spread | None = None
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, options: program.Options = program.DEFAULT) -> Nearby:

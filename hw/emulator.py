@@ -185,7 +185,7 @@ class Line:
         return [] if fault.kind == "drop" else [frame, frame]
 
 
-class EmulatedPlant:
+class _EmulatedPlant:
     """The devices and their passive humans between ticks, by the matrix exponential.
 
     The person starts to move at the first tick after `begin`, so that a session can be armed at rest. With `coulomb`
@@ -275,7 +275,7 @@ class Emulator:
         self.info = info or info_of(scenario)
         self.device = Device(self.info)
         self.device.deadman = True
-        self.plant = EmulatedPlant(scenario, 1e-12 * np.array(self.info.encoder_step, dtype=float), coulomb)
+        self.plant = _EmulatedPlant(scenario, 1e-12 * np.array(self.info.encoder_step, dtype=float), coulomb)
         self.force_step = 1e-6 * np.array(self.info.force_step, dtype=float)
         self.armed_at: int | None = None  # [us] of the first arming: faults are timed from here
         self.begun_at: int | None = None  # tick at which the person began to move

@@ -22,11 +22,11 @@ _STATES_PER_ANSWER = 8  # at most: a USB frame of 1 ms may bring several FORCEs,
 _MEASURED_TOLERANCE = 0.01  # of the device's clock against T, over the measurement
 _UNTOLD = 0.9  # part of STATEs without a margin above which nobody can judge the link; a USB frame may carry several
 _DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # of a clock over a block; a busy host and its buffers blur the second
-BLOCK = 200  # ticks over which a clock is compared
+_BLOCK = 200  # ticks over which a clock is compared
 _CLOCK_US = 1.5  # [us] by which two stamps of the device's clock may err together
 _REMEMBERED = 64  # forces on their way, of which at most theta matter
 _ROUNDING = 1  # [steps] for a firmware that rounds otherwise
-PATIENCE = 5  # ticks in a row
+_PATIENCE = 5  # ticks in a row
 _CHANGE = 1.0  # [N] of force that moves any handle which is not against a stop
 _IMPULSE = 0.1  # [N s] of such a change without a motion: 100 ms of 1 N, 20 ms of 5 N
 _HEAVIEST = 2.5  # [kg] of hand and handle
@@ -247,7 +247,7 @@ class _Tick(NamedTuple):
 
 
 @dataclass
-class ClockDrift:
+class _ClockDrift:
     """One clock against ticks of `T_us`, in blocks, each without its longest delay: a freeze is no drift."""
 
     whose: str
@@ -270,11 +270,11 @@ class ClockDrift:
             self._ticks += ticks
             if drift > 0:
                 drift -= min(self._freeze, drift)
-            if abs(drift) > self.tolerance * BLOCK * self.T_us:
+            if abs(drift) > self.tolerance * _BLOCK * self.T_us:
                 lasts = self.T_us + drift / self._ticks
                 what = f"over {self._ticks} tick{'s' if self._ticks > 1 else ''}, T is {self.T_us:g} us"
                 raise SafetyStop(f"a tick of the device lasts {lasts:.4g} us by {self.whose} clock {what}")
-            if self._ticks >= BLOCK:
+            if self._ticks >= _BLOCK:
                 self._ticks, self._behind, self._freeze = 0, 0.0, 0.0
         self._last = at_us
 
@@ -285,8 +285,8 @@ class ClockMonitor:
     def __init__(self, limits: SafetyLimits, T: float) -> None:
         T_us = 1e6 * T
         self.most = max(1, int(limits.watchdog_us / T_us))  # [ticks] that may be missing at once
-        self._device = ClockDrift("its own", T_us, _DEVICE_TOLERANCE, limits.watchdog_us)
-        self._host = ClockDrift("the host's", T_us, _HOST_TOLERANCE, limits.watchdog_us)
+        self._device = _ClockDrift("its own", T_us, _DEVICE_TOLERANCE, limits.watchdog_us)
+        self._host = _ClockDrift("the host's", T_us, _HOST_TOLERANCE, limits.watchdog_us)
 
     def check(self, state: State, ticks: int, now: int) -> None:
         """Raise SafetyStop where the STATE that came at `now` [us] cannot be `ticks` after the one before."""
@@ -353,9 +353,9 @@ class CommandMonitor:
             return False
         wrong = not self._could(state, last.applied, told)
         self._unlike = max(0, self._unlike + (_FORGETTING if wrong else -1))
-        if self._unlike > _FORGETTING * (PATIENCE - 1):
+        if self._unlike > _FORGETTING * (_PATIENCE - 1):
             what = f"told {told}" if phase == Phase.ARMED else f"to hold {last.applied}"
-            raise SafetyStop(f"the device applies {state.applied} steps, it was {what}, and so for {PATIENCE} ticks")
+            raise SafetyStop(f"the device applies {state.applied} steps, it was {what}, and so for {_PATIENCE} ticks")
         return wrong
 
     def _could(self, state: State, last: tuple[int, ...], told: tuple[int, ...] | None) -> bool:

@@ -204,7 +204,7 @@ class _Layout(NamedTuple):
     limits: tuple[tuple[int, int], ...]
 
 
-LAYOUTS: dict[type, _Layout] = {
+_LAYOUTS: dict[type, _Layout] = {
     Hello: _Layout(1, "B", "", (_U8,)),
     Info: _Layout(
         2,
@@ -230,16 +230,16 @@ class _Form(NamedTuple):
 
 
 def _form(kind: type, axes: int) -> _Form:
-    layout = LAYOUTS[kind]
+    layout = _LAYOUTS[kind]
     columns = len(layout.axis)
     return _Form(kind, Struct("<B" + layout.fixed + layout.axis * axes), 1 + len(layout.limits) - columns, columns)
 
 
 #: by kind and number of axes (0 where a message has none) to write, by type byte and length to read
 _FORMS = {
-    (kind, n): _form(kind, n) for kind in LAYOUTS for n in (range(1, _MAX_AXES + 1) if LAYOUTS[kind].axis else (0,))
+    (kind, n): _form(kind, n) for kind in _LAYOUTS for n in (range(1, _MAX_AXES + 1) if _LAYOUTS[kind].axis else (0,))
 }
-READ = {(LAYOUTS[kind].code, f.struct.size): f for (kind, _), f in _FORMS.items()}
+_READ = {(_LAYOUTS[kind].code, f.struct.size): f for (kind, _), f in _FORMS.items()}
 
 _OVERHEAD = 6  # CRC-32, the COBS byte, the delimiter
 _MAX_WIRE = max(f.struct.size for f in _FORMS.values()) + _OVERHEAD
@@ -250,7 +250,7 @@ _CHECKED = (Hello, Info, Config, Ack, Stop)  # seldom sent: every field looked a
 
 def wire_bytes(kind: type, axes: int) -> int:
     """Length of a frame, delimiter included: STATE 20 + 6N, FORCE 12 + 2N."""
-    f = _FORMS.get((kind, axes if LAYOUTS[kind].axis else 0))
+    f = _FORMS.get((kind, axes if _LAYOUTS[kind].axis else 0))
     if f is None:
         raise ValueError(f"axes: {axes}; the protocol carries 1 to {_MAX_AXES}")
     return f.struct.size + _OVERHEAD
@@ -272,7 +272,7 @@ _CODES = [bytes((n + 1,)) for n in range(254)]
 def pack(message: Message) -> bytes:
     """The payload of a message."""
     kind = type(message)
-    layout = LAYOUTS[kind]
+    layout = _LAYOUTS[kind]
     values: Any = message
     if isinstance(message, Info):
         values = (message.version, message.firmware.encode("ascii"), *message[2:])
@@ -290,7 +290,7 @@ def pack(message: Message) -> bytes:
 
 def _check(message: Message) -> None:
     """Raises ValueError for the first field that cannot travel."""
-    layout, name = LAYOUTS[type(message)], type(message).__name__
+    layout, name = _LAYOUTS[type(message)], type(message).__name__
     fixed = len(layout.limits) - len(layout.axis)
     axes, values = None, tuple[Any, ...](message)
     for index, (field, value, limits) in enumerate(zip(message._fields, values, layout.limits, strict=True)):
@@ -321,7 +321,7 @@ def _check_integer(name: str, value: Any, limits: tuple[int, int]) -> None:
 
 def _unpack(payload: bytes) -> Message | None:
     """The message of a payload; None where type and length fit none, a status has no name or a text is not ASCII."""
-    f = READ.get((payload[0], len(payload)))
+    f = _READ.get((payload[0], len(payload)))
     if f is None or (f.kind is State and payload[1] not in _STATUSES):
         return None
     values = f.struct.unpack(payload)

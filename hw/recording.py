@@ -426,7 +426,7 @@ class _Comparison:
         return not (self.asked.any() or self.sent.any())
 
 
-def recipes_of(result: Trace) -> list[_Recipe]:
+def _recipes_of(result: Trace) -> list[_Recipe]:
     """The recipes in a trace, one for each arming. Raises InputError where there is none."""
     try:
         raw = result.meta.get("replay")
@@ -452,7 +452,7 @@ def _require_limits(raw: object) -> None:
 
 def replay(result: Trace, link: dict[str, Array]) -> _Comparison:
     """Feed the recorded displacements through controller, gain, limits and rounding, every arming from rest."""
-    recipes, arming = recipes_of(result), link["arming"]
+    recipes, arming = _recipes_of(result), link["arming"]
     channels = result.x.shape[1]
     if int(arming[-1]) + 1 != len(recipes) or any(recipe.scenario.channels != channels for recipe in recipes):
         told = f"{len(recipes)} recipes for {int(arming[-1]) + 1} armings of {channels} channels"

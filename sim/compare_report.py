@@ -72,7 +72,7 @@ class Here:
 
 
 @dataclass(frozen=True)
-class Limits:
+class LimitCurves:
     """How good a coupling can be, along axes of the loop."""
 
     scenario: str

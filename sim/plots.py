@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # whose figures are drawn
     from sim.accuracy import Row
     from sim.adversary import Shortage
     from sim.baselines import Baselines
-    from sim.compare_report import Comparison, Limits
+    from sim.compare_report import Comparison, LimitCurves
 
 # ----------------------------------------------------------------------------------------------------
 # The style.
@@ -563,7 +563,7 @@ _EXACT = -60.0
 _FIGURES = {"rms": "rms_mismatch_db", "sup": "relative_mismatch_db"}
 
 
-def plot_limits(report: Limits, path: Path) -> Path:
+def plot_limits(report: LimitCurves, path: Path) -> Path:
     """One panel per sweep; a point without a solution is a cross at the top of its panel."""
     sweeps = {name: sweep for name, sweep in report.sweeps.items() if sweep.curves["optimal"]}
     rows, columns = (len(sweeps) + 1) // 2, min(len(sweeps), 2)
@@ -600,7 +600,7 @@ def plot_baselines(report: Baselines, path: Path) -> Path:
     return save(figure, path)
 
 
-def _here(name: str, report: Limits) -> float:
+def _here(name: str, report: LimitCurves) -> float:
     """Where the scenario stands on this axis, in the unit drawn."""
     here = report.here
     each = {"damping": min(here.delta), "delay": max(here.theta), "period": 1e3 * here.T_s}

@@ -22,7 +22,7 @@ def this_environment_demand(F, delta, T_max=None, latency=None):
 
 
 def latency_demand(F, delta, latency, T_max=None):
-    return conditions.latency_demand(F, loop(F.T, delta, T_max=T_max, latency=latency))
+    return this_environment_demand(F, delta, T_max, latency)
 
 
 def this_environment(F, delta, T_max=None, latency=None):

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from hw.emulator import EmulatedPlant, nobody
+from hw.emulator import _EmulatedPlant, nobody
 from hw.identify import Estimate, chirp, identify
 from models.device import RigidDevice
 from sim.scenario import load
@@ -70,7 +70,7 @@ def estimated(c: Case) -> Estimate:
             base.device[0], damping=c.viscous, delta=None, transmission_stiffness=c.stiffness, **masses
         )
     scenario = nobody(base.replace(device=(device,) * base.channels))
-    plant = EmulatedPlant(scenario, np.full(base.channels, c.step), c.coulomb)
+    plant = _EmulatedPlant(scenario, np.full(base.channels, c.step), c.coulomb)
     signal = chirp(base.channels, base.T, 1, 1.0, (3.0, 200.0), c.seconds).signal
     late = np.vstack([np.zeros(base.channels), signal[:-1]])
     applied = -FORCE_STEP * np.round(late / FORCE_STEP)  # the device feels -f

@@ -16,7 +16,7 @@ from controller.environment import environment
 from design import compare as limit_curve
 from design.compare import AXES, LADDERS, SHORT, Point, Sweep, ladder_row, measured, optimum, points_along, remembered
 from design.program import LADDER, Options
-from sim.compare_report import Here, Limits
+from sim.compare_report import Here, LimitCurves
 from sim.plots import plot_limits
 from sim.scenario import InputError, load
 
@@ -201,7 +201,7 @@ def test_a_picture_of_every_number_of_panels(tmp_path):
     here = Here((1.37,), (1,), (0,), 1e-3)
     for n in range(1, 5):
         chosen = dict.fromkeys(list(AXES)[:n], sweep)
-        report = Limits("s", 0, "I", "rms", "samples", SMALL, here, chosen, [], 0.0, False)
+        report = LimitCurves("s", 0, "I", "rms", "samples", SMALL, here, chosen, [], 0.0, False)
         assert plot_limits(report, tmp_path / f"{n}.png").stat().st_size > 5000
 
 

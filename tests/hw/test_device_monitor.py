@@ -14,14 +14,14 @@ from hw.haptic_device import Driver, SerialDevice
 from hw.identify import chirp
 from hw.limits import SafetyLimits, SafetyStop, Stage
 from hw.monitor import (
-    BLOCK,
-    PATIENCE,
+    _BLOCK,
+    _PATIENCE,
     Ages,
-    ClockDrift,
     ClockMonitor,
     CommandMonitor,
     LinkSettings,
     Measurement,
+    _ClockDrift,
     check_state,
 )
 from hw.protocol import NO_MARGIN, Command, Config, Force, Phase, Reason, Refused, State, Stop, encode
@@ -72,12 +72,12 @@ def test_a_device_that_obeys_is_never_found_out(seed):
 def test_a_force_that_nobody_asked_for_is_a_fault_after_a_few_ticks(phase, force):
     told = CommandMonitor(CONFIG)
     told.unlike(state(0), 1)
-    for tick in range(1, PATIENCE):
+    for tick in range(1, _PATIENCE):
         assert told.unlike(state(tick, (force[0] * tick, force[1]), phase), 1)
     with pytest.raises(
         SafetyStop, match=r"it was told None, and so for 5 ticks|holds a force for 5 ticks, 4 are agreed"
     ):
-        told.unlike(state(PATIENCE, (force[0] * PATIENCE, force[1]), phase), 1)
+        told.unlike(state(_PATIENCE, (force[0] * _PATIENCE, force[1]), phase), 1)
 
 
 def test_a_device_that_is_wrong_every_other_tick_is_found_out_later():
@@ -246,7 +246,7 @@ def test_a_clock_that_is_made_of_ticks_is_found_by_the_host(scenario, rungs):
 
 def run_clock(ticks):
     """A clock whose ticks last so long [us], and which wraps around."""
-    pace, t = ClockDrift("its own", T_US, 0.01, 6000), 2.0**32 - 1e5
+    pace, t = _ClockDrift("its own", T_US, 0.01, 6000), 2.0**32 - 1e5
     for lasts in ticks:
         pace.note(round(t) & 0xFFFFFFFF, 1)
         t += lasts
@@ -255,14 +255,14 @@ def run_clock(ticks):
 @pytest.mark.parametrize(("factor", "found"), [(1.005, False), (0.995, False), (1.012, True), (0.988, True)])
 def test_a_percent_of_a_block_is_told_apart(factor, found):
     with pytest.raises(SafetyStop, match="by its own clock") if found else nullcontext():
-        run_clock([factor * T_US] * 3 * BLOCK)
+        run_clock([factor * T_US] * 3 * _BLOCK)
 
 
 def test_one_freeze_is_no_drift_and_many_are():
-    once = [T_US + 4000 * (n == 50) for n in range(BLOCK)]
+    once = [T_US + 4000 * (n == 50) for n in range(_BLOCK)]
     run_clock(once)
     with pytest.raises(SafetyStop, match="by its own clock"):
-        run_clock([T_US + 4000 * (n in (50, 60)) for n in range(BLOCK)])
+        run_clock([T_US + 4000 * (n in (50, 60)) for n in range(_BLOCK)])
     with pytest.raises(SafetyStop, match="by its own clock"):
         run_clock([T_US, -5000, T_US])  # a clock that goes back
 

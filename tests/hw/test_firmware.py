@@ -14,8 +14,8 @@ import pytest
 
 from hw.device_state import Device
 from hw.protocol import (
-    LAYOUTS,
-    READ,
+    _LAYOUTS,
+    _READ,
     Ack,
     Cause,
     Command,
@@ -135,7 +135,7 @@ class Traffic:
     def oddity(self) -> bytes:
         """A well-formed message that is wrong here and now, or a wrong frame."""
         rng, d, good = self.rng, self.device, self.force()
-        axes, (code, size) = rng.randint(1, 8), rng.choice(list(READ))
+        axes, (code, size) = rng.randint(1, 8), rng.choice(list(_READ))
         late = rng.choice((-1, -2, 1, 2, 300, 0x8000, rng.randint(0, 0xFFFF)))
         choices = [
             lambda: encode(self.config()),
@@ -157,7 +157,7 @@ class Traffic:
             lambda: encode(Ack(rng.getrandbits(32), 0)),
             lambda: d.info_frame,
             lambda: enclosed(bytes([code]) + rng.randbytes(size - rng.choice((0, 1, 1, 1, 2)))),
-            lambda: enclosed(bytes([LAYOUTS[Config].code]) + rng.randbytes(5 + 4 * rng.randint(8, 10))),
+            lambda: enclosed(bytes([_LAYOUTS[Config].code]) + rng.randbytes(5 + 4 * rng.randint(8, 10))),
             lambda: rng.randbytes(rng.randint(1, 400)),
             lambda: rng.randbytes(rng.choice((174, 175, 176, 177, 600))).replace(b"\0", b"\1"),
             lambda: bytes(rng.randint(0, 3)),

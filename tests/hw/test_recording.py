@@ -17,7 +17,7 @@ from design.files import plain
 from hw.control import CertifiedCoupling, certified_coupling, fill
 from hw.emulator import Emulator
 from hw.limits import SafetyLimits, Stage, Units
-from hw.recording import Recorder, digest, load, outcome, recipes_of, replay, result_of, save, save_npz, steady_ticks
+from hw.recording import Recorder, _recipes_of, digest, load, outcome, replay, result_of, save, save_npz, steady_ticks
 from hw.rehearsal import Rehearsal
 from hw.session import Session
 from sim.couplings import choose, limits_of
@@ -74,7 +74,7 @@ def test_a_session_armed_twice_is_replayed_with_both_couplings(scenario, rungs, 
     rehearsal.run(1e-6 * session.now + 0.2)
     files = save(tmp_path, session, recorder, outcome("I", session, recorder, 0), False)
     result, link = load(files[0])
-    assert [recipe.link_delay for recipe in recipes_of(result)] == [1, 2]
+    assert [recipe.link_delay for recipe in _recipes_of(result)] == [1, 2]
     assert np.bincount(link["arming"]).min() > 300
     assert replay(result, link).identical
     assert np.abs(link["sent"][link["arming"] == 1]).max() > 100

@@ -19,7 +19,7 @@ from hw.haptic_device import Driver, SerialDevice
 from hw.limits import SafetyLimits, SafetyStop, Stage
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import Command, Decoder, Force, Hello, Phase, State, Stop, encode
-from hw.recording import Recorder, load, outcome, recipes_of, replay, result_of, save
+from hw.recording import Recorder, _recipes_of, load, outcome, replay, result_of, save
 from hw.rehearsal import Rehearsal
 from hw.session import Session
 from models.hold import hold
@@ -313,11 +313,11 @@ def test_the_spring_damper_follows_the_optimal_coupling(scenario, optimal_rungs,
     rehearsal.run(1e-6 * session.now + 0.2)
     files = save(tmp_path, session, recorder, outcome("I", session, recorder, 0), False)
     result, link = load(files[0])
-    assert [recipe.link_delay for recipe in recipes_of(result)] == [1, 2]
-    made, today = recipes_of(result), result.meta["replay"][0]["scenario"]
+    assert [recipe.link_delay for recipe in _recipes_of(result)] == [1, 2]
+    made, today = _recipes_of(result), result.meta["replay"][0]["scenario"]
     for name, older in (("ranges", "box"), ("varying_delay", "jitter")):  # as traces of earlier versions call them
         today[older] = today.pop(name)
-    assert recipes_of(result) == made
+    assert _recipes_of(result) == made
     assert replay(result, link).identical
     assert np.abs(link["sent"][link["arming"] == 1]).max() > 100
 
