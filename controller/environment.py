@@ -160,6 +160,10 @@ class Environment:
         """Raises ValueError where no loop with this environment makes sense."""
         self.E(T)
 
+    def as_network(self) -> Network:
+        """Itself, if it is one. Raises ValueError."""
+        raise ValueError(f"{self.here} is no network of springs, dampers and masses")
+
     def E(self, T: Number) -> Lti:
         """E(z), contact displacements [m] to forces [N], every wall touching, in the arithmetic of T."""
         raise TypeError(f"{type(self).__name__} has no E(T): define it")
@@ -245,6 +249,9 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         loose = [n for n in self.contacts if n not in held and not self.block]
         if loose:
             raise ValueError(f"contact {loose[0]!r} has neither spring nor mass nor wall, so it can render no force")
+
+    def as_network(self) -> Network:
+        return self
 
     def check(self, psi: Sequence[int], T: float) -> None:
         environment(self, T)

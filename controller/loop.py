@@ -176,9 +176,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
     @property
     def network(self) -> Network:
         """The environment, of which parameters or walls are asked. Raises ValueError where it is no network."""
-        if not isinstance(self.environment, Network):
-            raise ValueError(f"{self.environment.here} is no network of springs, dampers and masses")
-        return self.environment
+        return self.environment.as_network()
 
     def frozen(self) -> tuple[Loop, ...]:
         """The loop around each frozen contact state of its environment."""

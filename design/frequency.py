@@ -244,7 +244,9 @@ def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Arr
     found = response(trial.ravel()).reshape(trial.shape)
     at, column = np.argmax(found, axis=0), np.arange(left.size)
     below, above, best = np.maximum(at - 1, 0), np.minimum(at + 1, 16), found[at, column]
-    reach = 2 * best - np.minimum(found[below, column], found[above, column])
+    lower = np.minimum(found[below, column], found[above, column])
+    # where all are infinite nothing drops
+    reach = best + np.subtract(best, lower, out=np.zeros_like(best), where=lower < best)
     return best, trial[at, column], (trial[below, column], trial[above, column]), reach
 
 

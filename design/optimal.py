@@ -447,7 +447,7 @@ def spread(
     for limit in (1 - program.MARGIN, 1 - 2.5 * program.MARGIN):
         found, needs = min((climb.fitted(one, slip, limit) for one in tried), key=lambda one: climb.merit(one[0]))
         with suppress(NotProved):
-            proved = climb.proofs(found, needs, slip, until)
+            proved = climb.proofs(found, needs, slip, max(until, time.thread_time() + seconds / 3))
             break
     db = climb.decibels(found)
     return _Spread(db, db - before, found.g, max(needs[1:], default=needs[0]), found.states, len(needs), proved)

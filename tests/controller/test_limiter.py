@@ -190,6 +190,27 @@ def test_the_short_tick_is_the_tick(channels, weakest):
     np.testing.assert_allclose(f[:, :, 1].min(axis=0), -np.minimum(limit, actuators))
 
 
+@pytest.mark.parametrize("walls", [0, 1, 2])
+@pytest.mark.parametrize("limited", [False, True])
+def test_a_tick_of_many_laws_is_each_of_them_alone(walls, limited):
+    """Walls and springs that differ from law to law, states that press into them and forces beyond their limits."""
+    laws = []
+    for k in range(6):
+        some = tuple(Wall(w.between, w.stiffness * (1 + k), 2.0 + k, w.gap / (1 + k)) for w in WALLED.walls[:walls])
+        springs = tuple(Spring(s.between, s.stiffness * (1 + k / 9), s.damping) for s in FIGURE_4.springs)
+        loop = loop_of(Network(FIGURE_4.contacts, springs, FIGURE_4.masses, some), (0, 1), (0, 0))
+        laws.append(loop.law(STIFF, (3.0 + k, 1.5), (5.0, 2.0)) if limited else loop.law(STIFF))
+    order, made = laws[0].open.order, laws[0].together(laws)
+    for before in 3e-3 * np.random.default_rng(0).normal(size=(40, order + 2, 6)):
+        if walls:
+            before[order - walls : order] = np.abs(before[order - walls : order])  # how deep they were pressed
+        together, alone = np.empty((order + 2, 6)), np.empty((order + 2, 1))
+        made(before, together)
+        for k, law in enumerate(laws):
+            law.transition()(np.ascontiguousarray(before[:, k : k + 1]), alone)
+            np.testing.assert_allclose(together[:, k], alone[:, 0], rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("i", [0, 1])
 def test_a_wall_and_every_limit_at_once(i):
     """All forces beyond their limits in the same tick, a wall pushing: each leaves with its limit."""
@@ -199,6 +220,12 @@ def test_a_wall_and_every_limit_at_once(i):
     buffer = drive(closed(limiter), np.repeat(0.05 * signs[None], 60, axis=0))
     assert (limiter.depths(buffer.z)[:60] > 0).any(axis=(0, 1)).sum() == 2
     np.testing.assert_allclose(buffer.f[:60], np.broadcast_to(signs * [[3.0], [1.5]], (60, 2, 4)), rtol=1e-12)
+    assert limiter.limited(buffer.z, buffer.f[:60], LIMITS).all()
+    still = drive(closed(limiter), np.zeros((5, 2, 1)))
+    assert not limiter.limited(still.z, still.f[:5], LIMITS).any()
+    actuators = loop_of(network, (0, 0), (0, 0)).law(STIFF)
+    force = np.array([[[3.0], [-1.4]]])
+    np.testing.assert_array_equal(actuators.limited(still.z, force, np.array([[3.0], [1.5]])), [[[True], [False]]])
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
