@@ -51,7 +51,7 @@ TABLE = {
     "controller/test_limiter controller/test_budget sim/test_switched sim/test_passivity_layer sim/test_engines "
     "sim/test_limited",
     "controller/complementarity.py": "controller/test_tick controller/test_walls controller/test_limiter",
-    "controller/law.py": "controller/test_tick controller/test_walls",
+    "controller/law.py": "controller/test_limiter controller/test_tick controller/test_walls",
     "controller/limiter.py": "controller/test_tick controller/test_limiter",
     "hw/limits.py": "hw/test_limits",
     "hw/device_state.py": "hw/test_device hw/test_latch_on_arrival",
