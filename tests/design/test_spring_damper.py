@@ -12,7 +12,7 @@ from worlds import DELTA, SOFT_NETWORK, T, force_map
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
-from controller.environment import FIGURE_4, Network, Spring, environment
+from controller.environment import FIGURE_4, Network, Spring
 from controller.loop import Loop
 from controller.lti import Lti
 from design import gain_search, spring_damper
@@ -174,7 +174,7 @@ def test_without_a_multiplier_the_delayed_condition_is_the_plain_one():
     for gains in random_starts(10, seed=4):
         V = gains.compliance(T)
         plain = any_environment(V, (1, 2), DELTA)
-        same = any_environment_delayed(V, environment(FIGURE_4, T), (1, 2), (0, 0), DELTA, np.zeros(2))
+        same = any_environment_delayed(V, asked(), np.zeros(2))
         assert same.ratio == pytest.approx(plain.ratio, rel=1e-6)
 
 
