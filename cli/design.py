@@ -89,6 +89,7 @@ def add_optimal_options(group: argparse._ActionsContainer) -> None:
     group.add_argument("--high-gain", type=options.number(), metavar="G", help=gain)
     limit = "begin no larger basis after this time [s] (default 60)"
     group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
+    options.add_older_optimal_options(group)
 
 
 def _percent(text: str) -> float:

@@ -63,6 +63,10 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
         """As argparse's; an empty word is refused for every option."""
         found, rest = super().parse_known_args(*args, **how)
+        if gone := getattr(found, "gone", None):
+            has = "has" if len(gone) == 1 else "have"
+            why = f"{has} no effect any more: the basis of an optimal coupling grows by itself"
+            print(", ".join(gone), why, file=sys.stderr)
         for action in self._actions:
             if getattr(found, action.dest, None) == "":
                 raise InputError(f"{action.option_strings[-1] if action.option_strings else action.dest} is empty")
@@ -272,6 +276,20 @@ def add_band_option(parser: argparse._ActionsContainer) -> None:
     """--band."""
     band = "frequencies over which the transparency error counts [Hz] (default 0.5,80)"
     parser.add_argument("--band", dest="band_hz", type=_band_of, metavar="LOW,HIGH", help=band)
+
+
+def add_older_optimal_options(parser: argparse._ActionsContainer) -> None:
+    """What the optimal coupling of version 0.1 was asked with: noted as without effect, for one version."""
+    for name, takes in (("functions", 1), ("filter", 1), ("margin", 1), ("diagonal", 0), ("full", 0)):
+        parser.add_argument(f"--{name}", dest="gone", action=_Gone, nargs=takes, help=argparse.SUPPRESS)
+
+
+class _Gone(argparse.Action):
+    """An option without effect: its name is kept, whatever it was given."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        """One name more in `gone`."""
+        namespace.gone = [*(namespace.gone or ()), option_string]
 
 
 def own_or(option: str, text: str, names: Collection[str]) -> Any:

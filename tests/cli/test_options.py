@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import pytest
 
+from cli import compare as cli_compare
+from cli import design as cli_design
 from cli import options, render
 from cli.audit import main as audit
 from cli.run import main as run
@@ -109,3 +111,15 @@ def test_a_message_quotes_eighty_characters_and_no_control_character():
     assert line.endswith("x1b[31m, 'I', 'II'")
     assert max(len(word) for word in line.split() if "/" not in word) == 80
     assert one_line("the scenario's words " + "and more " * 20 + "'x'").endswith("'x'")
+
+
+def test_what_an_optimal_coupling_was_asked_with_is_accepted_with_one_note(capsys):
+    older = ["--functions", "16", "--filter", "mixed", "--margin", "0.0072", "--diagonal", "--full"]
+    for command, words in ((cli_design, ["--best"]), (cli_compare, ["--over"])):
+        plain, args = (command._parser().parse_args([*words, *more]) for more in ([], older))
+        assert {**vars(args), "gone": None} == vars(plain)
+        assert capsys.readouterr().err.splitlines() == [
+            "--functions, --filter, --margin, --diagonal, --full have no effect any more: "
+            "the basis of an optimal coupling grows by itself"
+        ]
+        assert not [word for word in older if word in command._parser().format_help().split()]
