@@ -21,6 +21,7 @@ from controller.loop import Loop
 from controller.lti import Array
 from design import compare
 from design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
+from design.optimal import Nearby
 from design.program import Options
 from design.result import CONDITIONS, Chosen, DesignFailed, finite
 from design.robustness import Robustness
@@ -108,7 +109,8 @@ def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
     chosen, failed = _chosen(scenario, args, names)
     report = Comparison.of(scenario, args.case, chosen, failed, args.seed)
     files = render.pictures(args, report, out, _PICTURES)
-    render.publish(args, report, [_guarantees(report), _feel(report)], report.notes, out, files)
+    prices = [line for c in report.couplings for line in _price(c.name, c.nearby)]
+    render.publish(args, report, [_guarantees(report), _feel(report)], [*report.notes, *prices], out, files)
     return options.exit_code(not failed)
 
 
@@ -168,7 +170,7 @@ def _guarantees(report: Comparison) -> Table:
         "coupling": lambda c: c.name,
         "this-env.": lambda c: _needs(c.conditions["this-environment"], scale),
         "at Hz": lambda c: _binds(c.conditions["this-environment"]),
-        "at 10 %": lambda c: _robust(c.robustness, scale),
+        "at 10 %": lambda c: _robust(c.nearby.robustness, scale),
         "any-env.": lambda c: _needs(c.conditions["any-environment"], scale),
         "at Hz ": lambda c: _binds(c.conditions["any-environment"]),
         "sup dB": lambda c: render.optional(finite(c.transparency.mismatch_db), "{:.2f}", "-inf"),
@@ -192,6 +194,12 @@ def _robust(part: Robustness | None, scale: float = 1.0) -> str:
     if part is None:
         return "-"
     return f"{scale * part.required_over_available:.4g}"
+
+
+def _price(name: str, nearby: Nearby) -> Iterable[str]:
+    """What a design for the environments within ten percent reaches, in a line, where that is known."""
+    if price := nearby.designed_for_it:
+        yield f"{name}, designed for 10 % more or less of every spring and mass: {render.price_words(price)}"
 
 
 def _feel(report: Comparison) -> Table:
@@ -239,6 +247,7 @@ def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
         some = [row for row in rows if row.case == case]
         shown.append(render.columns(f"the ladder · {scenario.name}, case {case}", _LADDER, some, left=(0, 5)))
     lines = [f"{row.design}, case {row.case}: {row.reason}" for row in rows if row.reason]
+    lines += [line for row in rows for line in _price(f"{row.design}, case {row.case}", row.nearby)]
     render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out)
     return options.exit_code(True, interrupted)
 
@@ -249,7 +258,7 @@ _LADDER: dict[str, str | Callable[[LadderRow], str]] = {
     "needs N s/m": lambda r: (
         "-" if r.required_damping is None else f"{max(r.required_damping):.4f}" + ("" if r.certified else " (no)")
     ),
-    "x, 10 %": lambda r: _robust(r.robustness),
+    "x, 10 %": lambda r: _robust(r.nearby.robustness),
     "sup dB": lambda r: (
         "-" if r.required_damping is None else render.optional(r.relative_mismatch_db, "{:.2f}", "exact")
     ),

@@ -27,7 +27,7 @@ from design.files import nobody_reads, plain, printable, write_json
 from design.result import DesignFailed, Requirement, listed
 
 if TYPE_CHECKING:  # the reports' parts, which no command without them loads
-    from design.optimal import Nearby
+    from design.optimal import Nearby, Spread
     from design.transparency import Transparency
     from sim.report import UnevenTicks, VaryingDelays
 
@@ -288,10 +288,15 @@ def robustness_rows(nearby: Nearby) -> Rows:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
         yield "robustness", f"{words}, the worst within {there.percent:g} %"
     if price := nearby.designed_for_it:
-        costs = f"at most {price.price_db:.2f} dB worse" if math.isfinite(price.price_db) else "not exact"
-        proved = f"proved in {price.proved} of {price.environments} environments"
-        rest = ", swept in the others" if price.proved < price.environments else ""
-        yield "designed for that", f"{price.mismatch_db:.2f} dB, {costs}: {proved}{rest}"
+        yield "designed for that", price_words(price)
+
+
+def price_words(price: Spread) -> str:
+    """What a design for more than one environment reaches and costs."""
+    costs = f"at most {price.price_db:.2f} dB worse" if math.isfinite(price.price_db) else "not exact"
+    proved = f"proved in {price.proved} of {price.environments} environments"
+    rest = ", swept in the others" if price.proved < price.environments else ""
+    return f"{price.mismatch_db:.2f} dB, {costs}: {proved}{rest}"
 
 
 def verdict(word: str | None) -> str:

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import PUBLISHED, Coupling, NoCoupling
+from controller.coupling import PUBLISHED, Coupling, ForceFilter, NoCoupling
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
@@ -22,11 +22,13 @@ from design.bound import MOST, NO_BOUND, bound
 from design.certificate import prove
 from design.coupling_file import digest
 from design.designs import design_by_kind
+from design.files import unseen
 from design.frequency import Response, frequencies, on_circle
 from design.lmi import ANY_ENVIRONMENT
+from design.optimal import Nearby
 from design.program import LADDER, Options
 from design.result import ConditionName, Design, DesignFailed, NotProved, Requirement, finite
-from design.robustness import Robustness, robustness_nearby
+from design.robustness import robustness_nearby
 from design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------
@@ -123,6 +125,13 @@ def perceived(G: NDArray[np.complex128], hz: Array) -> Perceived:
     """The diagonal of displacement-to-force responses (k, m, m) at `hz` (k,) > 0 as stiffness and damping."""
     own = np.diagonal(G, axis1=1, axis2=2)
     return Perceived(own.real, own.imag / (2 * np.pi * hz)[:, None])
+
+
+def nearby(loop: Loop, coupling: Coupling) -> Nearby:
+    """What a coupling needs within ten percent; of a force filter also what a design for that would cost."""
+    if isinstance(coupling, ForceFilter):
+        return Nearby.of(loop, coupling)
+    return Nearby(robustness_nearby(loop, coupling))
 
 
 def _multiplier(loop: Loop, coupling: Coupling) -> Array | None:
@@ -405,7 +414,7 @@ class LadderRow:
     wall_s: float  # of the design, with its check
     proof_s: float
     reason: str | None = None
-    robustness: Robustness | None = None  # the worst need within ten percent of every spring and mass
+    nearby: Nearby = unseen("beside", Nearby())  # within ten percent of every spring and mass
 
 
 SHORT = (
@@ -462,7 +471,7 @@ def ladder_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:
     mismatch = finite(decibels(figures.relative_mismatch)), finite(decibels(figures.rms_mismatch))
     proof_s, certified = time.perf_counter() - begin, requirement.certified
     place = _name(entry, case), case, required, certified, entry.condition
-    return LadderRow(*place, *mismatch, proof, wall, proof_s, reason, robustness_nearby(loop, coupling))
+    return LadderRow(*place, *mismatch, proof, wall, proof_s, reason, nearby(loop, coupling))
 
 
 def _bound_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:

@@ -31,6 +31,7 @@ from design.transparency import Transparency, decibels, transparency
 
 _PRICED = 15.0  # [s] of the processor: what the price of a range may take, a third of it for proofs
 _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
+_FIRST = 3  # of the environments: those that the nominal design misses most are imposed first
 _SETTLED_DB = 0.05  # a rung that gains less ends the climb
 _FEWEST_RUNGS = 3
 _KEPT_STIFFNESS = 0.5  # of the most static stiffness of a rung that was best: one that renders less is not taken
@@ -260,19 +261,9 @@ class _Search:
         self, taps: int, poles: int, before: Optimal | None, slip: program.Slip | None, heavier: float
     ) -> Optimal:
         share = self.mismatch(before) if before else 1.0
-        span, cases = self.span(taps, poles), self.asked(slip)
-        active = [0]
-        while True:
-            chosen = tuple(cases[i] for i in active)
-            problem = program.Problem(
-                span, chosen, self.options, program.SOFT[0] * min(share, program.SOFT[1]), heavier=heavier
-            )
-            coupling = span.filter(problem.solve(self._start(problem)))
-            needs = [ratio_in(case.loop, coupling) for case in cases]
-            missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + _TOLERATED and i not in active]
-            if not missed:
-                break
-            active += missed[:2]
+        soft = program.SOFT[0] * min(share, program.SOFT[1])
+        problem = program.Problem(self.span(taps, poles), self.asked(slip), self.options, soft, heavier=heavier)
+        coupling, needs = self.kept_in_all(problem, [0])
         if slip:
             needs.append(min(limiter_requirement(self.loop, coupling, slip.beta).requirement.ratio, 1 + _TOLERATED))
         for limit in (1 - 0.95 * program.MARGIN, 1 - 1.5 * program.MARGIN, 1 - 2.5 * program.MARGIN):
@@ -282,6 +273,22 @@ class _Search:
             if self.loop.ranges or (found := self._proved(found, slip)).proved:
                 break
         return found
+
+    def kept_in_all(
+        self, problem: program.Problem, active: list[int], until: float = np.inf, **how: Any
+    ) -> tuple[ForceFilter, list[float]]:
+        """The optimum where the environments `active` are imposed, and those that turn out to be missed.
+
+        Beside it what each of all needs.
+        """
+        while True:
+            some = replace(problem, cases=tuple(problem.cases[i] for i in active))
+            coupling = problem.span.filter(some.solve(self._start(some), until=until, **how))
+            needs = [ratio_in(case.loop, coupling) for case in self.cases]
+            missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + _TOLERATED and i not in active]
+            if not missed or time.thread_time() > until:
+                return coupling, needs
+            active = active + missed[:2]
 
     def fitted(self, coupling: ForceFilter, slip: program.Slip | None, limit: float) -> tuple[Optimal, list[float]]:
         """(the coupling scaled until no environment needs more than `limit` of the damping, what each needs then)."""
@@ -403,7 +410,7 @@ def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
 
 
 @dataclass(frozen=True)
-class _Spread:
+class Spread:
     """A design that keeps the condition over `vertices`, too: what it costs at most, for it is made in a short time."""
 
     mismatch_db: float  # of this design in the nominal environment
@@ -421,7 +428,7 @@ def spread(
     options: program.Options = program.DEFAULT,
     percent: float = 10.0,
     seconds: float = _PRICED,
-) -> _Spread:
+) -> Spread:
     """The better of a design over a small basis and the nominal one scaled down, both safe over `vertices`.
 
     Each rung's own frequencies are those of the nominal environment; the vertices are imposed at few, and where sweeps
@@ -439,9 +446,11 @@ def spread(
     problem = program.Problem(
         climb.span(taps, poles), climb.asked(slip), options, program.SOFT[0] * program.SOFT[1], sparse=True
     )
+    hardest = np.argsort([-ratio_in(case.loop, nominal) for case in climb.cases])
+    active = [0, *(int(i) for i in hardest if i)][: _FIRST + 1]
     tried = [nominal]
     with suppress(DesignFailed):
-        tried.append(problem.span.filter(problem.solve(climb._start(problem), _TOLERATED, until - seconds / 3)))
+        tried.append(climb.kept_in_all(problem, active, until - seconds / 3, forgiven=_TOLERATED)[0])
     proved = 0
     for limit in (1 - program.MARGIN, 1 - 2.5 * program.MARGIN):
         found, needs = min((climb.fitted(one, slip, limit) for one in tried), key=lambda one: climb.merit(one[0]))
@@ -449,7 +458,7 @@ def spread(
             proved = climb.proofs(found, needs, slip, max(until, time.thread_time() + seconds / 3))
             break
     db = climb.decibels(found)
-    return _Spread(db, db - before, found.g, max(needs[1:], default=needs[0]), found.states, len(needs), proved)
+    return Spread(db, db - before, found.g, max(needs[1:], default=needs[0]), found.states, len(needs), proved)
 
 
 @dataclass(frozen=True)
@@ -457,7 +466,7 @@ class Nearby:
     """What a coupling for this environment needs in one that is 10 % off, and what a design for that would cost."""
 
     robustness: Robustness | None = None
-    designed_for_it: _Spread | None = None
+    designed_for_it: Spread | None = None
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, options: program.Options = program.DEFAULT) -> Nearby:

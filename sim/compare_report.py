@@ -12,9 +12,9 @@ from controller.older import CONDITIONS as OLDER
 from controller.older import with_older
 from design import compare
 from design.files import unseen
+from design.optimal import Nearby
 from design.program import Options
 from design.result import CONDITIONS, Chosen, Requirement
-from design.robustness import Robustness, robustness_nearby
 from design.transparency import Transparency, transparency
 from sim.report import CouplingFigures
 from sim.scenario import Scenario
@@ -37,7 +37,7 @@ class ComparedCoupling:
     name: str
     states: int
     transparency: Transparency
-    robustness: Robustness | None
+    nearby: Nearby = unseen("beside")
     curves: compare.Curves = unseen("beside")
     coupling: CouplingFigures = unseen("beside")
     conditions: dict[str, ConditionCurve] = unseen("beside")  # also under the names that they had before
@@ -54,7 +54,7 @@ class ComparedCoupling:
             Path(name).name,
             judged.F.order,
             transparency(judged.F, loop.E(), loop.lam),
-            robustness_nearby(loop, chosen.coupling),
+            compare.nearby(loop, chosen.coupling),
             curves,
             CouplingFigures.of(chosen.kind, chosen.coupling, loop.T),
             with_older(conditions, OLDER),

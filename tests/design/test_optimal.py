@@ -13,6 +13,7 @@ import pytest
 from asked import this_environment
 from scipy.optimize import minimize_scalar
 
+from cli.compare import main as compare_main
 from cli.design import main
 from controller.coupling import ForceFilter, NoCoupling, SpringDamper, basis
 from controller.environment import Network, Spring
@@ -325,7 +326,7 @@ def test_a_design_for_every_spring_and_mass_is_proved_at_each_and_costs_little(n
 
 
 def test_the_price_of_a_range_is_at_most_that_of_the_nominal_design_scaled_down(monkeypatch):
-    def nothing(*args):
+    def nothing(*args, **how):
         raise DesignFailed(None, (), "no time")
 
     loop, nominal = loop_of("n3"), best("n3")
@@ -529,6 +530,11 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     assert found["ladder"][-1]["mismatch_db"] <= found["ladder"][0]["mismatch_db"]
     assert "no linear coupling can be better than" in text
     assert verify(load_file(tmp_path / "c.json")).proved
+    options = ["--coupling", str(tmp_path / "c.json"), "--scenario", str(scenario), "--no-plot", "--out", str(tmp_path)]
+    assert compare_main(options) == 0
+    compared = json.loads((tmp_path / "report.json").read_text())["couplings"][0]
+    assert compared["designed_for_it"] == found["designed_for_it"]
+    assert "designed for 10 % more or less" in " ".join(capsys.readouterr().out.split())
 
 
 # the period, the latency and the limiter ------------------------------------------------------------------------------
