@@ -26,9 +26,9 @@ import msgspec
 from threadpoolctl import threadpool_limits
 
 from controller import older
+from controller.arithmetic import SingularLoop
 from controller.delay import LOST, VaryingDelay
 from controller.loop import DelayRange, Loop
-from controller.lti import SingularLoop
 from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
 from design.own import named, place_of

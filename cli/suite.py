@@ -22,7 +22,7 @@ from cli import options, render
 from cli import suite_report as reports
 from cli.checks.endurance import endurance
 from cli.checks.faults import rehearse_faults
-from controller.lti import SingularLoop
+from controller.arithmetic import SingularLoop
 from design.files import folder, write, write_json
 from design.result import DesignFailed
 from sim.adversary import shortages

@@ -17,7 +17,8 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controller.lti import Array, Block, Complex, Lti, Number, ReadOnly, Sampled, frozen, numbers, taps
+from controller.arithmetic import Number, numbers
+from controller.lti import Array, Block, Complex, Lti, ReadOnly, Sampled, frozen, taps
 
 _LARGEST_COEFFICIENT = 1e12  # of a stored coupling, SI units
 _MOST_TERMS = 2000  # of a moving average; every one is a state

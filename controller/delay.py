@@ -10,7 +10,8 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controller.lti import Array, Lti, Number, taps
+from controller.arithmetic import Number
+from controller.lti import Array, Lti, taps
 
 # ----------------------------------------------------------------------------------------------------
 # Delays: constant ones as linear blocks, Theta (4), Psi (5) and Lambda (7); varying ones as a line that holds.

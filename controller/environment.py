@@ -17,9 +17,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.arithmetic import Number, inverse, numbers, rational, times
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.lti import Array, Complex, Lti, Number, Sampled, as_like, inverse, numbers, rational, times
+from controller.lti import Array, Complex, Lti, Sampled, as_like
 
 GROUND = "ground"
 

@@ -16,12 +16,13 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from controller.arithmetic import Number, rational
 from controller.coupling import Coupling, Strict
 from controller.delay import delay
 from controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_environment
 from controller.law import Law
 from controller.limiter import Limiter
-from controller.lti import Complex, Lti, Number, Sampled, rational
+from controller.lti import Complex, Lti, Sampled
 from controller.ranges import Member, Ranges, members
 
 MOST_SAMPLES = 1000  # of delay on a channel; every one is a state

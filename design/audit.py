@@ -12,13 +12,13 @@ from typing import Any, TypeVar, cast, get_args
 import msgspec
 import numpy as np
 
+from controller.arithmetic import TooLong
 from controller.coupling import (
     Coupling,
     SpringDamper,
 )
 from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
-from controller.lti import TooLong
 from controller.older import CONDITIONS, with_older
 from design.certificate import RangesCheck, named
 from design.conditions import any_environment

@@ -14,11 +14,12 @@ import msgspec
 import numpy as np
 import scipy
 
+from controller.arithmetic import SingularLoop, TooLong, rational, within
 from controller.coupling import (
     Coupling,
 )
 from controller.loop import Loop
-from controller.lti import Array, Lti, SingularLoop, TooLong, rational, within
+from controller.lti import Array, Lti
 from controller.ranges import Member, inside, number_of_vertices
 from design import conditions, multipliers
 from design.conditions import Condition

@@ -28,23 +28,11 @@ from typing import Any, Generic
 import numpy as np
 import scipy  # its parts load when they are used
 
+from controller.arithmetic import Number, SingularLoop, numbers
 from controller.coupling import Coupling
 from controller.delay import delay, moving_sum
 from controller.loop import Loop
-from controller.lti import (
-    Array,
-    Block,
-    Complex,
-    Lti,
-    Number,
-    Sampled,
-    SingularLoop,
-    as_like,
-    constant_like,
-    hstack,
-    numbers,
-    vstack,
-)
+from controller.lti import Array, Block, Complex, Lti, Sampled, as_like, constant_like, hstack, vstack
 from controller.ranges import Member
 from design.frequency import (
     Response,

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from controller.arithmetic import SingularLoop, TooLong, numbers
 from controller.coupling import Coupling
 from controller.delay import delay
 from controller.loop import Loop
-from controller.lti import Array, Block, Lti, Sampled, SingularLoop, TooLong, constant_like, numbers, vstack
+from controller.lti import Array, Block, Lti, Sampled, constant_like, vstack
 from controller.ranges import Member, Region, regions
 from design.conditions import (
     Condition,

@@ -13,7 +13,8 @@ import numpy as np
 import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
-from controller.lti import Array, Lti, on_time, rational
+from controller.arithmetic import on_time, rational
+from controller.lti import Array, Lti
 from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import NotProved, Requirement
 

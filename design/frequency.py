@@ -8,7 +8,8 @@ from contextlib import AbstractContextManager
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.lti import Array, Lti, within
+from controller.arithmetic import within
+from controller.lti import Array, Lti
 
 # ----------------------------------------------------------------------------------------------------
 # Integrals over frequency, by Gauss's rule on intervals that are halved until it no longer matters.

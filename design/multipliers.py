@@ -13,24 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from controller.arithmetic import Number, SingularLoop, TooLong, numbers
 from controller.coupling import Coupling
 from controller.delay import delay
 from controller.loop import DelayRange, Loop
-from controller.lti import (
-    Array,
-    Block,
-    Complex,
-    Lti,
-    Number,
-    SingularLoop,
-    TooLong,
-    as_like,
-    constant_like,
-    hstack,
-    numbers,
-    taps,
-    vstack,
-)
+from controller.lti import Array, Block, Complex, Lti, as_like, constant_like, hstack, taps, vstack
 from design import conditions, cone
 from design.frequency import frequencies, hermitian, on_circle, peaks, supremum, sweeping
 from design.result import DesignFailed, Requirement, from_ratio, refusal

@@ -21,12 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller import environment
+from controller.arithmetic import SingularLoop
 from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.delay import delay
 from controller.law import Law
 from controller.limiter import Limiter
 from controller.loop import Loop
-from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
+from controller.lti import Array, Complex, Lti, Sampled, as_like
 from controller.tick import Process
 from design import conditions
 from design.audit import check_loop, edge

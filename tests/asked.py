@@ -14,7 +14,8 @@ def loop(T, delta, theta=None, walls=(), psi=None, environment=None, **further) 
     springs = tuple(Spring((contact, GROUND), 1.0) for contact in contacts)
     network = environment or Network(contacts, springs, walls=tuple(Wall((contacts[0], GROUND), k) for k in walls))
     none = (0,) * m
-    return Loop(float(T), tuple(theta or none), tuple(psi or none), none, tuple(delta), network, **further)
+    theta, psi = (none if n is None else tuple(n) for n in (theta, psi))
+    return Loop(float(T), theta, psi, none, tuple(delta), network, **further)
 
 
 def this_environment_demand(F, delta, T_max=None, latency=None):

@@ -16,10 +16,11 @@ from itertools import product
 
 import numpy as np
 
+from controller.arithmetic import SingularLoop
 from controller.coupling import SpringDamper
 from controller.environment import GROUND, Network, Spring
 from controller.loop import Loop
-from controller.lti import Array, SingularLoop
+from controller.lti import Array
 from design.environments import THIS_ENVIRONMENT
 from models.hold import at_the_latch, hold
 from models.scene import Plant

@@ -19,7 +19,8 @@ from queue import Empty, SimpleQueue
 
 import numpy as np
 
-from controller.lti import Array, SingularLoop
+from controller.arithmetic import SingularLoop
+from controller.lti import Array
 from controller.tick import StepBuffer
 from design.result import DesignFailed
 from models.hold import HeldPlant, hold

@@ -6,8 +6,9 @@ import control
 import numpy as np
 import pytest
 
+from controller.arithmetic import SingularLoop, times
 from controller.delay import delay
-from controller.lti import Lti, Sampled, SingularLoop, hstack, times
+from controller.lti import Lti, Sampled, hstack
 
 Z = np.exp(1j * np.linspace(0.01, 3.1, 60))
 

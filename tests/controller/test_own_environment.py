@@ -6,8 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from controller.arithmetic import rational
 from controller.environment import Block, Network, Spring, Wall, environment, parts_of
-from controller.lti import Lti, rational
+from controller.lti import Lti
 from sim import load
 from sim.scenario import InputError
 

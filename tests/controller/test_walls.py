@@ -12,11 +12,12 @@ from worlds import SOFT, force_map, loop_of
 
 from cli.accuracy import main as accuracy
 from cli.run import main
+from controller.arithmetic import SingularLoop
 from controller.complementarity import Complementarity
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
 from controller.law import Law
-from controller.lti import Lti, SingularLoop
+from controller.lti import Lti
 from controller.tick import Process
 from design.audit import audit, requirement
 from design.certificate import assess, prove

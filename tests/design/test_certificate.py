@@ -10,10 +10,11 @@ from asked import this_environment
 from worlds import PAIR, SOFT, SOFT_NETWORK, STIFF
 
 from controller import coupling as controller_coupling
+from controller.arithmetic import SingularLoop, rational
 from controller.coupling import PUBLISHED, Compliance, ComplianceForm, InternalModelForm, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
-from controller.lti import Lti, SingularLoop, rational
+from controller.lti import Lti
 from design import certificate as design_certificate
 from design import environments, exact, spring_damper
 from design.certificate import Verdict, prove, required_damping, verify

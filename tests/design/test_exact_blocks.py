@@ -22,10 +22,11 @@ from asked import (
 from scipy.optimize import minimize_scalar
 from worlds import SOFT, STIFF, T
 
+from controller.arithmetic import rational
 from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
-from controller.lti import Lti, rational
+from controller.lti import Lti
 from controller.ranges import Ranges, UncertainSpring
 from design import certificate
 from design.certificate import condition_block, prove, verify

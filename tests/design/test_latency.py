@@ -7,11 +7,12 @@ from asked import latency_demand, this_environment, this_environment_demand
 from driven import growing
 from scipy.linalg import expm
 
+from controller.arithmetic import numbers
 from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
-from controller.lti import Lti, Sampled, hstack, numbers, vstack
+from controller.lti import Lti, Sampled, hstack, vstack
 from design.api import design_coupling, transparency_of
 from design.certificate import assess, prove, required_damping, verify
 from design.conditions import Condition, Demand, least_scale
