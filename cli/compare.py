@@ -21,12 +21,11 @@ from controller.loop import Loop
 from controller.lti import Array
 from design import compare
 from design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
-from design.optimal import Nearby
 from design.program import Options
 from design.result import CONDITIONS, Chosen, DesignFailed, finite
-from design.robustness import Robustness
+from design.robustness import Nearby, Robustness
 from sim import baselines
-from sim.compare_report import ComparedCoupling, Comparison, ConditionCurve, Here, LimitCurves
+from sim.compare_report import ComparedCoupling, Comparison, ConditionCurve, Here, LimitCurves, nearby
 from sim.couplings import NAMES, choose
 from sim.scenario import InputError, Scenario
 
@@ -196,9 +195,9 @@ def _robust(part: Robustness | None, scale: float = 1.0) -> str:
     return f"{scale * part.required_over_available:.4g}"
 
 
-def _price(name: str, nearby: Nearby) -> Iterable[str]:
+def _price(name: str, part: Nearby) -> Iterable[str]:
     """What a design for the environments within ten percent reaches, in a line, where that is known."""
-    if price := nearby.designed_for_it:
+    if price := part.designed_for_it:
         yield f"{name}, designed for 10 % more or less of every spring and mass: {render.price_words(price)}"
 
 
@@ -240,7 +239,9 @@ def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
     out, begin = options.out_folder(args, "compare"), time.perf_counter()
     loops = {case: scenario.loop(case) for case in ("I", "II")}
     with render.progress("designing") as move:
-        rows, interrupted = options.until_interrupted(compare.compare_designs(loops, LADDERS[args.ladder], move))
+        rows, interrupted = options.until_interrupted(
+            compare.compare_designs(loops, LADDERS[args.ladder], move, nearby)
+        )
     report = _Ladder(scenario.name, args.seed, rows, time.perf_counter() - begin, interrupted)
     shown = []
     for case in loops:

@@ -21,10 +21,11 @@ from design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
 from design.guarantees import ANY
-from design.optimal import Nearby, Optimal
+from design.optimal import Optimal
+from design.optimal import nearby as nearby_of
 from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import Design, Requirement, finite, listed
-from design.robustness import ranges_around
+from design.robustness import Nearby, ranges_around
 from design.transparency import BAND_HZ, Transparency, transparency
 from sim.judged import Judged
 from sim.scenario import InputError, Scenario
@@ -175,7 +176,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
     asked = Options(**asked_of(args, "optimal")) if best else DEFAULT
     with render.progress("working out robustness and its price, and the bound"):
         if design.condition == "this-environment":
-            nearby = Nearby.of(loop, design.coupling, asked)
+            nearby = nearby_of(loop, design.coupling, asked)
         limit = best and BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, asked)
     return _Report(
         case=args.case,

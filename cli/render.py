@@ -27,7 +27,7 @@ from design.files import nobody_reads, plain, printable, write_json
 from design.result import DesignFailed, Requirement, listed
 
 if TYPE_CHECKING:  # the reports' parts, which no command without them loads
-    from design.optimal import Nearby, Spread
+    from design.robustness import Nearby, Spread
     from design.transparency import Transparency
     from sim.report import UnevenTicks, VaryingDelays
 

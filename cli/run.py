@@ -15,8 +15,9 @@ from controller.environment import GROUND
 from controller.loop import Loop
 from design.files import write
 from design.guarantees import ANY
-from design.optimal import Nearby
+from design.optimal import nearby
 from design.result import CONDITIONS, Chosen, finite, listed
+from design.robustness import Nearby
 from design.transparency import BAND_HZ
 from sim import accuracy
 from sim import passivity_layer as layer
@@ -167,7 +168,7 @@ def _nearby(loop: Loop, judged: Judged) -> Nearby:
     if not alone or judged.guarantee == ANY:
         return Nearby()
     with render.progress("working out robustness and its price"):
-        return Nearby.of(loop, chosen.coupling)
+        return nearby(loop, chosen.coupling)
 
 
 def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import PUBLISHED, Coupling, ForceFilter, NoCoupling
+from controller.coupling import PUBLISHED, Coupling, NoCoupling
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
@@ -25,10 +25,9 @@ from design.designs import design_by_kind
 from design.files import unseen
 from design.frequency import Response, frequencies, on_circle
 from design.lmi import ANY_ENVIRONMENT
-from design.optimal import Nearby
 from design.program import LADDER, Options
 from design.result import ConditionName, Design, DesignFailed, NotProved, Requirement, finite
-from design.robustness import robustness_nearby
+from design.robustness import Nearby
 from design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------
@@ -36,6 +35,7 @@ from design.transparency import decibels, transparency
 
 
 _Progress = Callable[[int, int], None]  # (designs done, designs in all)
+_NearbyOf = Callable[[Loop, Coupling], Nearby]
 
 _LOWEST_HZ = 0.1
 FEEL_HZ = (1.0, 10.0)  # where perceived stiffness and damping are quoted
@@ -125,13 +125,6 @@ def perceived(G: NDArray[np.complex128], hz: Array) -> Perceived:
     """The diagonal of displacement-to-force responses (k, m, m) at `hz` (k,) > 0 as stiffness and damping."""
     own = np.diagonal(G, axis1=1, axis2=2)
     return Perceived(own.real, own.imag / (2 * np.pi * hz)[:, None])
-
-
-def nearby(loop: Loop, coupling: Coupling) -> Nearby:
-    """What a coupling needs within ten percent; of a force filter also what a design for that would cost."""
-    if isinstance(coupling, ForceFilter):
-        return Nearby.of(loop, coupling)
-    return Nearby(robustness_nearby(loop, coupling))
 
 
 def _multiplier(loop: Loop, coupling: Coupling) -> Array | None:
@@ -436,15 +429,17 @@ _FULL = (
 LADDERS = {"short": SHORT, "full": _FULL}
 
 
-def compare_designs(loops: Mapping[str, Loop], entries: Sequence[_Entry], progress: _Progress) -> Iterator[LadderRow]:
+def compare_designs(
+    loops: Mapping[str, Loop], entries: Sequence[_Entry], progress: _Progress, judge_nearby: _NearbyOf
+) -> Iterator[LadderRow]:
     """The rows of every case."""
     jobs = [(case, loop, entry) for case, loop in loops.items() for entry in entries]
     for done, (case, loop, entry) in enumerate(jobs):
         progress(done, len(jobs))
-        yield ladder_row(case, loop, entry)
+        yield ladder_row(case, loop, entry, judge_nearby)
 
 
-def ladder_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:
+def ladder_row(case: str, loop: Loop, entry: _Entry, judge_nearby: _NearbyOf) -> LadderRow:
     """One design with its proof; a request without a solution gives its reason."""
     begin = time.perf_counter()
     if entry.kind == "bound":
@@ -471,7 +466,7 @@ def ladder_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:
     mismatch = finite(decibels(figures.relative_mismatch)), finite(decibels(figures.rms_mismatch))
     proof_s, certified = time.perf_counter() - begin, requirement.certified
     place = _name(entry, case), case, required, certified, entry.condition
-    return LadderRow(*place, *mismatch, proof, wall, proof_s, reason, nearby(loop, coupling))
+    return LadderRow(*place, *mismatch, proof, wall, proof_s, reason, judge_nearby(loop, coupling))
 
 
 def _bound_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:

@@ -25,7 +25,7 @@ from design.coupling_file import Certificate, LimiterCertificate
 from design.environments import Searched, in_each, ratio_in, search_ranges, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.result import Design, DesignFailed, NotProved, from_ratio
-from design.robustness import Robustness, at, robustness_nearby, vertices
+from design.robustness import Nearby, Spread, at, robustness_nearby, vertices
 from design.spring_damper import design as design_spring_damper
 from design.transparency import Transparency, decibels, transparency
 
@@ -409,19 +409,6 @@ def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
 # What a design for more than one environment costs.
 
 
-@dataclass(frozen=True)
-class Spread:
-    """A design that keeps the condition over `vertices`, too: what it costs at most, for it is made in a short time."""
-
-    mismatch_db: float  # of this design in the nominal environment
-    price_db: float  # beside the nominal design
-    g: float
-    worst: float  # times the damping that there is, over the vertices
-    states: int  # of the loop
-    environments: int  # with the nominal one
-    proved: int  # of these, in exact arithmetic; the others by the refined sweep, when the time for proofs was over
-
-
 def spread(
     loop: Loop,
     nominal: ForceFilter | NoCoupling,
@@ -461,19 +448,13 @@ def spread(
     return Spread(db, db - before, found.g, max(needs[1:], default=needs[0]), found.states, len(needs), proved)
 
 
-@dataclass(frozen=True)
-class Nearby:
-    """What a coupling for this environment needs in one that is 10 % off, and what a design for that would cost."""
+def nearby(loop: Loop, coupling: Coupling, options: program.Options = program.DEFAULT) -> Nearby:
+    """What a coupling needs within ten percent, and what a design for that would cost.
 
-    robustness: Robustness | None = None
-    designed_for_it: Spread | None = None
-
-    @classmethod
-    def of(cls, loop: Loop, coupling: Coupling, options: program.Options = program.DEFAULT) -> Nearby:
-        """Without the design before walls, with ranges, for an environment that is no network of springs, and for a
-        coupling that is no optimal one.
-        """
-        known, there = robustness_nearby(loop, coupling), loop.environment
-        if known is None or loop.ranges or there.one_period or not isinstance(coupling, ForceFilter | NoCoupling):
-            return cls(known)
-        return cls(known, spread(loop, coupling, options))
+    Without the design before walls, with ranges, for an environment that is no network of springs, and for a coupling
+    that is no optimal one.
+    """
+    known, there = robustness_nearby(loop, coupling), loop.environment
+    if known is None or loop.ranges or there.one_period or not isinstance(coupling, ForceFilter | NoCoupling):
+        return Nearby(known)
+    return Nearby(known, spread(loop, coupling, options))

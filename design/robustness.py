@@ -29,6 +29,27 @@ class Robustness:
     certified: bool  # there
 
 
+@dataclass(frozen=True)
+class Spread:
+    """A design that keeps the condition over `vertices`, too: what it costs at most, for it is made in a short time."""
+
+    mismatch_db: float  # of this design in the nominal environment
+    price_db: float  # beside the nominal design
+    g: float
+    worst: float  # times the damping that there is, over the vertices
+    states: int  # of the loop
+    environments: int  # with the nominal one
+    proved: int  # of these, in exact arithmetic; the others by the refined sweep, when the time for proofs was over
+
+
+@dataclass(frozen=True)
+class Nearby:
+    """What a coupling for this environment needs in one that is 10 % off, and what a design for that would cost."""
+
+    robustness: Robustness | None = None
+    designed_for_it: Spread | None = None
+
+
 def at(loop: Loop, network: Network) -> Loop:
     """The loop around this environment, its delays constant."""
     return loop.at(network).switching(None)

@@ -6,18 +6,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from controller.coupling import Coupling, ForceFilter
 from controller.loop import Loop
 from controller.lti import Array
 from controller.older import CONDITIONS as OLDER
 from controller.older import with_older
 from design import compare
 from design.files import unseen
-from design.optimal import Nearby
+from design.optimal import nearby as nearby_with_price
 from design.program import Options
 from design.result import CONDITIONS, Chosen, Requirement
+from design.robustness import Nearby, robustness_nearby
 from design.transparency import Transparency, transparency
 from sim.report import CouplingFigures
 from sim.scenario import Scenario
+
+
+def nearby(loop: Loop, coupling: Coupling) -> Nearby:
+    """What a coupling needs within ten percent; beside an optimal one what a design for that would cost."""
+    optimal = isinstance(coupling, ForceFilter)
+    return nearby_with_price(loop, coupling) if optimal else Nearby(robustness_nearby(loop, coupling))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +62,7 @@ class ComparedCoupling:
             Path(name).name,
             judged.F.order,
             transparency(judged.F, loop.E(), loop.lam),
-            compare.nearby(loop, chosen.coupling),
+            nearby(loop, chosen.coupling),
             curves,
             CouplingFigures.of(chosen.kind, chosen.coupling, loop.T),
             with_older(conditions, OLDER),

@@ -8,8 +8,8 @@ from typing import Any
 from controller.lti import Array
 from design.files import unseen
 from design.guarantees import ANY, CAVEATS, MAKING, EncoderSteps
-from design.optimal import Nearby
 from design.result import Requirement, listed
+from design.robustness import Nearby
 from design.transparency import Transparency, transparency
 from sim import accuracy
 from sim.alternatives import Alternative

@@ -16,6 +16,7 @@ from controller.environment import environment
 from design import compare as limit_curve
 from design.compare import AXES, LADDERS, SHORT, Point, Sweep, ladder_row, measured, optimum, points_along, remembered
 from design.program import LADDER, Options
+from design.robustness import Nearby
 from sim.compare_report import Here, LimitCurves
 from sim.plots import plot_limits
 from sim.scenario import InputError, load
@@ -23,6 +24,11 @@ from sim.scenario import InputError, load
 LOOP = load().loop("I")
 SMALL = Options(ladder=LADDER[:1])
 IMPOSSIBLE = Point(0.0, load().replace(theta=(60, 60), delta=(1e-3, 1e-3)).loop("I"), SMALL)
+
+
+def unasked(loop, coupling):
+    """What a coupling needs nearby, where no test asks."""
+    return Nearby()
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +217,7 @@ def test_a_picture_of_every_number_of_panels(tmp_path):
 def test_rungs_are_the_designs_that_they_name():
     """Against figures of their own: required damping and mismatch of the other commands."""
     by_name = {entry.name: entry for entry in SHORT}
-    published = ladder_row("I", LOOP, by_name["published"])
+    published = ladder_row("I", LOOP, by_name["published"], unasked)
     E = environment(LOOP.environment, LOOP.T)
     expected = this_environment(force_map(E, CASE_I, LOOP.theta, LOOP.psi), LOOP.delta)
     assert published.design == "published (27)"
@@ -219,22 +225,22 @@ def test_rungs_are_the_designs_that_they_name():
     assert not published.certified
     assert published.proof is None
     assert published.relative_mismatch_db == pytest.approx(7.70, abs=0.005)
-    any_environment = ladder_row("I", LOOP, by_name["spring-damper, any-environment"])
+    any_environment = ladder_row("I", LOOP, by_name["spring-damper, any-environment"], unasked)
     assert any_environment.required_damping == pytest.approx([0.7145] * 2, abs=1e-4)
     assert any_environment.condition == "any-environment"
     assert any_environment.proof == "rational"
-    optimal = ladder_row("I", LOOP, by_name["optimal"])
+    optimal = ladder_row("I", LOOP, by_name["optimal"], unasked)
     assert optimal.rms_mismatch_db <= -34.8
     assert optimal.proof == "rational"
     assert optimal.certified
-    limit = ladder_row("I", LOOP, by_name["bound for any linear coupling"])
+    limit = ladder_row("I", LOOP, by_name["bound for any linear coupling"], unasked)
     assert optimal.rms_mismatch_db - 1 < limit.rms_mismatch_db < optimal.rms_mismatch_db
     assert limit.required_damping is None
 
 
 def test_a_rung_that_does_not_exist_says_so():
     loop = load("three-rigid").loop("I")
-    missing = ladder_row("I", loop, next(entry for entry in SHORT if entry.kind == "published"))
+    missing = ladder_row("I", loop, next(entry for entry in SHORT if entry.kind == "published"), unasked)
     assert missing.required_damping is None
     assert missing.reason == "the paper prints gains for 2 channels, not 3"
 
