@@ -18,7 +18,7 @@ from controller.lti import Array, Lti
 from design.files import unseen
 from models.device import credible_force
 from sim.mujoco_engines import EXPONENTIAL, default_integrator
-from sim.run import AnyEngine, Simulation, make_engine, run
+from sim.run import AnyEngine, Progress, Simulation, make_engine, run
 from sim.scenario import InputError
 from sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode
 from sim.step_choice import NEUTRAL, default_substeps, measured_hold, simulated_growth, step_radius
@@ -332,12 +332,17 @@ def _rms(values: Array) -> float:
 # ---- speed against error for a scene of one's own: which engine and step keep an error that is asked for
 #
 # The error is the relative rms of the encoders' positions over the run: against the exact loop on a smooth scene. Where
-# something rubs there is no exact loop; Runge-Kutta with n steps is compared with 2 n there, until they are near
-# enough. The method is of first order at least, so what n steps miss is at most twice the difference, and 2 n steps at
-# most once.
+# something rubs there is no exact loop: Runge-Kutta with n steps is compared with 2 n, until they are near enough.
+# Differences that shrink by q with every halving sum up to q/(1 - q) of the last one, which is what the finest run
+# misses; the method is of first order at least, q = 1/2. One pair may agree by chance, so q is seen over two halvings,
+# and is no less than _EVEN, since switching by friction makes it jump.
 
 _CANDIDATES = ((EXPONENTIAL, 1), ("RK4", 1), ("RK4", 2), ("RK4", 4), ("RK4", 8), ("Euler", 1), ("Euler", 4))
 _MOST_COMPARED = 256  # substeps, where a refined run is the reference
+_MOST_CPU_S = 120.0  # [s] of all these runs together
+_EVEN = 0.6
+_CONTRACTS = 0.7  # q above this is no convergence; then a few times the largest difference is what may be missed
+_FEW = 4.0
 
 
 @dataclass(frozen=True)
@@ -346,7 +351,7 @@ class EngineChoice:
 
     integrator: str
     substeps: int
-    position_relative_rms: float  # of the encoders' positions over the run, at most
+    position_relative_rms: float  # of the encoders' positions over the run, at most, as far as refining shows
     verdict_correct: bool  # whether the loop that it simulates has the exact loop's verdict
     cpu_s: float  # of that run
 
@@ -355,12 +360,14 @@ class EngineChoice:
         return f"{self.integrator} x {self.substeps}"
 
 
-def compare_engines(simulation: Simulation, error: float, ticks: int | None = None) -> tuple[EngineChoice, ...]:
+def compare_engines(
+    simulation: Simulation, error: float, ticks: int | None = None, progress: Progress = lambda done, ticks: None
+) -> tuple[EngineChoice, ...]:
     """Every setting that is stable on the scene's plant, the cheapest first, over `ticks` of the scenario (all).
 
     With its walls, limits, encoder steps, varying delays and net; verdicts are of the loop without a net and with
     constant delays. Where something rubs the reference is refined until RK4 keeps `error`. Raises InputError where it
-    cannot.
+    cannot, or not in two minutes, and where nothing moves. `progress` is that of each run.
     """
     if not error > 0:
         raise InputError(f"--error is {error:g}, expected a positive relative error")
@@ -369,16 +376,17 @@ def compare_engines(simulation: Simulation, error: float, ticks: int | None = No
     runs: dict[tuple[str, int], tuple[Array, float]] = {}
     if default_integrator(simulation.scene) == EXPONENTIAL:
         settings = list(dict.fromkeys((*_CANDIDATES, ("RK4", default_substeps(linear, "RK4")))))
-        truth, missed = _positions(simulation, ticks, "exact")[0], 0.0
+        truth, missed = _positions(simulation, ticks, "exact", progress=progress)[0], 0.0
     else:
-        truth, missed = _refined(simulation, error, ticks, runs)
+        truth, missed = _refined(simulation, error, ticks, runs, progress)
         rest = ("RK4",) if simulation.scene.plant.felt is None else ("RK4", EXPONENTIAL)  # which knows no such scene
         settings = [*runs, *(one for one in _CANDIDATES if one[0] not in rest)]
+    _require_motion(truth)
     choices = []
     for name, n in settings:
         if name != EXPONENTIAL and step_radius(linear, name, n) > 1 + NEUTRAL:
             continue
-        own, cost = runs.get((name, n)) or _positions(simulation, ticks, "mujoco", name, n)
+        own, cost = runs.get((name, n)) or _positions(simulation, ticks, "mujoco", name, n, progress)
         right = not disagree(exact_growth(linear), simulated_growth(linear, name, n))
         choices.append(EngineChoice(name, n, _apart(own, truth) + missed, right, cost))
     return tuple(sorted(choices, key=lambda choice: choice.cpu_s))
@@ -428,30 +436,65 @@ def cross_check(
 
 
 def _refined(
-    simulation: Simulation, error: float, ticks: int, runs: dict[tuple[str, int], tuple[Array, float]]
+    simulation: Simulation,
+    error: float,
+    ticks: int,
+    runs: dict[tuple[str, int], tuple[Array, float]],
+    progress: Progress,
 ) -> tuple[Array, float]:
     """(positions of a run by RK4, the most that it misses), fine enough to judge the error; all runs are kept."""
-    substeps, best = 1, math.inf
-    runs["RK4", 1] = _positions(simulation, ticks, "mujoco", "RK4", 1)
-    while 2 * substeps <= _MOST_COMPARED:
-        runs["RK4", 2 * substeps] = _positions(simulation, ticks, "mujoco", "RK4", 2 * substeps)
-        missed = _apart(runs["RK4", substeps][0], runs["RK4", 2 * substeps][0])
-        substeps, best = 2 * substeps, min(best, 2 * missed)
-        if 2 * missed <= error:
-            return runs["RK4", substeps][0], missed
-    raise InputError(f"--error {error:g}: RK4 comes within {best:.1g} with up to {_MOST_COMPARED // 2} substeps")
+    finest, best, gaps = 1, math.inf, list[float]()
+    runs["RK4", 1] = _positions(simulation, ticks, "mujoco", "RK4", 1, progress)
+    _require_motion(runs["RK4", 1][0])
+    while finest < _MOST_COMPARED:
+        (coarse, cheaper), finest = runs["RK4", finest], 2 * finest
+        fine, cost = runs["RK4", finest] = _positions(simulation, ticks, "mujoco", "RK4", finest, progress)
+        gaps.append(_apart(coarse, fine))
+        missed = _missed(gaps)
+        best = min(best, gaps[-1] + missed)
+        if gaps[-1] + missed <= error:
+            return fine, missed
+        needed = min(max(2 * gaps[-1] / error, 1.0) * finest, _MOST_COMPARED)  # by a method of first order
+        seconds = 4 * needed / finest * (cost - cheaper)  # of n + n/2 + ... steps
+        if seconds > _MOST_CPU_S:
+            raise InputError(
+                f"--error {error:g}: where devices rub it asks for RK4 with about {needed:.0f} substeps, {seconds:.0f} "
+                f"CPU s; allowed are {_MOST_CPU_S:g}: give a shorter --duration or a larger error"
+            )
+    within = f"comes within {best:.1g}" if best < math.inf else "does not converge"
+    raise InputError(f"--error {error:g}: RK4 {within} with up to {_MOST_COMPARED // 2} substeps")
+
+
+def _missed(gaps: Sequence[float]) -> float:
+    """Most that the finest of some runs misses, from the differences of successive ones; inf of less than three."""
+    *_, first, second, last = math.inf, math.inf, *gaps
+    if not math.isfinite(first + second + last):
+        return math.inf
+    q = max(_EVEN, *(fine / coarse if coarse else 1.0 for coarse, fine in ((first, second), (second, last))))
+    return last * q / (1 - q) if q <= _CONTRACTS else _FEW * max(first, second, last)
 
 
 def _positions(
-    simulation: Simulation, ticks: int, engine: str, integrator: str | None = None, substeps: int | None = None
+    simulation: Simulation,
+    ticks: int,
+    engine: str,
+    integrator: str | None = None,
+    substeps: int | None = None,
+    progress: Progress = lambda done, ticks: None,
 ) -> tuple[Array, float]:
     """Positions (N, m) of a run from rest, with its CPU seconds."""
     stepped = make_engine(simulation, engine, integrator, substeps)
     begin = time.process_time()
-    trace = run(simulation, stepped, ticks=ticks)
+    trace = run(simulation, stepped, ticks=ticks, progress=progress)
     if trace.interrupted:  # a part of a run is no measurement
         raise KeyboardInterrupt
     return trace.s[:, : simulation.process.channels], time.process_time() - begin
+
+
+def _require_motion(positions: Array) -> None:
+    """Raises InputError where there is nothing to be relative to."""
+    if not positions.any():
+        raise InputError("--error is relative to the motion, and nothing moves: give a tap, or a human an amplitude")
 
 
 def _apart(own: Array, truth: Array) -> float:

@@ -80,7 +80,7 @@ def run_scenario(
         simulation, period = switching(simulation, seed, scenario.samples)
     ran = simulation if net is None else netted(simulation, net)
     if error is not None:
-        choices = compare_engines(ran, error)
+        choices = compare_engines(ran, error, progress=progress)
         kept = pick(choices, error)
         integrator, substeps = kept.integrator, kept.substeps
     else:

@@ -76,8 +76,9 @@ def settle(
             )
         return None, None, []
     integrator = integrator or default_integrator(simulation.scene)
-    if substeps is None:
+    if substeps is None and integrator != EXPONENTIAL:
         return integrator, default_substeps(simulation, integrator), []
+    substeps = default_substeps(simulation, integrator) if substeps is None else substeps
     return integrator, substeps, check_substeps(simulation, integrator, substeps)
 
 
@@ -105,8 +106,9 @@ def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
 def check_substeps(simulation: Simulation, integrator: str, substeps: int) -> list[str]:
     """Remarks on a number of substeps that was asked for. Raises InputError outside the stable region."""
     if integrator == EXPONENTIAL:
-        first_order = f"{EXPONENTIAL} x {substeps}: of first order where devices rub, RK4 is nearer at equal cost."
-        return [] if default_integrator(simulation.scene) == EXPONENTIAL else [first_order]
+        nearer = "of first order where devices rub, RK4 is nearer at equal cost (--cross-check: by how much)."
+        rubs = default_integrator(simulation.scene) != EXPONENTIAL
+        return [f"{integrator} x {substeps}: {nearer}"] if rubs else []
     simulation = simulation.smooth.even
     speed, h = pace(simulation.scene.plant.A), simulation.scenario.T / substeps
     radius = step_radius(simulation, integrator, substeps)

@@ -17,7 +17,7 @@ from models.hold import expm_each, exponential_step, hold
 from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
 from sim import mujoco_engines
-from sim.accuracy import compare_engines, cross_check, pick
+from sim.accuracy import _missed, compare_engines, cross_check, pick
 from sim.api import run_scenario
 from sim.engines import Engine, ExactEngine
 from sim.mujoco_engines import EXPONENTIAL, INTEGRATORS, MujocoBatchEngine, MujocoEngine, default_integrator
@@ -29,6 +29,7 @@ from sim.step_choice import check_substeps, default_substeps, measured_hold, pac
 
 SCENARIO = load()
 RUBBING = SCENARIO.replace(device=(CompliantDevice(friction=0.5),) * 2)
+RESTING = SCENARIO.replace(human=(Human((Link(0.3, 3.0, 200.0),)),) * 2, tap=None)
 
 
 def stiff(transmission: float):
@@ -230,7 +231,7 @@ def test_the_default_follows_from_the_scene(simulation):
     assert default_substeps(stiff(1.45e6), "RK4") == 32
     assert check_substeps(stiff(1.45e6), EXPONENTIAL, 1) == []
     assert check_substeps(rubbing, EXPONENTIAL, 8) == [
-        "exponential x 8: of first order where devices rub, RK4 is nearer at equal cost."
+        "exponential x 8: of first order where devices rub, RK4 is nearer at equal cost (--cross-check: by how much)."
     ]
     assert default_substeps(rubbing, EXPONENTIAL) == 4
 
@@ -281,7 +282,7 @@ def test_the_cheapest_on_a_smooth_scene_is_one_exponential_step(simulation):
 
 def test_where_devices_rub_the_asked_error_is_kept_with_the_fewest_steps():
     """The reference knows 64 steps, which the search does not look at."""
-    loop, ticks = assemble(RUBBING, CASE_I), 1500
+    loop, ticks = assemble(RUBBING, CASE_I), 500
 
     def positions(integrator, substeps):
         return run(loop, make_engine(loop, "mujoco", integrator, substeps), ticks=ticks).s[:, :2]
@@ -298,9 +299,24 @@ def test_where_devices_rub_the_asked_error_is_kept_with_the_fewest_steps():
             assert missed("RK4", found.substeps // 2) > asked / 4
 
 
+def test_what_the_finest_run_misses_is_no_chance():
+    """Of x + c/n it is c/n, and half as much for safety; of slower contraction q the sum q + q^2 + .. of the last."""
+    assert _missed([1 / n - 1 / (2 * n) for n in (1, 2, 4)]) == pytest.approx(1.5 / 8)
+    assert _missed([1.0, 0.65, 0.65**2]) == pytest.approx(sum(0.65**k for k in range(3, 99)))
+    assert _missed([1.0, 0.1]) == _missed([np.inf, 0.1, 0.01]) == np.inf
+    assert _missed([1e-12, 2e-12, 1e-12]) < 1e-11  # rounding does not contract, and need not
+    assert _missed([0.0, 0.0, 0.0]) == 0
+    # two omegas that rub by .02 N, without a coupling, for 6 s: differences, and distances from a run with 512 substeps
+    gaps = [1.05, 0.167, 0.0794, 0.0849, 0.0183, 0.0117]
+    for count, apart in ((3, 9.76e-2), (4, 1.29e-2), (5, 3.11e-2), (6, 1.97e-2)):
+        assert _missed(gaps[:count]) > apart
+
+
 @pytest.mark.parametrize(
     ("scenario", "error", "message"),
     [
+        (RESTING, 1e-3, "nothing moves: give a tap, or a human an amplitude"),
+        (RESTING.replace(device=RUBBING.device), 1e-3, "nothing moves: give"),
         (SCENARIO, 0.0, "--error is 0, expected a positive relative error"),
         (SCENARIO, 1e-18, "--error 1e-18: the nearest, exponential x 1, is within"),
         (RUBBING, 1e-18, "--error 1e-18: RK4 comes within .* with up to 128 substeps"),
@@ -309,6 +325,16 @@ def test_where_devices_rub_the_asked_error_is_kept_with_the_fewest_steps():
 def test_errors_that_nothing_keeps(scenario, error, message):
     with pytest.raises(InputError, match=message):
         cheapest(assemble(scenario, CASE_I), error, 100)
+
+
+def test_what_would_take_minutes_is_refused_after_two_runs(monkeypatch):
+    """The third would be one of the many that the first two foretell; seconds are those of a clock that is made up."""
+    clock = iter(np.cumsum([0.0, 2.0, 0.0, 3.0]))  # so that a run takes 1 s, and 1 s for each substep
+    monkeypatch.setattr("sim.accuracy.time.process_time", lambda: float(next(clock)))
+    moved = []
+    with pytest.raises(InputError, match="asks for RK4 with about 256 substeps, 512 CPU s; allowed are 120"):
+        compare_engines(assemble(RUBBING, CASE_I), 1e-12, 100, lambda done, ticks: moved.append((done, ticks)))
+    assert moved.count((100, 100)) == 2
 
 
 def test_a_wrong_verdict_is_shown_and_never_chosen():
