@@ -288,7 +288,7 @@ def robustness_rows(nearby: Nearby) -> Rows:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
         yield "robustness", f"{words}, the worst within {there.percent:g} %"
     if price := nearby.designed_for_it:
-        yield "designed for that", price_words(price)
+        yield f"design for ±{there.percent if there else 10:g} %", price_words(price)
 
 
 def price_words(price: Spread) -> str:
