@@ -42,7 +42,6 @@ _MOST_STATES = 200  # of the loop, up to which a rung is tried: half a minute wi
 _MOST_PROOFS = 30 * 112**2.7  # and (environments) states^2.7: a minute
 _SEARCHED = 0.2  # of the time limit, at least: what the search between the vertices of ranges may take
 _TRIED = 3  # rungs, the best first, until one is proved at every vertex of ranges
-_SHARES = (0.95, 1.5, 2.5, 15.0, 50.0)  # times the margin, which stay unused until a rung is proved
 _MOST_WORK = 1.2e7  # (channels x unknowns)^2 up to which a rung is tried
 
 
@@ -267,13 +266,14 @@ class _Search:
     def solved(
         self, taps: int, poles: int, before: Optimal | None, slip: program.Slip | None, heavier: float
     ) -> Optimal:
-        share = self.mismatch(before) if before else 1.0
-        soft = program.SOFT[0] * min(share, program.SOFT[1])
+        error = self.mismatch(before) if before else 1.0
+        soft = program.SOFT[0] * min(error, program.SOFT[1])
         problem = program.Problem(self.span(taps, poles), self.asked(slip), self.options, soft, heavier=heavier)
         coupling, needs = self.kept_in_all(problem, [0])
         if slip:
             needs.append(min(limiter_requirement(self.loop, coupling, slip.beta).requirement.ratio, 1 + _TOLERATED))
-        for limit in (1 - share * program.MARGIN for share in _SHARES):
+        for share in (0.95, 1.5, 2.5, 15.0, 50.0):  # of the margin, which stays unused until the rung is proved
+            limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
             found = self._assessed(scaled, scaled.g)

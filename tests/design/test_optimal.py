@@ -367,6 +367,13 @@ def test_the_price_of_a_range_is_at_most_that_of_the_nominal_design_scaled_down(
     assert found.proved == found.environments
 
 
+def test_a_part_of_what_delays_forbid_leaves_a_bound(monkeypatch):
+    loop = loop_of("n3")
+    whole = bound(loop, knots=8).rms
+    monkeypatch.setattr("design.bound._MOST_FORBIDDEN", 2)
+    assert 0 < bound(loop, knots=8).rms < whole < best("n3").figures.rms_mismatch
+
+
 def test_a_bound_says_what_it_does_not_know():
     loop = loop_of("n3")
     T_max = msgspec.structs.replace(loop, T_max=0.0012)
