@@ -36,15 +36,16 @@ from design.result import Design
 from design.transparency import BAND_HZ, decibels
 
 _GRID = 250  # points, even and even in the logarithm, on which H is given
-_KNOTS = {1: 60, 2: 60, 3: 24, 4: 20}  # of h, by channels
+_KNOTS = {1: 60, 2: 60, 3: 24, 4: 20, 5: 4}  # of h, by channels: with five a coarse bound in a few seconds
 MOST = max(_KNOTS)  # channels for which there is a bound
 NO_BOUND = f"no bound for more than {MOST} devices: its program would take many minutes"
 _NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the ends of the band
 _NEAR_MODE = 1.0  # of the width of a mode, from it: further knots
 _CLOSEST = 0.1  # of a step: nearer knots are one
+_MOST_FORBIDDEN = 240  # sums of coefficients: more take long, and add little
 _MOST_ADDED = 96  # frequencies after a sweep
 _DEGREE = 3  # of the splines that h is made of
-_GAP = 0.002  # of the bound, relatively, that the barrier leaves
+_GAP, _GAP_OF_MANY = 0.002, 0.03  # of the bound, relatively, that the barrier leaves; for more than four channels
 _SWEEPS = 6
 _QUADRATURE = 1e-8  # of the mean square: what Gauss's rule may differ from the integral
 _LARGEST_CHARGE = 0.003  # of the bound, for what D lacks between the frequencies where it is imposed
@@ -144,7 +145,8 @@ class _Dual:
         for at, (i, j) in enumerate(triangle):
             slope[:, at, i, j] = 1.0 if i == j else 2.0
         for at, (i, weights) in enumerate(self.forbidden, start=len(triangle)):
-            slope[:, at, i] = z[:, None] ** -np.arange(len(weights)) @ weights
+            steps = np.flatnonzero(weights.any(axis=1))
+            slope[:, at, i] = z[:, None] ** -steps.astype(float) @ weights[steps]
         return slope
 
     def block(self, w: Array) -> Block:
@@ -181,6 +183,7 @@ class _Dual:
         A, b, c = self.objective()
         x, nothing = self.start, float(b @ b)
         t, found = None, 0.0
+        gap = _GAP if self.loop.channels < MOST else _GAP_OF_MANY
         for sweep in range(_SWEEPS):
             imposed = np.unique(imposed)
             program = Program(A, b, c, (self.block(imposed),))
@@ -191,7 +194,7 @@ class _Dual:
             while True:
                 y = centre(program, y, t)
                 left = max(nothing - program.value(y), 1e-9)
-                if program.degree / t <= (_GAP if sweep else 5 * _GAP) * left:
+                if program.degree / t <= (gap if sweep else 5 * gap) * left:
                     break
                 t *= _STEEPER
             x = scipy.linalg.solve_triangular(U, y)
@@ -227,10 +230,11 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[int, Array], ...]:
     """What the delays forbid: (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E.
 
     Row i of s_k is zero for 1 <= k <= theta_i. The next coefficients of F are those of R times those of Psi E: where
-    the channels' psi differ they lie in a subspace, and v is from its complement.
+    the channels' psi differ they lie in a subspace, and v is from its complement. Of long delays the first steps are
+    taken: any part of all leaves a bound.
     """
-    m, span = E.inputs, max(loop.psi)
-    found = []
+    m, span = E.inputs, min(max(loop.psi), _MOST_FORBIDDEN // E.inputs)
+    found: list[tuple[int, Array]] = []
     for i, theta in enumerate(loop.theta):
         for k in range(1, theta + 1):
             for unit in np.eye(m):
@@ -238,7 +242,7 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[int, Array], ...]:
                 weights[k] = unit
                 found.append((i, weights))
     if not span:
-        return tuple(found)
+        return _first(found)
     G = delay(loop.psi, loop.T) @ E
     impulse = [G.D, *(G.C @ np.linalg.matrix_power(G.A, k) @ G.B for k in range(span - 1))]
     reach = np.zeros((span * m, span * m))  # coefficient l of R's row by step k of F's row
@@ -253,7 +257,12 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[int, Array], ...]:
                 if k:
                     weights[theta + k] -= row
             found.append((i, weights))
-    return tuple(found)
+    return _first(found)
+
+
+def _first(sums: list[tuple[int, Array]]) -> tuple[tuple[int, Array], ...]:
+    """Those that begin first, as many as are taken."""
+    return tuple(sorted(sums, key=lambda one: int(np.flatnonzero(one[1].any(axis=1))[0]))[:_MOST_FORBIDDEN])
 
 
 def _causal(grid: Array, heights: Array, w: Array) -> Complex:

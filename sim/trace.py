@@ -135,7 +135,7 @@ class Trace(ReadOnly):
 # ---- octaves, and whether something goes on oscillating
 
 _PERIODS = 4  # in a window, of the slowest oscillation that is seen: of fewer the window function mixes octaves
-_CUBIC = 3  # degree of the polynomial that is the slow part of a hand at rest or under a constant force
+_TREND = 7  # degree of the polynomial that is the slow part: of 15 mm at 0.6 Hz it leaves less than a micrometre
 SUSTAINED = 0.95
 RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
 
@@ -159,8 +159,8 @@ def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
     half = x.shape[0] // 2
     diverged = ~(np.abs(x) < RUNAWAY).all(axis=(0, 1))
     calm = np.where(diverged, 0.0, x)
-    before, _, _ = _octaves(calm[:half], T, _CUBIC)
-    after, line, _ = _octaves(calm[half : 2 * half], T, _CUBIC)  # (octaves, m, nsim)
+    before, _, _ = _octaves(calm[:half], T)
+    after, line, _ = _octaves(calm[half : 2 * half], T)  # (octaves, m, nsim)
     lasting = (after > threshold) & (after >= SUSTAINED * before)
     shown = np.where(lasting | ~lasting.any(axis=(0, 1)), after, 0.0).reshape(-1, x.shape[2])
     at = np.argmax(shown, axis=0)[None]
@@ -173,13 +173,13 @@ def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
     )
 
 
-def _octaves(x: Array, T: float, trend: int) -> tuple[Array, Array, Array]:
-    """Of x (ticks, m, nsim) without a polynomial of degree `trend`: amplitude of each octave (that of a sinusoid of its
-    power) and frequency [Hz] of its strongest line, both (octaves, m, nsim), and its part of all lines, (octaves,).
+def _octaves(x: Array, T: float) -> tuple[Array, Array, Array]:
+    """Of x (ticks, m, nsim) without its slow part: amplitude of each octave (that of a sinusoid of its power) and
+    frequency [Hz] of its strongest line, both (octaves, m, nsim), and its part of all lines, (octaves,).
     """
     ticks = x.shape[0]
     window = np.hanning(ticks)
-    basis, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, ticks), trend + 1))
+    basis, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, ticks), _TREND + 1))
     flat = x.reshape(ticks, -1)
     fast = flat - basis @ (basis.T @ flat)
     # a sinusoid of amplitude a has power a^2/2; a window w keeps sum w^2 of ticks
@@ -201,7 +201,6 @@ def _octaves(x: Array, T: float, trend: int) -> tuple[Array, Array, Array]:
 # ---- how fast an oscillation grows
 
 _WINDOW = 1.0  # [s] at most
-_TREND = 7  # degree of the polynomial that is the slow part: of 15 mm at 0.6 Hz it leaves less than a micrometre
 _WINDOWS = 7  # in the second half of such a part, each half over the next, at least
 _NEEDED = 4  # of them, one after the other, that an oscillation is seen in
 _SHORTEST = 200  # ticks
@@ -273,7 +272,7 @@ class _Lines(NamedTuple):
 def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
     hop = min(round(_WINDOW / T), 2 * len(x) // (_WINDOWS + 1)) // 2
     windows = [x[start : start + 2 * hop] for start in range(0, len(x) - 2 * hop + 1, hop)]
-    amplitude, line, part = map(np.array, zip(*(_octaves(w[:, :, None], T, _TREND) for w in windows), strict=True))
+    amplitude, line, part = map(np.array, zip(*(_octaves(w[:, :, None], T) for w in windows), strict=True))
     seen = np.sqrt(np.square(amplitude[..., 0]).sum(axis=2))  # (windows, octaves): a mode moves all channels
     # rounding is white with a variance of step^2/12, and a sinusoid's amplitude is the root of twice its power
     floor = _FLOOR * np.sqrt(2 * part[0] * np.square(encoder_step).sum() / 12)

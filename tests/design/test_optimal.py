@@ -285,6 +285,36 @@ def test_the_supremum_and_the_cap_are_kept():
     assert capped.figures.rms_mismatch > rms.figures.rms_mismatch
 
 
+@pytest.mark.parametrize(
+    ("further", "asked"),
+    [
+        ({"objective": "sup", "limiter": True}, {}),
+        ({"objective": "sup", "high_gain": 1.2}, {}),
+        ({"objective": "sup"}, {"varying_delay": DelayRange((4,), (6,))}),
+        ({"high_gain": 1.2, "limiter": True}, {"T_max": 0.0015}),
+        ({"objective": "sup", "high_gain": 1.2}, {"latency": ((0.0, 0.0004),)}),
+    ],
+)
+def test_demands_are_kept_together(further, asked):
+    """The own unknowns of each demand have their own place in the program, however many there are."""
+    loop = msgspec.structs.replace(loop_of("n3"), **asked)
+    found = design(loop, Options(ladder=((4, 3),), **further))
+    assert found.proved
+    assert found.figures.high_frequency_gain <= further.get("high_gain", np.inf) + 1e-6
+    assert bool(found.certificate.limiter) == further.get("limiter", False)
+
+
+def test_a_range_gets_a_coupling_that_is_proved_where_the_best_rung_is_not():
+    """A ton on a soft spring: at a vertex the exact proof needs more room than the rungs leave at first."""
+    contact = Spring(("a", "m"), 1000.0)
+    network = Network(contacts=("a",), springs=(contact, Spring(("m", "ground"), 1.0)), masses={"m": 1000.0})
+    loop = Loop(1e-3, (2,), (0,), (2,), (1.0,), network)
+    ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
+    found = design(ranged, Options(ladder=((4, 3),), seconds=5.0))
+    assert found.proved
+    assert found.figures.rms_mismatch < 10 ** (-4 / 20)  # the environment scaled down reaches -3.05 dB
+
+
 def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
     loop = loop_of("n3")
     nominal = best("n3")
@@ -335,6 +365,13 @@ def test_the_price_of_a_range_is_at_most_that_of_the_nominal_design_scaled_down(
     worst = robustness(loop, nominal.coupling).required_over_available
     assert found.g == pytest.approx(nominal.g / worst, rel=0.01)
     assert found.proved == found.environments
+
+
+def test_a_part_of_what_delays_forbid_leaves_a_bound(monkeypatch):
+    loop = loop_of("n3")
+    whole = bound(loop, knots=8).rms
+    monkeypatch.setattr("design.bound._MOST_FORBIDDEN", 2)
+    assert 0 < bound(loop, knots=8).rms < whole < best("n3").figures.rms_mismatch
 
 
 def test_a_bound_says_what_it_does_not_know():

@@ -241,6 +241,20 @@ def test_what_counts_as_an_oscillation():
     assert slowest_seen(4.0) == 4.0
 
 
+def test_a_slow_swing_that_decays_is_no_oscillation():
+    """A hand that springs back, as soft environments leave it: 4 mm at 1 Hz, at any phase, 400 times the threshold.
+
+    Hann's window of .75 s leaves 2e-3 of it in the lowest octave, and more or less than before; the trend takes it out.
+    """
+    t, phases = (np.arange(1500) * T)[:, None, None], np.linspace(0, np.pi, 24, endpoint=False)
+    for hz in (0.6, 1.0, 1.12, 1.2):
+        slow = 4e-3 * np.exp(-0.45 * t) * np.cos(2 * np.pi * hz * t + phases)
+        assert not oscillation(slow, T, 1e-5).sustained.any()
+        found = oscillation(slow + 2e-5 * np.sin(2 * np.pi * 6 * t), T, 1e-5)
+        assert found.sustained.all()
+        assert found.amplitude == pytest.approx(2e-5, rel=0.2)  # a line near the octave's edge
+
+
 def walled(count):
     walls = tuple(Wall(("tip", GROUND), 900.0 * (i + 1), 0.7, 1e-4 * i) for i in range(count))
     network = Network(("tip",), (Spring(("tip", GROUND), 1.0),), walls=walls)
