@@ -24,6 +24,7 @@ from controller.coupling import Coupling
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
+from controller.ranges import Member
 from design import conditions
 from design.conditions import Condition, Demand, even_damping, regular_part, uncovered, v_hat
 from design.cone import ConeProgram, Inequality
@@ -294,7 +295,7 @@ class _AnyEnvironment(Condition):
     Its multiplier is then Phi (m,) [N s/m]. Walls are covered without delay in the environment, and refused with it.
     """
 
-    name = "any-environment"
+    name, covers = "any-environment", conditions.BEYOND  # what it says nothing of it refuses, see `_refused`
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
         V = coupling.compliance(loop.period(exact))
@@ -361,6 +362,12 @@ class _AnyEnvironment(Condition):
 
     def multiplier_name(self, loop: Loop) -> str | None:
         return "Phi" if any(loop.psi) else None
+
+    def members(self, loop: Loop) -> tuple[Member, ...]:
+        return ()
+
+    def lag(self, loop: Loop) -> tuple[float, ...] | None:
+        return None if any(loop.psi) or loop.varying_delay else (0.0,) * loop.channels
 
     def guarantee(self, loop: Loop) -> Guarantee:
         return "this environment" if any(loop.psi) else "any passive environment"
