@@ -163,8 +163,8 @@ def test_what_is_wrong_with_them_is_said_in_a_line(environment, message, place):
             "human #1.voluntary_force(t) is nan at 0.15 s, expected a finite force in N",
         ),
         (
-            "0 * t if t[-1] < 0.2 else 1 / 0",
-            "friends.py, line 10, which is your own: ZeroDivisionError: division by zero",
+            "0 * t if t[-1] < 0.2 else 1 // 0 + t",
+            "friends.py, line 10, which is your own: ZeroDivisionError: ",
         ),
     ],
 )
