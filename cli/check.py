@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 from rich.table import Table
 
 from cli import options, render
-from design.certificate import NotProved, Verdict, lag, prove, verify, violated_between
+from controller.ranges import regions
+from design.certificate import NotProved, Verdict, lag, prove, required_damping, verify, violated_between
 from design.conditions import Condition
 from design.coupling_file import Stored, SwitchingProof
 from design.coverage import SearchFigures
-from design.environments import Searched, search_ranges
+from design.environments import Searched, search, search_ranges
 from design.files import InputError
 from design.guarantees import HERE, RANGES, switching_guarantee
 from design.own import called, named
@@ -50,6 +52,7 @@ class _Checked:
     limited_forces: str | None = render.figure("forces")
     wall_s: float = render.figure("seconds", "{:.6g}")
     switching: _Switching | None = field(default=None)
+    claim: str | None = render.figure("claim", default=None, json="given")  # of a condition of the user's own
 
 
 def main(argv: list[str]) -> int:
@@ -59,11 +62,14 @@ def main(argv: list[str]) -> int:
     begin = time.perf_counter()
     stored = read_coupling(args.coupling)
     with options.refused(f"{args.coupling}: "):
-        stored, verdict = _by_own(stored, args.condition) if args.condition else (stored, verify(stored))
-    searched = _searched(stored) if verdict.proved else None
+        own = _own_condition(args.condition) if args.condition else None
+        stored, verdict = _by_own(stored, own) if own else (stored, verify(stored))
+    searched = _searched(stored, own) if verdict.proved else None
     if searched and not searched.worst[0].ratio < 1:
         verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
     checked = _checked(stored, verdict, searched, time.perf_counter() - begin)
+    if own and verdict.proved:
+        checked = replace(checked, claim=f"that the block of {own.name} keeps this loop safe is yours, and not proved")
     render.publish(args, checked, [_table(checked)])
     return options.exit_code(verdict.proved)
 
@@ -78,11 +84,15 @@ def _parser() -> options.Parser:
     return parser
 
 
-def _by_own(stored: Stored, name: str) -> tuple[Stored, Verdict]:
-    """The coupling with a certificate by the condition that `name` names, proved and verified. Raises InputError."""
+def _own_condition(name: str) -> Condition:
     condition = called(f"--condition {name}", named("--condition", name))
     if not isinstance(condition, Condition):
         raise InputError(f"--condition {name} makes {condition!r}, expected a design.conditions.Condition")
+    return condition
+
+
+def _by_own(stored: Stored, condition: Condition) -> tuple[Stored, Verdict]:
+    """The coupling with a certificate by this condition, proved and verified. Raises ValueError for a taken name."""
     coupling = stored.built()
     try:
         proved = Stored.of(stored.loop, coupling, prove(stored.loop, coupling, condition))
@@ -91,12 +101,17 @@ def _by_own(stored: Stored, name: str) -> tuple[Stored, Verdict]:
     return proved, verify(proved, condition)
 
 
-def _searched(stored: Stored) -> Searched | None:
+def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
     """The search between the vertices, again, where the file guarantees ranges of parameters."""
     if not (stored.certificate and stored.certificate.guarantee == RANGES):
         return None
+    loop, coupling = stored.loop, stored.built()
     with render.progress("searching the ranges between their vertices") as move:
-        return search_ranges(stored.loop, stored.coupling.build(stored.loop.T), move)
+        if condition is None:
+            return search_ranges(loop, coupling, move)
+        assert loop.ranges
+        need = partial(required_damping, coupling=coupling, condition=condition)
+        return search(regions(loop.network, loop.ranges), lambda m: need(loop.at(m.network)).ratio, move)
 
 
 def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, seconds: float) -> _Checked:

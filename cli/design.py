@@ -235,7 +235,10 @@ class _Best:
         yield "bound", self.bound and self.bound.words
         share = finite(self.rendered_stiffness)  # a free mass has no static stiffness to render
         yield "rendered stiffness", None if share is None else f"{share:.3f} of the environment's"
-        yield "ladder [dB]", ", ".join(f"{rung.mismatch_db:.2f}" for rung in self.ladder) or None
+        rungs = (f"{rung.mismatch_db:.2f}{'' if rung.proved else ' (not proved)'}" for rung in self.ladder)
+        yield "ladder [dB]", ", ".join(rungs) or None
+        if missed := [rung.reason for rung in self.ladder if not rung.proved]:
+            yield "last not proved", missed[-1]
 
 
 def _switching_words(proof: coverage.Switching) -> str:

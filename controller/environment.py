@@ -133,10 +133,11 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(
                 f"block: not passive, its force feeds power in at {w[worst] / (2 * np.pi * self.T):.3g} Hz"
             )
-        still = E.at(np.ones((1, 1), dtype=complex))[0, 0].real
-        rounding = 1e-9 * np.abs(still).max()
-        if np.abs(still - still.T).max() > rounding or np.linalg.eigvalsh(still).min() < -rounding:
-            raise ValueError("block: not passive, its static stiffness E(1) is not symmetric and nonnegative")
+        static = E.dc()
+        rounding = 1e-9 * np.abs(E.at(z[None])[0]).max()  # E(1) of a Maxwell element is 0 out of large numbers
+        if np.abs(static - static.T).max() > rounding or np.linalg.eigvalsh((static + static.T) / 2)[0] < -rounding:
+            shown = [[float(f"{value:.6g}") for value in row] for row in static]
+            raise ValueError(f"block: not passive, its static stiffness E(1) is {shown}, expected symmetric and >= 0")
 
     def at(self, T: Number) -> Lti:
         """E(z) in the arithmetic of T. Raises ValueError for another period."""
@@ -145,7 +146,16 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         n, m = len(self.A), len(self.D)
         shapes = {"A": (n, n), "B": (n, m), "C": (m, n), "D": (m, m)}
         A, B, C, D = (np.array(getattr(self, name), dtype=float).reshape(shape) for name, shape in shapes.items())
-        return Lti(numbers(A, T), numbers(B, T), numbers(C, T), numbers(D, T), T)
+        E = Lti(numbers(A, T), numbers(B, T), numbers(C, T), numbers(D, T), T)
+        return Lti(E.A, E.B, E.C, E.D + _static_rounding(E.dc()), T) if E.is_exact else E
+
+
+def _static_rounding(E1: Array) -> Array:
+    """What rounding of its numbers took: with it an exact E(1), (m, m), is symmetric and >= 0 again."""
+    even = (E1 + E1.T) / 2
+    plain = even.astype(float)
+    lift = max(1e-14 * np.abs(plain).max() - np.linalg.eigvalsh(plain)[0], 0.0)
+    return even - E1 + rational(float(lift)) * np.eye(len(E1), dtype=int)
 
 
 class Environment:

@@ -20,6 +20,7 @@ from controller.coupling import (
 )
 from controller.loop import Loop
 from controller.lti import Array, Lti
+from controller.older import AUDITS as OLDER
 from controller.ranges import Member, inside, number_of_vertices
 from design import conditions, multipliers
 from design.conditions import Condition
@@ -29,6 +30,7 @@ from design.coupling_file import (
     Stored,
     SwitchingProof,
     digest,
+    filed,
     own_fields,
     sealed,
 )
@@ -151,8 +153,8 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
         return None
     if certificate.limiter is not msgspec.UNSET:
         return certificate.limiter.rho
-    covered = certificate.condition == "any-environment" and not any(loop.psi) and loop.varying_delay is None
-    return (0.0,) * loop.channels if covered else None
+    known = _NAMED.get(certificate.condition)
+    return known.lag(loop) if known else None
 
 
 @_in_time()
@@ -160,6 +162,7 @@ def prove_limiter(
     loop: Loop, coupling: Coupling, beta: float = multipliers.BETA, c: multipliers.Lags | None = None
 ) -> LimiterCertificate:
     """An exact proof with the multiplier `c` or the best one. Raises NotProved with the reason."""
+    coupling = filed(loop, coupling)
     _require_limits(loop, coupling, THIS_ENVIRONMENT)
     found = multipliers.limiter_requirement(loop, coupling, beta, c)
     requirement = found.requirement
@@ -207,6 +210,7 @@ def check_limiter(
 
 def switching_requirement(loop: Loop, coupling: Coupling) -> multipliers.SwitchingSweep:
     """The damping that switching in loop.varying_delay asks; `proof` is "rational" where it is proved exactly."""
+    coupling = filed(loop, coupling)
     found = multipliers.swept(loop, coupling)
     if not found.requirement.certified or not isinstance(storage(loop, coupling, found.alpha), Matrix):
         return found
@@ -253,13 +257,15 @@ def prove(
     under any-environment without delay in the environment rho is 0 and the certificate is the same. `swept` is what
     `required_damping` gives, of a caller who has just asked. Raises NotProved with the reason.
     """
-    asked = named(condition)
+    asked, coupling = named(condition), filed(loop, coupling)
     _require_limits(loop, coupling, asked)
     given = asked.multiplier(loop, coupling, phi)
     multiplier = None if given is None else [rational(float(p)) for p in given]
     requirement = swept or required_damping(loop, coupling, asked, multiplier)
     if not requirement.certified:
-        place = f"P{worst(in_each(loop, coupling, loop.members()))}" if len(asked.members(loop)) > 1 else "P"
+        members = asked.members(loop)
+        each = [required_damping(loop.at(m.network), coupling, asked) for m in members if len(members) > 1]
+        place = f"P{worst(each) if each else ''}"
         raise NotProved(f"{_place(loop, asked, place)}{requirement.shortfall}", requirement)
     if reason := _another_system(loop, coupling):
         raise NotProved(reason, requirement)
@@ -285,7 +291,7 @@ def prove(
             scenario=digest(loop, coupling.form()),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
             switching=_switching(loop, coupling, requirement),
-            limiter=msgspec.UNSET if limiter is None or asked is ANY_ENVIRONMENT else limiter,
+            limiter=msgspec.UNSET if limiter is None or asked is not THIS_ENVIRONMENT else limiter,
         )
     )
 
@@ -296,7 +302,9 @@ _MOST_COST = 8  # environments of ranges, each as many as LARGEST states are
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
-    """Raises NotProved, in a moment, where a sweep or a proof would take minutes."""
+    """Raises NotProved, in a moment, where the condition says nothing of the loop or a proof would take minutes."""
+    if reason := condition.beyond(loop):
+        raise NotProved(reason)
     late = sum(loop.delays.hi) + sum(loop.psi)
     require_size(late)
     for value in _coefficients(msgspec.to_builtins((loop, coupling.form()), enc_hook=own_fields)):
@@ -360,7 +368,8 @@ def _switching(loop: Loop, coupling: Coupling, requirement: Requirement) -> Swit
 def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
     """Prove the stored certificate again: its bookkeeping, its figures, then its matrices in exact arithmetic.
 
-    `condition` is the certificate's own, where its name is not one of design.result.CONDITIONS.
+    `condition` is the certificate's own, where its name is not one of design.result.CONDITIONS. Of one's own condition
+    its block is proved again; that the block keeps the loop safe is the claim of who wrote it.
     """
     certificate, loop = stored.certificate, stored.loop
     if certificate is None:
@@ -373,11 +382,11 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
         return Verdict(False, f"the certificate is of {certificate.condition!r}, not of {condition.name!r}")
     coupling = stored.built()
     try:
-        asked = condition or named(certificate.condition)
+        asked = named(condition or certificate.condition)
         with _in_time():
             reason = _refuted_claims(loop, coupling, asked, certificate)
             reason = reason or _refuted_proof(loop, coupling, asked, certificate)
-    except ValueError as refused:  # NotProved, or a condition of somebody's own
+    except ValueError as refused:  # NotProved, or a user's own condition
         reason = str(refused)
     return Verdict(reason is None, reason)
 
@@ -386,8 +395,12 @@ _NAMED: dict[str, Condition] = {each.name: each for each in (THIS_ENVIRONMENT, A
 
 
 def named(condition: str | Condition) -> Condition:
-    """The condition of that name; one that comes itself is itself. Raises ValueError for an unknown name."""
+    """The condition of that name; one that comes itself is itself. Raises ValueError for an unknown or a taken name."""
     if not isinstance(condition, str):
+        name, taken = getattr(condition, "name", None), {*_NAMED, *OLDER, "switching", "limiter"}
+        if condition not in _NAMED.values() and (not isinstance(name, str) or not name.strip() or name in taken):
+            own = f"condition {type(condition).__name__}: its name is {name!r}"
+            raise ValueError(f"{own}, expected one of its own, not {', '.join(sorted(taken))}")
         return condition
     if condition not in _NAMED:
         raise ValueError(f"condition is {condition!r}, allowed are {', '.join(_NAMED)}, or a Condition of your own")
@@ -402,6 +415,8 @@ def required_damping(
     this-environment: the most over all members. A loop that has no solution is refused.
     """
     asked = named(condition)
+    if reason := asked.beyond(loop):
+        return refusal(asked.name, loop.delta, reason)
     try:
         found = asked.required(loop, coupling, multiplier)
     except SingularLoop as error:

@@ -224,13 +224,19 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
     return needed
 
 
+#: What a loop may have beyond even ticks, constant delays of its forces and one linear environment, by its field.
+BEYOND = ("psi", "T_max", "latency", "varying_delay", "walls", "ranges")
+
+
 class Condition(ABC):
     """What must hold of a coupling in a loop, as a block. One of your own is a class with a name and `demand`.
 
-    `design.certificate` proves and verifies it as it does those that it knows by name.
+    `design.certificate` proves and verifies it as it does those that it knows by name. That the block keeps a loop safe
+    is the claim of who wrote it; a loop that has something of `BEYOND` which its class does not name is refused.
     """
 
     name: str  # in requirements, certificates and reports
+    covers: tuple[str, ...] = ()  # of `BEYOND`, what the block is about; a subclass states its own
 
     @abstractmethod
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
@@ -238,12 +244,30 @@ class Condition(ABC):
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """The damping that it asks of the devices, from a refined sweep. Raises SingularLoop."""
-        demand = self.demand(loop, coupling)
-        return _least_damping(self.name, demand.free, lambda: demand, loop.delta)
+        demands = [self.demand(each, coupling) for each in self._loops(loop)]
+        found = [_least_damping(self.name, demand.free, lambda d=demand: d, loop.delta) for demand in demands]
+        return max(found, key=lambda requirement: requirement.ratio)
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         """What is to be proved over the rationals, by the name of the matrix that proves it. Raises NotProved."""
-        return {"P": self.demand(loop, coupling, exact=True)}
+        return {f"P{i or ''}": self.demand(each, coupling, exact=True) for i, each in enumerate(self._loops(loop))}
+
+    def _loops(self, loop: Loop) -> list[Loop]:
+        return [loop.at(member.network) for member in self.members(loop)] or [loop]
+
+    def beyond(self, loop: Loop) -> str | None:
+        """Why it says nothing of this loop, whatever the coupling: what its class does not cover."""
+        changes = loop.T_max not in (None, loop.T)
+        walls = loop.environment.walls
+        has = (any(loop.psi), changes, loop.latency, loop.varying_delay, walls, loop.ranges)
+        named = vars(type(self)).get("covers", ())
+        missing = [name for name, there in zip(BEYOND, has, strict=True) if there and name not in named]
+        left = f"the loop has {', '.join(missing)}, which the condition {self.name} does not name in covers"
+        return left if missing else None
+
+    def lag(self, loop: Loop) -> tuple[float, ...] | None:
+        """rho (m,) [N/m] of a limiter that needs no further proof; None where limited forces are not covered."""
+        return None
 
     def multiplier(self, loop: Loop, coupling: Coupling, given: Sequence[float] | None) -> Sequence[float] | None:
         """The numbers that the block needs beside the coupling: those given or the best found. Raises NotProved."""
@@ -255,11 +279,12 @@ class Condition(ABC):
 
     def members(self, loop: Loop) -> tuple[Member, ...]:
         """The environments in which it is proved one by one; P, P1, P2, .. are of these."""
-        return ()
+        return loop.members()
 
     def guarantee(self, loop: Loop) -> Guarantee:
         """For which environments it holds."""
-        return "this environment"
+        # proved at every vertex; whether it is kept between them is searched by check_ranges and design.check
+        return "these ranges" if loop.ranges else "this environment"
 
 
 def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], delta: Sequence[float]) -> Requirement:
@@ -498,7 +523,7 @@ def _delayed_response(V: Block, theta: Sequence[int]) -> Block:
 
 
 def _delayed_scale(response: Complex, delta: Array, phi: Array) -> Array:
-    """The least s of `any_environment_delayed`, (...,), from `_delayed_response` (..., 3m, m); inf: none is enough.
+    """The least s of `any_environment_delayed`, (...,), from `_delayed_response` (..., 3m, m); inf: no damping will do.
 
     With S = He v_hat(V)/T - V* Phi V/T^2 and N = (1 + ... + z^-theta)/2 - Phi V/T the inequality is S > 0 and
     s Delta_D >= Phi + N S^-1 N*: two Schur complements of a matrix that is affine in s.

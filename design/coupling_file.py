@@ -20,6 +20,7 @@ from controller.environment import Network
 from controller.loop import Loop
 from controller.older import CONDITIONS, GUARANTEES, named_first, named_today
 from design.files import InputError, counted, read, write
+from design.frequency import frequencies, on_circle, rounding
 from design.result import Guarantee
 
 _Rows = tuple[tuple[float, ...], ...]
@@ -85,11 +86,41 @@ class Stored(Strict, frozen=True):
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, certificate: Certificate | None = None) -> Stored:
         """The stored form of a coupling in its loop."""
-        return cls(loop, coupling.form(), certificate)
+        made = cls(loop, coupling.form(), certificate)
+        filed(loop, coupling)
+        return made
 
     def built(self) -> Coupling:
         """The coupling."""
         return self.coupling.build(self.loop.T)
+
+
+#: What the response of a coupling may differ by from that of its form, beside the largest: rounding.
+_SAME = 1e-9
+
+
+def filed(loop: Loop, coupling: Coupling) -> Coupling:
+    """The coupling as a file gives it back: itself, or what the form of one of the user's own builds.
+
+    Raises InputError where that is another system, in the loop or in what it says of its compliance.
+    """
+    built = coupling.form().build(loop.T)
+    if type(built) is type(coupling):
+        return coupling
+    through = loop.walled if loop.environment.walls else loop.sent
+    V, kept = coupling.compliance(loop.T), built.compliance(loop.T)
+    for what, own, other in (("around", through(coupling), through(built)), ("compliance", V, kept)):
+        if own is None:
+            continue
+        name = f"coupling {type(coupling).__name__}: form(), which a file keeps, is another system than {what}()"
+        if other is None:
+            raise InputError(f"{name}: it is a {built.kind} and has no compliance")
+        z = on_circle(frequencies(own))
+        response = own.at(z)
+        scale, apart = np.abs(response).max(), np.abs(response - other.at(z)).max()
+        if not apart <= _SAME * scale + rounding(own, z):  # of one that is not a number, too
+            raise InputError(f"{name}: responses differ by {apart / scale:.1e} of the largest")
+    return built
 
 
 def digest(*parts: msgspec.Struct) -> str:

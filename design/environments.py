@@ -21,6 +21,7 @@ from controller.loop import Loop
 from controller.lti import Array, Block, Lti, Sampled, constant_like, vstack
 from controller.ranges import Member, Region, regions
 from design.conditions import (
+    BEYOND,
     Condition,
     Demand,
     dampings,
@@ -32,13 +33,13 @@ from design.conditions import (
 )
 from design.exact import require_size
 from design.frequency import MOST_SECONDS, frequencies, hermitian, on_circle, supremum, sweeping, too_long
-from design.result import Guarantee, NotProved, Requirement, from_ratio, refusal
+from design.result import NotProved, Requirement, from_ratio, refusal
 
 
 class ThisEnvironment(Condition):
     """Safe in the environment of the loop: around its walls, whether they touch or not, and at all of its members."""
 
-    name = "this-environment"
+    name, covers = "this-environment", BEYOND
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
         F = loop.F(coupling, exact)
@@ -61,8 +62,7 @@ class ThisEnvironment(Condition):
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         if loop.environment.walls:
             return {"P": self._walls(loop, coupling, multiplier)}
-        loops = [loop.at(member.network) for member in self.members(loop)]
-        return {f"P{i or ''}": self.demand(each, coupling, exact=True) for i, each in enumerate(loops)}
+        return super().exact_demands(loop, coupling)
 
     def _walls(self, loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Demand[Lti]:
         G = loop.walled(coupling, exact=True)
@@ -74,13 +74,6 @@ class ThisEnvironment(Condition):
 
     def multiplier_name(self, loop: Loop) -> str | None:
         return _WALL_MULTIPLIER if loop.environment.walls else None
-
-    def members(self, loop: Loop) -> tuple[Member, ...]:
-        return loop.members()
-
-    def guarantee(self, loop: Loop) -> Guarantee:
-        # proved at every vertex; whether it is kept between them is searched by check_ranges and design.check
-        return "these ranges" if loop.ranges else "this environment"
 
 
 THIS_ENVIRONMENT = ThisEnvironment()
@@ -402,7 +395,7 @@ def search_ranges(
 def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
     """The damping that this-environment requires over the available damping, by a refined sweep of a stable coupling.
 
-    With `thin` by every so-manieth frequency of its grid alone. Of one in series, a force filter, the responses of
+    With `thin` by every `thin`-th frequency of its grid alone. Of one in series, a force filter, the responses of
     environment and filter are multiplied: the poles of their series are defective and cost digits, and time.
     """
     if (chain := coupling.in_series(loop.T)) is None:
@@ -422,7 +415,7 @@ def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
 
 
 def _thinly(loop: Loop, coupling: Coupling, thin: int) -> float:
-    """`ratio_in` at every so-manieth frequency."""
+    """`ratio_in` at every `thin`-th frequency."""
     try:
         F = loop.F(coupling)
         demand = this_environment_demand(F, loop)

@@ -24,6 +24,7 @@ from controller.coupling import Coupling
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
+from controller.ranges import Member
 from design import conditions
 from design.conditions import Condition, Demand, even_damping, regular_part, uncovered, v_hat
 from design.cone import ConeProgram, Inequality
@@ -294,7 +295,7 @@ class _AnyEnvironment(Condition):
     Its multiplier is then Phi (m,) [N s/m]. Walls are covered without delay in the environment, and refused with it.
     """
 
-    name = "any-environment"
+    name, covers = "any-environment", conditions.BEYOND  # what it says nothing of it refuses, see `_refused`
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
         V = coupling.compliance(loop.period(exact))
@@ -361,6 +362,12 @@ class _AnyEnvironment(Condition):
 
     def multiplier_name(self, loop: Loop) -> str | None:
         return "Phi" if any(loop.psi) else None
+
+    def members(self, loop: Loop) -> tuple[Member, ...]:
+        return ()
+
+    def lag(self, loop: Loop) -> tuple[float, ...] | None:
+        return None if any(loop.psi) or loop.varying_delay else (0.0,) * loop.channels
 
     def guarantee(self, loop: Loop) -> Guarantee:
         return "this environment" if any(loop.psi) else "any passive environment"
@@ -432,12 +439,6 @@ def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matri
         [C, D, np.zeros((p, n)), np.eye(p)],
     ]
     return symmetric(rows)
-
-
-def lemma4(Delta_V: _Matrix, Phi: _Matrix) -> _Matrix:
-    """(14): the excess of passivity of devices (I) and V-hat covers the shortage Phi of E-hat; also Delta_V > 0."""
-    one = np.eye(Phi.shape[0])
-    return symmetric([[one - Phi, -Phi], [-Phi, Delta_V - Phi]])
 
 
 def e_hat_regular(E: Lti, psi: Sequence[int]) -> Lti:

@@ -41,6 +41,7 @@ _TOLERATED = 0.02  # by which a further environment may be short before it enter
 _MOST_STATES = 200  # of the loop, up to which a rung is tried: half a minute with five devices
 _MOST_PROOFS = 30 * 112**2.7  # and (environments) states^2.7: a minute
 _SEARCHED = 0.2  # of the time limit, at least: what the search between the vertices of ranges may take
+_TRIED = 3  # rungs, the best first, until one is proved at every vertex of ranges
 _MOST_WORK = 1.2e7  # (channels x unknowns)^2 up to which a rung is tried
 
 
@@ -111,8 +112,7 @@ def design(
     Where nothing that was designed can be proved the environment scaled down is returned, or the best spring-damper
     where that is better.
 
-    Raises ValueError for a loop with walls or an environment that is not stable, DesignFailed where not even a
-    millionth of the environment keeps what is asked.
+    Raises ValueError for a loop with walls or an environment that no damping makes safe, as it is not passive.
     """
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
@@ -120,6 +120,7 @@ def design(
     if exactly := climb.nothing():
         return exactly
     best: Optimal | None = None
+    better: list[Optimal] = []  # each than the one before
     rungs: list[_Rung] = []
     hurried, floor = False, min(climb.simple, 1.0)
     for taps, poles in options.ladder:
@@ -131,14 +132,18 @@ def design(
         gained = np.inf if rung.reason or best is None else decibels(climb.merit(best)) - decibels(climb.merit(found))
         if rung.reason is None and (best is None or (found.g >= floor and climb.merit(found) < climb.merit(best))):
             best, floor = found, max(floor if best else 0.0, _KEPT_STIFFNESS * found.g)
+            better.append(found)
         settled = gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS
         hurried = not settled and climb.elapsed > options.seconds
         if settled or hurried:
             break
-    if best and loop.ranges:
-        best = climb.between(best)
-        hurried |= best.searched is not None and best.searched.ended
-    if best is None or climb.mismatch(best) > _HOPELESS:
+    if loop.ranges:
+        for found in better[: -_TRIED - 1 : -1]:
+            best = climb.between(found)
+            hurried |= best.searched is not None and best.searched.ended
+            if best.proved:
+                break
+    if best is None or not best.proved or climb.mismatch(best) > _HOPELESS:
         rivals = [one for one in (best, climb.scaled(), climb.spring_damper()) if one is not None]
         best = min(rivals, key=lambda one: (not one.proved, climb.merit(one)))
     return replace(best, ladder=tuple(rungs), sdps=len(rungs), wall_s=climb.elapsed, hurried=hurried)
@@ -175,7 +180,7 @@ class _Search:
             raise ValueError(reason)
         needs = in_each(loop, NoCoupling(), loop.members())
         if not np.isfinite(bare := max(each.ratio for each in needs)):
-            raise ValueError(f"no coupling is safe here: {next(each.reason for each in needs if each.reason)}")
+            raise ValueError(f"the loop without a coupling: {next(each.reason for each in needs if each.reason)}")
         return cls(loop, options, tuple(cases), bare, started)
 
     @property
@@ -260,13 +265,14 @@ class _Search:
     def solved(
         self, taps: int, poles: int, before: Optimal | None, slip: program.Slip | None, heavier: float
     ) -> Optimal:
-        share = self.mismatch(before) if before else 1.0
-        soft = program.SOFT[0] * min(share, program.SOFT[1])
+        error = self.mismatch(before) if before else 1.0
+        soft = program.SOFT[0] * min(error, program.SOFT[1])
         problem = program.Problem(self.span(taps, poles), self.asked(slip), self.options, soft, heavier=heavier)
         coupling, needs = self.kept_in_all(problem, [0])
         if slip:
             needs.append(min(limiter_requirement(self.loop, coupling, slip.beta).requirement.ratio, 1 + _TOLERATED))
-        for limit in (1 - 0.95 * program.MARGIN, 1 - 1.5 * program.MARGIN, 1 - 2.5 * program.MARGIN):
+        for share in (0.95, 1.5, 2.5, 15.0, 50.0):  # of the margin, which stays unused until the rung is proved
+            limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
             found = self._assessed(scaled, scaled.g)
@@ -338,8 +344,12 @@ class _Search:
         (slip, *_) = self.slips(None)
         problem = program.Problem(span, self.asked(slip), self.options, 0.0)
         kappa = self._start(problem)[0] if self.constrained else min(1.0, self.simple)
-        kappa = np.floor(kappa * 1e6) / 1e6
-        return self._proved(self._assessed(span.filter(np.array([kappa])), kappa), slip)
+        for share in (1.0, 0.97, 0.9, 0.7, 0.5):
+            part = np.floor(share * kappa * 1e6) / 1e6
+            found = self._proved(self._assessed(span.filter(np.array([part])), part), slip)
+            if found.proved:
+                break
+        return found
 
     def spring_damper(self) -> Optimal | None:
         """The best spring-damper of this-environment, where nothing else is asked and one is found."""
@@ -352,15 +362,15 @@ class _Search:
             return None
 
     def _start(self, problem: program.Problem) -> Array:
-        """R = kappa I that keeps every constraint with room to spare. Raises DesignFailed."""
+        """R = kappa I that keeps every constraint with room to spare.
+
+        There is one: no force keeps each strictly. Of the limiter's block with F = 0 the Schur complement is
+        2 rho (Re M/z - beta/4), and Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) is at least 1.
+        """
         kappa = 0.5 / max(self.bare, 0.5)
-        for _ in range(20):
-            start = problem.start(kappa)
-            if problem.room(start) > 0:
-                return start
+        while problem.room(start := problem.start(kappa)) <= 0:
             kappa /= 2
-        names = ", ".join(dict.fromkeys(one.name for case in problem.cases for one in case.constraints))
-        raise DesignFailed(problem, (), f"not even a millionth of the environment keeps what is asked: {names}")
+        return start
 
     def _assessed(self, coupling: Coupling, g: float) -> Optimal:
         """The coupling with its figures, and what a sweep of it alone asks for."""
@@ -435,9 +445,7 @@ def spread(
     )
     hardest = np.argsort([-ratio_in(case.loop, nominal) for case in climb.cases])
     active = [0, *(int(i) for i in hardest if i)][: _FIRST + 1]
-    tried = [nominal]
-    with suppress(DesignFailed):
-        tried.append(climb.kept_in_all(problem, active, until - seconds / 3, forgiven=_TOLERATED)[0])
+    tried = [nominal, climb.kept_in_all(problem, active, until - seconds / 3, forgiven=_TOLERATED)[0]]
     proved = 0
     for limit in (1 - program.MARGIN, 1 - 2.5 * program.MARGIN):
         found, needs = min((climb.fitted(one, slip, limit) for one in tried), key=lambda one: climb.merit(one[0]))

@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, Literal
 
 import msgspec
@@ -323,10 +323,8 @@ class Problem:
     @property
     def own(self) -> list[tuple[int, int]]:
         """Where the own unknowns of each demand begin and end, case by case."""
-        ends = [self.span.unknowns]
-        for case in self.cases:
-            ends += [ends[-1] + len(constraint.start) for constraint in case.constraints]
-        return list(pairwise(ends))
+        counts = [len(constraint.start) for case in self.cases for constraint in case.constraints]
+        return list(pairwise(accumulate(counts, initial=self.span.unknowns)))
 
     @property
     def unknowns(self) -> int:

@@ -9,6 +9,7 @@ import pytest
 from controller.arithmetic import rational
 from controller.environment import Block, Network, Spring, Wall, environment, parts_of
 from controller.lti import Lti
+from design.exact import Matrix, definiteness
 from sim import load
 from sim.scenario import InputError
 
@@ -103,6 +104,25 @@ class Gel:
 
     def E(self, T):
         return Network(self.contacts, (Spring(self.contacts, 600.0, 2.0),)).E(T)
+
+
+def test_maxwell_elements_are_passive_though_rounding_leaves_no_zero_of_their_static_stiffness():
+    """E(1) = 0 out of k b/T/(k + b/T): a spring and a damper in series, by backward Euler, between two contacts."""
+    rng, g, below = np.random.default_rng(0), np.array([[1.0, -1.0], [-1.0, 1.0]]), 0
+    for i in range(300):
+        k, b, period = np.exp(rng.uniform(3, 9)), np.exp(rng.uniform(-2, 4)), rng.choice([1e-3, 5e-4, 1.2e-3])
+        a, D = b / (b + k * period), k * b / period / (k + b / period)
+        E = Lti([[a]], [[1.0, -1.0]], [[D * (a - 1)], [-D * (a - 1)]], D * g, period)
+        block = Block.of(E)
+        below += E.dc()[0, 0] < 0
+        if i % 10 == 0:  # over Fractions, as a proof has it
+            static = block.at(rational(period)).dc()
+            assert (static == static.T).all()
+            assert definiteness(Matrix.of(static)).semidefinite
+            np.testing.assert_allclose(static.astype(float), 0, atol=1e-12 * D)
+    assert below > 30
+    with pytest.raises(ValueError, match=r"static stiffness E\(1\) is \[\[-1e-05, 1e-05\], \[1e-05, -1e-05\]\]"):
+        Block.of(Lti([[a]], [[1.0, -1.0]], [[D * (a - 1)], [-D * (a - 1)]], (D - 1e-5) * g, period))
 
 
 def test_a_scenario_takes_an_environment_of_one_s_own():

@@ -1,0 +1,141 @@
+"""A condition and a coupling of one's own: what they do not say is not taken for said."""
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+import pytest
+
+from controller.coupling import Compliance, Coupling, SpringDamper
+from controller.loop import DelayRange
+from controller.lti import Lti, as_like, constant_like, numbers, taps
+from design.certificate import lag, prove, required_damping, verify
+from design.conditions import BEYOND, Condition, Demand
+from design.coupling_file import Stored, filed
+from design.files import InputError
+from design.result import NotProved
+from sim import load
+
+PAIR = load("omega-pair").loop("I")
+SOFT = SpringDamper([400.0, 300.0], [0.1, 0.1])
+change = msgspec.structs.replace
+
+
+class Plain(Condition):
+    """this-environment of even ticks, written out again."""
+
+    name = "plain"
+
+    def demand(self, loop, coupling, exact=False):
+        F = loop.F(coupling, exact)
+        F1, R = F.split_at_one()
+        return Demand(R - F1 / 2, constant_like(F, np.diag(numbers(loop.delta, F.T) / F.T)), {"F(1)": F1}, ("F(1)",))
+
+
+class Uneven(Plain):
+    covers = ("T_max",)
+
+    def demand(self, loop, coupling, exact=False):
+        longest = loop.T if loop.T_max is None else loop.T_max
+        demand = super().demand(loop, coupling, exact)
+        return Demand(demand.free, demand.gain * (loop.period(exact) / numbers(longest, loop.period(exact))))
+
+
+class Everywhere(Plain):
+    covers = ("ranges",)
+
+
+def _beyond() -> dict[str, tuple]:
+    wall = load("one-wall").loop("I")
+    one = SpringDamper([400.0] * wall.channels, [0.1] * wall.channels)
+    return {
+        "psi": (change(PAIR, psi=(1, 0)), SOFT),
+        "T_max": (change(PAIR, T_max=2e-3), SOFT),
+        "latency": (change(PAIR, latency=((0.0, 1.1e-3),) * 2), SOFT),
+        "varying_delay": (PAIR.switching(DelayRange(PAIR.theta, tuple(n + 1 for n in PAIR.theta))), SOFT),
+        "walls": (wall, one),
+        "ranges": (load("omega-pair-ranges").loop("I"), SOFT),
+    }
+
+
+@pytest.mark.parametrize("name", BEYOND)
+def test_what_it_does_not_name_it_does_not_cover(name):
+    loop, coupling = _beyond()[name]
+    found = required_damping(loop, coupling, Plain())
+    assert np.isinf(found.ratio)
+    assert f"{name}, which the condition plain" in str(found.reason)
+    with pytest.raises(NotProved, match=f"the loop has {name}, which the condition plain does not name"):
+        prove(loop, coupling, Plain())
+
+
+def test_a_subclass_names_its_own_and_a_stored_proof_is_refused_by_one_that_does_not():
+    loop = change(PAIR, T_max=2e-3)
+    assert required_damping(loop, SOFT, Uneven()).ratio == pytest.approx(
+        required_damping(PAIR, SOFT, Plain()).ratio * 2e-3 / PAIR.T, rel=1e-9
+    )
+    stored = Stored.of(loop, SOFT, prove(loop, SOFT, Uneven()))
+    assert verify(stored, Uneven()).proved
+    assert "T_max" in str(verify(stored, Plain()).reason)
+
+    class More(Uneven):
+        pass
+
+    assert "T_max" in str(required_damping(loop, SOFT, More()).reason)
+
+
+def test_ranges_that_it_names_are_proved_at_every_vertex():
+    loop = load("omega-pair-ranges").loop("I")
+    own, shipped = (required_damping(loop, SOFT, condition) for condition in (Everywhere(), "this-environment"))
+    assert own.ratio == pytest.approx(shipped.ratio, rel=1e-9)
+    certificate = prove(loop, SOFT, Everywhere())
+    assert len(certificate.matrices) == len(loop.members()) > 1
+    assert certificate.guarantee == "these ranges"
+    assert verify(Stored.of(loop, SOFT, certificate), Everywhere()).proved
+
+
+@pytest.mark.parametrize("taken", ["any-environment", "this-environment", "theorem4", "closed-loop", "limiter", "", 7])
+def test_a_name_of_ours_is_refused(taken):
+    own = type("Steal", (Plain,), {"name": taken})()
+    for asked in (lambda: required_damping(PAIR, SOFT, own), lambda: prove(PAIR, SOFT, own)):
+        with pytest.raises(ValueError, match="condition Steal: its name is"):
+            asked()
+    ours = Stored.of(PAIR, SOFT, prove(PAIR, SOFT, "this-environment"))
+    if taken == "this-environment":
+        assert "condition Steal: its name is" in str(verify(ours, own).reason)
+
+
+def test_limited_forces_are_not_covered_by_ones_own():
+    assert lag(PAIR, prove(PAIR, SOFT, Plain())) is None
+    assert lag(PAIR, prove(PAIR, SOFT, "any-environment")) == (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Mean(Coupling):
+    """A spring behind a weighted mean of two samples; by its form `kept` times as soft, by its compliance `told`."""
+
+    K: float
+    kept: float = 1.0
+    told: float = 1.0
+
+    def _V(self, T, times=1.0):
+        return Lti.diag(*[taps(numbers([0.8, 0.2], T) * numbers(times / self.K, T), T)] * 2)
+
+    def compliance(self, T):
+        return self._V(T, self.told)
+
+    def around(self, environment, further=0):
+        return environment.feedback(as_like(environment, self._V(environment.T)))
+
+    def form(self):
+        return Compliance(self._V(PAIR.T, self.kept)).form()
+
+
+def test_a_coupling_is_the_system_that_its_file_gives_back():
+    assert isinstance(filed(PAIR, Mean(400.0)), Compliance)
+    assert filed(PAIR, SOFT) is SOFT
+    certificate = prove(PAIR, Mean(400.0), "this-environment")
+    assert verify(Stored.of(PAIR, Mean(400.0), certificate)).proved
+    for other, what in ((Mean(400.0, kept=1.00001), "around"), (Mean(400.0, told=2.0), "compliance")):
+        for asked in (Stored.of, filed, lambda loop, given: prove(loop, given, "this-environment")):
+            with pytest.raises(InputError, match=f"coupling Mean: form.*another system than {what}"):
+                asked(PAIR, other)
