@@ -23,7 +23,7 @@ from design.files import unseen
 from design.guarantees import EncoderSteps
 from design.result import CONDITIONS, listed
 from models.device import CATALOGUE, listed_device
-from sim.couplings import check_stored, fitted, read_coupling
+from sim.couplings import check_stored, fitted, own_of, read_coupling
 from sim.report import encoder_steps
 from sim.scenario import InputError, Scenario
 
@@ -59,7 +59,7 @@ def main(argv: list[str]) -> int:
     args = _with_device(args)
     scenario = options.scenario_from(args)
     loop = options.rigid_loop(args, scenario) if args.rigid else scenario.loop(args.case)
-    coupling = _coupling(args, loop.channels, scenario)
+    coupling = _coupling(args, loop, scenario)
     switching = _switching(args, loop)
     out = options.out_folder(args, "audit")
 
@@ -69,7 +69,7 @@ def main(argv: list[str]) -> int:
     with options.refused():
         found = audit(loop, coupling, switching, whole)
     notes = ()
-    if args.coupling:  # what its file is worth in the loop that is audited
+    if args.coupling and not _is_own(args):  # what its file is worth in the loop that is audited
         notes = check_stored(read_coupling(args.coupling), scenario.loop(args.case).switching(switching)).notes
     report = _Report(
         args.case,
@@ -93,7 +93,8 @@ def _parser() -> options.Parser:
     coupling.add_argument("--K", type=stiffness, metavar="K,K,..", help="stiffness per channel [N/m]; one is for all")
     damping = options.several(float, 0, 1e6, "N s/m")
     coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m]; one is for all")
-    coupling.add_argument("--coupling", metavar="FILE.json", help="a stored coupling, in place of --K and --B")
+    stored = "a stored coupling, or a function of your own, in place of --K and --B"
+    coupling.add_argument("--coupling", metavar="FILE.json|MODULE:NAME", help=stored)
     device = "its damping and, where no gains are given, the largest that CHAI3D allows it, on a rigid wall at 1 kHz"
     coupling.add_argument("--device", metavar="NAME", help=f"of the catalogue: {device}; other options go first")
     coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")
@@ -150,7 +151,12 @@ def _list_devices(args: argparse.Namespace) -> int:
     return options.DONE
 
 
-def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Coupling:
+def _is_own(args: argparse.Namespace) -> bool:
+    """Whether --coupling names a user's own function, not a file."""
+    return ":" in (args.coupling or "") and not Path(args.coupling).exists()
+
+
+def _coupling(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> Coupling:
     gains = [name for name in ("K", "B") if getattr(args, name) is not None]
     given = [f"--{name}" for name in (*gains, *(["coupling"] if args.coupling else []))]
     if args.case == "none":
@@ -160,18 +166,22 @@ def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Co
     if args.coupling:
         if gains:
             raise InputError(f"{given[0]} with --coupling: give one of them")
+        if _is_own(args):
+            return own_of(args.coupling, loop).coupling
         if args.coupling in KINDS and not Path(args.coupling).exists():
             design = f"`python -m design --coupling {args.coupling} --out {args.coupling}.json`"
             raise InputError(
                 f"--coupling {args.coupling}: an audit takes the file of a coupling; make it with {design}"
             )
-        return fitted(read_coupling(args.coupling), args.coupling, channels, scenario.T)
+        return fitted(read_coupling(args.coupling), args.coupling, loop.channels, scenario.T)
     if len(gains) == 1:
         missing = "B" if gains == ["K"] else "K"
         raise InputError(f"--{gains[0]} without --{missing}: a spring-damper has both (--B 0 is a spring alone)")
     if not gains:
-        raise InputError("nothing to audit: give --K and --B, --coupling FILE.json, --device NAME or --case none")
-    K, B = (options.per_channel(f"--{name}", getattr(args, name), channels) for name in "KB")
+        raise InputError(
+            "nothing to audit: give --K and --B, --coupling FILE.json or module:function, --device NAME or --case none"
+        )
+    K, B = (options.per_channel(f"--{name}", getattr(args, name), loop.channels) for name in "KB")
     return SpringDamper(K, B)
 
 

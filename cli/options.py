@@ -31,7 +31,7 @@ from controller.delay import LOST, VaryingDelay
 from controller.loop import DelayRange, Loop
 from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
-from design.own import named, place_of
+from design.own import is_refusal, named, place_of
 from design.result import CONDITIONS, DesignFailed
 from models.device import MOST_DAMPING
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
@@ -524,10 +524,13 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
     except OSError as error:  # a full disk behind standard output, mostly
         code = _cannot(error)
     except Exception as error:  # not 1, which says that what was asked does not hold
-        traceback.print_exc()
         place, code = place_of(error), UNFINISHED  # a mistake of ours, or one in a class that the user named
-        if place:
-            code = _say(f"error: {place}, which is your own: {type(error).__name__}: {error}", BAD_INPUT)
+        if place and is_refusal(error):
+            code = _say(f"error: {place}: {error}", BAD_INPUT)
+        else:
+            traceback.print_exc()
+            if place:
+                code = _say(f"error: {place}, which is your own: {type(error).__name__}: {error}", BAD_INPUT)
     try:
         sys.stdout.flush()
     except BrokenPipeError:

@@ -288,12 +288,12 @@ def robustness_rows(nearby: Nearby) -> Rows:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
         yield "robustness", f"{words}, the worst within {there.percent:g} %"
     if price := nearby.designed_for_it:
-        yield "designed for that", price_words(price)
+        yield f"design for ±{there.percent if there else 10:g} %", price_words(price)
 
 
 def price_words(price: Spread) -> str:
     """What a design for more than one environment reaches and costs."""
-    costs = f"at most {price.price_db:.2f} dB worse" if math.isfinite(price.price_db) else "not exact"
+    costs = f"at most {max(price.price_db, 0.0):.2f} dB worse" if math.isfinite(price.price_db) else "not exact"
     proved = f"proved in {price.proved} of {price.environments} environments"
     rest = ", swept in the others" if price.proved < price.environments else ""
     return f"{price.mismatch_db:.2f} dB, {costs}: {proved}{rest}"

@@ -66,7 +66,7 @@ def add_pace_option(parser: argparse._ActionsContainer, what: str) -> None:
 
 
 def add_safety_options(parser: options.Parser) -> None:
-    """Limits of force and speed, and the switch that somebody has to hold."""
+    """Limits of force and speed, and the switch that the user has to hold."""
     add, number = parser.add_argument_group("safety").add_argument, options.number
     cap = "largest force (default 2, for first sessions)"
     add("--force-cap", type=number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
@@ -78,7 +78,7 @@ def add_safety_options(parser: options.Parser) -> None:
     add("--thermal-time", type=number(0.1, 1000), default=10.0, metavar="SECONDS", help=warm)
     absolute = "count positions from the encoders' zero, not from where the handles are at arming"
     add("--no-rereference", action="store_true", help=absolute)
-    who = "forces act only while somebody presses a key or touches FILE once a second, or holds the device's own switch"
+    who = "forces act only while the user presses a key or touches FILE once a second, or holds the device's own switch"
     add("--deadman", metavar="key|device|FILE", help=who)
     add("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
     parser.only("with --port", lambda args: args.port, "no_preflight")
@@ -116,7 +116,7 @@ def touched(path: str) -> Callable[[], bool]:
 
 
 def _deadman(named: str | None) -> Callable[[], bool] | None:
-    """A function that says whether somebody touched the file of --deadman; keys are read elsewhere.
+    """A function that says whether the file was touched of --deadman; keys are read elsewhere.
 
     None where no one has to be present, or where the device has a switch of its own.
     """

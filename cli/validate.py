@@ -73,7 +73,7 @@ def _parser() -> options.Parser:
     options.add_limiter_option(parser)
     add("--humans", type=whole(1, 1_000_000), default=1000, metavar="N", help="random humans per device (default 1000)")
     add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
-    add("--engine", choices=ENGINES, default="both", help="who decides (default both)")
+    add("--engine", choices=ENGINES, default="both", help="who decides (default both); one of your own is for sim.run")
     seconds = "length of the traces (default 2; 0 for none)"
     add("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
     add("--shards", type=whole(1, 256), default=1, metavar="K", help="local processes, for the same result (default 1)")

@@ -7,7 +7,6 @@ floats, a stack, Fractions, or sampled responses (controller.lti). Its form is w
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -18,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller.arithmetic import Number, numbers
-from controller.lti import Array, Block, Complex, Lti, ReadOnly, Sampled, frozen, taps
+from controller.lti import Array, Block, Complex, Lti, ReadOnly, Sampled, as_like, frozen, taps
 
 _LARGEST_COEFFICIENT = 1e12  # of a stored coupling, SI units
 _MOST_TERMS = 2000  # of a moving average; every one is a state
@@ -26,19 +25,31 @@ _LARGEST_WEIGHT = 1e9  # of a force filter: beyond it arithmetic would overflow 
 _Rows = tuple[tuple[float, ...], ...]
 
 
-class Coupling(ABC):
+class Coupling:
     """Anything that can be closed around the (delayed) environment.
 
-    A new one has `around` and `form`, which judging asks for; `compliance` where any-environment is to judge it.
+    A new one is derived from it and has `compliance` and `form`; its own `around` where it is no V in feedback.
     """
 
     kind: ClassVar[str] = "own"  # how reports name it
     holds_model: ClassVar[bool] = False  # a linear model of the environment: it cannot face walls
     one_period: ClassVar[bool] = False  # its coefficients are for the T that it was designed for
 
-    @abstractmethod
     def around(self, environment: Block, further: int = 0) -> Block:
-        """(I + Psi E V)^-1 Psi E, given Psi E, whose last `further` ports lie behind no coupling."""
+        """(I + Psi E V)^-1 Psi E, given Psi E, whose last `further` ports lie behind no coupling: walls have them.
+
+        Raises ValueError for another number of contacts, and where there is no V.
+        """
+        V = self.compliance(environment.T)
+        if V is None:
+            raise ValueError(f"a coupling of class {type(self).__name__} has no compliance(T): define it")
+        if isinstance(environment, Lti):
+            contacts = environment.inputs - further
+            if (V.outputs, V.inputs) != (contacts, environment.outputs - further):
+                raise ValueError(f"the coupling is {V.outputs} x {V.inputs}, the environment has {contacts} contacts")
+        if further:
+            V = Lti.diag(V, Lti.constant(np.zeros((further, further)), V.T))
+        return environment.feedback(as_like(environment, V))
 
     def compliance(self, T: Number) -> Lti | None:
         """V(z) in the arithmetic of T; None where the coupling is not a V in feedback around any environment."""
@@ -151,7 +162,7 @@ class SpringDamper(ReadOnly, Coupling):
     def around(self, environment: Block, further: int = 0) -> Block:
         if isinstance(environment, Sampled):
             return environment.feedback(self.sampled(environment.z, environment.T))
-        return _feedback(environment, self.compliance(environment.T), further)
+        return super().around(environment, further)
 
     def form(self) -> SpringDamperForm:
         if self.cutoff is not None:
@@ -225,15 +236,8 @@ class MovingAverage(ReadOnly, Coupling):
         rows = zip(numbers(self.weight, T), self.terms, numbers(self.constant, T), strict=True)
         return [taps([w + e, *[w] * (n - 1)], T) for w, n, e in rows]
 
-    def compliance(self, T: Number) -> Lti:
-        """V(z), diagonal."""
-        return Lti.diag(*self.channels(T))
-
     def figures(self, T: float) -> dict[str, Any]:
         return {"stiffness": self.stiffness.tolist()} | super().figures(T)
-
-    def around(self, environment: Block, further: int = 0) -> Block:
-        return Compliance(self.compliance(environment.T)).around(environment, further)
 
     def form(self) -> _MovingAverageForm:
         return _MovingAverageForm(tuple(self.weight.tolist()), self.terms, tuple(self.constant.tolist()))
@@ -248,19 +252,10 @@ class Compliance(Coupling):
     kind, one_period = "compliance", True
 
     def compliance(self, T: Number) -> Lti:
-        return Lti(self.V.A, self.V.B, self.V.C, self.V.D, T)
+        return self.V if isinstance(T, float) and T == self.V.T else Lti(self.V.A, self.V.B, self.V.C, self.V.D, T)
 
     def at_period(self, T: float) -> Compliance:
         return Compliance(replace(self.V, T=T))
-
-    def around(self, environment: Block, further: int = 0) -> Block:
-        if isinstance(environment, Sampled):
-            return environment.feedback(Sampled.of(self.V, environment.z))
-        contacts = environment.inputs - further
-        if self.V.inputs != environment.outputs - further or self.V.outputs != contacts:
-            channels = f"{self.V.outputs} x {self.V.inputs}"
-            raise ValueError(f"the coupling is {channels}, the environment has {contacts} contacts")
-        return _feedback(environment, self.compliance(environment.T) if environment.is_exact else self.V, further)
 
     def form(self) -> ComplianceForm:
         return ComplianceForm(*(_rows(getattr(self.V, name)) for name in "ABCD"))
@@ -490,13 +485,6 @@ def _reached(R: Array, reals: int) -> int:
         return 0
     length = int(used[-1]) + 1
     return length + (length - reals) % 2 if length > reals else length
-
-
-def _feedback(environment: Lti, V: Lti, further: int) -> Lti:
-    """V around all ports of the environment but the last `further`."""
-    if further:
-        V = Lti.diag(V, Lti.constant(np.zeros((further, further)), V.T))
-    return environment.feedback(V)
 
 
 class Strict(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

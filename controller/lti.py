@@ -269,10 +269,6 @@ class Lti(ReadOnly):
         static, R = self._rest
         return static, Lti(self.A, self.B, -R, np.zeros_like(self.D), self.T)
 
-    def quotient_at_one(self) -> Lti:
-        """(G(z) - G(1))/(z - 1)."""
-        return self.split_at_one()[1]
-
     def __matmul__(self, other: Lti | Array) -> Lti:
         B, D = self.B, self.D
         if not isinstance(other, Lti):

@@ -209,7 +209,7 @@ class StepBuffer:
         return bool(self._bounds)
 
     def linear_until(self, ticks: int, most: float = 1.0) -> int:
-        """The first of these ticks in which a force asks for more than `most` of what there is, else `ticks`.
+        """The first of these ticks in which a force is more than `most` of its limit, else `ticks`.
 
         Not a number counts as such.
         """

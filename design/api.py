@@ -234,7 +234,11 @@ def bare(coupling: Coupling | Design, expected: str = COUPLING) -> Coupling:
     found = coupling.coupling if isinstance(coupling, Design) else coupling
     if isinstance(found, Lti):
         raise TypeError("coupling is an Lti, expected a coupling: wrap it in Compliance(...) (controller.coupling)")
-    if isinstance(found, type) or not callable(getattr(found, "around", None)):
+    if not isinstance(found, Coupling):
+        if hasattr(found, "compliance") and not isinstance(found, type):
+            raise TypeError(
+                f"coupling is a {type(found).__name__}, which is not derived from controller.coupling.Coupling"
+            )
         raise TypeError(f"coupling is {shown(coupling)}, expected {expected}")
     return found
 

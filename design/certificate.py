@@ -386,7 +386,7 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
         with _in_time():
             reason = _refuted_claims(loop, coupling, asked, certificate)
             reason = reason or _refuted_proof(loop, coupling, asked, certificate)
-    except ValueError as refused:  # NotProved, or a condition of somebody's own
+    except ValueError as refused:  # NotProved, or a user's own condition
         reason = str(refused)
     return Verdict(reason is None, reason)
 

@@ -523,7 +523,7 @@ def _delayed_response(V: Block, theta: Sequence[int]) -> Block:
 
 
 def _delayed_scale(response: Complex, delta: Array, phi: Array) -> Array:
-    """The least s of `any_environment_delayed`, (...,), from `_delayed_response` (..., 3m, m); inf: none is enough.
+    """The least s of `any_environment_delayed`, (...,), from `_delayed_response` (..., 3m, m); inf: no damping will do.
 
     With S = He v_hat(V)/T - V* Phi V/T^2 and N = (1 + ... + z^-theta)/2 - Phi V/T the inequality is S > 0 and
     s Delta_D >= Phi + N S^-1 N*: two Schur complements of a matrix that is affine in s.

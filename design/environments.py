@@ -395,7 +395,7 @@ def search_ranges(
 def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
     """The damping that this-environment requires over the available damping, by a refined sweep of a stable coupling.
 
-    With `thin` by every so-manieth frequency of its grid alone. Of one in series, a force filter, the responses of
+    With `thin` by every `thin`-th frequency of its grid alone. Of one in series, a force filter, the responses of
     environment and filter are multiplied: the poles of their series are defective and cost digits, and time.
     """
     if (chain := coupling.in_series(loop.T)) is None:
@@ -415,7 +415,7 @@ def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
 
 
 def _thinly(loop: Loop, coupling: Coupling, thin: int) -> float:
-    """`ratio_in` at every so-manieth frequency."""
+    """`ratio_in` at every `thin`-th frequency."""
     try:
         F = loop.F(coupling)
         demand = this_environment_demand(F, loop)

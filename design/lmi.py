@@ -441,12 +441,6 @@ def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matri
     return symmetric(rows)
 
 
-def lemma4(Delta_V: _Matrix, Phi: _Matrix) -> _Matrix:
-    """(14): the excess of passivity of devices (I) and V-hat covers the shortage Phi of E-hat; also Delta_V > 0."""
-    one = np.eye(Phi.shape[0])
-    return symmetric([[one - Phi, -Phi], [-Phi, Delta_V - Phi]])
-
-
 def e_hat_regular(E: Lti, psi: Sequence[int]) -> Lti:
     """E-hat less its pole at z = 1, plus E(1)/2; E(1) must be symmetric and >= 0."""
     return regular_part(delay(psi, E.T) @ E)

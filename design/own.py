@@ -14,7 +14,8 @@ from design.files import InputError
 
 _Made = TypeVar("_Made")
 _HOME, _WORLDS = Path(__file__).parents[1], ("models", "controller", "design", "sim", "hw", "cli")
-_OTHERS = ("<", *(f"{place}{os.sep}" for place in (sys.prefix, sys.base_prefix, *(_HOME / w for w in _WORLDS))))
+_OURS = tuple(f"{_HOME / world}{os.sep}" for world in _WORLDS)
+_OTHERS = ("<", f"{sys.prefix}{os.sep}", f"{sys.base_prefix}{os.sep}", *_OURS)
 
 
 def named(option: str, text: str) -> Any:
@@ -54,6 +55,12 @@ def called(what: str, make: Callable[..., _Made], *given: Any, **named: Any) -> 
             raise
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
         raise InputError(f"{what}: {kind}{error}") from error
+
+
+def is_refusal(error: BaseException) -> bool:
+    """Whether a statement of ours refused what a user's own code gave it: then its traceback says nothing more."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return last.filename.startswith(_OURS) and (last.line or "").startswith("raise ")
 
 
 def place_of(error: BaseException) -> str | None:

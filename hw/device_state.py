@@ -23,7 +23,7 @@ class Device:
         self.info_frame = wire.encode(info)
         self.decoder = wire.Decoder()
         self.unexpected = 0  # well-formed frames that this device has no use for
-        self.deadman = False  # whether somebody holds it: yours to set, where the device has one
+        self.deadman = False  # whether a hand holds it: yours to set, where the device has one
         self.phase, self.cause = wire.Phase.SILENT, wire.Cause.NONE
         self.config: wire.Config | None = None
         self.k, self.now = 0, 0  # this tick, and the clock at it [us]

@@ -307,7 +307,7 @@ class Estimate:
 def identify(x: Array, force: Array, used: _Flags, T: float, step: float, rigid: bool) -> Estimate:
     """Fit one axis: displacements x (N,) [m], what the motor did (N,) [N], which samples count (N,), encoder step [m].
 
-    Raises ValueError where the device did not move, somebody holds it or nothing is left of its damping.
+    Raises ValueError where the device did not move, a hand holds it or nothing is left of its damping.
     """
     if np.ptp(x[used]) < 20 * step:
         raise ValueError(f"the axis moved by {np.ptp(x[used]) / step:.0f} encoder steps, at least 20 are needed")
@@ -400,8 +400,8 @@ def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> lis
     for i, (e, said) in enumerate(zip(estimates, _declared(scenario, session), strict=False), start=1):
         if e.viscous > (1 + _SUSPICIOUS) * said:
             found.append(
-                f"axis {i}: {e.viscous:.4g} N s/m estimated, {said:.4g} declared (scenario, INFO): is somebody "
-                "holding it? No bound is offered; where the device really has more, declare it and take another record"
+                f"axis {i}: {e.viscous:.4g} N s/m estimated, {said:.4g} declared (scenario, INFO): is a hand "
+                "on it? No bound is offered; where the device really has more, declare it and take another record"
             )
     return found
 

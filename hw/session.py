@@ -412,16 +412,16 @@ class _Shutdown:
 class Operator:
     """A person's part in a session: arming, the planned end, keys. It arms by itself at most once, ever.
 
-    With a `deadman`, forces act only as long as it is told every second that somebody is there: by any key, or by
+    With a `deadman`, forces act only as long as it is told every second that the user is there: by any key, or by
     whatever answers `deadman`.
     """
 
     auto_arm: bool
     seconds: float  # of forces at full gain, from each arming on
-    deadman: Callable[[], bool] | None = None  # whether somebody showed up since the last call
+    deadman: Callable[[], bool] | None = None  # whether the user gave a sign since the last call
     _asked: bool = False  # auto_arm has been used up
     _armed_at: int | None = None  # [us]
-    _seen_at: int | None = None  # [us] when somebody showed up last
+    _seen_at: int | None = None  # [us] when the user gave a sign last
     _free_at: int = 0  # [us] before which it does not arm by itself
 
     def decide(self, session: Session, now: int) -> Said:

@@ -167,7 +167,7 @@ class Live(Driver):
         keyboard: int | None = None,  # a file descriptor with single keys
         glance: Callable[[Session], None] = lambda session: None,  # called a few times a second
         pace: float = 1.0,  # seconds of the session per second; 1 with any real device
-        deadman: Callable[[], bool] | None = None,  # whether somebody showed up since the last call
+        deadman: Callable[[], bool] | None = None,  # whether the user gave a sign since the last call
     ) -> None:
         super().__init__(session, device, plan, lambda: int(time.monotonic_ns() * pace) // 1000)
         self._operator = Operator(auto_arm, seconds, deadman)

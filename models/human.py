@@ -351,7 +351,7 @@ def check_holds(held_by: Sequence[tuple[int, ...]], channels: int) -> None:
             if channel > channels:
                 raise ValueError(f"person #{i}.holds has channel {channel}, allowed are 1 to {channels}")
             if channel in held:
-                raise ValueError(f"person #{i}.holds has channel {channel}, which somebody else holds already")
+                raise ValueError(f"person #{i}.holds has channel {channel}, which another person holds already")
         held.update(holds)
 
 

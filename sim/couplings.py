@@ -49,10 +49,7 @@ def choose(
             raise InputError(f"--coupling published: the paper prints gains for 2 channels, not {scenario.channels}")
         return Chosen(PUBLISHED[case], condition or "any-environment", kind=name)
     if name not in KINDS and ":" in name:
-        loop = scenario.loop(case)
-        found = own_coupling(name, loop)
-        called(f"--coupling {name}", fitting, loop, found)
-        own = given(found, name)
+        own = own_of(name, scenario.loop(case))
         return replace(own, condition=condition or own.condition)
     if name in KINDS:
         try:
@@ -82,6 +79,13 @@ def choose(
     proof = (stored.certificate and stored.certificate.limiter) or None
     how = {"notes": checked.notes, "switching": checked.switching, "limiter": proof}
     return Chosen(coupling, condition or made_for, kind=Path(name).name, **how)
+
+
+def own_of(name: str, loop: Loop) -> Chosen:
+    """What a user's own function makes of a loop, which it must fit. Raises InputError."""
+    found = own_coupling(name, loop)
+    called(f"--coupling {name}", fitting, loop, found)
+    return given(found, name)
 
 
 def given(coupling: Coupling | Design | None, kind: str = "given") -> Chosen:

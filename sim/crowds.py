@@ -97,7 +97,7 @@ def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterat
 def _draw_bodies(population: Population, persons: int, seed: int, index: int) -> Array:
     """Bodies of the persons with this index who hold several devices: (persons, 5) as in Crowd, from the same ranges.
 
-    Drawn apart from the links, which are the same whether or not somebody holds several devices.
+    Drawn apart from the links, which are the same whether or not a person holds several devices.
     """
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
     ranges = (population.mass, population.damping, population.stiffness, population.damping, population.stiffness)

@@ -17,11 +17,16 @@ from design.lmi import (
     check_passive,
     e_hat_regular,
     lemma1,
-    lemma4,
+    symmetric,
     unit_coupling,
     unit_environment,
     v_hat_ports,
 )
+
+
+def lemma4(Delta_V: cp.Variable, Phi: cp.Variable) -> cp.Expression:
+    """(14): the excess of passivity of devices (I) and V-hat covers the shortage Phi of E-hat; also Delta_V > 0."""
+    return symmetric([[np.eye(Phi.shape[0]) - Phi, -Phi], [-Phi, Delta_V - Phi]])
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,7 +82,7 @@ def test_a_sampled_split_keeps_what_z_loses_near_one():
 
 def test_quotient_at_one(blocks):
     G = blocks[0]
-    close(G.quotient_at_one().at(Z), (G.at(Z) - G.dc()) / (Z - 1)[:, None, None])
+    close(G.split_at_one()[1].at(Z), (G.at(Z) - G.dc()) / (Z - 1)[:, None, None])
 
 
 @pytest.mark.parametrize("steps", [(0,), (3,), (1, 2), (0, 4, 50)])
@@ -101,7 +101,7 @@ def test_delays_at_the_outputs_are_powers_of_z_wherever_they_stand(blocks):
         ring[i, j] = 1
     ring[0, 0] = 0.5
     branches = Lti(ring, np.eye(8, 1), np.arange(16.0).reshape(2, 8), np.zeros((2, 1)), T)
-    for block in (loop, loop.quotient_at_one(), delay((2, 3), T) @ G.feedback(0.01 * loop), branches):
+    for block in (loop, loop.split_at_one()[1], delay((2, 3), T) @ G.feedback(0.01 * loop), branches):
         z = 1.1 * Z[:, None, None]
         close(block.at(1.1 * Z), block.C @ np.linalg.solve(z * np.eye(block.order) - block.A, block.B + 0j) + block.D)
         assert block.poles().size == block.order

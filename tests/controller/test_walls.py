@@ -17,7 +17,7 @@ from controller.complementarity import Complementarity
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
 from controller.law import Law
-from controller.lti import Lti
+from controller.lti import Lti, taps
 from controller.tick import Process
 from design.audit import audit, requirement
 from design.certificate import assess, prove
@@ -102,6 +102,27 @@ def test_a_wall_behind_a_coupling_against_a_root_finder():
     f = drive(walled(one(stiffness, damping, gap), SpringDamper([K], [B]), [1], [0]), x[:, None, None]).f[:400, 0, 0]
     np.testing.assert_allclose(f, expected[:400], atol=1e-9)  # 1e-13 m times 5000 N/m
     assert 0 < (f > 0).mean() < 1
+
+
+class Weighted(Coupling):
+    """A user's own: V = (0.8 + 0.2/z)/900 on each of two channels."""
+
+    def compliance(self, T):
+        return Lti.diag(*[taps([0.8 / 900, 0.2 / 900], T)] * 2)
+
+
+def test_a_wall_behind_a_coupling_of_ones_own():
+    """Between two contacts, with a wall one way only; by hand: f = max(0, k w), w = a - b - 2 (0.8 f + 0.2 f-)/900."""
+    network = Network(("a", "b"), walls=(Wall(("a", "b"), 3000.0),))
+    x = wander(60, 2, 1)
+    f, expected = 0.0, []
+    for a, b in x[..., 0]:
+        expected.append(f := max(0.0, 3000 * (a - b - 2 * 0.2 / 900 * f) / (1 + 3000 * 2 * 0.8 / 900)))
+    got = drive(walled(network, Weighted(), [0, 0], [0, 0]), x).f[:60, :, 0]
+    np.testing.assert_allclose(got, np.outer(expected, [1, -1]), atol=1e-9)
+    assert 0 < (got > 0).mean() < 0.5
+    with pytest.raises(ValueError, match="the coupling is 2 x 2, the environment has 1 contacts"):
+        load("one-wall").loop("I").law(Weighted())
 
 
 BOXED = Network(

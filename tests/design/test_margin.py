@@ -70,7 +70,7 @@ def test_rigid_wall_closed_forms(K, B, theta, factor):
 
 def crossings(F: Lti, level: float) -> np.ndarray:
     """Frequencies where det(level/T I - F(1)/2 + He R) = 0 on the circle: an extended symplectic pencil."""
-    R, n, m = F.quotient_at_one(), F.order, F.inputs
+    R, n, m = F.split_at_one()[1], F.order, F.inputs
     direct = 2 * (level / F.T * np.eye(m) - F.dc() / 2)
     zero = np.zeros
     right = np.block(

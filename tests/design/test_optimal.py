@@ -28,7 +28,6 @@ from design.environments import ratio_in
 from design.frequency import hermitian, on_circle
 from design.optimal import design, spread
 from design.program import MARGIN, Options, Problem, Span, span_of, static_weight
-from design.result import DesignFailed
 from design.robustness import ranges_around, robustness, vertices
 from design.transparency import transparency
 from sim.scenario import load
@@ -356,8 +355,8 @@ def test_a_design_for_every_spring_and_mass_is_proved_at_each_and_costs_little(n
 
 
 def test_the_price_of_a_range_is_at_most_that_of_the_nominal_design_scaled_down(monkeypatch):
-    def nothing(*args, **how):
-        raise DesignFailed(None, (), "no time")
+    def nothing(self, start, *args, **how):
+        return 1e-3 * start
 
     loop, nominal = loop_of("n3"), best("n3")
     monkeypatch.setattr(Problem, "solve", nothing)

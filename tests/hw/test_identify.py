@@ -269,7 +269,7 @@ def test_more_damping_than_declared_asks_who_holds_it(viscous, suspicious):
     warnings = held([estimate], scenario, session)
     assert len(warnings) == suspicious
     if suspicious:
-        assert "is somebody holding it?" in warnings[0]
+        assert "is a hand on it?" in warnings[0]
 
 
 @pytest.fixture(scope="module")

@@ -273,3 +273,19 @@ def test_chains_are_the_same_by_their_numbers_and_by_their_classes():
 def test_ports_that_cannot_be_are_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize(("d", "b"), [(2.0, 1.5), (2.0, 2.0), (1.0, 1.5)])
+def test_a_dead_time_is_said_as_its_pade_form(d, b):
+    """d + b (1 - s tau/2)/(1 + s tau/2), of exp(-s tau) the same to (w tau)^3/12: passive just where d >= b."""
+    tau = 0.05
+    parts = [[-2 / tau]], [[1.0]], [[4 * b / tau]], d - b
+    if d < b:
+        with pytest.raises(ValueError, match="not passive"):
+            state_space(*parts)
+        return
+    port = state_space(*parts)
+    for w in (0.5, 2.0, 8.0):
+        assert felt(port, w) - DEVICE.mass * 1j * w - DEVICE.damping == pytest.approx(
+            d + b * np.exp(-1j * w * tau), abs=1.01 * b * (w * tau) ** 3 / 12
+        )

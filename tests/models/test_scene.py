@@ -220,7 +220,7 @@ def test_voluntary_motion_is_smooth_and_its_velocity_its_derivative():
         (lambda: build([RigidDevice()], [HAND], [TWO_HANDS]), r"person #1.holds has channel 2, allowed are 1 to 1"),
         (
             lambda: build([RigidDevice()] * 2, [HAND] * 2, [TWO_HANDS] * 2),
-            "channel 1, which somebody else holds already",
+            "channel 1, which another person holds already",
         ),
         (lambda: build([RigidDevice()], []), "1 devices and 0 humans"),
     ],

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from cli.main import COMMANDS
+
 ROOT = Path(__file__).parents[2]
 WORLDS = ("models", "controller", "design", "sim", "hw", "cli")
 
@@ -185,6 +187,23 @@ SPEAKING += [ROOT / n for n in (".pre-commit-config.yaml", ".github/workflows/ci
 YOURS = {"h.py", "performance"}
 
 
+def _off_the_map(page: str) -> list[str]:
+    """Files of its table that are not there, a name alone being in the folder before it; ours that the page does not
+    name, but for commands and their doors."""
+    named, gone = set(re.findall(r"`((?:\w+/)+\w+\.py)`", page)), []
+    table = page[page.index("## Where each concept") :]
+    for files, tests in re.findall(r"^\|[^|]*\|([^|]*)\|([^|]*)\|", table, re.MULTILINE):
+        for cell in (files, re.sub(r"`(?=\w+/)", "`tests/", tests)):
+            folder = ""
+            for place, file in re.findall(r"`((?:\w+/)*)(\w+\.py)`", cell):
+                folder = place or folder
+                named.add(folder + file)
+                gone += [] if (ROOT / folder / file).exists() else [folder + file]
+    ours = {str(path.relative_to(ROOT)) for world in WORLDS for path in ROOT.glob(f"{world}/**/[!_]*.py")}
+    doors = {f"{module.replace('.', '/')}.py" for module, _ in COMMANDS.values()} | {f"cli/{n}.py" for n in COMMANDS}
+    return gone + sorted(ours - named - doors)
+
+
 def test_what_is_named_is_there():
     """In comments, docstrings, headers and pages: files of ours, names by their module, words in backticks on pages."""
     names = {path.name for place in PLACES for path in ROOT.glob(f"{place}/**/*.*")} | YOURS
@@ -203,6 +222,8 @@ def test_what_is_named_is_there():
             within = [name] if file.exists() else [] if (ROOT / world / module).is_dir() else [module]
             known = (file if file.exists() else front).read_text()
             gone += [f"{world}.{module}" for one in within if one not in YOURS and not re.search(rf"\b{one}\b", known)]
+        if path.name == "architecture.md":
+            gone += _off_the_map(path.read_text())
         if path.suffix == ".md":
             gone += {*re.findall(r"`([a-z]{4}\w*)(?:\([^`]*)?`", text)} - words
         wrong += [f"{place}: {name}" for name in gone]

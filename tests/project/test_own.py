@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from controller.coupling import Compliance, Coupling
 from controller.environment import Spring, Wall
-from controller.lti import Lti
+from controller.lti import Lti, numbers, taps
 
 
 class Trapezoidal:
@@ -26,6 +27,30 @@ class Trapezoidal:
 
     def troubled(self):
         return False
+
+
+@dataclass
+class Weighted(Coupling):
+    K: float
+    T: float
+
+    def compliance(self, T):
+        return Lti.diag(*[taps(numbers([0.8, 0.2], T) / numbers(self.K, T), T)] * 2)
+
+    def form(self):
+        return Compliance(self.compliance(self.T)).form()
+
+
+class Duck:
+    around, compliance, form = Weighted.around, Weighted.compliance, Weighted.form
+
+
+def duck(loop):
+    return Duck()
+
+
+def weighted(loop):
+    return Weighted(900.0, loop.T)
 
 
 class Untroubled(Trapezoidal):
@@ -110,14 +135,14 @@ def test_an_element_and_an_environment_in_a_scenario(scenario, covered, place):
         (f'contacts = ["left", "right"]\n{HARD.replace("mine", "yours")}', "environment.elements #1.type is 'yours:H"),
         (
             f'contacts = ["left", "right"]\n{HARD.replace("300.0", "-5.0")}',
-            "your own: ValueError: stiffness between left",
+            "mine.py, line 68: stiffness between left",
         ),
         (f'contacts = ["left", "right"]\n{HARD.replace("type", "kind")}', "environment.elements #1 is {'kind': 'mine"),
         (f'contacts = ["left", "up"]\n{HARD}', "contact 'up' has neither spring"),
         ('type = "mine:Broken"\nstiffness = 6', "which is your own: ZeroDivisionError: division by zero"),
         (
             f'contacts = ["left", "right"]\n{HARD.replace("Hardening", "Negative")}',
-            "own: ValueError: stiffness between",
+            "mine.py, line 73: stiffness between",
         ),
     ],
 )
@@ -138,8 +163,8 @@ def test_what_is_wrong_with_them_is_said_in_a_line(environment, message, place):
             "human #1.voluntary_force(t) is nan at 0.15 s, expected a finite force in N",
         ),
         (
-            "0 * t if t[-1] < 0.2 else 1 / 0",
-            "friends.py, line 10, which is your own: ZeroDivisionError: division by zero",
+            "0 * t if t[-1] < 0.2 else 1 // 0 + t",
+            "friends.py, line 10, which is your own: ZeroDivisionError: ",
         ),
     ],
 )
@@ -158,8 +183,9 @@ def test_a_hand_that_fails_after_a_while(force, message, place):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ("--coupling mine:duck", "coupling is a Duck, which is not derived from controller.coupling.Coupling"),
         ("--engine mine:Untroubled", "engine mine:Untroubled has no troubled: expected what has start(buffer), adv"),
-        ("--engine mine:Nobody", "--engine is 'mine:Nobody': mine has no Nobody, but Trapezoidal, Untroubled, Short, "),
+        ("--engine mine:Nobody", "--engine is 'mine:Nobody': mine has no Nobody, but Trapezoidal, Weighted, Duck, "),
         ("--engine yours:X", "--engine is 'yours:X': there is no module 'yours' in"),
         ("--engine mine:1", "--engine is 'mine:1', expected package.module:Name"),
         ("--engine euler", "--engine is 'euler', allowed are mujoco, exact and package.module:Name"),
@@ -173,3 +199,11 @@ def test_what_is_wrong_with_it_is_said_in_a_line(options, message, place):
     assert done.returncode == 2
     assert message in last
     assert bool(before) == ("your own" in last), "only an error within their code has a traceback"
+
+
+@pytest.mark.parametrize("command", [f"{RUN} --scenario hard.toml --coupling", "python -m design.audit --coupling"])
+def test_a_coupling_that_is_its_compliance(command, place):
+    """Behind it walls, and an audit, which takes the same words."""
+    done = run(f"{command} mine:weighted", place)
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr
