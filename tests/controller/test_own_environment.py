@@ -108,21 +108,24 @@ class Gel:
 
 def test_maxwell_elements_are_passive_though_rounding_leaves_no_zero_of_their_static_stiffness():
     """E(1) = 0 out of k b/T/(k + b/T): a spring and a damper in series, by backward Euler, between two contacts."""
-    rng, g, below = np.random.default_rng(0), np.array([[1.0, -1.0], [-1.0, 1.0]]), 0
-    for i in range(300):
-        k, b, period = np.exp(rng.uniform(3, 9)), np.exp(rng.uniform(-2, 4)), rng.choice([1e-3, 5e-4, 1.2e-3])
+    rng, below = np.random.default_rng(0), 0
+
+    def maxwell(k: float, b: float, period: float, less: float = 0.0) -> Lti:
         a, D = b / (b + k * period), k * b / period / (k + b / period)
-        E = Lti([[a]], [[1.0, -1.0]], [[D * (a - 1)], [-D * (a - 1)]], D * g, period)
+        return Lti([[a]], [[1, -1]], [[D * (a - 1)], [D * (1 - a)]], (D - less) * np.array([[1, -1], [-1, 1]]), period)
+
+    for i in range(300):
+        E = maxwell(np.exp(rng.uniform(3, 9)), np.exp(rng.uniform(-2, 4)), rng.choice([1e-3, 5e-4, 1.2e-3]))
         block = Block.of(E)
         below += E.dc()[0, 0] < 0
         if i % 10 == 0:  # over Fractions, as a proof has it
-            static = block.at(rational(period)).dc()
+            static = block.at(rational(E.T)).dc()
             assert (static == static.T).all()
             assert definiteness(Matrix.of(static)).semidefinite
-            np.testing.assert_allclose(static.astype(float), 0, atol=1e-12 * D)
+            np.testing.assert_allclose(static.astype(float), 0, atol=1e-12 * np.abs(E.D).max())
     assert below > 30
     with pytest.raises(ValueError, match=r"static stiffness E\(1\) is \[\[-1e-05, 1e-05\], \[1e-05, -1e-05\]\]"):
-        Block.of(Lti([[a]], [[1.0, -1.0]], [[D * (a - 1)], [-D * (a - 1)]], (D - 1e-5) * g, period))
+        Block.of(maxwell(500.0, 6.0, T, less=1e-5))
 
 
 def test_a_scenario_takes_an_environment_of_one_s_own():
