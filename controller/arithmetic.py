@@ -129,6 +129,7 @@ def _cleared(M: Array) -> tuple[list[list[int]], list[int]]:
 
 
 def solve(M: Array, right: Array) -> Array:
+    """M^-1 right in their own arithmetic. Raises SingularLoop."""
     if M.dtype != object:
         try:
             return np.linalg.solve(M, right)

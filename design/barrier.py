@@ -26,14 +26,14 @@ _RIDGE = 1e-9  # of its column: what a direction that neither objective nor ineq
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class MatrixInequality:
     """constant + sum_a x_a slope_a > 0 at k frequencies, as real vectors (`packed`)."""
 
     constant: Array  # (k, r^2)
     slope: Array  # (k, r^2, n)
 
     @classmethod
-    def of(cls, constant: Complex, slope: Complex) -> Block:
+    def of(cls, constant: Complex, slope: Complex) -> MatrixInequality:
         """Of Hermitian matrices: constant (k, r, r), slope (k, n, r, r)."""
         return cls(packed(constant), np.ascontiguousarray(np.swapaxes(packed(slope), 1, 2)))
 
@@ -45,17 +45,19 @@ class Block:
         """S(x), shape (k, r, r)."""
         return _unpacked(self.constant + self.slope @ x)
 
-    def changed(self, U: Array) -> Block:
+    def changed(self, U: Array) -> MatrixInequality:
         """The same of y where x = U^-1 y."""
         slope = scipy.linalg.solve_triangular(U, self.slope.reshape(-1, len(U)).T, trans=1).T
-        return Block(self.constant, np.ascontiguousarray(slope).reshape(self.slope.shape))
+        return MatrixInequality(self.constant, np.ascontiguousarray(slope).reshape(self.slope.shape))
 
 
-def joined(blocks: Sequence[Block]) -> tuple[Block, ...]:
+def joined(blocks: Sequence[MatrixInequality]) -> tuple[MatrixInequality, ...]:
     """The same inequalities as one block for each size of matrices."""
     sizes = dict.fromkeys(block.constant.shape[1] for block in blocks)
     alike = [[block for block in blocks if block.constant.shape[1] == size] for size in sizes]
-    return tuple(Block(np.concatenate([b.constant for b in s]), np.concatenate([b.slope for b in s])) for s in alike)
+    return tuple(
+        MatrixInequality(np.concatenate([b.constant for b in s]), np.concatenate([b.slope for b in s])) for s in alike
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +67,7 @@ class Program:
     A: Array  # (rows, n)
     b: Array  # (rows,)
     c: Array  # (n,)
-    blocks: tuple[Block, ...]
+    blocks: tuple[MatrixInequality, ...]
 
     @property
     def degree(self) -> int:
@@ -158,14 +160,14 @@ def _length(program: Program, step: Array, x: Array, t: float) -> float:
     return (low + high) / 2
 
 
-def _eigenvalues(block: Block, x: Array, step: Array) -> Array:
+def _eigenvalues(block: MatrixInequality, x: Array, step: Array) -> Array:
     """Those of S^-1/2 dS S^-1/2 for the step, at every frequency."""
     inverse = _inverse_root(block.at(x))
     moved = _unpacked(block.slope @ step)
     return np.linalg.eigvalsh(inverse @ moved @ np.conj(np.swapaxes(inverse, 1, 2))).ravel()
 
 
-def _directions(block: Block, x: Array) -> tuple[Array, Array]:
+def _directions(block: MatrixInequality, x: Array) -> tuple[Array, Array]:
     """(rows, ones): the vectors of S^-1/2 slope_a S^-1/2 as columns, (k r^2, n), and that of the identity."""
     rows = _turned(_inverse_root(block.at(x))) @ block.slope
     r = math.isqrt(rows.shape[1])

@@ -27,7 +27,7 @@ import scipy  # its parts load when they are used
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti
-from design.barrier import Block, Program, centre, packed, towards
+from design.barrier import MatrixInequality, Program, centre, packed, towards
 from design.conditions import even_damping
 from design.files import unseen
 from design.frequency import frequencies, hermitian, on_circle
@@ -149,13 +149,13 @@ class _Dual:
             slope[:, at, i] = z[:, None] ** -steps.astype(float) @ weights[steps]
         return slope
 
-    def block(self, w: Array) -> Block:
+    def block(self, w: Array) -> MatrixInequality:
         """D > 0 at these frequencies, scaled by root(delta) from both sides."""
         m, parts = self.loop.channels, self.parts(w)[..., None, None]
         units = self.scale[..., None, None] * np.eye(m * m).reshape(m, m, m, m)
         slopes = [packed(hermitian(parts * unit)) for row in units for unit in row]
         slope = np.concatenate([*slopes, packed(hermitian(self.further(w)))], axis=1)
-        return Block(np.zeros((w.size, m * m)), np.ascontiguousarray(np.swapaxes(slope, 1, 2)))
+        return MatrixInequality(np.zeros((w.size, m * m)), np.ascontiguousarray(np.swapaxes(slope, 1, 2)))
 
     def lacking(self, x: Array, parts: Complex, further: Complex) -> Array:
         """By how much D is not positive, (k,)."""

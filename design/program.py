@@ -24,7 +24,7 @@ from controller.delay import delay
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Complex, Lti, Sampled, as_like
 from design.arguments import number, one_of
-from design.barrier import Block, Program, centre, joined, towards
+from design.barrier import MatrixInequality, Program, centre, joined, towards
 from design.conditions import Demand, even_damping, this_environment_demand
 from design.frequency import frequencies, hermitian, on_circle, peaks
 from design.multipliers import SPARE, limiter_demand, limiter_lag, switching_block
@@ -391,7 +391,7 @@ class Problem:
         G[np.arange(1, len(G)), :, which[:, 1]] = np.swapaxes(through, 0, 1)
         return Sampled(z[None], G, case.loop.T)
 
-    def block(self, case: Case, constraint: _Constraint, own: tuple[int, int], w: Array) -> Block:
+    def block(self, case: Case, constraint: _Constraint, own: tuple[int, int], w: Array) -> MatrixInequality:
         """The inequality of a constraint at these frequencies: an affine map, by what it makes of each unknown."""
         slopes = self._slopes(case, on_circle(w))
         nothing, units = Sampled(slopes.z, np.zeros_like(slopes.G[:1]), slopes.T), np.eye(own[1] - own[0])
@@ -402,13 +402,13 @@ class Problem:
         slope[: len(moved)] = moved
         for a, unit in enumerate(units, start=own[0]):
             slope[a] = (constraint.at(nothing, unit) - constant)[0]
-        return Block.of(constant[0], np.swapaxes(slope, 0, 1))
+        return MatrixInequality.of(constant[0], np.swapaxes(slope, 0, 1))
 
-    def positive(self) -> Block:
+    def positive(self) -> MatrixInequality:
         """g > 0."""
         slope = np.zeros((1, self.unknowns, 1, 1), dtype=complex)
         slope[0, 0] = 1
-        return Block.of(np.zeros((1, 1, 1), dtype=complex), slope)
+        return MatrixInequality.of(np.zeros((1, 1, 1), dtype=complex), slope)
 
     def least(self, case: Case, constraint: _Constraint, own: tuple[int, int], x: Array, w: Array) -> Array:
         """The least eigenvalue of a constraint at x, (k,)."""

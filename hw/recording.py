@@ -202,7 +202,7 @@ class IncidentLog:
         self._told = 0  # [us]
 
     def attach(self, session: Session) -> None:
-        """Record this session from now on."""
+        """Record from now on."""
         self._write({"at": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "scenario": session.scenario.name, "pid": os.getpid()})
         session.listen = lambda event: self._write({"t_us": event.t_us, "stage": event.stage, "cause": event.cause})
 

@@ -19,7 +19,7 @@ from controller.coupling import ForceFilter, NoCoupling, SpringDamper, basis
 from controller.environment import Network, Spring
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
-from design.barrier import Block, Program, centre
+from design.barrier import MatrixInequality, Program, centre
 from design.bound import BoundBeside, _causal, bound
 from design.certificate import verify
 from design.coupling_file import Stored, save
@@ -414,7 +414,7 @@ def test_the_barrier_finds_what_a_cone_solver_finds():
     n, r, k = 6, 2, 5
     A, b, c = rng.normal(size=(9, n)), rng.normal(size=9), rng.normal(size=n) / 3
     slope = hermitian(rng.normal(size=(k, n, r, r)) + 1j * rng.normal(size=(k, n, r, r)))
-    block = Block.of(np.tile(np.eye(r, dtype=complex), (k, 1, 1)), slope)
+    block = MatrixInequality.of(np.tile(np.eye(r, dtype=complex), (k, 1, 1)), slope)
     program, U = Program(A, b, c, (block,)).conditioned(np.zeros(n))
     y = np.zeros(n)
     for t in np.geomspace(1, 1e7, 22):
