@@ -337,8 +337,7 @@ class _AnyEnvironment(Condition):
             multiplier, reason = self.least_multiplier(loop)
         if multiplier is None:
             return refusal(self.name, loop.delta, str(reason))
-        phi = np.array([float(p) for p in multiplier])
-        return conditions.any_environment_delayed(V, loop, phi)
+        return conditions.any_environment(V, loop, np.array([float(p) for p in multiplier]))
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         if not any(loop.psi):
@@ -349,7 +348,7 @@ class _AnyEnvironment(Condition):
         require_size(V.order + sum(loop.theta))
         delayed = delay(loop.psi, T) @ loop.E(exact=True)
         return {
-            "P": conditions.delayed_coupling_demand(V, loop, multiplier),
+            "P": conditions.any_environment_demand(V, loop, multiplier),
             "P_E": conditions.delayed_environment_demand(delayed, multiplier),
         }
 
