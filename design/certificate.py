@@ -514,14 +514,15 @@ def assess(
     conditions = (*_NAMED.values(), *([named(own)] if own else []))
     proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
 
-    def judged(each: Condition) -> Requirement:
-        needs = each.judge(loop, coupling, phi if each is ANY_ENVIRONMENT else None)
+    asked = [(each, each.judge(loop, coupling, phi if each is ANY_ENVIRONMENT else None)) for each in conditions]
+
+    def judged(each: Condition, needs: Requirement) -> Requirement:
         if each.name == proved:
             return replace(needs, proof="rational")
         return _proved(loop, coupling, each, needs, phi) if more or not proved else needs
 
     with within(_LONGEST):  # all proofs together
-        return {each.name: judged(each) for each in conditions}
+        return {each.name: judged(each, needs) for each, needs in asked}
 
 
 def _proved(
