@@ -48,7 +48,7 @@ def show(session: LiveLoop, stage: ShownScene, until: float | None = None) -> No
     threads = set(threading.enumerate())
     try:
         window = viewer.launch_passive(
-            stage.model, stage.data, key_callback=typed(session), show_left_ui=False, show_right_ui=False
+            stage.model, stage.data, key_callback=_typed(session), show_left_ui=False, show_right_ui=False
         )
     except RuntimeError as error:
         raise NoWindow(str(error)) from None
@@ -99,7 +99,7 @@ def _shown(stage: ShownScene, window: viewer.Handle, frame: Frame) -> Grip | Non
     return grip
 
 
-def typed(session: LiveLoop) -> Callable[[int], None]:
+def _typed(session: LiveLoop) -> Callable[[int], None]:
     """The viewer's callback for a key, in the viewer's own thread."""
 
     def key(code: int) -> None:

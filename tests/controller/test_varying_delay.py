@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from worlds import force_map
+from worlds import FIGURE_4, force_map
 
 from controller.coupling import SpringDamper
 from controller.delay import LOST, HeldLine, VaryingDelay, ages, newest, packet_delays, realising
-from controller.environment import FIGURE_4, environment
+from controller.environment import environment
 from controller.law import Law
 from controller.tick import Process, StepBuffer
 
