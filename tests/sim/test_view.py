@@ -28,7 +28,7 @@ from sim.view.events import GIVEN, KEYS, Delay, Menu, Push, Restart, changed, fi
 from sim.view.film import Flat
 from sim.view.session import DAMPING, STIFFNESS, Grip, LiveLoop, _gripped, _Pace
 from sim.view.stage import COLUMNS, ShownScene, _dressed, apart, channels, envelope, keys_help, overlay, places, scale
-from sim.view.window import loop, typed
+from sim.view.window import _typed, loop
 
 SCENARIO = load()
 
@@ -74,7 +74,7 @@ def session(prepared, script="", patience=np.inf):
 def press(running, *names):
     codes = {name: code for code, (name, _) in KEYS.items()}
     for name in names:
-        typed(running)(codes[name])
+        _typed(running)(codes[name])
 
 
 # the loop itself
