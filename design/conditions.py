@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Generic
 
@@ -244,6 +244,9 @@ class Condition(ABC):
 
     name: str  # in requirements, certificates and reports
     covers: tuple[str, ...] = ()  # of `BEYOND`, what the block is about; a subclass states its own
+    source: str | None = None  # where it is from, for a report
+    separable: bool = False  # whether it judges the channels of a coupling without cross terms one by one
+    limitable: bool = False  # whether forces that are limited have a block of their own, which a file may prove
 
     @abstractmethod
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
@@ -254,6 +257,23 @@ class Condition(ABC):
         demands = [self.demand(each, coupling) for each in self._loops(loop)]
         found = [_least_damping(self.name, demand.free, lambda d=demand: d, loop.delta) for demand in demands]
         return max(found, key=lambda requirement: requirement.ratio)
+
+    def judge(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
+        """`required`, and for whom that is; a loop that it says nothing of, or without a solution, is refused."""
+        reason = self.beyond(loop)
+        try:
+            found = refusal(self.name, loop.delta, reason) if reason else self.required(loop, coupling, multiplier)
+        except SingularLoop as error:
+            found = refusal(self.name, loop.delta, str(error))
+        return replace(found, guarantee=self.words(loop), lag=self.lag(loop))
+
+    def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
+        """w (k,) [rad/sample] -> required over available damping there; None for a coupling without such a curve."""
+        return partial(least_scale, self.demand(loop, coupling))
+
+    def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
+        """Required over available damping, (n,), where loop or coupling is a stack; None: ask them one by one."""
+        return None
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         """What is to be proved over the rationals, by the name of the matrix that proves it. Raises NotProved."""
@@ -284,6 +304,14 @@ class Condition(ABC):
         """What a file calls them; None for a condition without any."""
         return None
 
+    def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
+        """The one for every coupling, None where none is needed; and why it says nothing of the loop, if so."""
+        return None, self.beyond(loop)
+
+    def not_varied(self, loop: Loop) -> str | None:
+        """Why it is not asked again and again of a loop that is varied; None where it is."""
+        return None
+
     def members(self, loop: Loop) -> tuple[Member, ...]:
         """The environments in which it is proved one by one; P, P1, P2, .. are of these."""
         return loop.members()
@@ -292,6 +320,11 @@ class Condition(ABC):
         """For which environments it holds."""
         # proved at every vertex; whether it is kept between them is searched by check_ranges and design.check
         return "these ranges" if loop.ranges else "this environment"
+
+    def words(self, loop: Loop) -> str:
+        """The same in the words of a report."""
+        held = self.guarantee(loop)
+        return loop.environment.here if held == "this environment" else held
 
 
 def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], delta: Sequence[float]) -> Requirement:

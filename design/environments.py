@@ -33,13 +33,13 @@ from design.conditions import (
 )
 from design.exact import require_size
 from design.frequency import MOST_SECONDS, frequencies, hermitian, on_circle, supremum, sweeping, too_long
-from design.result import NotProved, Requirement, from_ratio, refusal
+from design.result import MAKING, NotProved, Requirement, from_ratio, refusal
 
 
 class ThisEnvironment(Condition):
     """Safe in the environment of the loop: around its walls, whether they touch or not, and at all of its members."""
 
-    name, covers = "this-environment", BEYOND
+    name, covers, limitable = "this-environment", BEYOND, True
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
         F = loop.F(coupling, exact)
@@ -74,6 +74,9 @@ class ThisEnvironment(Condition):
 
     def multiplier_name(self, loop: Loop) -> str | None:
         return _WALL_MULTIPLIER if loop.environment.walls else None
+
+    def words(self, loop: Loop) -> str:
+        return MAKING if loop.environment.walls else super().words(loop)
 
 
 THIS_ENVIRONMENT = ThisEnvironment()

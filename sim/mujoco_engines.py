@@ -205,7 +205,7 @@ class MujocoEngine:
     ) -> None:
         import mujoco
 
-        self.model = discretised(scene, T, integrator, substeps)
+        self.model = _discretised(scene, T, integrator, substeps)
         self.data = mujoco.MjData(self.model)
         self._warnings = self.data.warning.number
         self.stretch: Stretch | None = None
@@ -313,7 +313,7 @@ class MujocoBatchEngine:
         import mujoco
         from mujoco.batch import Batch
 
-        model = discretised(scene, T, integrator, substeps)
+        model = _discretised(scene, T, integrator, substeps)
         self.batch = batch = Batch(model, nsim, nthread)
         for name, rows in (humans.fields if humans else {}).items():
             batch.expand(name)[...] = rows
@@ -383,7 +383,7 @@ def _kicks(plants: Plant) -> Callable[[float], Product] | None:
     return kick
 
 
-def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
+def _discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
     """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T."""
     import mujoco
 

@@ -36,7 +36,7 @@ from sim.trace import Trace
 ENGINES = ("mujoco", "exact")
 AnyEngine = str | Engine | Callable[["Simulation"], Engine]  # a name, one of a user's own, or what makes it
 
-Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the hands (ticks, outside) [N]
+_Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the hands (ticks, outside) [N]
 _AfterBlock = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
 Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 
@@ -119,7 +119,7 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
 def run(
     simulation: Simulation,
     engine: AnyEngine = "mujoco",
-    outside: Outside | None = None,
+    outside: _Outside | None = None,
     ticks: int | None = None,
     start: Array | None = None,
     progress: Progress = lambda done, ticks: None,
@@ -212,7 +212,7 @@ def _free_memory() -> float:
 def run_blocks(
     process: Process,
     engine: Engine,
-    outside: Outside,
+    outside: _Outside,
     ticks: int,
     start: Array,
     each_block: _AfterBlock,
@@ -265,7 +265,7 @@ def beginnings(T: float, timing: Timing | None, first: int, ticks: int) -> Array
 def outside_forces(
     scenario: Scenario, scene: Scene, first: int, ticks: int, voluntary: bool = True, timing: Timing | None = None
 ) -> Array:
-    """Outside forces [N] at ticks first .. first + ticks - 1, sampled as they begin, shape (ticks, outside).
+    """_Outside forces [N] at ticks first .. first + ticks - 1, sampled as they begin, shape (ticks, outside).
 
     The voluntary motion reaches the end of each human, the tap reaches one handle.
     """

@@ -160,7 +160,7 @@ class CouplingSweep(_Sweep):
         if condition == "this-environment":
             states = [conditions.this_environment(s.F(coupling), loop) for s in self._states]
             return max(states, key=lambda requirement: requirement.ratio)
-        return ANY_ENVIRONMENT.required(loop, coupling, self.multiplier[0])
+        return ANY_ENVIRONMENT.judge(loop, coupling, self.multiplier[0])
 
     def _coupling(self, K: float, B: float) -> SpringDamper:
         return SpringDamper([K] * self.loop.channels, [B] * self.loop.channels, self.cutoff)

@@ -8,14 +8,14 @@ import pytest
 from asked import this_environment
 from driven import drive, wander
 from scipy.optimize import brentq
-from worlds import SOFT, force_map, loop_of
+from worlds import FIGURE_4, SOFT, force_map, loop_of
 
 from cli.accuracy import main as accuracy
 from cli.run import main
 from controller.arithmetic import SingularLoop
 from controller.complementarity import Complementarity
 from controller.coupling import Coupling, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
+from controller.environment import GROUND, Network, Wall, environment, held
 from controller.law import Law
 from controller.lti import Lti, taps
 from controller.tick import Process

@@ -19,11 +19,11 @@ from asked import (
     walls_demand,
 )
 from scipy.optimize import minimize_scalar
-from worlds import SOFT, STIFF, T
+from worlds import FIGURE_4, SOFT, STIFF, T
 
 from controller.arithmetic import rational
 from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, Network, Spring, Wall
+from controller.environment import Network, Spring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti
 from controller.ranges import Ranges, UncertainSpring

@@ -8,11 +8,11 @@ import pytest
 from analysis import analysis, solve
 from asked import any_environment, this_environment
 from scipy.optimize import brentq
-from worlds import DELTA, SOFT_NETWORK, T, force_map
+from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
-from controller.environment import FIGURE_4, Network, Spring
+from controller.environment import Network, Spring
 from controller.loop import Loop
 from controller.lti import Lti
 from design import conditions, gain_search, spring_damper

@@ -17,11 +17,11 @@ from design.files import InputError
 from models.hold import at_the_latch, hold
 from models.scene import Plant, plant
 from sim import load
-from sim.checks import uneven
 from sim.crowds import Validation, examine
 from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
 from sim.run import assemble, make_engine, run
 from sim.stability import close, dominant_mode
+from tests.checks import uneven
 
 SOFT = SpringDamper([879.0, 552.0], [0.39, 0.52])
 PAIR = load("omega-pair").replace(duration=0.3)
