@@ -35,6 +35,7 @@ from controller.loop import Loop
 from controller.lti import Array, Block, Complex, Lti, Sampled, as_like, constant_like, hstack, vstack
 from controller.ranges import Member
 from design.frequency import (
+    Response,
     frequencies,
     frequencies_of_many,
     hermitian,

@@ -14,6 +14,7 @@ Two transfer matrices of the paper can never satisfy the strict inequalities pri
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -326,9 +327,10 @@ class _AnyEnvironment(Condition):
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         V = coupling.compliance(loop.T)
-        if V is None or not any(loop.psi):
-            return V and super().over_frequency(loop, coupling)
-        return None if multiplier is None else conditions.delayed_demand(V, loop, multiplier)
+        phi = multiplier if any(loop.psi) else None
+        if V is None or (phi is None and any(loop.psi)):
+            return None
+        return partial(conditions.least_scale, conditions.any_environment_demand(V, loop, phi))
 
     def _without(self, coupling: Coupling) -> str:
         """Why it says nothing of a coupling that has no V(z)."""
