@@ -24,12 +24,8 @@ from cli.checks.endurance import endurance
 from cli.checks.faults import rehearse_faults
 from controller.arithmetic import SingularLoop
 from design.files import folder, write, write_json
+from design.own import named
 from design.result import DesignFailed
-from sim.adversary import shortages
-from sim.checks.challenges import challenges
-from sim.checks.hard import cases, measure
-from sim.checks.random_loops import proofs, traces
-from sim.checks.uneven import uneven_ticks
 from sim.scenario import InputError
 
 # ----------------------------------------------------------------------------------------------------
@@ -44,7 +40,7 @@ class Check:
     asks: str
     answer: str | Callable[[int], Iterable[Any]]  # a command ({humans}, {seed} are filled in), or rows by the seed
     figures: reports.Figures
-    picture: Callable[[Any], Callable[..., Path]] | None = None  # of rows: from sim.plots the function that draws them
+    picture: Callable[[Iterable[Any], Path], object] | None = None  # draws the rows
 
     def command(self, humans: int, seed: int) -> str:
         """The command that repeats this check."""
@@ -52,14 +48,14 @@ class Check:
         return (self.answer if isinstance(self.answer, str) else own).format(humans=humans, seed=seed)
 
 
-def _drawn(plots: Any) -> Callable[..., Path]:
-    return plots.plot_tightness
+def _of_ours(name: str) -> Callable[..., Any]:
+    """A function of tests/checks, which measures this project itself and comes with the repository alone."""
+    return lambda *given: named("sim.suite", f"tests.checks.{name}")(*given)
 
 
 _MEET = "--humans {humans} --links mixed --duration 1 --adversary --generations 60 --seed {seed}"
 _MAP = "sim.zwidth --rigid --T 1e-3 --theta 0 --grid 30 --points 8 --seed {seed}"
-_SHORT = shortages(("none", "spring-damper"), (0, 0.01, 0.02, 0.05, 0.1, 0.2), 25)
-_DELAYED = shortages(("none",), (0, 0.002, 0.005, 0.01, 0.02), 40, theta=(4, 9))
+_SHORT, _DELAYED, _DRAWN = map(_of_ours, ("tightness:usual", "tightness:delayed", "tightness:plot_tightness"))
 
 
 def _meets(name: str, asks: str, loop: str) -> Check:
@@ -74,15 +70,32 @@ CHECKS = (
     _meets("optimal", "The best linear coupling for this environment", "--case I --coupling optimal"),
     _meets("published", "The gains that the paper prints", "--case I --coupling published"),
     _meets("three", "Three people, rigid devices, unequal delays", "--scenario three-rigid --case I"),
-    Check("tightness", "How tight is the condition?", _SHORT, reports.tightness, _drawn),
-    Check("delayed", "How tight is it with long delays?", _DELAYED, reports.tightness, _drawn),
+    Check("tightness", "How tight is the condition?", _SHORT, reports.tightness, _DRAWN),
+    Check("delayed", "How tight is it with long delays?", _DELAYED, reports.tightness, _DRAWN),
     Check("map", "Which springs and dampers may a device render against a wall?", _MAP, reports.gain_map),
     Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", reports.accuracy),
-    Check("hard", "Numerically hard loops", lambda seed: (measure(case) for case in cases()), reports.hard),
-    Check("proofs", "Are random networks proved where the sweep says so?", proofs, reports.proved),
-    Check("traces", "Does a trace ever say the opposite of the eigenvalues?", traces, reports.traced),
-    Check("uneven", "Do uneven periods and late forces keep the guarantee?", uneven_ticks, reports.uneven),
-    Check("guarantees", "Do limits, budgets, walls and friction hold at what they ask?", challenges, reports.edges),
+    Check("hard", "Numerically hard loops", _of_ours("hard:hard_loops"), reports.hard),
+    Check(
+        "proofs", "Are random networks proved where the sweep says so?", _of_ours("random_loops:proofs"), reports.proved
+    ),
+    Check(
+        "traces",
+        "Does a trace ever say the opposite of the eigenvalues?",
+        _of_ours("random_loops:traces"),
+        reports.traced,
+    ),
+    Check(
+        "uneven",
+        "Do uneven periods and late forces keep the guarantee?",
+        _of_ours("uneven:uneven_ticks"),
+        reports.uneven,
+    ),
+    Check(
+        "guarantees",
+        "Do limits, budgets, walls and friction hold at what they ask?",
+        _of_ours("challenges:challenges"),
+        reports.edges,
+    ),
     Check("faults", "Does every fault of a link end as it must?", lambda seed: rehearse_faults(), reports.faults),
     Check("endurance", "Does memory stay flat over an hour and 100,000 hands?", endurance, reports.memory_table),
 )
@@ -122,9 +135,7 @@ def _measured(check: Check, place: Path, seed: int) -> int:
     found, interrupted = options.until_interrupted(check.answer(seed))
     rows = [row if isinstance(row, dict) else render.plain(row) | {"holds": row.holds} for row in found]
     if check.picture and rows:
-        from sim import plots
-
-        check.picture(plots)(found, place / f"{check.name}.png")
+        check.picture(found, place / f"{check.name}.png")
     holds = all(row["holds"] for row in rows)
     write_json(place / "report.json", {"rows": rows, "holds": holds, "seed": seed, "interrupted": interrupted})
     return options.exit_code(holds, interrupted)

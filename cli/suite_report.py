@@ -11,7 +11,6 @@ from typing import Any
 
 from cli import render
 from design.result import CONDITIONS
-from sim.checks.uneven import HANDS
 from sim.stability import unstable
 
 
@@ -170,7 +169,7 @@ _uneven_rows = _table(
         "needs": "{required:.4g} N s/m",
         "most energy, of the start's": "{energy:.6g}",
         "balance below 0": lambda row: "never" if row["balance"] >= 0 else f"to {row['balance']:.1e} of what it sums",
-        "grow with half": f"{{grow}} of {HANDS}",
+        "grow with half": "{grow} of {hands}",
     },
 )
 

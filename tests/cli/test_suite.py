@@ -72,7 +72,7 @@ def test_the_report_begins_with_verdicts_and_every_number_has_its_command(tmp_pa
 
 
 def test_a_check_that_fails_fails_the_suite_and_the_rest_is_done(tmp_path, quick, monkeypatch):
-    monkeypatch.setattr("sim.checks.hard.CLOSE", 0.0)  # as if the rule were wrong
+    monkeypatch.setattr("tests.checks.hard.CLOSE", 0.0)  # as if the rule were wrong
     assert main(["--humans", "5", "--out", str(tmp_path)]) == 1
     text = (tmp_path / "report.md").read_text()
     assert "**1 of 2 checks hold; not: hard.**" in text
@@ -137,7 +137,7 @@ def test_ctrl_c_keeps_the_checks_that_are_done(tmp_path, monkeypatch):
     other = replace(HARD, name="other", asks="Never asked?")
     first = Check("none", "No coupling?", QUICK, suite_report.verdicts)
     monkeypatch.setattr(suite, "CHECKS", (first, HARD, other))
-    monkeypatch.setattr(suite, "measure", interrupted)
+    monkeypatch.setattr("tests.checks.hard.measure", interrupted)
     assert main(["--humans", "5", "--out", str(tmp_path)]) == 130
     outcome = json.loads((tmp_path / "report.json").read_text())
     assert outcome["interrupted"]

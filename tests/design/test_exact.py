@@ -5,12 +5,12 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from worlds import force_map
+from worlds import FIGURE_4, force_map
 
 from controller.arithmetic import SingularLoop, inverse, numbers, rational
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.delay import delay, moving_sum
-from controller.environment import FIGURE_4, Network, Spring, environment
+from controller.environment import Network, Spring, environment
 from controller.lti import Lti
 from design import exact
 from design.exact import Matrix, definiteness, find_storage, prove_positive_real, reached, strictly_positive
