@@ -452,8 +452,8 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     a part of mu = min over |z| = 1 of the least eigenvalue of He G, and the equation is driven by e I,
     small enough that e |(zI - A)^-1 B|^2 leaves the rest of it. It is solved in coordinates in which white noise at the
     inputs moves every state alike and independently of the others (but for those that next to none of it moves): there
-    P has condition numbers of 1e9 where it has 1e15 in the states as they are. Back there it is multiplied
-    exactly, and rounded to _STORED_BITS where the proof survives that.
+    P has condition numbers of 1e9 where it has 1e15 in the states as they are, which are tried next. Back there it is
+    multiplied exactly, and rounded to _STORED_BITS where the proof survives that.
     """
     if not G.floats().is_stable():
         return None, "the block has a pole on or outside the unit circle"
@@ -464,20 +464,28 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
         return None, f"the condition is violated at {w:.6g} rad/sample"
     if G.order == 0:
         return Matrix.zeros(0, 0), prove_positive_real(G, Matrix.zeros(0, 0))
-    out, into = _independent(_doubled(block.A, block.B @ block.B.T))
-    white = Lti(out @ block.A @ into, out @ block.B, block.C @ into, block.D, 1.0)
     reason: str | None = None
-    for share in (0.5, 0.9, 0.1):
+    for share, white in ((0.5, True), (0.5, False), (0.9, True), (0.1, True)):
         try:
-            P = _congruent(out, _riccati(white, margin, share), half)
+            out, riccati = _solved(block, margin, share, white)
         except np.linalg.LinAlgError as error:
             reason = f"the Riccati equation has no solution: {error}"
             continue
+        P = _congruent(out, riccati, half)
         for stored in (_shortened(P), P):
             reason = prove_positive_real(G, stored)
             if reason is None:
                 return stored, None
     return None, reason
+
+
+def _solved(G: Lti, margin: float, share: float, white: bool) -> tuple[Array, Array]:
+    """(the change to independent coordinates, P there), or of the states as they are. Raises LinAlgError."""
+    with np.errstate(all="ignore"):
+        if not white:
+            return np.eye(G.order), _riccati(G, margin, share)
+        out, into = _independent(_doubled(G.A, G.B @ G.B.T))
+        return out, _riccati(Lti(out @ G.A @ into, out @ G.B, G.C @ into, G.D, 1.0), margin, share)
 
 
 def _scaled(G: Lti) -> tuple[Lti, NDArray[np.int64]]:
