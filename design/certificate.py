@@ -46,7 +46,7 @@ from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_ro
 from design.frequency import frequencies, on_circle, rounding
 from design.guarantees import switching_guarantee
 from design.lmi import ANY_ENVIRONMENT
-from design.result import NotProved, Requirement, refusal
+from design.result import NotProved, Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # An exact proof that no switching of the delays within a loop's range is dangerous: made, stored, proved again.
@@ -298,7 +298,7 @@ def prove(
 
 #: More delays, states or digits than these are not looked at: a proof would take minutes.
 _MOST_BITS = 400  # of the denominator of a coefficient: a decimal of 120 places
-_MOST_COST = 8  # environments of ranges, each as many as LARGEST states are
+_MOST_COST = 2  # environments of ranges, each as many as LARGEST states are
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
@@ -391,7 +391,7 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
     return Verdict(reason is None, reason)
 
 
-_NAMED: dict[str, Condition] = {each.name: each for each in (THIS_ENVIRONMENT, ANY_ENVIRONMENT)}
+_NAMED: dict[str, Condition] = {each.name: each for each in (ANY_ENVIRONMENT, THIS_ENVIRONMENT)}
 
 
 def named(condition: str | Condition) -> Condition:
@@ -414,14 +414,8 @@ def required_damping(
 
     this-environment: the most over all members. A loop that has no solution is refused.
     """
-    asked = named(condition)
-    if reason := asked.beyond(loop):
-        return refusal(asked.name, loop.delta, reason)
-    try:
-        found = asked.required(loop, coupling, multiplier)
-    except SingularLoop as error:
-        return refusal(asked.name, loop.delta, str(error))
-    return replace(found, required=tuple(found.ratio * d for d in found.available))
+    found = named(condition).judge(loop, coupling, multiplier)
+    return found if found.reason else replace(found, required=tuple(found.ratio * d for d in found.available))
 
 
 def _blocks(loop: Loop, coupling: Coupling, condition: Condition, multiplier: Any) -> dict[str, Lti]:
@@ -501,33 +495,44 @@ def _multiplier(loop: Loop, condition: Condition, certificate: Certificate) -> S
 
 
 def assess(
-    loop: Loop, coupling: Coupling, phi: Array | None = None, known: Certificate | None = None, more: bool = True
+    loop: Loop,
+    coupling: Coupling,
+    phi: Array | None = None,
+    known: Certificate | None = None,
+    more: bool = True,
+    own: Condition | None = None,
 ) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
+
+    Beside those with names that of the user's `own`, if there is one.
 
     this-environment is about the nominal environment alone (design.coverage.RangesFigures asks for the rest of its
     ranges) and the constant theta (sim.switching.DelaysCovered asks for the rest of its range). What `known`, a
     certificate just made, proves is not proved again; without `more` nothing else is proved beside it.
     """
     loop = loop.at(loop.environment).switching(None)
-    asked = ANY_ENVIRONMENT.required(loop, coupling, phi), THIS_ENVIRONMENT.required(loop, coupling)
+    conditions = (*_NAMED.values(), *([named(own)] if own else []))
     proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
 
-    def judged(each: Requirement) -> Requirement:
-        if each.condition == proved:
-            return replace(each, proof="rational")
-        return _proved(loop, coupling, each, phi) if more or not proved else each
+    asked = [(each, each.judge(loop, coupling, phi if each is ANY_ENVIRONMENT else None)) for each in conditions]
 
-    with within(_LONGEST):  # both proofs together
-        return {each.condition: judged(each) for each in asked}
+    def judged(each: Condition, needs: Requirement) -> Requirement:
+        if each.name == proved:
+            return replace(needs, proof="rational")
+        return _proved(loop, coupling, each, needs, phi) if more or not proved else needs
+
+    with within(_LONGEST):  # all proofs together
+        return {each.name: judged(each, needs) for each, needs in asked}
 
 
-def _proved(loop: Loop, coupling: Coupling, requirement: Requirement, phi: Array | None = None) -> Requirement:
+def _proved(
+    loop: Loop, coupling: Coupling, condition: Condition, requirement: Requirement, phi: Array | None = None
+) -> Requirement:
     """The requirement with `proof` = 'rational' where an exact proof was found, as it is where not."""
     if not requirement.certified:
         return requirement
     try:
-        prove(loop, coupling, requirement.condition, None if phi is None else phi.tolist())
+        prove(loop, coupling, condition, None if phi is None else phi.tolist())
     except NotProved:
         return requirement
     return replace(requirement, proof="rational")

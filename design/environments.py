@@ -33,13 +33,13 @@ from design.conditions import (
 )
 from design.exact import require_size
 from design.frequency import MOST_SECONDS, frequencies, hermitian, on_circle, supremum, sweeping, too_long
-from design.result import NotProved, Requirement, from_ratio, refusal
+from design.result import MAKING, NotProved, Requirement, from_ratio, refusal
 
 
 class ThisEnvironment(Condition):
     """Safe in the environment of the loop: around its walls, whether they touch or not, and at all of its members."""
 
-    name, covers = "this-environment", BEYOND
+    name, covers, limitable = "this-environment", BEYOND, True
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
         F = loop.F(coupling, exact)
@@ -74,6 +74,9 @@ class ThisEnvironment(Condition):
 
     def multiplier_name(self, loop: Loop) -> str | None:
         return _WALL_MULTIPLIER if loop.environment.walls else None
+
+    def words(self, loop: Loop) -> str:
+        return MAKING if loop.environment.walls else super().words(loop)
 
 
 THIS_ENVIRONMENT = ThisEnvironment()
@@ -402,11 +405,10 @@ def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
         nominal = Member("", loop.environment)
         return _thinly(loop, coupling, thin) if thin > 1 else _required(loop, coupling, nominal).ratio
     E = loop.E()
-    late, delayed = delay(loop.theta, loop.T), delay(loop.psi, loop.T) @ E
+    delayed = delay(loop.psi, loop.T) @ E
 
     def needed(w: Array) -> Array:
-        z = on_circle(w)[None]
-        F = Sampled.of(late, z) @ coupling.around(Sampled.of(delayed, z))
+        F = loop.late(coupling.around(Sampled.of(delayed, on_circle(w)[None])))
         demand = this_environment_demand(F, loop)
         return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
 

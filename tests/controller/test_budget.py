@@ -4,10 +4,11 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from worlds import FIGURE_4
 
 from controller.budget import EnergyBounding, EnergyBudget, PassivityControl, Shell
 from controller.coupling import SpringDamper
-from controller.environment import FIGURE_4, Network, Networks, Spring, environment
+from controller.environment import Network, Networks, Spring, environment
 from controller.lti import Lti
 from design import design_coupling
 from models.hold import hold as hold_input
