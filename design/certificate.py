@@ -298,7 +298,7 @@ def prove(
 
 #: More delays, states or digits than these are not looked at: a proof would take minutes.
 _MOST_BITS = 400  # of the denominator of a coefficient: a decimal of 120 places
-_MOST_COST = 8  # environments of ranges, each as many as LARGEST states are
+_MOST_COST = 2  # environments of ranges, each as many as LARGEST states are
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:

@@ -55,8 +55,8 @@ def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
 
 
 def test_a_model_too_large_to_prove_in_seconds_is_said_so():
-    loop = change(DEFAULT, theta=(150, 150), delta=(600.0, 600.0))
-    with pytest.raises(NotProved, match="over 306 states takes long: up to 300 are tried"):
+    loop = change(DEFAULT, theta=(400, 400), delta=(600.0, 600.0))
+    with pytest.raises(NotProved, match="over 806 states takes long: up to 800 are tried"):
         prove(loop, SpringDamper((4.0, 4.0), (0.5, 0.5)), "this-environment")
 
 
@@ -340,7 +340,7 @@ def test_a_sweep_that_says_no_is_not_outvoted(monkeypatch):
 @pytest.mark.parametrize(
     ("loop", "coupling", "said"),
     [
-        (change(DEFAULT, theta=(150, 150), psi=(1, 0)), STIFF, "over 301 states takes long: up to 300 are tried"),
+        (change(DEFAULT, theta=(400, 400), psi=(1, 0)), STIFF, "over 801 states takes long: up to 800 are tried"),
         (DEFAULT, SpringDamper((7806.0, 3137.0), (1e-300, 1.0)), "1e-300 has too many digits for exact arithmetic"),
     ],
 )

@@ -9,7 +9,6 @@ from sessions import AT_REST, FAST, rehearsal_of, session_with
 from worlds import FakePort
 
 from cli import bridge
-from cli.checks.faults import CASES, Fault, _rehearse_case, at, person
 from controller.law import Law
 from design.coupling_file import Stored
 from design.coupling_file import save as save_coupling
@@ -27,6 +26,7 @@ from models.hold import hold
 from models.scene import plant
 from sim.run import assemble, outside_forces, run
 from sim.scenario import InputError
+from tests.checks.faults import CASES, Fault, _rehearse_case, at, person
 
 # faults
 
