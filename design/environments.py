@@ -39,7 +39,7 @@ from design.result import MAKING, NotProved, Requirement, from_ratio, refusal
 class ThisEnvironment(Condition):
     """Safe in the environment of the loop: around its walls, whether they touch or not, and at all of its members."""
 
-    name, covers, limitable = "this-environment", BEYOND, True
+    name, covers, extensible = "this-environment", BEYOND, True
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
         F = loop.F(coupling, exact)
@@ -74,6 +74,9 @@ class ThisEnvironment(Condition):
 
     def multiplier_name(self, loop: Loop) -> str | None:
         return _WALL_MULTIPLIER if loop.environment.walls else None
+
+    def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
+        return ratio_in(loop, coupling, thin)
 
     def words(self, loop: Loop) -> str:
         return MAKING if loop.environment.walls else super().words(loop)

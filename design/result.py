@@ -147,6 +147,11 @@ class Chosen:
     switching: DelayRange | None = field(kw_only=True, default=None)  # its file proves any switching within it
     notes: tuple[str, ...] = field(kw_only=True, default=())  # what a reader should know of its origin
 
+    @property
+    def asked(self) -> Any:
+        """The condition as design.certificate takes it: the user's own, or a name."""
+        return self.own or self.condition
+
 
 @dataclass(frozen=True, eq=False)
 class Design(Chosen):
