@@ -24,8 +24,9 @@ from design.result import listed
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages
-from hw.recording import Recorder, SessionReport, outcome, save
+from hw.recording import Recorder
 from hw.session import session_for
+from hw.session_report import SessionReport, outcome, save
 from sim.couplings import NAMES
 from sim.scenario import InputError, Scenario
 

@@ -471,7 +471,9 @@ def nearby(
     """
     if condition.guarantee(loop) == ANY or condition.not_varied(loop):
         return Nearby()
-    known, best = robustness_nearby(loop, coupling, condition), isinstance(coupling, ForceFilter | NoCoupling)
-    if known is None or not best or loop.ranges or loop.environment.one_period or condition is not THIS_ENVIRONMENT:
+    known, there = robustness_nearby(loop, coupling, condition), loop.environment
+    if known is None or loop.ranges or there.one_period or condition is not THIS_ENVIRONMENT:
+        return Nearby(known)
+    if not isinstance(coupling, ForceFilter | NoCoupling):
         return Nearby(known)
     return Nearby(known, spread(loop, coupling, options))

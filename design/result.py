@@ -18,7 +18,7 @@ ConditionName = Literal["this-environment", "any-environment"]
 Guarantee = Literal["any passive environment", "these ranges", "this environment"]
 
 #: the conditions in the order of tables, each with the environments for which it holds
-CONDITIONS: dict[ConditionName, str] = {
+CONDITIONS: dict[str, str] = {
     "this-environment": "this environment",
     "any-environment": "any passive environment",
 }

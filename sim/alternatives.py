@@ -28,7 +28,7 @@ from sim.stability import exact_growth, unstable
 from sim.trace import Trace
 
 #: (kind, condition) in the order of a table, and the samples of delay in all beyond which a design takes long
-_ROWS = {
+_ROWS: dict[tuple[str, str | None], float] = {
     ("none", None): math.inf,
     ("published", None): math.inf,
     ("spring-damper", "any-environment"): 200,

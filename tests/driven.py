@@ -6,7 +6,7 @@ import numpy as np
 
 from controller.tick import Process, StepBuffer
 from sim.engines import Engine
-from sim.run import Outside, run_blocks
+from sim.run import _Outside, run_blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +19,7 @@ class Driven:
 
 
 def driven(
-    process: Process, engine: Engine, outside: Outside, ticks: int, start: np.ndarray, last: int | None = None
+    process: Process, engine: Engine, outside: _Outside, ticks: int, start: np.ndarray, last: int | None = None
 ) -> Driven:
     """Close the loop from the plant states `start`, (2n, nsim); only the blocks of the last ticks are kept."""
     kept = []

@@ -21,7 +21,7 @@ from models.hold import hold
 from models.scene import plant, variants
 from sim.crowds import crowds
 from sim.engines import ExactEngine
-from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, discretised, profiler_off
+from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, _discretised, profiler_off
 from sim.run import assemble, make_engine, run, run_block
 from sim.scenario import load
 from sim.stability import exact_growth
@@ -53,7 +53,7 @@ def raw(simulation, integrator, substeps, record, view=np.asarray) -> float:
 
     Numbers are copied between arrays, or, with `view` memoryview, in the least time that Python can.
     """
-    model = discretised(simulation.scene, simulation.scenario.T, integrator, substeps)
+    model = _discretised(simulation.scene, simulation.scenario.T, integrator, substeps)
     move = make_engine(simulation, "mujoco", EXPONENTIAL, substeps)._access.move(simulation.scenario.T / substeps)
     every = slice(None) if view is memoryview else ...
     nq, inputs = model.nq, [view(row) for row in np.concatenate([record.w, record.f], axis=1)]

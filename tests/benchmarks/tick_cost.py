@@ -25,7 +25,7 @@ from hw.limits import ENDED, Stage
 from hw.monitor import LinkSettings
 from hw.protocol import Command, Decoder, Force, State, encode
 from hw.recording import Recorder
-from hw.session import session_for
+from hw.session import Operator, session_for
 from hw.transport import Live, SerialPort
 from sim.scenario import load
 
@@ -88,7 +88,7 @@ def tick_cost(ticks: int) -> dict[str, list[float]]:
     """Times [us] of `ticks` whole ticks at full gain, of as many bare ones, and of writing a FORCE."""
     with _Bench() as port:
         session = port.session
-        live = Live(session, SerialDevice(port), lambda ages: port.made, True, 3600.0)
+        live = Live(session, SerialDevice(port), lambda ages: port.made, Operator(True, 3600.0))
         live.clock = lambda: port.clock  # that of the ticks: what is measured here takes longer than they do
         session.start(0)
         gc.collect()

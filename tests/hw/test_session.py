@@ -15,13 +15,14 @@ from design.coupling_file import Stored
 from design.coupling_file import save as save_coupling
 from hw.control import HostController, certified_coupling, certified_couplings, link_delay
 from hw.emulator import Emulator, FaultInjection
-from hw.haptic_device import Driver, SerialDevice
-from hw.limits import SafetyLimits, SafetyStop, Stage
+from hw.haptic_device import SerialDevice
+from hw.limits import SafetyLimits, Stage
 from hw.monitor import Ages, LinkSettings
-from hw.protocol import Command, Decoder, Force, Hello, Phase, State, Stop, encode
-from hw.recording import Recorder, _recipes_of, load, outcome, replay, result_of, save
+from hw.protocol import Command, Decoder, Force, Hello, Phase, SafetyStop, State, Stop, encode
+from hw.recording import Recorder, _recipes_of, load, replay, result_of
 from hw.rehearsal import Rehearsal
-from hw.session import Session
+from hw.session import Driver, Session
+from hw.session_report import outcome, save
 from models.hold import hold
 from models.scene import plant
 from sim.run import assemble, outside_forces, run
