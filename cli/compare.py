@@ -21,6 +21,7 @@ from controller.loop import Loop
 from controller.lti import Array
 from design import compare
 from design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
+from design.conditions import Condition
 from design.program import Options
 from design.result import CONDITIONS, Chosen, DesignFailed, finite
 from design.robustness import Nearby, Robustness
@@ -147,7 +148,7 @@ def _chosen(scenario: Scenario, args: argparse.Namespace, names: Sequence[str]) 
     return chosen, [f"{name}: not possible: {' '.join(str(error).split())}" for name, error in failures.items()]
 
 
-def _named(name: str) -> tuple[str, str | None]:
+def _named(name: str) -> tuple[str, str | Condition | None]:
     """NAME:CONDITION as both, the condition None where none is named. Raises InputError."""
     kind, _, words = name.partition(":")
     plain, words = (kind, words) if kind in NAMES else name.rpartition(":")[::2]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -177,6 +178,9 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
     with render.progress("working out robustness and its price, and the bound"):
         nearby = nearby_of(loop, design.coupling, asked, named(design.asked))
         limit = best and BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, asked)
+    nominal = None
+    if kind_of(args.coupling).model:
+        nominal = partial(design_by_kind, kind=args.coupling, **asked_of(args, args.coupling))
     return _Report(
         case=args.case,
         seed=args.seed,
@@ -184,7 +188,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         objective_name=design.figure,
         wall_s=design.wall_s,
         certificate=judged.certificates[design.condition],
-        price=coverage.price(loop, design, args.coupling, asked_of(args, args.coupling)) if judged.whole else None,
+        price=coverage.price(loop, design, args.coupling, nominal) if judged.whole else None,
         judged=judged,
         switching=switching,
         delays=stored.switching.guarantee if stored.switching and stored.switching.proof else None,

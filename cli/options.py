@@ -177,7 +177,7 @@ def condition(text: str) -> str:
     """A condition by its name, or by the name that it had before; one of the user's own as it is."""
     name = older.CONDITIONS.get(text, text)
     if name not in CONDITIONS and ":" not in text:
-        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)}, FILE.py:NAME of your own")
+        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)} and FILE.py:NAME")
     return name
 
 

@@ -149,11 +149,12 @@ def _with_less_damping(loop: Loop, made: Callable[[Loop], Design], condition: Co
 
     It is made for forces that latch at the tick, and walls that all touch; the condition is about the loop as it is.
     """
-    share, best = 1.0, None
+    share, best, shortfall = 1.0, None, ""
     for _ in range(_MOST_ROUNDS):
         part = msgspec.structs.replace(loop, latency=None, delta=tuple(share * d for d in loop.delta))
         found = made(part)
         needs = condition.judge(loop.at(loop.environment), found.coupling)
+        shortfall = needs.shortfall
         if needs.certified:
             best = replace(found, requirement=needs)
             if needs.ratio > 1 - _UNUSED:
@@ -164,6 +165,5 @@ def _with_less_damping(loop: Loop, made: Callable[[Loop], Design], condition: Co
         if best and share == 1.0:
             return best
     if best is None:
-        why = needs.reason or f"the last one needs {needs.ratio:.4g} of the damping"
-        raise DesignFailed(None, (), f"no coupling was found for {condition.name}: {why}")
+        raise DesignFailed(None, (), f"no coupling was found for {condition.name}: {shortfall}")
     return best
