@@ -22,7 +22,7 @@ from controller.delay import delay
 from controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_environment
 from controller.law import Law
 from controller.limiter import Limiter
-from controller.lti import Complex, Lti, Sampled
+from controller.lti import Block, Complex, Lti, Sampled, as_like
 from controller.ranges import Member, Ranges, members
 
 MOST_SAMPLES = 1000  # of delay on a channel; every one is a state
@@ -136,9 +136,13 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         """The same at points z of the circle, (n, k) or (1, k)."""
         return self.environment.sent_at(coupling, self.psi, z, self.T)
 
+    def late(self, G: Block) -> Block:
+        """Theta G (6): what devices feel of forces G as they leave."""
+        return as_like(G, delay(self.theta, G.T)) @ G
+
     def F(self, coupling: Coupling, exact: bool = False) -> Lti:
         """F = Theta G (6): displacements to forces, as the devices see them. Raises SingularLoop."""
-        return delay(self.theta, self.period(exact)) @ self.sent(coupling, exact)
+        return self.late(self.sent(coupling, exact))
 
     def walled(self, coupling: Coupling, exact: bool = False) -> Lti:
         """[x; p] to [f; y]: as F with no wall touching, wall forces [N] put in and the ways into walls [m] out.

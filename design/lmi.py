@@ -14,6 +14,7 @@ Two transfer matrices of the paper can never satisfy the strict inequalities pri
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -326,9 +327,10 @@ class _AnyEnvironment(Condition):
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         V = coupling.compliance(loop.T)
-        if V is None or not any(loop.psi):
-            return V and super().over_frequency(loop, coupling)
-        return None if multiplier is None else conditions.delayed_demand(V, loop, multiplier)
+        phi = multiplier if any(loop.psi) else None
+        if V is None or (phi is None and any(loop.psi)):
+            return None
+        return partial(conditions.least_scale, conditions.any_environment_demand(V, loop, phi))
 
     def _without(self, coupling: Coupling) -> str:
         """Why it says nothing of a coupling that has no V(z)."""
@@ -349,8 +351,7 @@ class _AnyEnvironment(Condition):
             multiplier, reason = self.least_multiplier(loop)
         if multiplier is None:
             return refusal(self.name, loop.delta, str(reason))
-        phi = np.array([float(p) for p in multiplier])
-        return conditions.any_environment_delayed(V, loop, phi)
+        return conditions.any_environment(V, loop, np.array([float(p) for p in multiplier]))
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         if not any(loop.psi):
@@ -361,7 +362,7 @@ class _AnyEnvironment(Condition):
         require_size(V.order + sum(loop.theta))
         delayed = delay(loop.psi, T) @ loop.E(exact=True)
         return {
-            "P": conditions.delayed_coupling_demand(V, loop, multiplier),
+            "P": conditions.any_environment_demand(V, loop, multiplier),
             "P_E": conditions.delayed_environment_demand(delayed, multiplier),
         }
 

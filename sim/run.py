@@ -27,6 +27,7 @@ from controller.tick import Net, Process, StepBuffer
 from controller.timing import Timing
 from design.own import called
 from models.hold import HeldPlant, hold
+from models.human import Hand, Person
 from models.scene import Scene, build
 from sim.engines import Engine, ExactEngine, ExactTimedEngine
 from sim.mujoco_engines import EXPONENTIAL, LEAST, MujocoEngine, default_integrator, profiler_off, quiet_warnings
@@ -86,6 +87,14 @@ class Simulation:
         devices = tuple(msgspec.structs.replace(device, friction=0.0) for device in self.scenario.device)
         scenario = self.scenario.replace(device=devices)
         return replace(self, scenario=scenario, scene=build(devices, scenario.human, scenario.person))
+
+    def held_by(self, humans: tuple[Hand, ...], persons: tuple[Person, ...]) -> Simulation:
+        """The same in the hands of others, who do not move by themselves."""
+        scene = build(self.scenario.device, humans, persons)
+        scenario = msgspec.structs.replace(self.scenario, human=humans, person=persons)
+        return replace(
+            self, scenario=scenario, scene=scene, plant=hold(scene.plant, scenario.T, scenario.usual_latency)
+        )
 
     @property
     def even(self) -> Simulation:

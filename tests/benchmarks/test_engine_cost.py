@@ -159,8 +159,8 @@ def test_many_hands(benchmark):
     plants = hold(held_by.plants(), scenario.T)
     batches = {
         "exact": ExactEngine(plants),
-        "exponential x 1": MujocoBatchEngine(held_by.scene, scenario.T, EXPONENTIAL, 1, nsim, 1, held_by),
-        "RK4 x 4": MujocoBatchEngine(held_by.scene, scenario.T, "RK4", 4, nsim, 1, held_by),
+        "exponential x 1": MujocoBatchEngine(held_by, scenario.T, EXPONENTIAL, 1, 1),
+        "RK4 x 4": MujocoBatchEngine(held_by, scenario.T, "RK4", 4, 1),
     }
     used, after = {name: [] for name in batches}, {}
     start = 1e-4 * np.random.default_rng(0).normal(size=(plants.A.shape[1], nsim))

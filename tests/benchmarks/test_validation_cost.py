@@ -87,7 +87,7 @@ def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
     """The loop around the batch against the batch's own steps, alternating, on all cores."""
     simulation, ticks, short, nsim = assemble(load(), PUBLISHED["I"]), 160, 32, 200
     T, some = simulation.scenario.T, Variants(held_by.scene, {n: rows[:nsim] for n, rows in held_by.fields.items()})
-    engine, bare = (MujocoBatchEngine(held_by.scene, T, "RK4", substeps, nsim, humans=some) for _ in range(2))
+    engine, bare = (MujocoBatchEngine(some, T, "RK4", substeps) for _ in range(2))
     buffer = StepBuffer(simulation.process, short, 2 * held_by.scene.model.nv, held_by.scene.outside, nsim)
     buffer.s[0] = 1e-4
     engine.start(buffer)

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from asked import (
     any_environment_demand,
-    delayed_coupling_demand,
     limiter_demand,
     switching_block,
     this_environment_demand,
@@ -211,7 +210,7 @@ def test_a_spring_behind_delay_with_its_multiplier(share):
     phi = share * K * T / 2
     least = min(a * (T / phi - 2 * a) / (4 * T / phi - 6 * a), (T / phi - 2 * a) / 2)
     V, multiplier = SpringDamper([K], [0.0]).compliance(rational(T)), [rational(phi)]
-    assert_limit(lambda d: certificate._block(delayed_coupling_demand(V, (1,), multiplier, [d])), T / (2 * least))
+    assert_limit(lambda d: certificate._block(any_environment_demand(V, (1,), [d], phi=multiplier)), T / (2 * least))
 
 
 def test_a_spring_damper_behind_delay_with_its_multiplier():
@@ -229,7 +228,7 @@ def test_a_spring_damper_behind_delay_with_its_multiplier():
         middle = (low + high) / 2
         low, high = (low, middle) if holds(middle) else (middle, high)
     V, multiplier = SpringDamper([K], [B]).compliance(rational(T)), [rational(phi)]
-    assert_limit(lambda d: certificate._block(delayed_coupling_demand(V, (theta,), multiplier, [d])), high)
+    assert_limit(lambda d: certificate._block(any_environment_demand(V, (theta,), [d], phi=multiplier)), high)
 
 
 # switching
@@ -450,7 +449,7 @@ def test_an_asymmetry_of_1e_12_is_refused_behind_delay_and_for_switching_too():
 
     made = prove(asked, crossed(1e-4), "any-environment", phi)
     skew = crossed(1e-4 * (1 + 1e-12))
-    assert forged(asked, skew, made) == "H(1) is not exactly symmetric"
+    assert forged(asked, skew, made) == "V(1) is not exactly symmetric"
     switching = change(asked, psi=(0, 0)).switching(DelayRange((0, 0), (1, 1)))
     assert condition_block(switching, crossed(1e-4), ALPHA).order
     with pytest.raises(ValueError, match="not exactly symmetric and positive semidefinite"):

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from asked import any_environment, any_environment_per_channel, delayed_demand, this_environment
+from asked import any_environment, any_environment_demand, any_environment_per_channel, this_environment
 from scipy.linalg import eig, eigh
 from worlds import FIGURE_4, STIFF, force_map
 
 from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, environment
 from controller.lti import Lti
-from design.conditions import least_multiple, regular_part
+from design.conditions import least_multiple, least_scale, regular_part
 from design.frequency import frequencies, hermitian, on_circle, supremum
 
 T, THETA, DELTA = 1.2e-3, (1, 2), (1.37, 1.37)
@@ -172,9 +172,10 @@ def test_the_frequency_at_which_a_condition_binds():
     assert found.frequency_hz == pytest.approx(w[needed.argmax()] / (2 * np.pi * T), rel=1e-3)
 
 
-def test_the_least_multiple_is_a_generalised_eigenvalue():
-    free, half = RNG.normal(size=(5, 3, 3)), RNG.normal(size=(5, 3, 3))
-    free, gain = free + np.swapaxes(free, 1, 2), half @ np.swapaxes(half, 1, 2) + 0.1 * np.eye(3)
+@pytest.mark.parametrize("n", [2, 3])
+def test_the_least_multiple_is_a_generalised_eigenvalue(n):
+    free, half = (RNG.normal(size=(9, n, n)) + 1j * RNG.normal(size=(9, n, n)) for _ in range(2))
+    free, gain = hermitian(free), half @ np.conj(np.swapaxes(half, 1, 2)) + 0.1 * np.eye(n)
     expected = [eigh(-one, other, eigvals_only=True)[-1] for one, other in zip(free, gain, strict=True)]
     np.testing.assert_allclose(least_multiple(free, gain), expected, rtol=1e-9)
 
@@ -208,7 +209,7 @@ def test_with_a_multiplier_the_factor_is_the_least_by_definition():
         H = V.at(z) / T - (vt / (2 * s[:, None] * delta))[:, :, None] * np.eye(2)
         return np.linalg.eigvalsh(hermitian(H / (1 - z)[:, None, None]) - star(H) @ (covered[:, :, None] * H))[:, 0]
 
-    s = delayed_demand(V, theta, delta, np.array(phi))(w)
+    s = least_scale(any_environment_demand(V, theta, delta, phi=phi), w)
     scale = np.abs(least(2 * s))
     assert (np.abs(least(s)) < 1e-9 * scale).all()
     assert (least(1.001 * s) > 0).all()

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from driven import driven
+from driven import alike, driven
 
 from controller.coupling import PUBLISHED, NoCoupling
 from models.scene import plant
@@ -96,8 +96,8 @@ def test_batch_and_single_agree_bit_for_bit(simulation):
 
     alone = [follow(MujocoEngine(scene, scenario.T), start[:, [i]]) for i in range(3)]
     # one buffer of three would sum the tick's product in another order, so each simulation runs its own
-    batched = [follow(MujocoBatchEngine(scene, scenario.T, nthread=1), start[:, [i]]) for i in range(3)]
-    together = follow(MujocoBatchEngine(scene, scenario.T, nsim=3, nthread=2), start)
+    batched = [follow(MujocoBatchEngine(alike(scene, 1), scenario.T, nthread=1), start[:, [i]]) for i in range(3)]
+    together = follow(MujocoBatchEngine(alike(scene, 3), scenario.T, nthread=2), start)
     for i in range(3):
         np.testing.assert_array_equal(alone[i].s, batched[i].s)
         np.testing.assert_allclose(together.s[:, :, i], alone[i].s[:, :, 0], rtol=1e-9, atol=1e-12)

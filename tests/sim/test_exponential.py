@@ -7,7 +7,7 @@ the position that the fastest spring turns it into.
 import mujoco
 import numpy as np
 import pytest
-from driven import Driven, driven, tick_by_tick
+from driven import Driven, alike, driven, tick_by_tick
 from scipy.linalg import expm
 
 from controller.coupling import PUBLISHED, NoCoupling
@@ -183,7 +183,7 @@ def test_a_batch_is_a_loop_over_single_engines(simulation):
     start = 1e-3 * np.random.default_rng(0).normal(size=(8, 3))
 
     def batch(nsim, nthread=1):
-        return MujocoBatchEngine(simulation.scene, SCENARIO.T, EXPONENTIAL, 1, nsim, nthread)
+        return MujocoBatchEngine(alike(simulation.scene, nsim), SCENARIO.T, EXPONENTIAL, 1, nthread)
 
     single = [tick_by_tick(make_engine(simulation, "mujoco")) for _ in range(3)]
     alone = [knocked(simulation, engine, 300, start[:, [i]]).s for i, engine in enumerate(single)]
@@ -201,7 +201,7 @@ def test_many_hands_are_each_their_own_scene(substeps):
     held_by = variants(SCENARIO.device, crowd)
     loop = assemble(SCENARIO, PUBLISHED["I"])
     start = 1e-3 * np.random.default_rng(1).normal(size=(8, 5))
-    batch = MujocoBatchEngine(held_by.scene, SCENARIO.T, EXPONENTIAL, substeps, 5, humans=held_by)
+    batch = MujocoBatchEngine(held_by, SCENARIO.T, EXPONENTIAL, substeps)
     together = knocked(loop, batch, 300, start).s
     for i in range(5):
         own = assemble(SCENARIO.replace(human=crowd.humans(i)), PUBLISHED["I"])

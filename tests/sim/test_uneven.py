@@ -6,6 +6,7 @@ import weakref
 
 import numpy as np
 import pytest
+from driven import alike
 from scipy.linalg import expm
 
 from cli.run import main
@@ -234,8 +235,8 @@ def test_no_cycle_keeps_an_engine(integrator, timed):
     simulation = assemble(PAIR.replace(period=DRAWN, latency=LATE) if timed else PAIR, SOFT)
     gc.disable()
     try:
-        for make in (MujocoEngine, MujocoBatchEngine):
-            engine = make(simulation.scene, simulation.scenario.T, integrator, timing=simulation.timing)
+        for make, scene in ((MujocoEngine, simulation.scene), (MujocoBatchEngine, alike(simulation.scene, 1))):
+            engine = make(scene, simulation.scenario.T, integrator, timing=simulation.timing)
             run(simulation, engine, ticks=3)
             kept = weakref.ref(engine._access)  # all that holds MuJoCo's memory
             del engine

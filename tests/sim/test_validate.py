@@ -15,6 +15,7 @@ from driven import driven
 from cli import run as run_command
 from cli.validate import main
 from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from controller.delay import VaryingDelay
 from models.device import RigidDevice
 from models.hold import hold
 from models.human import Person
@@ -300,7 +301,7 @@ def test_hands_that_had_no_time_to_rest_are_no_verdict(duration):
     [
         (["--humans", "0"], "--humans is 0, allowed are 1 to 1000000"),
         (["--humans", "many"], "--humans is 'many', expected a whole number"),
-        (["--engine", "drake"], "--engine: invalid choice: 'drake'"),
+        (["--engine", "drake"], "--engine is 'drake', allowed are exact, mujoco, both and package"),
         (["--links", "9"], "--links: invalid choice: '9'"),
         (["--shards", "2", "--dask", "here:8786"], "--shards 2 with --dask: the cluster decides"),
         (["--shards", "0"], "--shards is 0, allowed are 1 to 256"),
@@ -359,3 +360,27 @@ def test_without_dask_the_command_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match="--dask needs Dask: pip install 'distributed"):
         main(["--dask", "127.0.0.1:9", "--humans", "5", "--out", str(tmp_path)])
+
+
+class OwnEngine(ExactEngine):
+    """The exact one, as somebody else would write it: of one simulation."""
+
+    def __init__(self, simulation):
+        super().__init__(simulation.plant)
+
+
+@pytest.mark.parametrize("delays", [None, VaryingDelay((1, 2), (2, 3), "random")])
+def test_an_engine_of_one_s_own_decides_of_everyone(delays):
+    """Made anew for each set of humans, it says of the period and of the traces what the stacked exact engine says."""
+    scenario = load().replace(varying_delay=delays)
+    found = examine_module.examine(Validation(scenario, PUBLISHED["I"], 0, 6, MIXED, OwnEngine, 0.5), range(6))
+    np.testing.assert_allclose(found.mujoco, found.exact, rtol=1e-6)
+    np.testing.assert_allclose(found.trace, found.exact, rtol=1e-5)
+    np.testing.assert_allclose(found.switching_mujoco, found.switching, rtol=1e-6)
+    assert not found.disagreements.any()
+
+
+def test_an_engine_of_one_s_own_needs_even_ticks():
+    question = Validation(load().replace(latency=((0.0, 1e-4),) * 2), PUBLISHED["I"], 0, 2, 1, OwnEngine, 0.5)
+    with pytest.raises(InputError, match=r"OwnEngine: uneven ticks \(period, latency\) run in mujoco and exact"):
+        examine_module.examine(question, range(2))
