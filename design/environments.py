@@ -30,6 +30,7 @@ from design.conditions import (
     least_scale,
     this_environment,
     this_environment_demand,
+    this_environment_ratios,
 )
 from design.exact import require_size
 from design.frequency import MOST_SECONDS, frequencies, hermitian, on_circle, supremum, sweeping, too_long
@@ -77,6 +78,10 @@ class ThisEnvironment(Condition):
 
     def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
         return ratio_in(loop, coupling, thin)
+
+    def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
+        poles = loop.F(coupling).poles()
+        return this_environment_ratios(lambda z: loop.late(loop.sent_at(coupling, z)), poles, loop)
 
     def words(self, loop: Loop) -> str:
         return MAKING if loop.environment.walls else super().words(loop)
