@@ -329,7 +329,7 @@ class Condition(ABC):
     @property
     def claim(self) -> str:
         """What is said of one of the user's own."""
-        return f"that the block of {self.name} keeps this loop safe is yours to show, and not proved"
+        return f"the block of {self.name} is what is proved; that it keeps this loop safe is yours to show"
 
     def words(self, loop: Loop) -> str:
         """The same in the words of a report."""

@@ -115,7 +115,7 @@ def design_by_kind(
     chosen = KINDS[kind]
     if own and not chosen.softened:
         able = ", ".join(other for other in KINDS if KINDS[other].softened)
-        why = f"for which {able} and functions of your own can be designed, not {kind}"
+        why = f"for which {able} and functions of your own can be designed, not {kind}; a FILE.json is judged by it"
         raise ValueError(f"condition is {own.name}, {why}")
     made_for = condition_named(usual_condition(loop, kind) if own or not name else name)
     if made_for.name not in chosen.conditions:

@@ -472,7 +472,7 @@ def nearby(
     if condition.guarantee(loop) == ANY or condition.not_varied(loop):
         return Nearby()
     known, there = robustness_nearby(loop, coupling, condition), loop.environment
-    if known is None or loop.ranges or there.one_period or condition is not THIS_ENVIRONMENT:
+    if known is None or loop.ranges or there.one_period or not condition.extensible:
         return Nearby(known)
     if not isinstance(coupling, ForceFilter | NoCoupling):
         return Nearby(known)
