@@ -14,11 +14,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from operator import sub
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from controller.budget import EPS, EnergyBudget
+from controller.budget import BudgetFigures, EnergyBudget, Packets
 from controller.coupling import Coupling
 from controller.law import Law
 from controller.loop import Loop
@@ -117,10 +117,9 @@ class SentBudget:
 
     def __init__(self, plan: BudgetPlan) -> None:
         m, cap = len(plan.delta), math.inf if plan.cap is None else plan.cap
-        given: dict[str, Any] = {"encoder_step": plan.encoder_step, "start": plan.start, "cap": cap}
-        lo = np.full(m, plan.theta)
+        packets, step = Packets(np.full(m, plan.theta), hold=plan.longer), plan.encoder_step
         self.plan = plan
-        self._budget = EnergyBudget(plan.delta, plan.T, lo, hold=plan.longer, **given)
+        self._budget = EnergyBudget(plan.delta, plan.T, packets, encoder_step=step, start=plan.start, cap=cap)
         self._unit = -np.array(plan.force_step)  # the wire carries -f
         self._before = self._applied = np.zeros(m)
         self._nothing = np.zeros((m, 1))
@@ -140,23 +139,11 @@ class SentBudget:
         whole = np.where(sent == wanted[:, 0], steps, np.trunc(sent / self._unit))
         return tuple(int(n) for n in whole)
 
-    def part(self) -> dict[str, Any]:
-        """What it has done since arming, as plain data."""
-        budget = self._budget
+    def figures(self) -> BudgetFigures:
+        """What it has done since arming."""
         given = f"more than {self.plan.start:g} J" if self.plan.start else "any energy"
-        return {
-            "start_J": self.plan.start,
-            "cap_J": self.plan.cap,
-            "eps": EPS,
-            "guarantee": f"no passive hand is given {given} in an arming beyond what the devices dissipate, "
-            "whatever computes the forces",
-            "ticks": budget.ticks,
-            "limited_ticks": int(budget.limited[0]),
-            "smallest_scale": float(budget.least[0]),
-            "energy_J": float(budget.energy[0]),
-            "reserved_J": float(budget.reserved[0]),
-            "surprises": budget.surprises,
-        }
+        dissipated = "in an arming beyond what the devices dissipate, whatever computes the forces"
+        return self._budget.figures(f"no passive hand is given {given} {dissipated}")
 
 
 class TraceRow(NamedTuple):

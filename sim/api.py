@@ -153,7 +153,7 @@ def simulate(
         "limiter": plain(limits),
         "stability": None if scenario.switches or environment else plain(stability_of(done.simulation, trace)),
         "remarks": done.remarks,
-        "energy_budget": trace.net.part() if trace.net else None,
+        "energy_budget": plain(trace.net.figures()) if trace.net else None,
     }
     return replace(trace, meta=meta)
 

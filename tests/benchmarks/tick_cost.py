@@ -17,7 +17,6 @@ import sys
 import time
 from collections import defaultdict
 
-from cli.checks.faults import _lively
 from hw.control import certified_couplings
 from hw.emulator import Emulator, Terminal
 from hw.haptic_device import SerialDevice
@@ -28,6 +27,7 @@ from hw.recording import Recorder
 from hw.session import Operator, session_for
 from hw.transport import Live, SerialPort
 from sim.scenario import load
+from tests.checks.faults import _lively
 
 BLOCK = 200
 PATIENCE = 5.0  # [s] for bytes on their way through the terminal, which a thread of the kernel's moves

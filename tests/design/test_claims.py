@@ -20,7 +20,7 @@ from controller.loop import Loop
 from controller.lti import Lti
 from design.lmi import Infeasible, Shaping, least_multiplier
 from design.multipliers import limiter_lag
-from design.spring_damper import step
+from design.spring_damper import GainSet, step
 from models.device import RigidDevice
 from models.human import Human, Link, Population
 from sim.report import _PRINTED_TAU_DB
@@ -432,7 +432,7 @@ def test_every_step_of_the_convex_sequence_improves():
     for _ in range(5):
         k, b = np.split(np.maximum(gains, 0) * np.tile(shaping.usable, 2), 2)
         norms.append(shaping.gain(SpringDamper(k / T, b).compliance(T), w).max())
-        gains, bound = step(shaping, np.full(2, np.inf), gains, norms[-1], w)
+        gains, bound = step(shaping, GainSet(shaping.loop), gains, norms[-1], w)
         assert bound <= norms[-1] * (1 + 1e-6)
     assert all(after <= before * (1 + 1e-6) for before, after in itertools.pairwise(norms))
     assert norms[-1] < 0.8 * norms[0]

@@ -10,7 +10,6 @@ import pytest
 from cli import run as run_command
 from cli.suite import Check
 from cli.suite import main as suite
-from cli.suite_report import tightness
 from cli.validate import main
 from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from design.environments import ThisEnvironment
@@ -22,6 +21,7 @@ from sim.adversary import _DESTABILISED, search
 from sim.run import assemble
 from sim.scenario import load
 from sim.stability import close, dominant_mode
+from tests.checks.ours import tightness
 from tests.checks.tightness import attempts, plot_tightness, shortages
 
 SCENARIO = load()
@@ -151,6 +151,7 @@ def test_a_human_who_destabilises_a_loop_with_enough_damping_fails_the_check(tmp
     rows = lambda seed: shortages(seed, ("none",), (0,), 5)  # noqa: E731
     check = Check("tightness", "How tight?", rows, tightness, plot_tightness)
     monkeypatch.setattr("cli.suite.CHECKS", (check,))
+    monkeypatch.setattr("cli.suite._OURS", ())
     assert suite(["--out", str(tmp_path)]) == 1
     assert (tmp_path / "tightness" / "tightness.png").stat().st_size > 10_000
     assert "| no coupling | 0.0% |" in (tmp_path / "report.md").read_text()
