@@ -12,13 +12,14 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from rich.console import Console
 
 from cli import options, render, session_cli
+from design.certificate import named
 from design.files import plain, write_json
 from design.guarantees import CAVEATS
-from design.lmi import LATE
 from design.result import listed
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
@@ -40,8 +41,10 @@ def main(argv: list[str]) -> int:
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
     at_once = args.latch == "arrival" or session_cli.host_clocked(args)  # a host that is the clock sends at once
-    if at_once and args.condition == "any-environment":
-        raise InputError(f"--latch arrival with --condition {args.condition}: {LATE}")
+    if at_once and args.condition:
+        asked, late = named(args.condition), ((0.0, scenario.T / 2),) * scenario.channels
+        if reason := asked.beyond(msgspec.structs.replace(scenario.loop(args.case), latency=late)):
+            raise InputError(f"--latch arrival with --condition {asked.name}: {reason}")
     if args.energy_budget and at_once:
         raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
     if args.energy_budget and not args.energy_budget[0]:
@@ -161,8 +164,8 @@ def _print_session(report: SessionReport, console: Console) -> None:
     for i, growth in enumerate(report.growth, start=1):
         console.print(f"growth at full gain, arming {i}, {growth.words(report.run.T_s)}")
     for i, part in enumerate(report.energy_budget or [], start=1):
-        console.print(f"energy budget, arming {i}: limited {part['limited_ticks']} of {part['ticks']} ticks")
-        console.print(f"  {part['guarantee']}")
+        console.print(f"energy budget, arming {i}: limited {part.limited_ticks} of {part.ticks} ticks")
+        console.print(f"  {part.guarantee}")
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link.counters.items() if n)
     console.print(f"counted: {counted or 'nothing'}")
     console.print(f"[dim]·[/] {CAVEATS}")

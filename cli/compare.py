@@ -21,6 +21,7 @@ from controller.loop import Loop
 from controller.lti import Array
 from design import compare
 from design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
+from design.conditions import Condition
 from design.program import Options
 from design.result import CONDITIONS, Chosen, DesignFailed, finite
 from design.robustness import Nearby, Robustness
@@ -147,11 +148,14 @@ def _chosen(scenario: Scenario, args: argparse.Namespace, names: Sequence[str]) 
     return chosen, [f"{name}: not possible: {' '.join(str(error).split())}" for name, error in failures.items()]
 
 
-def _named(name: str) -> tuple[str, str | None]:
+def _named(name: str) -> tuple[str, str | Condition | None]:
     """NAME:CONDITION as both, the condition None where none is named. Raises InputError."""
-    plain, _, words = name.rpartition(":")
+    kind, _, words = name.partition(":")
+    plain, words = (kind, words) if kind in NAMES else name.rpartition(":")[::2]
     try:
-        return (plain, options.condition(words)) if plain else (name, None)
+        if not plain or plain == name:
+            return name, None
+        return plain, options.own_condition(words) if ":" in words else options.condition(words)
     except argparse.ArgumentTypeError as error:
         if plain in NAMES:
             raise InputError(f"--coupling {name}: the condition {error}") from None
@@ -165,13 +169,15 @@ def _guarantees(report: Comparison) -> Table:
     damping = "required damping" if alike else "required share of the damping"
     title = f"{damping} of {_list(available)} N s/m · {report.scenario}, case {report.case}"
     scale = available[0] if alike else 1.0
-    cells: dict[str, Callable[[ComparedCoupling], str]] = {
-        "coupling": lambda c: c.name,
-        "this-env.": lambda c: _needs(c.conditions["this-environment"], scale),
-        "at Hz": lambda c: _binds(c.conditions["this-environment"]),
-        "at 10 %": lambda c: _robust(c.nearby.robustness, scale),
-        "any-env.": lambda c: _needs(c.conditions["any-environment"], scale),
-        "at Hz ": lambda c: _binds(c.conditions["any-environment"]),
+    cells: dict[str, Callable[[ComparedCoupling], str]] = {"coupling": lambda c: c.name}
+    for i, condition in enumerate(report.conditions):
+        cells |= {
+            render.short(condition): lambda c, of=condition: _needs(c.conditions[of], scale),
+            "at Hz" + " " * i: lambda c, of=condition: _binds(c.conditions[of]),
+        }
+        if i == 0:
+            cells["at 10 %"] = lambda c: _robust(c.nearby.robustness, scale)
+    cells |= {
         "sup dB": lambda c: render.optional(finite(c.transparency.mismatch_db), "{:.2f}", "-inf"),
         "rms dB": lambda c: render.optional(finite(c.transparency.rms_mismatch_db), "{:.2f}", "-inf"),
     }

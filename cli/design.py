@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -16,7 +17,7 @@ from design import coverage
 from design.api import Filed, proved, store
 from design.audit import LONGEST_DELAY
 from design.bound import BoundBeside
-from design.certificate import SAMPLES, assess, check_ranges
+from design.certificate import SAMPLES, assess, check_ranges, named
 from design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
@@ -126,7 +127,7 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 def _for_switching(args: argparse.Namespace) -> bool:
     """Whether this design can be made for delays that vary; any other is only judged under them."""
     kind = kind_of(args.coupling)
-    return "switching" in kind.options and (args.condition or kind.conditions[0]) == "this-environment"
+    return "switching" in kind.options and named(args.condition or kind.conditions[0]).extensible
 
 
 def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
@@ -159,7 +160,7 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
 def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Judged:
     """What each condition asks of the coupling, by a sweep and an exact proof, and the limiter that it may have."""
     held, searched = design.certificate, design.searched if isinstance(design, Optimal) else None
-    requirements = assess(loop, design.coupling, design.phi, held)
+    requirements = assess(loop, design.coupling, design.phi, held, own=design.own)
     samples = SAMPLES if args.samples is None else args.samples
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
         whole = check_ranges(loop, design.coupling, args.seed, samples, move, searched, held)
@@ -171,13 +172,15 @@ def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: De
 
 
 def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judged, stored: Filed) -> _Report:
-    band, best, nearby = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None, Nearby()
+    band, best = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None
     switching = coverage.Switching.of(loop, design.coupling) if loop.varying_delay else None
     asked = Options(**asked_of(args, "optimal")) if best else DEFAULT
     with render.progress("working out robustness and its price, and the bound"):
-        if design.condition == "this-environment":
-            nearby = nearby_of(loop, design.coupling, asked)
+        nearby = nearby_of(loop, design.coupling, asked, named(design.asked))
         limit = best and BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, asked)
+    nominal = None
+    if kind_of(args.coupling).model:
+        nominal = partial(design_by_kind, kind=args.coupling, **asked_of(args, args.coupling))
     return _Report(
         case=args.case,
         seed=args.seed,
@@ -185,7 +188,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         objective_name=design.figure,
         wall_s=design.wall_s,
         certificate=judged.certificates[design.condition],
-        price=coverage.price(loop, design, args.coupling, asked_of(args, args.coupling)) if judged.whole else None,
+        price=coverage.price(loop, design, args.coupling, nominal) if judged.whole else None,
         judged=judged,
         switching=switching,
         delays=stored.switching.guarantee if stored.switching and stored.switching.proof else None,
@@ -194,6 +197,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         best=best and _Best(limit, best.g, best.ladder),
         sdps=design.sdps,
         stored=stored,
+        claim=design.own and design.own.claim,
     )
 
 
@@ -272,6 +276,7 @@ class _Report:
     best: _Best | None = render.several(_Best.rows, "beside")
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
     stored: Filed = render.several(_stored_rows)
+    claim: str | None = render.figure("claim", default=None, json="given")  # of a condition of the user's own
 
     @property
     def aim(self) -> str:

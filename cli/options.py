@@ -20,21 +20,23 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import msgspec
 from threadpoolctl import threadpool_limits
 
 from controller import older
 from controller.arithmetic import SingularLoop
-from controller.delay import LOST, VaryingDelay
+from controller.delay import LOST, Periods, VaryingDelay
 from controller.loop import DelayRange, Loop
-from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
-from design.own import is_refusal, named, place_of
+from design.own import called, is_refusal, named, place_of
 from design.result import CONDITIONS, DesignFailed
 from models.device import MOST_DAMPING
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
+
+if TYPE_CHECKING:
+    from design.conditions import Condition
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -67,6 +69,8 @@ class Parser(argparse.ArgumentParser):
             has = "has" if len(gone) == 1 else "have"
             why = f"{has} no effect any more: the basis of an optimal coupling grows by itself"
             print(", ".join(gone), why, file=sys.stderr)
+        if ":" in (getattr(found, "condition", None) or ""):
+            found.condition = own_condition(found.condition)
         for action in self._actions:
             if getattr(found, action.dest, None) == "":
                 raise InputError(f"{action.option_strings[-1] if action.option_strings else action.dest} is empty")
@@ -169,11 +173,24 @@ def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 
 def condition(text: str) -> str:
-    """A condition by its name, or by the name that it had before."""
+    """A condition by its name, or by the name that it had before; one of the user's own as it is."""
     name = older.CONDITIONS.get(text, text)
-    if name not in CONDITIONS:
-        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)}")
+    if name not in CONDITIONS and ":" not in text:
+        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)} and FILE.py:NAME")
     return name
+
+
+def own_condition(text: str) -> Condition:
+    """The user's own condition that `package.module:Name` or `FILE.py:NAME` names. Raises InputError."""
+    from design.certificate import named as checked
+    from design.conditions import Condition
+
+    found = named("--condition", text)
+    made = called(f"--condition {text}", found) if isinstance(found, type) else found
+    if not isinstance(made, Condition):
+        raise InputError(f"--condition {text} is {made!r}, expected a design.conditions.Condition")
+    with refused(f"--condition {text}: "):
+        return checked(made)
 
 
 def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
@@ -320,9 +337,8 @@ def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: s
 
 def add_condition_option(parser: argparse._ActionsContainer, what: str = "the condition of the certificate") -> None:
     """--condition."""
-    names = ",".join(CONDITIONS)
-    help_ = f"{what}: {' or '.join(CONDITIONS)} (default: the coupling's own)"
-    parser.add_argument("--condition", type=condition, metavar=f"{{{names}}}", help=help_)
+    help_ = f"{what}: {', '.join(CONDITIONS)} or FILE.py:NAME of your own (default: the coupling's)"
+    parser.add_argument("--condition", type=condition, metavar="NAME|FILE.py:NAME", help=help_)
 
 
 def add_limiter_option(parser: argparse._ActionsContainer, what: str = "clip forces at the devices' limits") -> None:

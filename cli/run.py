@@ -11,8 +11,10 @@ from typing import Any
 from cli import options, render
 from cli.judged import chosen_by, judge
 from cli.judged import rows as judged_rows
+from controller.budget import BudgetFigures
 from controller.environment import GROUND
 from controller.loop import Loop
+from design.certificate import named
 from design.files import write
 from design.guarantees import ANY
 from design.optimal import nearby
@@ -24,8 +26,9 @@ from sim import passivity_layer as layer
 from sim.alternatives import Alternative, alternatives
 from sim.api import ScenarioRun, run_scenario
 from sim.couplings import NAMES, choose
+from sim.engines import INTEGRATORS
 from sim.judged import Judged
-from sim.mujoco_engines import INTEGRATORS
+from sim.passivity_layer import BaselineFigures
 from sim.run import ENGINES, AnyEngine
 from sim.run_report import Ran, RunReport, run_report
 from sim.scenario import InputError, Scenario
@@ -135,7 +138,9 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun
     skipped = args.no_alternatives or run.trace.interrupted or args.vertex > 0
     same = args.limiter is None and not scenario.ranges and args.case != "none"
     with render.progress("other couplings") as move:
-        made = [] if skipped else alternatives(scenario, args.case, move, judged if same else None)
+        made = []
+        if not skipped:
+            made = alternatives(scenario, args.case, move, judged if same else None, judged.chosen.own)
     if args.side_by_side and not any(other.trace is not None for other in made):
         raise InputError("--side-by-side is for runs without walls, friction, varying delays and --no-alternatives")
     return made
@@ -164,11 +169,10 @@ def _panel_title(other: Alternative) -> str:
 def _nearby(loop: Loop, judged: Judged) -> Nearby:
     """The damping needed where the environment is not as modelled; empty where no guarantee depends on that."""
     chosen = judged.chosen
-    alone = chosen.condition == "this-environment" and judged.certificates[chosen.condition].certified
-    if not alone or judged.guarantee == ANY:
+    if not judged.certificates[chosen.condition].certified or judged.guarantee == ANY:
         return Nearby()
     with render.progress("working out robustness and its price"):
-        return nearby(loop, chosen.coupling)
+        return nearby(loop, chosen.coupling, condition=named(chosen.asked))
 
 
 def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
@@ -298,21 +302,23 @@ def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> 
 def _beside(report: RunReport) -> Any:
     """A table of other couplings; the one of this run is marked."""
     own = report.judged.coupling.kind, report.certificate.condition
+    names = [*CONDITIONS, *([own[1]] if own[1] not in CONDITIONS else [])]
     cells = []
     for other in report.alternatives:
         if other.reason:
-            cells.append((other.name, "", "", f"not possible: {other.reason}", "", ""))
+            cells.append((other.name, *[""] * len(names), f"not possible: {other.reason}", "", ""))
             continue
         same = own == (other.coupling, other.condition) or own[0] == other.coupling != "spring-damper"
-        needs = (_share(other.needs(condition), "never") for condition in CONDITIONS)
+        needs = (_share(other.needs(condition), "never") for condition in names)
         grows = other.growth_rate_per_s is None or other.growth_rate_per_s > MARGINAL
         error = "grows" if grows else render.optional(other.force_error_percent, "{:.3g} %")
         felt = _share(other.dc_ratio, "-")
         cells.append((other.name + "*" * same, *needs, other.guarantee or "none", felt, error))
-    heads = ("coupling", "this-env.", "any-env.", "guarantee", "stiffness", "error")
+    heads = ("coupling", *map(render.short, names), "guarantee", "stiffness", "error")
     marked = " (*: this run)" if any(cell[0].endswith("*") for cell in cells) else ""
     title = f"the same devices with other couplings{marked}: required damping\nin % of theirs"
-    return render.grid(f"{title}, guarantee, rendered stiffness and force error", heads, cells, left=(0, 3))
+    what = f"{title}, guarantee, rendered stiffness and force error"
+    return render.grid(what, heads, cells, left=(0, heads.index("guarantee")))
 
 
 def _share(value: float | None, absent: str) -> str:
@@ -326,14 +332,14 @@ def _crossed(other: accuracy.CrossCheck) -> str:
     return f"{other.integrator} x {other.substeps}: {apart}, {growth}: {verdict}"
 
 
-def _net_rows(budget: dict[str, Any] | None, baseline: dict[str, Any] | None) -> render.Rows:
+def _net_rows(budget: BudgetFigures | None, baseline: BaselineFigures | None) -> render.Rows:
     if baseline:
-        acted = f"acted in {baseline['limited_ticks']} of {baseline['ticks']} ticks"
-        yield "baseline", f"{baseline['name']}, {acted}; no guarantee"
+        acted = f"acted in {baseline.limited_ticks} of {baseline.ticks} ticks"
+        yield "baseline", f"{baseline.name}, {acted}; no guarantee"
     if budget:
-        why = f" ({budget['idle']})" if budget["idle"] else ""
-        yield "energy budget", f"limited {budget['limited_ticks']} of {budget['ticks']} ticks{why}"
-        yield "", budget["guarantee"]
+        why = f" ({budget.idle})" if budget.idle else ""
+        yield "energy budget", f"limited {budget.limited_ticks} of {budget.ticks} ticks{why}"
+        yield "", budget.guarantee
 
 
 def _growth(loop: ExactVerdict) -> str:

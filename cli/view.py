@@ -12,7 +12,7 @@ from pathlib import Path
 from cli import options, render
 from design.coverage import Limits
 from design.files import unseen, write_json
-from design.result import CONDITIONS, Requirement
+from design.result import Requirement
 from sim.scenario import InputError, require_even_ticks
 from sim.view.session import (
     COUPLINGS,
@@ -87,7 +87,7 @@ class _Event:
         return cls(t, what, *loop, prepared.requirements, prepared.guarantee, prepared.limits)
 
     def line(self) -> str:
-        held = [name for name in CONDITIONS if self.certificates[name].certified]
+        held = [name for name, need in self.certificates.items() if need.certified]
         growth = f"{self.exact_growth_rate_per_s:+.3g} 1/s at {self.exact_frequency_hz:.1f} Hz"
         grows = growth if isfinite(self.exact_growth_rate_per_s) else "no growth"
         proved = f"certified ({', '.join(held)})" if held else "NOT certified"

@@ -343,9 +343,12 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
         running, exact = loop.sent(coupling), loop.sent(coupling, exact=True)
     except SingularLoop as error:
         return str(error)
-    z = on_circle(frequencies(running))
+    z, meant = on_circle(frequencies(running)), exact.floats()
     response = running.at(z)
-    lost = rounding(running, z) + float(np.abs(response - exact.floats().at(z)).max())
+    if running.A.shape == meant.A.shape:
+        lost = rounding(running, z, meant)
+    else:  # rounding has kept a state that cancels
+        lost = rounding(running, z) + float(np.abs(response - meant.at(z)).max())
     scale = max(float(np.abs(response).max()), min(loop.delta) / loop.T)
     if lost <= _MOST_LOST * scale:
         return None
@@ -403,7 +406,9 @@ def named(condition: str | Condition) -> Condition:
             raise ValueError(f"{own}, expected one of its own, not {', '.join(sorted(taken))}")
         return condition
     if condition not in _NAMED:
-        raise ValueError(f"condition is {condition!r}, allowed are {', '.join(_NAMED)}, or a Condition of your own")
+        raise ValueError(
+            f"condition is {condition!r}, allowed are {', '.join(_NAMED)}, or one of your own (FILE.py:NAME)"
+        )
     return _NAMED[condition]
 
 

@@ -254,10 +254,10 @@ def _definite(W: Floats, bits: int) -> bool:
     for _ in range(_PASSES):
         if _dominates(W):
             return True
-        W = _even(W)
-        if W is None or (R := _whitening(_floats(W))) is None:
+        even = _even(W)
+        if even is None or (R := _whitening(_floats(even))) is None:
             return False
-        W = _times(_transposed(R), _times(W, R))
+        W = _times(_transposed(R), _times(even, R))
         if len(W) > kept:
             W = _less(W[-kept:], W.shape[1])
     return _dominates(W)

@@ -332,6 +332,10 @@ class _AnyEnvironment(Condition):
             return None
         return partial(conditions.least_scale, conditions.any_environment_demand(V, loop, phi))
 
+    def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
+        count = len(coupling.sampled(np.array([[1j]]), loop.T).G)
+        return conditions.any_environment_ratios(lambda z: coupling.sampled(z, loop.T), count, loop, multiplier)
+
     def _without(self, coupling: Coupling) -> str:
         """Why it says nothing of a coupling that has no V(z)."""
         if coupling.holds_model:

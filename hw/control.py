@@ -14,16 +14,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from operator import sub
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from controller.budget import EPS, EnergyBudget
+from controller.budget import BudgetFigures, EnergyBudget, Packets
 from controller.coupling import Coupling
 from controller.law import Law
 from controller.loop import Loop
 from controller.lti import Array
 from design.certificate import assess
+from design.conditions import Condition
 from design.coverage import Limits
 from design.files import unseen
 from design.guarantees import guarantee_of
@@ -116,10 +117,9 @@ class SentBudget:
 
     def __init__(self, plan: BudgetPlan) -> None:
         m, cap = len(plan.delta), math.inf if plan.cap is None else plan.cap
-        given: dict[str, Any] = {"encoder_step": plan.encoder_step, "start": plan.start, "cap": cap}
-        lo = np.full(m, plan.theta)
+        packets, step = Packets(np.full(m, plan.theta), hold=plan.longer), plan.encoder_step
         self.plan = plan
-        self._budget = EnergyBudget(plan.delta, plan.T, lo, hold=plan.longer, **given)
+        self._budget = EnergyBudget(plan.delta, plan.T, packets, encoder_step=step, start=plan.start, cap=cap)
         self._unit = -np.array(plan.force_step)  # the wire carries -f
         self._before = self._applied = np.zeros(m)
         self._nothing = np.zeros((m, 1))
@@ -139,23 +139,11 @@ class SentBudget:
         whole = np.where(sent == wanted[:, 0], steps, np.trunc(sent / self._unit))
         return tuple(int(n) for n in whole)
 
-    def part(self) -> dict[str, Any]:
-        """What it has done since arming, as plain data."""
-        budget = self._budget
+    def figures(self) -> BudgetFigures:
+        """What it has done since arming."""
         given = f"more than {self.plan.start:g} J" if self.plan.start else "any energy"
-        return {
-            "start_J": self.plan.start,
-            "cap_J": self.plan.cap,
-            "eps": EPS,
-            "guarantee": f"no passive hand is given {given} in an arming beyond what the devices dissipate, "
-            "whatever computes the forces",
-            "ticks": budget.ticks,
-            "limited_ticks": int(budget.limited[0]),
-            "smallest_scale": float(budget.least[0]),
-            "energy_J": float(budget.energy[0]),
-            "reserved_J": float(budget.reserved[0]),
-            "surprises": budget.surprises,
-        }
+        dissipated = "in an arming beyond what the devices dissipate, whatever computes the forces"
+        return self._budget.figures(f"no passive hand is given {given} {dissipated}")
 
 
 class TraceRow(NamedTuple):
@@ -404,7 +392,7 @@ def certified_coupling(
     scenario: Scenario,
     case: str,
     name: str | None,
-    condition: str | None,
+    condition: str | Condition | None,
     link: int,
     own: Coupling | Design | None = None,
     limiter: bool | None = None,
@@ -420,12 +408,10 @@ def certified_coupling(
     delays = tuple(max(n, link) for n in scenario.theta)
     slower = scenario.replace(theta=delays, latency=None if link else scenario.latency)
     try:
-        # a latency is derived for this environment only
-        wanted = condition or ("this-environment" if slower.latency else None)
-        chosen = choose(slower, case, name, wanted, limiter) if own is None else given(own)
+        chosen = choose(slower, case, name, condition, limiter) if own is None else given(own)
     except DesignFailed as error:
         raise SafetyStop(f"no coupling for a link of {link} tick{'s' if link > 1 else ''}: {error}") from None
-    requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
+    requirements = assess(slower.loop(case), chosen.coupling, chosen.phi, own=chosen.own)
     limits = limits_of(slower, chosen, requirements, limiter)
     waits = min(MAX_THETA, *slower.theta) if link else 0  # what is longer, the host waits for
     made = CertifiedCoupling(waits, slower, case, chosen, requirements, limits)
@@ -439,7 +425,7 @@ def certified_couplings(
     scenario: Scenario,
     case: str,
     name: str | None,
-    condition: str | None,
+    condition: str | Condition | None,
     link: int,
     spare: int = 2,
     limiter: bool | None = None,
@@ -451,7 +437,7 @@ def certified_couplings(
     SafetyStop where the first coupling is not certified.
     """
     found = [certified_coupling(scenario, case, name, condition, link, limiter=limiter)]
-    wanted = [(name, condition), _FALLBACK]
+    wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), _FALLBACK]
     while len(found) <= spare and wanted:
         kind, by = wanted[0]
         try:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from controller.budget import BudgetFigures
 from design.files import plain, unseen, write_json
 from hw.control import CertifiedCoupling, ProgramFigures
 from hw.protocol import NO_MARGIN
@@ -135,7 +136,7 @@ class SessionReport:
     link: _Link = unseen()
     run: _Ran = unseen()
     growth: list[Growth] = unseen()
-    energy_budget: list[dict[str, Any]] | None = unseen()  # arming by arming
+    energy_budget: list[BudgetFigures] | None = unseen()  # arming by arming
 
 
 def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:
@@ -158,7 +159,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
         _Link.of(session, recorder, dropped),
         ran,
         growths(trace) if trace else [],
-        [arming.budget.part() for arming in session.armings if arming.budget] or None,
+        [arming.budget.figures() for arming in session.armings if arming.budget] or None,
     )
 
 

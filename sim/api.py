@@ -15,8 +15,7 @@ from design.files import plain
 from design.result import Design
 from sim.accuracy import EngineChoice, compare_engines, pick
 from sim.couplings import given, limits_of
-from sim.engines import Engine
-from sim.mujoco_engines import INTEGRATORS
+from sim.engines import INTEGRATORS, Engine
 from sim.passivity_layer import EnergyNet, Plugged, Wanted, netted
 from sim.run import ENGINES, AnyEngine, Progress, Simulation, assemble, engine_name, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
@@ -153,7 +152,7 @@ def simulate(
         "limiter": plain(limits),
         "stability": None if scenario.switches or environment else plain(stability_of(done.simulation, trace)),
         "remarks": done.remarks,
-        "energy_budget": trace.net.part() if trace.net else None,
+        "energy_budget": plain(trace.net.figures()) if trace.net else None,
     }
     return replace(trace, meta=meta)
 

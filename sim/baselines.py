@@ -16,7 +16,7 @@ import numpy as np
 from controller.coupling import NoCoupling
 from controller.lti import Array
 from controller.tick import StepBuffer
-from design.result import Chosen, DesignFailed
+from design.result import CONDITIONS, Chosen, DesignFailed
 from models.hold import hold
 from models.scene import Crowd, variants
 from sim.accuracy import force_error
@@ -35,7 +35,6 @@ _DESIGNS = (
     ("spring-damper", "this-environment"),
     ("optimal", "this-environment"),
 )
-_GUARANTEES = {"any-environment": "any passive environment", "this-environment": "this environment"}
 
 
 @dataclass(frozen=True)
@@ -123,11 +122,11 @@ def _judged(
     # of the force within its limits: what acted, whatever computed it
     error = force_error(with_net, trace, scenario.loop(case).lam)
     apart = _apart(trace.f, error.ideal) if not scenario.environment.walls else None
-    part = trace.net.part() if trace.net else {"limited_ticks": 0}
+    acted = trace.net.figures().limited_ticks if trace.net else 0
     moving, fastest = _left_alone(with_net)
     name, guarantee, source = (net.name, net.guarantee, net.source) if net else ("none, clipped", None, None)
     if design:
-        guarantee = _GUARANTEES[design.condition]
+        guarantee = CONDITIONS[design.condition]
         name = f"{design.kind}, {guarantee}"
     return Rival(
         name,
@@ -137,7 +136,7 @@ def _judged(
         apart,
         _fast(trace.f, scenario.T),
         float(np.abs(trace.f).max(initial=0.0)),
-        100 * part["limited_ticks"] / max(1, len(trace.t)),
+        100 * acted / max(1, len(trace.t)),
         moving,
         fastest,
         "walls have no linear ideal to compare with" if apart is None else None,

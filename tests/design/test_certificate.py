@@ -10,8 +10,16 @@ from asked import this_environment
 from worlds import FIGURE_4, PAIR, SOFT, SOFT_NETWORK, STIFF
 
 from controller import coupling as controller_coupling
-from controller.arithmetic import SingularLoop, rational
-from controller.coupling import PUBLISHED, Compliance, NoCoupling, SpringDamper, _ComplianceForm, _InternalModelForm
+from controller.arithmetic import SingularLoop, numbers, rational, solve
+from controller.coupling import (
+    PUBLISHED,
+    Compliance,
+    ForceFilter,
+    NoCoupling,
+    SpringDamper,
+    _ComplianceForm,
+    _InternalModelForm,
+)
 from controller.environment import Network, Spring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti
@@ -324,6 +332,33 @@ def test_the_bound_on_rounding_holds_for_a_tick():
             z, xi = running.A @ z + running.B @ u, exact.A @ xi + exact.B @ v
         assert np.abs(off).max() <= 3 * rounding(running, on_circle(frequencies(running))) * np.sqrt(x.size)
         assert np.abs(off).max() > 0
+
+
+def test_beside_a_sharp_resonance_what_runs_is_what_is_proved():
+    """A gram beside 50 kg: both exactly, at a rational point of the circle beside the peak.
+
+    The Schur form of either misses it by more than the two are apart; the bound holds, and the filter is proved.
+    """
+    springs = (("a", "m", 1000.0, 0.01), ("m", "n", 100.0, 0.0), ("n", "k", 1000.0, 0.0), ("k", "b", 3000.0, 0.01))
+    parts = tuple(Spring((one, other), stiffness, damping) for one, other, stiffness, damping in springs)
+    network = Network(contacts=("a", "b"), springs=parts, masses={"m": 0.001, "n": 50.0, "k": 0.1})
+    loop = Loop(1e-3, (0, 16), (2, 2), (2, 18), (0.1, 5.0), network)
+    coupling = ForceFilter([0.0, 0.9, 0.995], [], np.broadcast_to(np.eye(2) / 800, (4, 2, 2)))
+    running, meant = loop.sent(coupling), loop.sent(coupling, exact=True)
+    t = Fraction(20503569, 10**10)  # z = (1 + it)^2/(1 + t^2)
+
+    def response(G: Lti) -> np.ndarray:
+        A, B, C, D = (np.vectorize(Fraction, otypes=[object])(part) for part in (G.A, G.B, G.C, G.D))
+        n, turned = len(A), 2 * t / (1 + t * t) * numbers(np.eye(len(A)), Fraction(1))
+        left = (1 - t * t) / (1 + t * t) * numbers(np.eye(n), Fraction(1)) - A
+        X = solve(np.block([[left, -turned], [turned, left]]), np.vstack([B, 0 * B]))
+        return (C @ X[:n] + D).astype(float) + 1j * (C @ X[n:]).astype(float)
+
+    z, here = on_circle(frequencies(running)), complex((1 + 1j * float(t)) ** 2 / (1 + float(t) ** 2))
+    exactly, apart = response(meant), np.abs(response(running) - response(meant)).max()
+    assert 0 < apart < rounding(running, z, meant.floats()) < 1e-6 * np.abs(exactly).max()
+    assert np.abs(meant.floats().at(here) - exactly).max() > apart
+    assert certified(loop, coupling, "this-environment").certificate.proof == "rational"
 
 
 def test_a_sweep_that_says_no_is_not_outvoted(monkeypatch):

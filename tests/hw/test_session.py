@@ -388,10 +388,10 @@ def test_a_budget_under_the_bridge_stands_by_while_the_coupling_is_certified_and
     run = rehearsal_of(scenario, rungs, recorder=recorder, settings=settings)
     run.run_to_the_end(5.0)
     (part,) = outcome("I", run.session, recorder, 0).energy_budget
-    assert part["limited_ticks"] == part["surprises"] == 0
-    assert part["ticks"] == len(recorder)
-    assert "no passive hand is given more than 0.05 J" in part["guarantee"]
-    assert part["reserved_J"] <= part["energy_J"]
+    assert part.limited_ticks == part.surprises == 0
+    assert part.ticks == len(recorder)
+    assert "no passive hand is given more than 0.05 J" in part.guarantee
+    assert part.reserved_J <= part.energy_J
 
 
 @pytest.mark.parametrize("faults", [(), ("down:drop=0.02@0.5",)], ids=["clean", "lossy"])
@@ -415,7 +415,7 @@ def test_a_thief_under_the_bridge_is_limited_and_hands_get_no_more_than_the_budg
         dx = np.diff(trace.x, axis=0)
         lost = (dx**2 * np.array(scenario.delta)).sum(axis=1) / scenario.T
         taken[budget] = np.cumsum(-(trace.f[:-1] * dx).sum(axis=1) - lost).max()
-        assert part["surprises"] == 0
-        assert part["limited_ticks"] > 50 or budget > 1
+        assert part.surprises == 0
+        assert part.limited_ticks > 50 or budget > 1
         assert taken[budget] <= budget + 1e-5
     assert taken[10.0] > 2 * 0.01
