@@ -47,6 +47,35 @@ def _tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
+#: conditions are asked what they say; only their homes know their names
+CONDITIONS = {"any-environment", "this-environment", "ANY_ENVIRONMENT", "THIS_ENVIRONMENT"}
+AT_HOME = {f"design/{name}.py" for name in ("conditions", "environments", "lmi", "result")} | {"controller/older.py"}
+#: where they stand as data: what a design is made for, the rows of a table, the styles of a picture, one figure's key
+NAMED_IN = {
+    *(
+        f"design/{name}.py"
+        for name in ("api", "certificate", "compare", "designs", "fixed_order", "optimal", "program")
+    ),
+    *("design/spring_damper.py", "sim/alternatives.py", "sim/baselines.py", "hw/control.py"),
+    *("sim/map_plot.py", "sim/plots.py", "sim/report.py", "cli/validate.py"),
+}
+
+
+def test_no_code_asks_for_a_conditions_name():
+    """A condition of a user's own works in every command, since none of them decides by a name."""
+    asking, named = [], set()
+    for path in FILES:
+        place = path.relative_to(ROOT).as_posix()
+        for node in () if place in AT_HOME else ast.walk(_tree(path)):
+            if isinstance(node, ast.Constant) and node.value in CONDITIONS:
+                named.add(place)
+            if isinstance(node, ast.Compare | ast.match_case):
+                parts = [getattr(part, of, None) for part in ast.walk(node) for of in ("value", "id", "attr")]
+                asking += [f"{place}: {ast.unparse(node)}"] * any(w in CONDITIONS for w in parts if isinstance(w, str))
+    assert not asking
+    assert named == NAMED_IN
+
+
 @cache
 def imported(path: Path) -> set[str]:
     """Every module that a file imports, at its head, later or by a string; names of modules in full."""
