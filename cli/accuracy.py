@@ -10,7 +10,7 @@ from cli.judged import chosen_by
 from controller.coupling import NoCoupling
 from sim.accuracy import Row, measure_all
 from sim.couplings import NAMES, limits_of
-from sim.mujoco_engines import EXPONENTIAL
+from sim.engines import EXPONENTIAL
 from sim.run import assemble
 from sim.scenario import InputError, require_even_ticks, require_linear
 from sim.step_choice import default_substeps

@@ -27,9 +27,8 @@ from threadpoolctl import threadpool_limits
 
 from controller import older
 from controller.arithmetic import SingularLoop
-from controller.delay import LOST, VaryingDelay
+from controller.delay import LOST, Periods, VaryingDelay
 from controller.loop import DelayRange, Loop
-from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
 from design.own import called, is_refusal, named, place_of
 from design.result import CONDITIONS, DesignFailed

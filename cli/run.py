@@ -26,8 +26,8 @@ from sim import passivity_layer as layer
 from sim.alternatives import Alternative, alternatives
 from sim.api import ScenarioRun, run_scenario
 from sim.couplings import NAMES, choose
+from sim.engines import INTEGRATORS
 from sim.judged import Judged
-from sim.mujoco_engines import INTEGRATORS
 from sim.passivity_layer import BaselineFigures
 from sim.run import ENGINES, AnyEngine
 from sim.run_report import Ran, RunReport, run_report

@@ -12,7 +12,7 @@ any-environment    Lemma 4 of the paper for any passive environment under backwa
 
 design/environments.py and lmi.py have the two as a `Condition` of a loop and a coupling: which form applies.
 design/multipliers.py has those of this-environment that weigh an error with a multiplier: walls that make and break
-contact, delays that switch, forces that leave through the limiter of controller.limiter.
+contact, delays that switch, forces that leave through the limiter of controller.law.
 
 The period may vary from tick to tick, up to T_max, in all of them: `even_damping` is where it enters.
 """

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from controller import environment
 from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
-from controller.law import Law
-from controller.limiter import Limiter
+from controller.law import Law, Limiter
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from controller.tick import Process

@@ -22,8 +22,8 @@ from models.human import Human, Link
 from models.scene import build, variants
 from sim import zwidth as zwidth_map
 from sim.crowds import crowds
+from sim.engines import _discretised
 from sim.limit_cycles import Effects, HeldDevices, Plan
-from sim.mujoco_engines import _discretised
 from sim.scenario import InputError, load
 from sim.stability import dominant_mode, exact_loops
 from sim.trace import oscillation, slowest_seen
