@@ -119,8 +119,7 @@ def v_hat(H: Block) -> tuple[Array, Block]:
 
     V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) carries the compliance V and what the delays add. It vanishes at
     z = 1, where nothing can be strict, so it is divided by |1 - 1/z|^2: (1 - 1/z) becomes 1/(1 - z), whose pole has
-    the Hermitian part 1/2. It is linear in H, so V and Theta-hat may come one by one. design.lmi.v_hat_ports states it
-    in the paper's ports, for realisations whose quotient is known, as a test compares.
+    the Hermitian part 1/2. It is linear in H, so V and Theta-hat may come one by one.
     """
     H1, R = H.split_at_one()
     return H1, H1 / 2 - R

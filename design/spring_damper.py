@@ -385,14 +385,6 @@ def _verified(loop: Loop, coupling: SpringDamper | MovingAverage, phi: Array | N
     return requirement
 
 
-def excess_limits(loop: Loop, phi: Array | None) -> Array:
-    """(N,) Sigma = Delta_V^-1 = Phi^-1 - Delta_D^-1 in units of the usable damping; inf without a multiplier."""
-    if phi is None:
-        return np.full(loop.channels, np.inf)
-    with np.errstate(divide="ignore"):
-        return usable(loop) / phi - 1
-
-
 def _coupling(loop: Loop, gains: Array) -> SpringDamper:
     (k, b), spend = np.split(np.maximum(gains, 0.0), 2), usable(loop)
     return SpringDamper(k * spend / loop.T, np.where(b < _NEGLIGIBLE, 0.0, b) * spend)
