@@ -28,7 +28,7 @@ HOMES = {
     "mujoco": {"models/scene.py", "sim/engines.py", "sim/view/"},
     "cvxpy": {"design/lmi.py"},  # the lemmas, for who gives expressions
     "clarabel": {"design/cone.py"},
-    "distributed": {"sim/shards.py"},
+    "distributed": {"sim/crowds.py"},
     "serial": {"hw/transport.py"},
     "matplotlib": {"sim/map_plot.py", "sim/plots.py"},
     "PIL": {"sim/view/"},
