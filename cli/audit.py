@@ -96,15 +96,15 @@ def _parser() -> options.Parser:
     coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m]; one is for all")
     stored = "a stored coupling, or a function of your own, in place of --K and --B"
     coupling.add_argument("--coupling", metavar="FILE.json|MODULE:NAME", help=stored)
-    options.add_condition_option(coupling, "a further condition that must hold, beside the two that are always asked")
+    parser.add_condition("a further condition that must hold, beside the two that are always asked", to=coupling)
     device = "its damping and, where no gains are given, the largest that CHAI3D allows it, on a rigid wall at 1 kHz"
     coupling.add_argument("--device", metavar="NAME", help=f"of the catalogue: {device}; other options go first")
     coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")
-    options.add_loop_options(parser)
-    options.add_rigid_option(parser)
+    parser.add_loop()
+    parser.add_rigid()
     switching = "also any switching of the forces' delays in this range [samples]; or LO-HI,LO-HI,.. per channel"
-    options.add_varying_delay_option(parser, switching)
-    options.add_output_options(parser)
+    parser.add_varying_delay(switching)
+    parser.add_output()
     return parser
 
 

@@ -83,19 +83,19 @@ def _parser() -> argparse.ArgumentParser:
         "Drive a device over a serial port with a coupling that is certified for the delay measured.",
         "python -m hw.bridge --rehearse --case I --duration 2",
     )
-    options.add_loop_options(parser)
+    parser.add_loop()
     session_cli.add_link_options(parser)
     session_cli.add_safety_options(parser)
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
-    options.add_condition_option(parser)
+    parser.add_condition()
     latch = "when forces act: at whole ticks (default), or as soon as they arrive, certified for the latency measured"
     parser.add_argument("--latch", choices=("tick", "arrival"), default="tick", help=latch)
-    options.add_energy_budget_option(parser)
-    options.add_limiter_option(parser)
+    parser.add_energy_budget()
+    parser.add_limiter()
     seconds, most = "of forces at full gain (default: the scenario's)", options.number(0.1, _LONGEST)
     parser.add_argument("--duration", type=most, metavar="SECONDS", help=seconds)
-    options.add_output_options(parser, picture=True)
+    parser.add_output(picture=True)
     return parser
 
 

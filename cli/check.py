@@ -76,8 +76,8 @@ def _parser() -> options.Parser:
     example = "python -m design.check coupling.json"
     parser = options.Parser("design.check", "Prove a stored coupling again, in exact arithmetic.", example)
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling")
-    options.add_condition_option(parser, "prove the coupling by this condition, in place of the file's")
-    options.add_json_option(parser)
+    parser.add_condition("prove the coupling by this condition, in place of the file's")
+    parser.add_json()
     return parser
 
 

@@ -53,16 +53,16 @@ def _parser() -> options.Parser:
   python -m design.compare --over damping=0.7:10,delay --points 5"""
     what = "Compare couplings over frequency, all designs as a ladder, or the best coupling along an axis of the loop."
     parser = options.Parser("design.compare", what, example)
-    options.add_loop_options(parser)
+    parser.add_loop()
     given = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION asks for a condition"
     parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"{given} (default none,spring-damper)")
-    options.add_condition_option(parser, "of designs that name none")
+    parser.add_condition("of designs that name none")
     short = "every design side by side, cases I and II (full: minutes)"
     parser.add_argument("--ladder", nargs="?", const="short", choices=tuple(LADDERS), help=short)
     classics = "on the same runs: no coupling, the classics (PO/PC, energy bounding), the energy budget, our designs"
     parser.add_argument("--baselines", action="store_true", help=classics)
     axes, names = ",".join(AXES), "damping, delay, period, order"
-    options.add_limiter_option(parser, "with --baselines clip the forces of our designs")
+    parser.add_limiter("with --baselines clip the forces of our designs")
     over = f"the best coupling along these axes: {names} (default: all of them)"
     parser.add_argument("--over", nargs="?", const=axes, metavar="NAME[=LOW:HIGH],..", help=over)
     curve = parser.add_argument_group("with --over")
@@ -72,9 +72,8 @@ def _parser() -> options.Parser:
     curve.add_argument("--keep", choices=("samples", "seconds"), default="samples", help="delays, as the period varies")
     beside = "spring-dampers drawn: none, any-environment, this-environment or both (default both)"
     curve.add_argument("--beside", type=_beside, default=tuple(CONDITIONS), metavar="NAME", help=beside)
-    optimal = parser.add_argument_group("the optimal coupling of --over")
-    add_optimal_options(optimal)
-    options.add_output_options(parser, picture=True)
+    add_optimal_options(parser, "the optimal coupling of --over")
+    parser.add_output(picture=True)
     plain = "without --over, --ladder and --baselines"
     parser.only(plain, lambda args: not (args.over or args.ladder or args.baselines), "coupling", "condition")
     parser.only("without --ladder, which has no picture", lambda args: not args.ladder, "no_plot")

@@ -28,7 +28,7 @@ from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import Design, Requirement, finite, listed
 from design.robustness import Nearby, ranges_around
 from design.transparency import BAND_HZ, Transparency, transparency
-from sim.judged import Judged
+from sim.couplings import Judged
 from sim.scenario import InputError, Scenario
 
 
@@ -56,7 +56,7 @@ def main(argv: list[str]) -> int:
 def _parser() -> options.Parser:
     example = "python -m design --case I --coupling spring-damper --out coupling.json"
     parser = options.Parser("design", "Design a coupling, prove its certificate and store both.", example)
-    options.add_loop_options(parser)
+    parser.add_loop()
     kind = parser.add_mutually_exclusive_group()
     kinds = f"{', '.join(KINDS)}, or package.module:function of your own (default spring-damper)"
     kind.add_argument("--coupling", metavar="NAME", default="spring-damper", help=kinds)
@@ -64,34 +64,34 @@ def _parser() -> options.Parser:
     kind.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
     around = "certify for every stiffness and mass this much more or less, as [ranges] of a scenario does"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
-    options.add_condition_option(parser, "what to certify")
+    parser.add_condition("what to certify")
     varying = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
-    options.add_varying_delay_option(parser, varying)
+    parser.add_varying_delay(varying)
     limiter = "for this-environment: proved also while forces are limited, or not made (spring-damper: if it can)"
     one_of = parser.add_mutually_exclusive_group()
     one_of.add_argument("--limiter", action="store_const", const=True, help=limiter)
-    options.add_limiter_option(one_of, "design and prove as if forces were never at their limits")
+    parser.add_limiter("design and prove as if forces were never at their limits", to=one_of)
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
     ways = "complementarity (as printed), inner or fixed-poles (default inner)"
     ccl.add_argument("--method", metavar="NAME", help=ways)
-    optimal = parser.add_argument_group("optimal: the best filter of the environment's forces")
-    add_optimal_options(optimal)
+    add_optimal_options(parser, "optimal: the best filter of the environment's forces")
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
     parser.add_argument("--samples", type=options.whole(0, 10_000), metavar="N", help=samples)
-    options.add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case or scenario>.json)")
+    parser.add_output("FILE.json", "the stored coupling (default out/design-<case or scenario>.json)")
     return parser
 
 
-def add_optimal_options(group: argparse._ActionsContainer) -> None:
-    """The options of an optimal coupling; None where not given."""
+def add_optimal_options(parser: options.Parser, title: str) -> None:
+    """The options of an optimal coupling, as a group of this title; None where not given."""
+    group = parser.add_argument_group(title)
     group.add_argument("--objective", choices=OBJECTIVES, help="which transparency error is minimised (default rms)")
-    options.add_band_option(group)
+    parser.add_band(to=group)
     gain = "limit of |F|/|E| above 100 Hz (default none: the force there is kept low, not limited)"
     group.add_argument("--high-gain", type=options.number(), metavar="G", help=gain)
     limit = "begin no larger basis after this time [s] (default 60)"
     group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
-    options.add_older_optimal_options(group)
+    parser.add_older_optimal(to=group)
 
 
 def _percent(text: str) -> float:

@@ -23,17 +23,16 @@ from design.robustness import Nearby
 from design.transparency import BAND_HZ
 from sim import accuracy
 from sim import passivity_layer as layer
+from sim.accuracy import MOST
 from sim.alternatives import Alternative, alternatives
 from sim.api import ScenarioRun, run_scenario
-from sim.couplings import NAMES, choose
+from sim.couplings import NAMES, Judged, choose
 from sim.engines import INTEGRATORS
-from sim.judged import Judged
 from sim.passivity_layer import BaselineFigures
 from sim.run import ENGINES, AnyEngine
 from sim.run_report import Ran, RunReport, run_report
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, ExactVerdict
-from sim.step_choice import MOST
 
 
 def main(argv: list[str]) -> int:
@@ -62,10 +61,10 @@ def _parser() -> options.Parser:
         "sim.run", "Close the loop once and report stability, transparency and error.", "python -m sim.run --case none"
     )
     add = parser.add_argument
-    options.add_loop_options(parser)
-    options.add_varying_delay_options(parser)
-    options.add_coupling_options(parser, f"{', '.join(NAMES)}, as baselines {', '.join(layer.BASELINES)}")
-    options.add_energy_budget_option(parser)
+    parser.add_loop()
+    parser.add_varying_delays()
+    parser.add_coupling(f"{', '.join(NAMES)}, as baselines {', '.join(layer.BASELINES)}")
+    parser.add_energy_budget()
     engines = "mujoco (default), exact, or package.module:Class of your own"
     add("--engine", default="mujoco", metavar="NAME|MODULE:CLASS", help=engines)
     steppers = "integrator of MuJoCo (default exponential, RK4 where devices rub)"
@@ -77,12 +76,12 @@ def _parser() -> options.Parser:
     add("--error", type=options.number(1e-18, 1.0), metavar="E", help=asked)
     check = "run RK4 beside the exponential engine, with which it shares no matrix"
     add("--cross-check", action="store_true", help=check)
-    options.add_human_option(parser)
-    options.add_band_option(parser)
-    options.add_limiter_option(parser)
+    parser.add_human()
+    parser.add_band()
+    parser.add_limiter()
     vertex = "simulate at this vertex of the scenario's ranges (default 0: nominal)"
     add("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
-    options.add_output_options(parser, picture=True)
+    parser.add_output(picture=True)
     beside = parser.add_argument_group("the same devices and hands with other couplings")
     beside.add_argument("--no-alternatives", action="store_true", help="no table of them, which takes a second or two")
     beside.add_argument("--side-by-side", action="store_true", help="draw their forces, too, as couplings.png")

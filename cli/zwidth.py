@@ -73,13 +73,13 @@ def main(argv: list[str]) -> int:
 def _parser() -> options.Parser:
     what = "Draw the Z-width map: which spring-dampers are safe, for whom, by which test."
     parser = options.Parser("sim.zwidth", what, _EXAMPLE)
-    options.add_loop_options(parser)
-    options.add_rigid_option(parser)
+    parser.add_loop()
+    parser.add_rigid()
     of_map = parser.add_argument_group("the map (K and B are the same on all channels)")
     fixed = "this coupling, fixed, and K and B of the environment's contact springs on the axes"
     names = f"{', '.join(NAMES)} or FILE.json (default: K and B of the coupling)"
     of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed}: {names}")
-    options.add_condition_option(of_map, "that such a coupling is designed for; one of your own is drawn in every map")
+    parser.add_condition("that such a coupling is designed for; one of your own is drawn in every map", to=of_map)
     rows = "rows and columns (default 60; 24 with --coupling)"
     of_map.add_argument("--grid", type=options.whole(4, 400), metavar="N", help=rows)
     K, B = "[N/m]; default from delta, theta and T", "[N s/m]; default from delta"
@@ -89,8 +89,8 @@ def _parser() -> options.Parser:
     of_map.add_argument("--mark", type=_mark, action="append", default=[], metavar="K,B", help=mark)
     humans = "random humans per device (default 200)"
     of_map.add_argument("--humans", type=options.whole(1, 100_000), default=200, metavar="N", help=humans)
-    _add_points(parser.add_argument_group("the points simulated in MuJoCo, and what they have beside the linear loop"))
-    options.add_output_options(parser, picture=True)
+    _add_points(parser)
+    parser.add_output(picture=True)
     simulated = ("trials", "duration", "start", "press", "threshold", "quantisation", "saturation", "friction")
     parser.only("about simulated points: --points 0 has none", lambda args: args.points, *simulated)
     parser.only("about simulated points with --rigid: --points 0 has none", lambda a: a.points or not a.rigid, "wall")
@@ -102,7 +102,9 @@ def _parser() -> options.Parser:
     return parser
 
 
-def _add_points(points: argparse._ActionsContainer) -> None:
+def _add_points(parser: options.Parser) -> None:
+    points = parser.add_argument_group("the points simulated in MuJoCo, and what they have beside the linear loop")
+
     def add(name: str, kind: Callable[[str], float], metavar: str, what: str, default: float | None = None) -> None:
         points.add_argument(f"--{name}", type=kind, metavar=metavar, default=default, help=what)
 
@@ -116,7 +118,7 @@ def _add_points(points: argparse._ActionsContainer) -> None:
     add("threshold", options.number(1e-9, 1, "m"), "METRES", swing)
     add("quantisation", options.number(0, 1e-2, "m"), "METRES", "encoder step of every device")
     points.add_argument("--saturation", action="store_true", help="motors have their force limits")
-    options.add_limiter_option(points, "with --saturation clip forces at these limits")
+    parser.add_limiter("with --saturation clip forces at these limits", to=points)
     add("friction", options.number(0, 1e3, "N"), "NEWTONS", "Coulomb friction of every device")
     points.add_argument("--wall", action="store_true", help="contacts push and never pull")
     cutoff = "first-order cut-off of the damped velocity; in all maps"

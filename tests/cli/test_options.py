@@ -25,7 +25,7 @@ def parser():
     made.add_argument("--theta", type=options.several(int))
     made.add_argument("--mark", type=options.pair, action="append")
     made.add_argument("--varying-delay", type=options._delay_ranges)
-    options.add_condition_option(made)
+    made.add_condition()
     return made
 
 
