@@ -28,7 +28,7 @@ from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import Design, Requirement, finite, listed
 from design.robustness import Nearby, ranges_around
 from design.transparency import BAND_HZ, Transparency, transparency
-from sim.judged import Judged
+from sim.couplings import Judged
 from sim.scenario import InputError, Scenario
 
 

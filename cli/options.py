@@ -310,6 +310,8 @@ def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[
     except (InputError, DesignFailed):
         raise
     except (ValueError, ArithmeticError) as error:
+        if place_of(error):  # in a class of the user's own
+            raise
         text = str(error)
         argument = text.partition(" ")[0]
         if given(getattr(args, argument, None)):
