@@ -22,7 +22,7 @@ from controller import older
 from controller.delay import LOST, Periods, VaryingDelay
 from controller.loop import DelayRange, Loop
 from design.files import check_file, folder, read_text
-from design.own import called, named
+from design.own import called, named, place_of
 from design.result import CONDITIONS, DesignFailed
 from models.device import MOST_DAMPING
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
