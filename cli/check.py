@@ -15,11 +15,11 @@ from design.certificate import NotProved, Verdict, lag, prove, required_damping,
 from design.conditions import Condition
 from design.coupling_file import Stored, SwitchingProof
 from design.coverage import SearchFigures
-from design.environments import Searched, search, search_ranges
 from design.files import InputError
-from design.guarantees import HERE, RANGES, switching_guarantee
+from design.guarantees import HERE, RANGES
 from design.own import called, named
-from design.result import listed
+from design.result import listed, switching_guarantee
+from design.worst_member import Searched, search, search_ranges
 from sim.couplings import read_coupling
 
 

@@ -17,17 +17,9 @@ from controller.delay import delay
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Sampled
 from design.conditions import even_damping, this_environment, this_environment_demand
+from design.environments import LIMITER, SWITCHING
 from design.frequency import frequencies, hermitian, on_circle
 from design.lmi import RESERVE, Complex
-from design.multipliers import (
-    BETA,
-    Lags,
-    half_widths,
-    limiter_lag,
-    switching_block,
-    switching_sweep,
-)
-from design.multipliers import limiter as limiter_proof
 from design.result import Requirement
 from design.transparency import BAND_HZ, transparency
 
@@ -100,7 +92,7 @@ class SampledLoop:
         self.conditions = np.append(self.conditions, w)
         self.loop_at_conditions, self.of_one = self._responses(self.conditions), self._of_one()
 
-    def multiplier(self, x: Array) -> Lags | None:
+    def multiplier(self, x: Array) -> Sequence[Sequence[float]] | None:
         """The limiter's multiplier c in x, where the condition has one."""
         return None
 
@@ -221,8 +213,8 @@ class SampledLoop:
 # ----------------------------------------------------------------------------------------------------
 # Spring-damper gains that are safe under any switching of their delays: a local search like the one above.
 #
-# Its sampled condition is `switching_block`: the multiplier is searched together with the gains. What is returned
-# passes the sweep of `switching_sweep`, which knows nothing of the multiplier found here.
+# Its sampled condition is that of `SWITCHING`: the multiplier is searched together with the gains. What is returned
+# passes the sweep of `SWITCHING`, which knows nothing of the multiplier found here.
 
 
 _FIRST = 0.5  # the multiplier alpha T/delta that a search begins with where the start has none
@@ -233,21 +225,19 @@ class SwitchingLoop(SampledLoop):
     """As SampledLoop, with x = (log K, B/delta, log alpha T/delta of the channels whose delay varies)."""
 
     def __init__(self, loop: Loop, lo: Sequence[int], hi: Sequence[int]) -> None:
-        self.h, loop = half_widths(lo, hi), loop.switching(DelayRange(tuple(lo), tuple(hi)))
-        self.active = np.flatnonzero(self.h)
-        super().__init__(loop)
+        self.active = np.flatnonzero(np.subtract(hi, lo))
+        super().__init__(loop.switching(DelayRange(tuple(lo), tuple(hi))))
 
     def point(self, coupling: SpringDamper) -> Array:
         """The gains with their best multiplier."""
         loop = self.loop
-        found = switching_sweep(loop.sent(coupling), loop)
-        a = np.array(found.alpha)[self.active] * loop.T / self.delta[self.active]
-        a = np.clip(np.where(np.isfinite(a), a, _FIRST), *_MULTIPLIERS)
+        found = SWITCHING.required(loop, coupling)
+        a = np.array(found.multiplier or self.delta * _FIRST / loop.T)[self.active] * loop.T / self.delta[self.active]
+        a = np.clip(a, *_MULTIPLIERS)
         return np.concatenate([super().point(coupling), np.log(a)])
 
     def judged(self, x: Array) -> Requirement:
-        sent = self.loop.sent(self.coupling(x))
-        return switching_sweep(sent, self.loop).requirement
+        return SWITCHING.required(self.loop, self.coupling(x))
 
     def room(self, x: Array) -> Array:
         """1 - SAMPLED_RESERVE less the damping ratio at each sampled frequency, with the multiplier in x."""
@@ -256,7 +246,8 @@ class SwitchingLoop(SampledLoop):
         D, E, _ = self.loop_at_conditions
         now = np.broadcast_to(np.eye(m, dtype=complex), E.shape)
         G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], loop.T)
-        block = hermitian(switching_block(G, loop, alpha)[0].G[0])
+        demand = SWITCHING.block(G, loop, alpha)
+        block = hermitian((demand.free + demand.gain).G[0])
         error = block[:, m:, :m]
         schur = block[:, :m, :m] - np.conj(np.swapaxes(error, 1, 2)) @ (error / (2 * alpha[self.active])[:, None])
         room = (np.linalg.eigvalsh(self.root[:, None] * schur * self.root)[:, 0] - _SAMPLED_RESERVE).astype(float)
@@ -268,14 +259,14 @@ class SwitchingLoop(SampledLoop):
 
 # ----------------------------------------------------------------------------------------------------
 # Spring-damper gains that are safe also while forces are limited: the same search with the limiter's block
-# (design.multipliers.limiter_demand) in the place of the linear one, and its multiplier among the unknowns.
+# (design.environments.Limiter) in the place of the linear one, and its multiplier among the unknowns.
 
 
 class LimiterLoop(SampledLoop):
     """As Sampled, with x = (log K, B/delta, c) and one weight c per channel, of the lag 1."""
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
-        self.rho = limiter_lag(loop.delta, loop.T, BETA)
+        self.rho = LIMITER.rho(loop)
         self._undelayed: tuple[_Responses, _Responses] | None = None
         super().__init__(loop, band_hz)
 
@@ -284,8 +275,7 @@ class LimiterLoop(SampledLoop):
         return np.append(super().point(coupling), np.full(self.loop.channels, _FIRST_WEIGHT))
 
     def judged(self, x: Array) -> Requirement:
-        loop, sent, c = self.loop, self.loop.sent(self.coupling(x)), self._weights(x).tolist()
-        return limiter_proof(sent, loop, self.rho, c).requirement
+        return LIMITER.required(self.loop, self.coupling(x), self._weights(x).ravel())
 
     def room(self, x: Array) -> Array:
         """The least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency."""
@@ -313,7 +303,7 @@ class LimiterLoop(SampledLoop):
         return self._undelayed[1]
 
     def _lines(self, x: Array) -> Array:
-        """N of `limiter_demand`, (k, m)."""
+        """N of the block of `LIMITER`, (k, m)."""
         windows = [polynomials(n, self.conditions)[0] for n in self.loop.theta]
         return -np.stack(windows, axis=1) - self._weights(x).T
 
@@ -328,7 +318,7 @@ class LimiterLoop(SampledLoop):
         return self._last[2], self._last[3]
 
     def parts(self, x: Array) -> tuple[Complex, Complex, Array]:
-        """The Hermitian part of `limiter_demand` with what the reserve leaves of the damping.
+        """The Hermitian part of the block of `LIMITER` with what the reserve leaves of the damping.
 
         Its first block (k, m, m), the one below that, and the diagonal (k, m) of its last one, which is diagonal: to
         make it whole, as that function does of any G, takes four times as long.
@@ -343,7 +333,7 @@ class LimiterLoop(SampledLoop):
     def search(self, x: Array, most: int) -> OptimizeResult:
         return self.minimised(x, most, [(0.0, _MOST_WEIGHT)] * self.loop.channels, self.room_slope)
 
-    def multiplier(self, x: Array) -> Lags:
+    def multiplier(self, x: Array) -> Sequence[Sequence[float]]:
         return np.round(self._weights(x), 6).tolist()
 
     def _weights(self, x: Array) -> Array:
@@ -372,7 +362,7 @@ def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, i
 
 def least_rms(
     sampled: Callable[[], SampledLoop], starts: Iterable[SpringDamper], band_hz: tuple[float, float] = BAND_HZ
-) -> tuple[SpringDamper | None, float, int, Lags | None]:
+) -> tuple[SpringDamper | None, float, int, Sequence[Sequence[float]] | None]:
     """(gains, rms mismatch as a ratio, searches, multiplier) of the best local optimum; gains None if none was found.
 
     `sampled` makes the condition, fresh for every start. Of more than FEW devices, where starts hardly matter and

@@ -12,7 +12,7 @@ from controller.coupling import Coupling
 from controller.environment import Network
 from controller.loop import Loop
 from controller.ranges import Ranges, UncertainSpring
-from design.environments import ratio_in
+from design.worst_member import ratio_in
 
 #: Of more environments than _FEW every _THIN-th frequency is looked at; only those that ask for the most there, or for
 #: next to it, are swept whole.

@@ -19,12 +19,10 @@ from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.conditions import even_damping, this_environment
 from design.cone import ConeProgram, Inequality
+from design.environments import LIMITER
 from design.frequency import peaks, too_long
 from design.gain_search import FEW, LimiterLoop, SampledLoop, SwitchingLoop, least_rms, likeliest_first, polynomials
 from design.lmi import ANY_ENVIRONMENT, RESERVE, Shaping, gain_block, least_phi, usable
-from design.multipliers import (
-    limiter_refusal,
-)
 from design.result import Design, DesignFailed, Infeasible, Requirement
 from design.transparency import BAND_HZ, transparency
 
@@ -236,7 +234,7 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
         _require_few(loop, _MOST_LIMITED, "the limiter's block: leave the limiter out")
     if limiter is False or loop.channels > _MOST_LIMITED:
         return design(loop, condition, **options)
-    refusal = limiter_refusal(loop)
+    refusal = LIMITER.beyond(loop)
     if limiter and refusal:
         raise ValueError(refusal)
     if refusal or options.get("switching"):

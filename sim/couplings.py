@@ -14,9 +14,8 @@ from design.certificate import assess, verify
 from design.coupling_file import Stored, load
 from design.coverage import Limits, covered_limits
 from design.designs import KINDS, design_by_kind, own_coupling, usual_condition
-from design.guarantees import switching_guarantee
 from design.own import called
-from design.result import Chosen, Design, DesignFailed, Requirement
+from design.result import Chosen, Design, DesignFailed, Requirement, switching_guarantee
 from sim import design_cache
 from sim.scenario import InputError, Scenario
 
