@@ -23,8 +23,9 @@ from design.result import listed
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages
-from hw.recording import Recorder, SessionReport, outcome, save
+from hw.recording import Recorder
 from hw.session import session_for
+from hw.session_report import SessionReport, outcome, save
 from sim.couplings import NAMES
 from sim.scenario import InputError, Scenario
 
@@ -160,8 +161,8 @@ def _print_session(report: SessionReport, console: Console) -> None:
     for i, growth in enumerate(report.growth, start=1):
         console.print(f"growth at full gain, arming {i}, {growth.words(report.run.T_s)}")
     for i, part in enumerate(report.energy_budget or [], start=1):
-        console.print(f"energy budget, arming {i}: limited {part['limited_ticks']} of {part['ticks']} ticks")
-        console.print(f"  {part['guarantee']}")
+        console.print(f"energy budget, arming {i}: limited {part.limited_ticks} of {part.ticks} ticks")
+        console.print(f"  {part.guarantee}")
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link.counters.items() if n)
     console.print(f"counted: {counted or 'nothing'}")
     console.print(f"[dim]·[/] {CAVEATS}")

@@ -23,8 +23,9 @@ from hw.emulator import nobody
 from hw.identify import Estimate, Excitation, capped, chirp, estimate, held, settled
 from hw.limits import Stage
 from hw.monitor import Ages, LinkSettings
-from hw.recording import Recorder, SessionReport, outcome, result_of
+from hw.recording import Recorder, result_of
 from hw.session import Session, session_for
+from hw.session_report import SessionReport, outcome
 from models.device import RigidDevice
 from sim.scenario import InputError, Scenario
 

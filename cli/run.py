@@ -11,6 +11,7 @@ from typing import Any
 from cli import options, render
 from cli.judged import chosen_by, judge
 from cli.judged import rows as judged_rows
+from controller.budget import BudgetFigures
 from controller.environment import GROUND
 from controller.loop import Loop
 from design.files import write
@@ -26,6 +27,7 @@ from sim.api import ScenarioRun, run_scenario
 from sim.couplings import NAMES, choose
 from sim.judged import Judged
 from sim.mujoco_engines import INTEGRATORS
+from sim.passivity_layer import BaselineFigures
 from sim.run import ENGINES, AnyEngine
 from sim.run_report import Ran, RunReport, run_report
 from sim.scenario import InputError, Scenario
@@ -326,14 +328,14 @@ def _crossed(other: accuracy.CrossCheck) -> str:
     return f"{other.integrator} x {other.substeps}: {apart}, {growth}: {verdict}"
 
 
-def _net_rows(budget: dict[str, Any] | None, baseline: dict[str, Any] | None) -> render.Rows:
+def _net_rows(budget: BudgetFigures | None, baseline: BaselineFigures | None) -> render.Rows:
     if baseline:
-        acted = f"acted in {baseline['limited_ticks']} of {baseline['ticks']} ticks"
-        yield "baseline", f"{baseline['name']}, {acted}; no guarantee"
+        acted = f"acted in {baseline.limited_ticks} of {baseline.ticks} ticks"
+        yield "baseline", f"{baseline.name}, {acted}; no guarantee"
     if budget:
-        why = f" ({budget['idle']})" if budget["idle"] else ""
-        yield "energy budget", f"limited {budget['limited_ticks']} of {budget['ticks']} ticks{why}"
-        yield "", budget["guarantee"]
+        why = f" ({budget.idle})" if budget.idle else ""
+        yield "energy budget", f"limited {budget.limited_ticks} of {budget.ticks} ticks{why}"
+        yield "", budget.guarantee
 
 
 def _growth(loop: ExactVerdict) -> str:

@@ -4,33 +4,36 @@ from __future__ import annotations
 
 import argparse
 import os
+import select
+import shutil
 import sys
 import termios
 import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from cli import options
-from cli.dashboard import Dashboard
 from cli.render import console, progress
 from hw.control import Armable
 from hw.emulator import Emulator, FaultInjection, spawned
 from hw.force_dimension import FORCE_DIMENSION, ForceDimension
 from hw.haptic_device import HapticDevice, SerialDevice
+from hw.limits import Stage
 from hw.monitor import Ages, LinkSettings
-from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
 from hw.session import Operator, Session
+from hw.session_report import IncidentLog
 from hw.transport import Live, SerialPort, preflight
 from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 _USUAL_BAUD = 921_600
 _SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself
 _SHOWN_US = 100_000  # of a rehearsal, between two moves of its progress bar
+_SHOWN = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale", "host_errors")  # counters
 _PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
 
 
@@ -194,16 +197,20 @@ def hold_session(
                 found = preflight(args.port)
             console(args).print(found, soft_wrap=True, highlight=False)
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
-        dashboard = stack.enter_context(closing(Dashboard())) if sys.stderr.isatty() else None
+        seen = sys.stderr.isatty()
+        if seen and keyboard is not None:
+            console(args).print("keys: a arm · s stop · space e-stop · q quit")
 
         def glance(session: Session) -> None:
             incidents.glance(session)
-            if dashboard:
-                dashboard(session)
+            if seen:
+                _show(session)
 
-        auto_arm, deadman = args.arm or args.emulate, _deadman(args.deadman)
-        live = Live(session, device, plan, auto_arm, seconds, keyboard, glance, args.pace, deadman)
+        operator = Operator(args.arm or args.emulate, seconds, _deadman(args.deadman))
+        live = Live(session, device, plan, operator, keyboard, glance, args.pace)
         live.run()
+        if seen:
+            print(file=sys.stderr)
     return _Held(live.signals, device.dropped if isinstance(device, SerialDevice) else 0)
 
 
@@ -260,6 +267,23 @@ def _emulator_options(args: argparse.Namespace, seconds: float) -> list[str]:
     words = [f"--{name}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in given.items()]
     words += [f"--fault={fault}" for fault in args.fault]
     return [*words, f"--seed={args.seed}", f"--pace={args.pace}", f"--duration={seconds + _SPARE:g}"]
+
+
+def _show(session: Session) -> None:
+    """One line on the terminal, over the one before, where that can be written without waiting for it."""
+    words, drive, counters = [str(session.stage)], session.drive, session.counters
+    if session.stage == Stage.MEASURING:
+        words.append(f"{len(session.measurement.ages)} of {session.settings.measure} answers")
+    elif session.stage == Stage.MEASURED:
+        words.append("designing the coupling")
+    elif drive and drive.x:
+        words += [f"{1e3 * x:+.3f} mm {f:+.3f} N" for x, f in zip(drive.x, drive.force, strict=True)]
+        words.append(f"gain {session.gain:.2f}")
+    words += [f"margin {margin} us"] if (margin := session.link.least_margin) is not None else []
+    words += [f"{name} {n}" for name in _SHOWN if (n := getattr(counters, name))]
+    line = " · ".join(words)[: shutil.get_terminal_size().columns - 1]
+    if select.select([], [sys.stderr], [], 0)[1]:
+        os.write(sys.stderr.fileno(), f"\r\x1b[K{line}".encode())
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from sim.couplings import NAMES
 from sim.crowds import ENGINES, MIXED, Findings, Validation
 from sim.judged import Judged
 from sim.report import DelaySpan, UnevenTicks, VaryingDelays
-from sim.run import assemble
+from sim.run import assemble, engine_name
 from sim.scenario import InputError, Scenario, require_linear, save_humans
 from sim.shards import Table, validate, validate_on_cluster
 from sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
@@ -73,7 +73,8 @@ def _parser() -> options.Parser:
     options.add_limiter_option(parser)
     add("--humans", type=whole(1, 1_000_000), default=1000, metavar="N", help="random humans per device (default 1000)")
     add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
-    add("--engine", choices=ENGINES, default="both", help="who decides (default both); one of your own is for sim.run")
+    who = f"who decides: {', '.join(ENGINES)} (default both), or package.module:Class, beside the exact one"
+    add("--engine", default="both", metavar="NAME", help=who)
     seconds = "length of the traces (default 2; 0 for none)"
     add("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
     add("--shards", type=whole(1, 256), default=1, metavar="K", help="local processes, for the same result (default 1)")
@@ -116,7 +117,8 @@ def _environments(args: argparse.Namespace, whole: RangesCheck | None) -> tuple[
 def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, judged: Judged) -> Validation:
     """The loop, the humans that are to hold it, and the engines that decide. Raises InputError."""
     links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
-    work, met = (args.humans, links, args.engine, args.duration), _environments(args, judged.whole)
+    engine = options.own_or("--engine", args.engine, ENGINES)
+    work, met = (args.humans, links, engine, args.duration), _environments(args, judged.whole)
     return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=judged.limiter.rho)
 
 
@@ -224,9 +226,7 @@ class _Report:
     disagreeing: list[verdicts.DrawnHumans]
     worst: verdicts.WorstDrawn | None = render.figure("worst human")
     own_humans: _Own = render.several(_Own.rows)
-    largest_difference_per_s: float | None = render.figure(
-        "MuJoCo's growth rates", "within {:.1e} 1/s of the exact ones"
-    )
+    largest_difference_per_s: float | None = render.figure("growth rates apart", "{:.1e} 1/s at most")
     traces: verdicts.Traces | None = render.several(verdicts.Traces.rows)
     judged: Judged = render.figure("force limits", "{.limiter.words}", json="beside")
     settled: str | None = render.figure("handles come to rest", json="table")
@@ -259,9 +259,9 @@ def _varying(
     if scenario.varying_delay:
         covered = DelaysCovered.of(scenario, chosen, certified)
         met = VaryingDelays(DelaySpan.of(scenario.varying_delay), None, covered)
-        switching = verdicts.Growing.of(findings, met, covered.covered)
+        switching = verdicts.Growing.of(question, findings, met, covered.covered)
     if scenario.uneven and (ticks := scenario.timing(question.seed, max(1, question.ticks))):
-        timing = verdicts.Growing.of(findings, UnevenTicks.of(ticks, scenario), certified)
+        timing = verdicts.Growing.of(question, findings, UnevenTicks.of(ticks, scenario), certified)
     return switching, timing
 
 
@@ -295,10 +295,10 @@ def _reported(
         scenario_digest=scenario.digest,
         links="mixed" if question.links == MIXED else question.links,
         seed=question.seed,
-        engine=question.engine,
+        engine=engine_name(question.engine),
         humans=findings.index.size,
         environments=verdicts.EnvironmentsMet.met(question, findings),
-        unstable=verdicts.Unstable(int(bad.sum()), int(grows.sum()) if both else None),
+        unstable=verdicts.Unstable.of(question, int(bad.sum()), int(grows.sum())),
         disagreements=disagreements,
         disagreeing=[verdicts.DrawnHumans.of(question, int(i)) for i in findings.index[findings.disagreements]],
         worst=verdicts.WorstDrawn.of(question, findings) if any_done else None,

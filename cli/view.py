@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import inf, isfinite
 from pathlib import Path
 
@@ -14,16 +14,25 @@ from design.coverage import Limits
 from design.files import unseen, write_json
 from design.result import CONDITIONS, Requirement
 from sim.scenario import InputError, require_even_ticks
-from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, PreparedLoop, Script, first_loop, parse_script
-from sim.view.film import Picture, check_film, painter, save_film
-from sim.view.session import LONGEST_LAG, LiveLoop
-from sim.view.stage import ShownScene, keys_help
+from sim.view.session import (
+    COUPLINGS,
+    GIVEN,
+    LABELS,
+    LONGEST_LAG,
+    Couple,
+    LiveLoop,
+    Menu,
+    PreparedLoop,
+    Script,
+    first_loop,
+    parse_script,
+)
+from sim.view.stage import FlatPictures, NoWindow, Picture, ShownScene, check_film, keys_help, save_film, show
 
 _EXAMPLE = "python -m sim.view --video out.gif --script '0:none 1:theta+1 6:designed'"
 _SCRIPT = "0:none 1:theta+1 6:designed"  # of a video: an oscillation starts and dies
 _AFTER = 3.0  # [s] that a video goes on after the last event of its script
 _LONGEST = 3600  # [s]
-_DRAWN = ("auto", "gl", "flat")
 
 
 def main(argv: list[str]) -> int:
@@ -93,7 +102,6 @@ class _Film:
     file: str
     pictures: int
     fps: int
-    drawn: str
 
 
 @dataclass(frozen=True)
@@ -109,7 +117,6 @@ class _Ended:
     """How the session was shown, and whether the keyboard ended it."""
 
     interrupted: bool
-    remarks: list[str] = field(default_factory=list)
     video: _Film | None = unseen("given", None)
     clock: _Clock | None = unseen("given", None)
 
@@ -132,8 +139,7 @@ class _Report:
         if clock := self.ended.clock:
             yield f"The clock was missed {clock.overruns} times: {clock.lost_s:.2f} s lost."
         if film := self.ended.video:
-            yield f"{film.file}: {film.pictures} pictures, drawn {'' if film.drawn == 'flat' else 'by '}{film.drawn}"
-        yield from (f"Note: {remark}." for remark in self.ended.remarks)
+            yield f"{film.file}: {film.pictures} pictures"
 
 
 def _parser() -> options.Parser:
@@ -153,8 +159,7 @@ def _parser() -> options.Parser:
     add("--video", metavar="FILE", help="a film: .gif, or .mp4 where ffmpeg is installed")
     rate = "pictures per second (default 10); for a .gif what divides 100"
     add("--fps", type=options.whole(1, 100), default=10, metavar="N", help=rate)
-    add("--draw", choices=_DRAWN, default="auto", help="by OpenGL, or flat without it (default: by what works)")
-    parser.only("with --video", lambda args: args.video, "fps", "draw")
+    parser.only("with --video", lambda args: args.video, "fps")
     return parser
 
 
@@ -195,7 +200,7 @@ def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
     seconds = args.duration or (session.script_ends + _AFTER)
     count, interrupted = round(seconds * args.fps) + 1, False
     simulation = session.prepared.simulation
-    artist, drawn, remarks = painter(args.draw, simulation.scene, simulation.process.force_limit)
+    artist = FlatPictures(simulation.scene, simulation.process.force_limit)
 
     def pictures(move: render.Move) -> Iterator[Picture]:
         nonlocal interrupted
@@ -208,17 +213,12 @@ def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
             yield picture
             move(i + 1, count)
 
-    try:
-        with render.progress("filming") as move:
-            made = save_film(Path(args.video), pictures(move), args.fps)
-    finally:
-        artist.close()
-    return _Ended(interrupted, remarks, _Film(args.video, made, args.fps, drawn))
+    with render.progress("filming") as move:
+        made = save_film(Path(args.video), pictures(move), args.fps)
+    return _Ended(interrupted, _Film(args.video, made, args.fps))
 
 
 def _window(session: LiveLoop, duration: float | None) -> _Ended:
-    from sim.view.window import NoWindow, show
-
     stage = ShownScene(session.prepared.simulation.scene, session.prepared.simulation.process.force_limit)
     interrupted = False
     try:

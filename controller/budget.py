@@ -37,39 +37,104 @@ channels and simulations.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller.lti import Array, Lti
 
-EPS = 0.05  # the share of the damping that a budget leaves alone, if nobody says otherwise
+EPS = 0.05  # the share of the damping that a budget leaves alone
 _UNTOLD = 4096  # ticks that wait for the device's word; older ones stay booked as their largest loss
 _HUGE = 1e12  # [N], from which a force is no number any more
 _SHAVE = 1 - 1e-12  # of a scaled force, so that rounding takes nothing from the reserve
 
 
-class _Net:
-    """What budgets have in common: W of every simulation, its cap, and how often the net acted."""
+@dataclass(frozen=True, kw_only=True)
+class NetFigures:
+    """What a net has done so far."""
+
+    guarantee: str | None  # in one line
+    ticks: int
+    limited_ticks: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShellFigures(NetFigures):
+    """What a net has done that keeps an account of energy."""
+
+    start_J: float
+    cap_J: float | None
+    smallest_scale: float
+    energy_J: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class BudgetFigures(ShellFigures):
+    """What an energy budget has done."""
+
+    eps: float = EPS
+    reserved_J: float
+    dropped_ticks: int = 0  # in which a device let go of a force that was too old
+    surprises: int
+    idle: str | None = None  # why it never acts, where that is proved
+
+
+class _Acting:
+    """How often a net acted, of every simulation."""
+
+    def __init__(self, nsim: int) -> None:
+        self.ticks = 0
+        self.limited = np.zeros(nsim, dtype=np.int64)  # (nsim,) ticks in which the wanted force was changed
+
+    def _act(self, acted: ArrayLike) -> None:
+        self.ticks += 1
+        self.limited += np.asarray(acted)
+
+    def figures(self, guarantee: str | None = None) -> NetFigures:
+        """Of the simulation in which it acted most."""
+        return NetFigures(guarantee=guarantee, ticks=self.ticks, limited_ticks=int(self.limited.max()))
+
+
+class _Net(_Acting):
+    """What budgets have in common: W of every simulation, its cap, and how small it made a force."""
 
     def __init__(self, start: float, cap: float, nsim: int) -> None:
+        super().__init__(nsim)
         if not 0 <= start < np.inf:
             raise ValueError(f"the budget starts with {start:g} J, expected a finite energy >= 0")
         if not start <= cap:
             raise ValueError(f"the budget's cap is {cap:g} J, expected at least its start, {start:g} J")
         self.energy = np.full(nsim, float(start))  # (nsim,) W [J]
-        self.ticks = 0
-        self.limited = np.zeros(nsim, dtype=np.int64)  # (nsim,) ticks in which the wanted force was made smaller
         self.least = np.ones(nsim)  # (nsim,) the smallest scale so far
-        self._cap = float(cap)
+        self._start, self._cap = float(start), float(cap)
 
     def _earn(self, increment: Array) -> None:
         np.minimum(self.energy + increment, self._cap, out=self.energy)
 
     def _count(self, scale: Array, spoilt: NDArray[np.bool_]) -> None:
-        self.ticks += 1
         scale = np.where(spoilt, 0.0, scale)
-        self.limited += scale < 1
+        self._act(scale < 1)
         np.minimum(self.least, scale, out=self.least)
+
+    def figures(self, guarantee: str | None = None) -> ShellFigures:
+        """The least energy and scale, the most that was limited."""
+        return ShellFigures(
+            **vars(super().figures(guarantee)),
+            start_J=self._start,
+            cap_J=self._cap if np.isfinite(self._cap) else None,
+            smallest_scale=float(self.least.min()),
+            energy_J=float(self.energy.min()),
+        )
+
+
+@dataclass(frozen=True)
+class Packets:
+    """How old the forces may be that a tick uses, (m,) each [samples]."""
+
+    lo: ArrayLike
+    hi: ArrayLike | None = None  # default: always lo
+    hold: int = 0  # ticks more for which a device holds a force whose successors are lost
 
 
 class EnergyBudget(_Net):
@@ -83,41 +148,34 @@ class EnergyBudget(_Net):
         self,
         delta: ArrayLike,
         T: float,
-        lo: ArrayLike,
-        hi: ArrayLike | None = None,
+        packets: Packets,
         *,
-        hold: int = 0,
         encoder_step: ArrayLike = 0.0,
-        eps: float = EPS,
         start: float = 0.0,
         cap: float = np.inf,
         nsim: int = 1,
     ) -> None:
         """`delta` (m,) damping that the devices guarantee [N s/m], `T` the (largest) period [s].
 
-        Packets take `lo` to `hi` (m,) samples (default: always lo); `hold` is for how many ticks more a device holds
-        a force whose successors are lost. `encoder_step` (m,) or one for all [m]: positions are rounded to it. `eps` is
-        the share of the damping that the budget leaves alone, `start` and `cap` are W0 and the most that W may be [J].
-        Raises ValueError for numbers out of range.
+        `encoder_step` (m,) or one for all [m]: positions are rounded to it. `start` and `cap` are W0 and the most that
+        W may be [J]. Raises ValueError for numbers out of range.
         """
         super().__init__(start, cap, nsim)
         delta = np.array(delta, dtype=float)
-        lo = np.array(lo, dtype=np.int64)
-        oldest = (lo if hi is None else np.array(hi, dtype=np.int64)) + hold
+        lo, hold = np.array(packets.lo, dtype=np.int64), packets.hold
+        oldest = (lo if packets.hi is None else np.array(packets.hi, dtype=np.int64)) + hold
         if delta.ndim != 1 or lo.shape != delta.shape or oldest.shape != delta.shape:
             shapes = f"{delta.shape}, {lo.shape} and {oldest.shape}"
             raise ValueError(f"delta, lo and hi have the shapes {shapes}, expected one number per channel each")
         if not ((delta > 0) & (delta < np.inf)).all() or not 0 < T < np.inf:
             raise ValueError(f"delta is {delta.tolist()} and T is {T:g}, expected positive numbers")
-        if not 0 < eps < 1:
-            raise ValueError(f"eps is {eps:g}, expected a share between 0 and 1")
         if hold < 0 or not ((lo >= 0) & (lo <= oldest - hold)).all():
             given = f"{lo.tolist()} to {(oldest - hold).tolist()} samples, held for {hold} more"
             raise ValueError(f"delays are {given}, expected 0 <= lo <= hi and hold >= 0")
         steps = np.broadcast_to(np.array(encoder_step, dtype=float), delta.shape)
         if not ((steps >= 0) & (steps < np.inf)).all():
             raise ValueError(f"encoder_step is {steps.tolist()}, expected steps >= 0 in m")
-        damping = (1 - eps) * delta[:, None]
+        damping = (1 - EPS) * delta[:, None]
         self._step, self._coarse = steps[:, None], bool(steps.any())
         self._damping, self._square = damping / T, T / (4 * damping)  # of dx^2 and of a^2
         #: (depth, m, nsim) the most that this tick and those after it may lose [J], by the packets sent so far
@@ -135,6 +193,10 @@ class EnergyBudget(_Net):
     def reserved(self) -> Array:
         """(nsim,) what the packets on their way may lose [J]: never more than `energy`."""
         return self._reserve.sum(axis=(0, 1))
+
+    def figures(self, guarantee: str | None = None) -> BudgetFigures:
+        reserved = float(self.reserved.max())
+        return BudgetFigures(**vars(super().figures(guarantee)), reserved_J=reserved, surprises=self.surprises)
 
     def limit(self, wanted: ArrayLike, dx: ArrayLike, acted: ArrayLike | None = None) -> Array:
         """The force to send now, (m, nsim) [N]: s times the wanted one, s in [0, 1] the same for all channels.
@@ -263,49 +325,34 @@ class Shell(_Net):
         return scale
 
 
-class PassivityControl:
+class PassivityControl(_Acting):
     """Passivity observer and series passivity controller at the devices: a baseline, without a guarantee here.
 
     After Hannaford & Ryu, *Time-domain passivity control of haptic interfaces*, IEEE Trans. Robotics and Automation
     18 (2002) 1-10, for the impedance causality: the observer adds up f dx of the newest force and the displacement
     just measured, and where the sum E is negative a damper alpha = -E T/dx^2 for that one tick returns it. Written
-    anew from the published idea. Ours are the credit E + delta dx^2/T for what the device dissipates, and the observer
-    for all devices together, with one alpha for all: an observer at each device takes what users pass on to each other
-    for a fault. The force acts in the tick to come, whose displacement is another: so E is no bound on what hands
-    receive. It stands at the devices, behind the delays.
+    anew from the published idea. Ours is the credit E + delta dx^2/T for what the device dissipates. The force acts in
+    the tick to come, whose displacement is another: so E is no bound on what hands receive. It stands at the devices,
+    behind the delays.
     """
 
-    def __init__(
-        self,
-        m: int,
-        T: float,
-        *,
-        delta: ArrayLike | None = None,
-        together: bool = False,
-        strongest: float = np.inf,
-        nsim: int = 1,
-    ) -> None:
-        """`delta` (m,) [N s/m] is credited where given; `strongest` [N s/m] is the most that alpha may be."""
+    def __init__(self, m: int, T: float, *, delta: ArrayLike | None = None, nsim: int = 1) -> None:
+        """`delta` (m,) [N s/m] is credited where given."""
+        super().__init__(nsim)
         self._credit = (np.zeros((m, 1)) if delta is None else np.array(delta, dtype=float)[:, None]) / T
-        self._sums = np.ones((m, m)) if together else np.eye(m)  # whose energies count together
-        self._strongest = strongest / T
         self.energy = np.zeros((m, nsim))  # [J] observed at each device, its dampers' share included
-        self.ticks = 0
-        self.limited = np.zeros(nsim, dtype=np.int64)  # (nsim,) ticks in which a damper was on
 
     def limit(self, wanted: Array, dx: Array) -> Array:
         """The force to apply, (m, nsim) [N], given the arriving one and the displacement of the last tick [m]."""
         self.energy += wanted * dx + self._credit * dx**2
-        missing = np.maximum(-(self._sums @ self.energy), 0.0)
-        moved = self._sums @ dx**2
-        damper = np.minimum(np.divide(missing, moved, out=np.zeros_like(moved), where=moved > 0), self._strongest)
-        self.energy += damper * dx**2
-        self.ticks += 1
-        self.limited += (damper > 0).any(axis=0)
+        missing, moved = np.maximum(-self.energy, 0.0), dx**2
+        damper = np.divide(missing, moved, out=np.zeros_like(moved), where=moved > 0)
+        self.energy += damper * moved
+        self._act(np.any(damper > 0, axis=0))
         return wanted + damper * dx
 
 
-class EnergyBounding:
+class EnergyBounding(_Acting):
     """The energy bounding algorithm, channel by channel: a baseline, whose guarantee is for loops without delay.
 
     After Kim & Ryu, *Robustly stable haptic interaction control using an energy-bounding algorithm*, Int. J. Robotics
@@ -316,17 +363,15 @@ class EnergyBounding:
     """
 
     def __init__(self, delta: ArrayLike, T: float, *, nsim: int = 1) -> None:
+        super().__init__(nsim)
         self._c1 = 2 * np.array(delta, dtype=float)[:, None] / T
         self._force = np.zeros((self._c1.size, nsim))
-        self.ticks = 0
-        self.limited = np.zeros(nsim, dtype=np.int64)  # (nsim,) ticks in which the wanted force was changed
 
     def limit(self, wanted: Array, dx: Array) -> Array:
         """The force to apply, (m, nsim) [N], given the wanted one and the displacement of the last tick [m]."""
         most = np.abs(self._force + self._c1 * dx)
         self._force = np.where(dx == 0, self._force, np.clip(wanted, -most, most))
-        self.ticks += 1
-        self.limited += (self._force != wanted).any(axis=0)
+        self._act(np.any(self._force != wanted, axis=0))
         return self._force.copy()
 
 

@@ -164,10 +164,10 @@ class SpringDamper(ReadOnly, Coupling):
             return environment.feedback(self.sampled(environment.z, environment.T))
         return super().around(environment, further)
 
-    def form(self) -> SpringDamperForm:
+    def form(self) -> _SpringDamperForm:
         if self.cutoff is not None:
             raise ValueError("a spring-damper with a velocity filter cannot be stored")
-        return SpringDamperForm(tuple(self.K.tolist()), tuple(self.B.tolist()))
+        return _SpringDamperForm(tuple(self.K.tolist()), tuple(self.B.tolist()))
 
     def _beta(self, T: Number) -> Any:
         return 0 if self.cutoff is None else 1 / (1 + 2 * np.pi * self.cutoff * T)
@@ -190,9 +190,10 @@ def _scalar(value: Any) -> Any:
 
 #: The gains that the paper prints, by case: (27) for Lambda = Theta Psi and (28) for Lambda = I. Neither satisfies the
 #: paper's own condition.
-CASE_I = SpringDamper(K=[2870.0, 2320.0], B=[5.47, 5.55])
-CASE_II = SpringDamper(K=[1810.0, 120.0], B=[5.78, 3.81])
-PUBLISHED = {"I": CASE_I, "II": CASE_II}
+PUBLISHED = {
+    "I": SpringDamper(K=[2870.0, 2320.0], B=[5.47, 5.55]),
+    "II": SpringDamper(K=[1810.0, 120.0], B=[5.78, 3.81]),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,8 +258,8 @@ class Compliance(Coupling):
     def at_period(self, T: float) -> Compliance:
         return Compliance(replace(self.V, T=T))
 
-    def form(self) -> ComplianceForm:
-        return ComplianceForm(*(_rows(getattr(self.V, name)) for name in "ABCD"))
+    def form(self) -> _ComplianceForm:
+        return _ComplianceForm(*(_rows(getattr(self.V, name)) for name in "ABCD"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,8 +313,8 @@ class InternalModel(ReadOnly, Coupling):
         T = environment.T
         return environment @ (Lti.constant(np.eye(m), T) - self.parameter(T) @ environment)
 
-    def form(self) -> InternalModelForm:
-        return InternalModelForm(tuple(self.poles.tolist()), tuple(_rows(q) for q in self.Q))
+    def form(self) -> _InternalModelForm:
+        return _InternalModelForm(tuple(self.poles.tolist()), tuple(_rows(q) for q in self.Q))
 
 
 @dataclass(frozen=True, eq=False)
@@ -503,7 +504,7 @@ class _NoForm(Strict, frozen=True, tag_field="kind", tag="none"):
         return NoCoupling()
 
 
-class SpringDamperForm(Strict, frozen=True, tag_field="kind", tag="spring-damper"):
+class _SpringDamperForm(Strict, frozen=True, tag_field="kind", tag="spring-damper"):
     """One spring and damper per channel (26)."""
 
     K: tuple[float, ...]  # (m,) [N/m]
@@ -538,7 +539,7 @@ class _MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-aver
         return MovingAverage(self.weight, self.terms, self.constant)
 
 
-class ComplianceForm(Strict, frozen=True, tag_field="kind", tag="compliance"):
+class _ComplianceForm(Strict, frozen=True, tag_field="kind", tag="compliance"):
     """A general V(z), as the rows of its state-space matrices."""
 
     A: _Rows
@@ -560,7 +561,7 @@ class ComplianceForm(Strict, frozen=True, tag_field="kind", tag="compliance"):
         return Compliance(Lti(*tables, D, T))
 
 
-class InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-model"):
+class _InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-model"):
     """The parameter Q(z) of the pair with the environment: poles of its basis, and a coefficient per function."""
 
     poles: tuple[float, ...]  # (n,)
@@ -601,7 +602,7 @@ class _ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter"
         return ForceFilter(self.poles, self.pairs, self.R)
 
 
-Form = _NoForm | SpringDamperForm | _MovingAverageForm | ComplianceForm | InternalModelForm | _ForceFilterForm
+Form = _NoForm | _SpringDamperForm | _MovingAverageForm | _ComplianceForm | _InternalModelForm | _ForceFilterForm
 
 
 def require_channels(form: Form, m: int) -> None:

@@ -59,7 +59,7 @@ def packet_delays(values: ArrayLike) -> Ticks:
     return delays
 
 
-def newest(delays: Ticks) -> Ticks:
+def _newest(delays: Ticks) -> Ticks:
     """The packet in use at every tick, (ticks, m, nsim); -1 before the first arrival."""
     ticks = delays.shape[0]
     sent = np.arange(ticks)[:, None, None]
@@ -72,7 +72,7 @@ def newest(delays: Ticks) -> Ticks:
 
 def ages(delays: Ticks) -> Ticks:
     """k - j of the force in use at every tick, (ticks, m, nsim); -1 before the first arrival."""
-    packet = newest(delays)
+    packet = _newest(delays)
     return np.where(packet >= 0, np.arange(delays.shape[0])[:, None, None] - packet, -1)
 
 
@@ -103,7 +103,7 @@ class HeldLine:
         if delays.shape[2] not in (1, nsim):
             raise ValueError(f"delays are those of {delays.shape[2]} simulations, expected 1 or {nsim}")
         ticks, m, _ = delays.shape
-        packet = np.broadcast_to(newest(delays), (ticks, m, nsim))
+        packet = np.broadcast_to(_newest(delays), (ticks, m, nsim))
         before = np.concatenate([np.full((1, m, nsim), -1), packet[:-1]])
         self._fresh = packet != before
         depth = int(delays.max(initial=0)) + 1

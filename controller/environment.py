@@ -27,7 +27,7 @@ GROUND = "ground"
 
 #: largest amounts, far from where arithmetic ends and beyond what anybody renders
 MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
-MOST_WALLS = 6
+_MOST_WALLS = 6
 _MOST_NODES, _MOST_PARTS = 200, 2000  # a mass is two states, and a proof has at most a few hundred
 
 
@@ -233,7 +233,7 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
     contacts: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
     springs: tuple[Spring, ...] = ()
     masses: dict[str, float] = {}  # [kg], by node; nodes that are not named have none
-    walls: Annotated[tuple[Wall, ...], msgspec.Meta(max_length=MOST_WALLS)] = ()  # 2^6 contact states
+    walls: Annotated[tuple[Wall, ...], msgspec.Meta(max_length=_MOST_WALLS)] = ()  # 2^6 contact states
     block: Block | None = None  # beside all these, of E(z) what is known by its numbers alone
     elements: tuple[Any, ...] = ()  # of one's own: their parts are put among springs and walls
 
@@ -242,8 +242,8 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
             name = "springs" if isinstance(part, Spring) else "walls"
             msgspec.structs.force_setattr(self, name, (*getattr(self, name), part))
         msgspec.structs.force_setattr(self, "elements", ())
-        if len(self.walls) > MOST_WALLS:
-            raise ValueError(f"the network has {len(self.walls)} walls, allowed are {MOST_WALLS}")
+        if len(self.walls) > _MOST_WALLS:
+            raise ValueError(f"the network has {len(self.walls)} walls, allowed are {_MOST_WALLS}")
         if self.block and len(self.block.D) != len(self.contacts):
             raise ValueError(f"block has {len(self.block.D)} channels, expected {len(self.contacts)}, as contacts")
         if len(set(self.contacts)) < len(self.contacts) or GROUND in self.contacts:
@@ -310,13 +310,13 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
 
 
 #: mass [kg], damping [N s/m] and stiffness [N/m], (..., nodes, nodes) each, as Network.matrices gives them
-Matrices = tuple[Array, Array, Array]
+_Matrices = tuple[Array, Array, Array]
 
 
 class Networks(Environment):
     """Networks with the same nodes, the contacts first, by their matrices: a stack where these have axes."""
 
-    def __init__(self, contacts: tuple[str, ...], matrices: Matrices) -> None:
+    def __init__(self, contacts: tuple[str, ...], matrices: _Matrices) -> None:
         self.contacts, self.matrices = contacts, matrices
 
     def E(self, T: Number) -> Lti:
@@ -334,17 +334,6 @@ class Networks(Environment):
     def sent_at(self, coupling: Coupling, psi: Sequence[int], z: Complex, T: float) -> Sampled:
         E = self.sampled(z, T)
         return coupling.around(as_like(E, delay(psi, T)) @ E)
-
-
-#: Figure 4 as we read it: contact 1 -(K1, B1)- M -(K2, B2)- contact 2, the mass free.
-FIGURE_4 = Network(
-    contacts=("contact 1", "contact 2"),
-    springs=(
-        Spring(("contact 1", "mass"), stiffness=800.0, damping=1.0),
-        Spring(("mass", "contact 2"), stiffness=700.0, damping=1.0),
-    ),
-    masses={"mass": 1.0},
-)
 
 
 def environment(network: Network, T: Number) -> Lti:
@@ -397,7 +386,7 @@ def _adrift(network: Network, springs: Sequence[Spring | Wall]) -> list[list[int
     return list(groups.values())
 
 
-def _solvable(network: Network, T: Number) -> Matrices:
+def _solvable(network: Network, T: Number) -> _Matrices:
     if isinstance(T, Fraction):
         return network.matrices(rational)
     M, D, K = network.matrices()
@@ -409,7 +398,7 @@ def _solvable(network: Network, T: Number) -> Matrices:
 
 
 def _realise(
-    matrices: Matrices,
+    matrices: _Matrices,
     c: int,
     T: Any,
     across: NDArray[np.int64] | None = None,

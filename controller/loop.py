@@ -22,19 +22,19 @@ from controller.delay import delay
 from controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_environment
 from controller.law import Law
 from controller.limiter import Limiter
-from controller.lti import Complex, Lti, Sampled
+from controller.lti import Block, Complex, Lti, Sampled, as_like
 from controller.ranges import Member, Ranges, members
 
 MOST_SAMPLES = 1000  # of delay on a channel; every one is a state
-Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=MOST_SAMPLES)], ...]
-Positive = Annotated[float, msgspec.Meta(gt=0)]
+_Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=MOST_SAMPLES)], ...]
+_Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class DelayRange(Strict, frozen=True):
     """Delays that may be any from lo to hi, on every channel and anew at every tick."""
 
-    lo: Steps  # (m,) [samples]
-    hi: Steps  # (m,) [samples]
+    lo: _Steps  # (m,) [samples]
+    hi: _Steps  # (m,) [samples]
 
     def __post_init__(self) -> None:
         if len(self.lo) != len(self.hi) or any(not 0 <= a <= b for a, b in zip(self.lo, self.hi, strict=True)):
@@ -54,15 +54,15 @@ class DelayRange(Strict, frozen=True):
 class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without the newer fields keeps the digest it had
     """All that enters a condition beside the coupling."""
 
-    T: Positive  # [s]
-    theta: Steps  # (m,) transmission delays [samples]
-    psi: Steps  # (m,) environment delays [samples]
-    lam: Steps  # (m,) delays of the reference [samples]; they matter to transparency only
-    delta: tuple[Positive, ...]  # (m,) damping that the devices guarantee [N s/m]
+    T: _Positive  # [s]
+    theta: _Steps  # (m,) transmission delays [samples]
+    psi: _Steps  # (m,) environment delays [samples]
+    lam: _Steps  # (m,) delays of the reference [samples]; they matter to transparency only
+    delta: tuple[_Positive, ...]  # (m,) damping that the devices guarantee [N s/m]
     environment: Network | RigidWall  # or a class of one's own, which cannot be stored
     ranges: Ranges | None = None  # what else the environment may be
     varying_delay: DelayRange | None = None  # what else the delays of the forces may be, switching at every tick
-    T_max: Positive | None = None  # [s] the longest period there is, where it varies from tick to tick; T if None
+    T_max: _Positive | None = None  # [s] the longest period there is, where it varies from tick to tick; T if None
     latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] least and most by which forces latch after kT
 
     def __post_init__(self) -> None:
@@ -136,9 +136,13 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         """The same at points z of the circle, (n, k) or (1, k)."""
         return self.environment.sent_at(coupling, self.psi, z, self.T)
 
+    def late(self, G: Block) -> Block:
+        """Theta G (6): what devices feel of forces G as they leave."""
+        return as_like(G, delay(self.theta, G.T)) @ G
+
     def F(self, coupling: Coupling, exact: bool = False) -> Lti:
         """F = Theta G (6): displacements to forces, as the devices see them. Raises SingularLoop."""
-        return delay(self.theta, self.period(exact)) @ self.sent(coupling, exact)
+        return self.late(self.sent(coupling, exact))
 
     def walled(self, coupling: Coupling, exact: bool = False) -> Lti:
         """[x; p] to [f; y]: as F with no wall touching, wall forces [N] put in and the ways into walls [m] out.
@@ -153,7 +157,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         E = walled_environment(self.network, self.period(exact))
         return coupling.around(self._beside_walls(self.psi, exact) @ E, further=len(self.environment.walls))
 
-    def _beside_walls(self, steps: Steps, exact: bool) -> Lti:
+    def _beside_walls(self, steps: _Steps, exact: bool) -> Lti:
         T = self.period(exact)
         return Lti.diag(delay(steps, T), Lti.constant(np.eye(len(self.environment.walls)), T))
 
@@ -191,7 +195,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         """Device i alone, at a rigid wall: any-environment is of the same gains whatever is behind them."""
         return Loop(self.T, self.theta[i : i + 1], (0,), (0,), self.delta[i : i + 1], RIGID_WALL, T_max=self.T_max)
 
-    def delayed(self, theta: Steps) -> Loop:
+    def delayed(self, theta: _Steps) -> Loop:
         """The loop whose forces have these delays, constant ones."""
         lam = tuple(min(n, t + p) for n, t, p in zip(self.lam, theta, self.psi, strict=True))
         return msgspec.structs.replace(self, theta=theta, lam=lam, varying_delay=None)

@@ -22,9 +22,6 @@ GUARANTEES = {"a set": "these ranges"}
 #: built-in scenarios
 SCENARIOS = {"omega-pair-box": "omega-pair-ranges"}
 
-#: parts of reports; the last is the other way round, its older name is still the field's
-REPORTS = {"set": "ranges", "jitter": "varying_delay", "guarantee": "promise"}
-
 #: of an audit
 AUDITS = CONDITIONS | {"jitter-proof": "switching"}
 

@@ -24,6 +24,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from controller.budget import NetFigures
 from controller.delay import HeldLine, Ticks, packet_delays
 from controller.environment import Wall
 from controller.law import Law, Transition
@@ -49,8 +50,8 @@ class Net(Protocol):
         """Behind them, at tick k."""
         ...
 
-    def part(self) -> dict[str, Any]:
-        """What it has done so far, as plain data."""
+    def figures(self) -> NetFigures:
+        """What it has done so far."""
         ...
 
 

@@ -40,7 +40,7 @@ LONGEST_DELAY = 100
 def requirement(loop: Loop, coupling: Coupling, condition: ConditionName) -> Requirement:
     """The damping that the condition asks of the devices."""
     try:
-        return named(condition).required(loop, coupling)
+        return named(condition).judge(loop, coupling)
     except TooLong:
         raise
     except ValueError as error:  # no solution of the algebraic loop

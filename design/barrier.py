@@ -12,11 +12,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy  # its parts load when they are used
+from numpy.typing import NDArray
 
 from controller.lti import Array, Complex
+from design.frequency import hermitian
 
 _CENTRED = 0.5  # Newton decrement squared at which a point counts as central: 0.05/t above the best value
 _MOST_STEPS = 60
@@ -45,10 +48,88 @@ class MatrixInequality:
         """S(x), shape (k, r, r)."""
         return _unpacked(self.constant + self.slope @ x)
 
+    def moved(self, step: Array) -> Complex:
+        """What a step adds to S, (k, r, r)."""
+        return _unpacked(self.slope @ step)
+
+    def directions(self, x: Array) -> Array:
+        """The vectors of S^-1/2 slope_a S^-1/2 as columns, (k r^2, n)."""
+        rows = _turned(_inverse_root(self.at(x))) @ self.slope
+        return rows.reshape(-1, rows.shape[2])
+
+    def newton(self, x: Array) -> tuple[Array, Array]:
+        """Gradient of -log det S, and its Hessian."""
+        rows = self.directions(x)
+        one = packed(np.eye(math.isqrt(self.constant.shape[1]), dtype=complex))
+        return -np.tile(one, len(self.constant)) @ rows, rows.T @ rows
+
     def changed(self, U: Array) -> MatrixInequality:
         """The same of y where x = U^-1 y."""
         slope = scipy.linalg.solve_triangular(U, self.slope.reshape(-1, len(U)).T, trans=1).T
         return MatrixInequality(self.constant, np.ascontiguousarray(slope).reshape(self.slope.shape))
+
+
+@dataclass(frozen=True, eq=False)
+class EntryInequality:
+    """He[sum_n t_n(w) root X_n root] + sum_a x_a slope_a > 0 at k frequencies, with real matrices X_n.
+
+    Unknowns are the X_n, entry by entry, and the x_a. S^-1 weighs all pairs of functions of two entries alike, so that
+    the Hessian is a product of the pairs of functions by the pairs of entries, over the frequencies.
+    """
+
+    functions: Complex  # (k, n)
+    root: Array  # (r,)
+    slope: Array  # (k, r^2, a): `packed`
+
+    @property
+    def degree(self) -> int:
+        return len(self.functions) * self.root.size
+
+    def at(self, x: Array) -> Complex:
+        """S(x), shape (k, r, r)."""
+        r = self.root.size
+        X, own = np.split(x, [r * r * self.functions.shape[1]])
+        S = (self.functions @ X.reshape(r * r, -1).T).reshape(-1, r, r) * np.outer(self.root, self.root)
+        return hermitian(S) + _unpacked(self.slope @ own)
+
+    def moved(self, step: Array) -> Complex:
+        """What a step adds to S, (k, r, r)."""
+        return self.at(step)
+
+    @cached_property
+    def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
+        """The pairs (first, second) of functions t, u: [Re tu, Im tu, Re tu*], (n (n + 1)/2, 3 k), and Im tu*."""
+        first, second = np.triu_indices(self.functions.shape[1])
+        t, u = self.functions.T[first], self.functions.T[second]
+        along, against = t * u, t * np.conj(u)
+        return first, second, np.hstack([along.real, along.imag, against.real]), np.ascontiguousarray(against.imag)
+
+    def newton(self, x: Array) -> tuple[Array, Array]:
+        """Gradient of -log det S, and the upper triangle of its Hessian."""
+        (k, n), r, scale = self.functions.shape, self.root.size, np.outer(self.root, self.root)
+        P = hermitian(np.linalg.inv(self.at(x)).astype(np.complex128, copy=False))
+        row, column = (v.ravel() for v in np.indices((r, r)))
+        one, two = np.triu_indices(r * r)
+        (i, j), (g, h), Q = (row[one], column[one]), (row[two], column[two]), P * scale
+        along, against = Q[:, h, i] * Q[:, j, g] / 2, Q[:, g, i] * Q[:, j, h] / 2
+        first, second, even, odd = self._pairs
+        even = even @ np.concatenate([along.real, -along.imag, against.real])
+        odd = odd @ against.imag
+        between = np.empty((one.size, n, n))
+        between[:, first, second], between[:, second, first] = (even - odd).T, (even + odd).T
+        entries = np.zeros((r * r, n, r * r, n))
+        entries[one, :, two] = between
+        # inner products with S^-1 and S^-1 slope_a S^-1
+        turned = np.concatenate([packed(P)[..., None], _turned(P) @ self.slope], axis=2)
+        entry = (_unpacked(np.swapaxes(turned, 1, 2)) * scale)[:, :, column, row].reshape(k, -1)
+        beside = self.functions.real.T @ entry.real - self.functions.imag.T @ entry.imag
+        beside = beside.reshape(n, -1, r * r).transpose(2, 0, 1).reshape(r * r * n, -1)
+        own = self.slope.reshape(k * r * r, -1).T @ turned.reshape(k * r * r, -1)
+        gradient = -np.concatenate([beside[:, 0], own[:, 0]])
+        hessian = np.zeros((x.size, x.size))
+        hessian[: r * r * n] = np.hstack([entries.reshape(r * r * n, -1), beside[:, 1:]])
+        hessian[r * r * n :, r * r * n :] = own[:, 1:]
+        return gradient, hessian
 
 
 def joined(blocks: Sequence[MatrixInequality]) -> tuple[MatrixInequality, ...]:
@@ -67,7 +148,12 @@ class Program:
     A: Array  # (rows, n)
     b: Array  # (rows,)
     c: Array  # (n,)
-    blocks: tuple[MatrixInequality, ...]
+    blocks: tuple[MatrixInequality | EntryInequality, ...]
+
+    @cached_property
+    def square(self) -> Array:
+        """A'A."""
+        return self.A.T @ self.A
 
     @property
     def degree(self) -> int:
@@ -88,25 +174,27 @@ class Program:
         U is the triangle of the stacked rows of both, so that no inner product is ever formed in the ill-conditioned
         coordinates of a basis of filters.
         """
-        rows = [_directions(block, x)[0] for block in self.blocks]
+        dense = [block for block in self.blocks if isinstance(block, MatrixInequality)]
+        assert len(dense) == len(self.blocks)
+        rows = [block.directions(x) for block in dense]
         scale = np.linalg.norm(np.vstack([self.A, *rows]), axis=0)
         scale = np.where(scale > 0, scale, 1.0)
         stacked = np.vstack([self.A, *rows, _RIDGE * np.diag(scale)])
         U = np.asarray(scipy.linalg.qr(stacked, mode="r")[0])[: x.size]
         A = scipy.linalg.solve_triangular(U, self.A.T, trans=1).T
-        blocks = tuple(block.changed(U) for block in self.blocks)
+        blocks = tuple(block.changed(U) for block in dense)
         return Program(A, self.b, scipy.linalg.solve_triangular(U, self.c, trans=1), blocks), U
 
 
 def centre(program: Program, x: Array, t: float) -> Array:
     """The minimiser of t (|A x - b|^2 + c'x) - sum log det S, from a strictly feasible x."""
     for _ in range(_MOST_STEPS):
-        parts = [_directions(block, x) for block in program.blocks]
-        gradient = 2 * t * program.A.T @ (program.A @ x - program.b) + t * program.c
-        hessian = 2 * t * program.A.T @ program.A
-        for rows, ones in parts:
-            gradient -= rows.T @ ones
-            hessian += rows.T @ rows
+        gradient = t * (2 * program.A.T @ (program.A @ x - program.b) + program.c)
+        hessian = 2 * t * program.square
+        for block in program.blocks:
+            slope, curvature = block.newton(x)
+            gradient += slope
+            hessian += curvature
         step = _solved(hessian, -gradient)
         decrement = float(-gradient @ step)
         if not decrement > _CENTRED:
@@ -160,18 +248,10 @@ def _length(program: Program, step: Array, x: Array, t: float) -> float:
     return (low + high) / 2
 
 
-def _eigenvalues(block: MatrixInequality, x: Array, step: Array) -> Array:
+def _eigenvalues(block: MatrixInequality | EntryInequality, x: Array, step: Array) -> Array:
     """Those of S^-1/2 dS S^-1/2 for the step, at every frequency."""
     inverse = _inverse_root(block.at(x))
-    moved = _unpacked(block.slope @ step)
-    return np.linalg.eigvalsh(inverse @ moved @ np.conj(np.swapaxes(inverse, 1, 2))).ravel()
-
-
-def _directions(block: MatrixInequality, x: Array) -> tuple[Array, Array]:
-    """(rows, ones): the vectors of S^-1/2 slope_a S^-1/2 as columns, (k r^2, n), and that of the identity."""
-    rows = _turned(_inverse_root(block.at(x))) @ block.slope
-    r = math.isqrt(rows.shape[1])
-    return rows.reshape(-1, rows.shape[2]), np.tile(packed(np.eye(r, dtype=complex)), len(rows))
+    return np.linalg.eigvalsh(inverse @ block.moved(step) @ np.conj(np.swapaxes(inverse, 1, 2))).ravel()
 
 
 def _turned(W: Complex) -> Array:

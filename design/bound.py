@@ -27,7 +27,7 @@ import scipy  # its parts load when they are used
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti
-from design.barrier import MatrixInequality, Program, centre, packed, towards
+from design.barrier import EntryInequality, Program, centre, packed, towards
 from design.conditions import even_damping
 from design.files import unseen
 from design.frequency import frequencies, hermitian, on_circle
@@ -36,20 +36,25 @@ from design.result import Design
 from design.transparency import BAND_HZ, decibels
 
 _GRID = 250  # points, even and even in the logarithm, on which H is given
-_KNOTS = {1: 60, 2: 60, 3: 24, 4: 20, 5: 4}  # of h, by channels: with five a coarse bound in a few seconds
+_KNOTS = {1: 60, 2: 60, 3: 24, 4: 20, 5: 16}  # of h, by channels
 MOST = max(_KNOTS)  # channels for which there is a bound
-NO_BOUND = f"no bound for more than {MOST} devices: its program would take many minutes"
+NO_BOUND = f"no bound for more than {MOST} devices: it would take half a minute of its own"
 _NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the ends of the band
 _NEAR_MODE = 1.0  # of the width of a mode, from it: further knots
 _CLOSEST = 0.1  # of a step: nearer knots are one
 _MOST_FORBIDDEN = 240  # sums of coefficients: more take long, and add little
 _MOST_ADDED = 96  # frequencies after a sweep
+_AWAY = np.exp(np.geomspace(0.002, 0.5, 18))  # of the band's ends: D bends there
+_AROUND = np.array(
+    [-8, -5, -3, -2, -1.4, -1, -0.7, -0.4, -0.2, 0, 0.2, 0.4, 0.7, 1, 1.4, 2, 3, 5, 8]
+)  # widths of a mode
 _DEGREE = 3  # of the splines that h is made of
-_GAP, _GAP_OF_MANY = 0.002, 0.03  # of the bound, relatively, that the barrier leaves; for more than four channels
+_FIRST, _STEEPER = 200.0, 6.0  # the barrier's first t, in degrees by the objective, and by how much it rises
+_GAP = 0.004  # of the bound, relatively, that the barrier leaves
+_LEAST = 1e-9  # mean square below which a bound says nothing
 _SWEEPS = 6
 _QUADRATURE = 1e-8  # of the mean square: what Gauss's rule may differ from the integral
-_LARGEST_CHARGE = 0.003  # of the bound, for what D lacks between the frequencies where it is imposed
-_STEEPER = 4.0
+_LARGEST_CHARGE = 0.005  # of the bound, for what D lacks between the frequencies where it is imposed
 
 
 @dataclass(frozen=True)
@@ -86,8 +91,7 @@ class _Dual:
 
     loop: Loop
     grid: Array  # (k,) [rad/sample]
-    heights: Array  # (k, inner): the scalar functions of H there
-    R: Array  # (inner, inner): of a scalar function the mean |h|^2 over the band is |R x|^2
+    heights: Array  # (k, inner): the scalar functions of H there; of those of h the mean products over the band are I
     target: Array  # (2 inner, m^2): -Lambda E/|E| in the same units, real and then imaginary parts
     knots: Array
     forbidden: tuple[tuple[int, Array], ...]  # (row, weights (k, m)): sums over s_k[row] that are zero for every F
@@ -119,7 +123,8 @@ class _Dual:
         target = np.sqrt(weight)[:, None] * target.reshape(w.size, -1)
         Q, R = np.linalg.qr((np.sqrt(weight) * span * w * size / np.pi)[:, None] * H)
         target = -np.vstack([Q.T @ target.real, Q.T @ target.imag])
-        return cls(loop, grid, heights, R, target, knots, _forbidden(loop, E))
+        heights = scipy.linalg.solve_triangular(R, heights.T, trans=1).T
+        return cls(loop, grid, heights, target, knots, _forbidden(loop, E))
 
     @property
     def start(self) -> Array:
@@ -130,12 +135,28 @@ class _Dual:
 
     def objective(self) -> tuple[Array, Array, Array]:
         """A, b, c: -2 <H, Lambda E> - <H, H/w> is |b|^2 - |A x - b|^2, and c'x is tr C_0."""
-        A = np.kron(np.eye(self.target.size // len(self.R)), self.R)
-        return np.hstack([A, np.zeros((len(A), self.start.size - len(A)))]), self.target.T.ravel(), self.start
+        return np.eye(self.target.size, self.start.size), self.target.T.ravel(), self.start
 
-    def parts(self, w: Array) -> Complex:
-        """What the scalar functions of h, real and then imaginary, contribute to an entry of D, (k, 2 inner)."""
-        return 4 / self.loop.T * _causal(self.grid, self.heights, w)
+    def imposed(self) -> Array:
+        """The frequencies at which D > 0 is imposed first, closer at the band's ends, by modes and where delays end."""
+        low, high = self.grid[0], self.grid[-1]
+        steps = np.arange(4 * self.knots.size - 3) / 4
+        within = np.exp(np.interp(steps, np.arange(self.knots.size), np.log(self.knots)))
+        beside = np.concatenate([_AWAY, 1 / _AWAY])
+        modes, width = _modes(self.loop.E())
+        near = modes * np.exp(np.outer(_AROUND, width))
+        turns = np.array([2 * np.pi * k / (n + 1) for n in set(self.loop.theta) for k in range(1, n // 2 + 1)])
+        rest = [low * np.geomspace(1e-3, 0.5, 8), np.geomspace(1.6 * high, np.pi, 12), np.linspace(high, np.pi, 60)]
+        some = [low * beside, high * beside, near.ravel(), turns, 0.99 * turns, 1.01 * turns, *rest]
+        w = np.unique(np.concatenate([[0.0], within, *some]))
+        return w[w <= np.pi]
+
+    def swept(self) -> Array:
+        """Those at which it is looked whether D > 0."""
+        low, high = self.grid[0], self.grid[-1]
+        beside = np.concatenate([low * np.geomspace(1e-3, 1, 60), np.geomspace(high, np.pi, 200)])
+        swept = np.unique(np.concatenate([[0.0], self.grid, beside, np.linspace(high, np.pi, 400)]))
+        return np.union1d(swept, (swept[1:] + swept[:-1]) / 2)
 
     def further(self, w: Array) -> Complex:
         """What each unknown of C_0 and the C_k adds to D, (k, unknowns, m, m), before its Hermitian part is taken."""
@@ -149,63 +170,46 @@ class _Dual:
             slope[:, at, i] = z[:, None] ** -steps.astype(float) @ weights[steps]
         return slope
 
-    def block(self, w: Array) -> MatrixInequality:
+    def block(self, w: Array) -> EntryInequality:
         """D > 0 at these frequencies, scaled by root(delta) from both sides."""
-        m, parts = self.loop.channels, self.parts(w)[..., None, None]
-        units = self.scale[..., None, None] * np.eye(m * m).reshape(m, m, m, m)
-        slopes = [packed(hermitian(parts * unit)) for row in units for unit in row]
-        slope = np.concatenate([*slopes, packed(hermitian(self.further(w)))], axis=1)
-        return MatrixInequality(np.zeros((w.size, m * m)), np.ascontiguousarray(np.swapaxes(slope, 1, 2)))
-
-    def lacking(self, x: Array, parts: Complex, further: Complex) -> Array:
-        """By how much D is not positive, (k,)."""
-        m = self.loop.channels
-        h, C = np.split(x, [m * m * len(self.target)])
-        D = (parts @ h.reshape(m * m, -1).T).reshape(-1, m, m) * self.scale + np.einsum("knij,n->kij", further, C)
-        return -np.linalg.eigvalsh(hermitian(D))[:, 0]
-
-    @property
-    def scale(self) -> Array:
-        """(m, m): what D's unit is."""
-        root = np.sqrt(np.asarray(self.loop.delta))
-        return np.outer(root, root)
+        further = np.swapaxes(packed(hermitian(self.further(w))), 1, 2)
+        functions = 4 / self.loop.T * _causal(self.grid, self.heights, w)
+        return EntryInequality(functions, np.sqrt(np.asarray(self.loop.delta)), np.ascontiguousarray(further))
 
     def best(self) -> float:
-        """The bound on the mean square."""
-        low, high = self.grid[0], self.grid[-1]
-        between = np.sqrt(self.knots[1:] * self.knots[:-1])
-        beside = np.concatenate([low * np.geomspace(1e-3, 0.95, 12), np.geomspace(1.01 * high, np.pi, 24)])
-        imposed = np.concatenate([[0.0], self.knots, between, beside, np.linspace(high, np.pi, 40)])
-        beside = np.concatenate([low * np.geomspace(1e-3, 1, 60), np.geomspace(high, np.pi, 200)])
-        swept = np.unique(np.concatenate([[0.0], self.grid, beside, np.linspace(high, np.pi, 400)]))
-        swept = np.union1d(swept, (swept[1:] + swept[:-1]) / 2)
-        parts = self.parts(swept), self.further(swept)
+        """The bound on the mean square: along the barrier's path, with further frequencies where D fails between."""
+        imposed, swept = self.imposed(), self.swept()
+        looked = self.block(swept)
         A, b, c = self.objective()
-        x, nothing = self.start, float(b @ b)
-        t, found = None, 0.0
-        gap = _GAP if self.loop.channels < MOST else _GAP_OF_MANY
-        for sweep in range(_SWEEPS):
-            imposed = np.unique(imposed)
+        nothing, found, x, t = float(b @ b), 0.0, self.start, 0.0
+        for _ in range(_SWEEPS):
             program = Program(A, b, c, (self.block(imposed),))
-            x = towards(self.start, x, program)
-            program, U = program.conditioned(x)
-            y = U @ x
-            t = program.degree / max(program.value(y), 1e-12) if t is None else t / _STEEPER
+            t, path = max(t, _FIRST * program.degree / nothing), [towards(self.start, x, program)]
             while True:
-                y = centre(program, y, t)
-                left = max(nothing - program.value(y), 1e-9)
-                if program.degree / t <= (gap if sweep else 5 * gap) * left:
+                path.append(centre(program, path[-1], t))
+                value = nothing - program.value(path[-1])
+                last = program.degree / (_GAP * max(value, _LEAST))
+                if t >= last:
                     break
-                t *= _STEEPER
-            x = scipy.linalg.solve_triangular(U, y)
-            lacking = self.lacking(x, *parts)
-            charge = self.loop.channels * max(0.0, float(lacking.max()))
-            value = nothing - program.value(y) - charge
-            found = max(found, value)
-            if sweep and charge <= _LARGEST_CHARGE * max(value, 1e-9):
+                t = min(_STEEPER * t, last)
+            rooms = [np.linalg.eigvalsh(looked.at(x))[:, 0] for x in path]
+            kept = [_between(inner, room, path[-1], rooms[-1]) for inner, room in zip(path, rooms, strict=True)]
+            kept.append(_between(self.start, np.ones(swept.size), path[-1], rooms[-1]))
+            found = max(found, *(nothing - program.value(x) for x in kept if x is not None))
+            if found >= (1 - _LARGEST_CHARGE) * value:
                 break
-            imposed = np.concatenate([imposed, _worst(lacking, swept)])
+            imposed = np.union1d(imposed, _worst(-rooms[-1], swept))
+            x, t = path[-2], t / _STEEPER
         return found
+
+
+def _between(inner: Array, room: Array, x: Array, lacking: Array) -> Array | None:
+    """The point nearest to x, on the way from `inner`, at which no least eigenvalue is negative: they are concave."""
+    if room.min() <= 0:
+        return None if lacking.min() < 0 else x
+    fails = lacking < 0
+    share = (-lacking[fails] / (room[fails] - lacking[fails])).max(initial=0.0)
+    return x + share * (inner - x)
 
 
 def _knots(E: Lti, low: float, high: float, count: int) -> Array:
@@ -213,13 +217,18 @@ def _knots(E: Lti, low: float, high: float, count: int) -> Array:
     even = np.geomspace(low, high, count)
     step = np.log(even[1] / even[0])
     ends = np.exp(step * np.array(_NEAR_END))
-    poles = E.poles()
-    poles = poles[(np.abs(poles) > 0.01) & (poles.imag > 0)]
-    width = np.array([-1.0, 0.0, 1.0])[:, None] * np.minimum(-np.log(np.abs(poles)) / np.angle(poles), step)
-    near = (np.angle(poles) * np.exp(_NEAR_MODE * width)).ravel()
-    knots = np.sort(np.concatenate([even, low * ends, high / ends, near]))
+    modes, width = _modes(E)
+    near = modes * np.exp(_NEAR_MODE * np.outer([-1.0, 0.0, 1.0], np.minimum(width, step)))
+    knots = np.sort(np.concatenate([even, low * ends, high / ends, near.ravel()]))
     knots = knots[(knots >= low) & (knots <= high)]
     return knots[np.concatenate([[True], np.diff(np.log(knots)) > _CLOSEST * step])]
+
+
+def _modes(E: Lti) -> tuple[Array, Array]:
+    """Those of E [rad/sample], and their relative widths."""
+    poles = E.poles()
+    poles = poles[(np.abs(poles) > 0.01) & (poles.imag > 0)]
+    return np.angle(poles), -np.log(np.abs(poles)) / np.angle(poles)
 
 
 def _triangle(m: int) -> list[tuple[int, int]]:

@@ -35,7 +35,7 @@ from design.environments import BETA, SWITCHING, THIS_ENVIRONMENT, Limiter, Swit
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, require_size, rows_of
 from design.frequency import frequencies, on_circle, rounding
 from design.lmi import ANY_ENVIRONMENT
-from design.result import NotProved, Requirement, refusal
+from design.result import NotProved, Requirement
 from design.worst_member import Progress, Searched, search_ranges
 
 _CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
@@ -189,7 +189,7 @@ def _with_proof(loop: Loop, coupling: Coupling, condition: Condition, needs: Req
 
 #: More delays, states or digits than these are not looked at: a proof would take minutes.
 _MOST_BITS = 400  # of the denominator of a coefficient: a decimal of 120 places
-_MOST_COST = 8  # environments of ranges, each as many as LARGEST states are
+_MOST_COST = 2  # environments of ranges, each as many as LARGEST states are
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
@@ -234,9 +234,12 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
         running, exact = loop.sent(coupling), loop.sent(coupling, exact=True)
     except SingularLoop as error:
         return str(error)
-    z = on_circle(frequencies(running))
+    z, meant = on_circle(frequencies(running)), exact.floats()
     response = running.at(z)
-    lost = rounding(running, z) + float(np.abs(response - exact.floats().at(z)).max())
+    if running.A.shape == meant.A.shape:
+        lost = rounding(running, z, meant)
+    else:  # rounding has kept a state that cancels
+        lost = rounding(running, z) + float(np.abs(response - meant.at(z)).max())
     scale = max(float(np.abs(response).max()), min(loop.delta) / loop.T)
     if lost <= _MOST_LOST * scale:
         return None
@@ -376,7 +379,7 @@ def _fractions(name: str, rows: Rows | None) -> Sequence[Fraction]:
         raise NotProved(f"{name} is no row of rational numbers") from None
 
 
-_NAMED: dict[str, Condition] = {each.name: each for each in (THIS_ENVIRONMENT, ANY_ENVIRONMENT)}
+_NAMED: dict[str, Condition] = {each.name: each for each in (ANY_ENVIRONMENT, THIS_ENVIRONMENT)}
 _PARTS = Switching, Limiter  # of a certificate, beside its condition
 
 
@@ -402,14 +405,8 @@ def required_damping(
 
     this-environment: the most over all members. A loop that has no solution is refused.
     """
-    asked = named(condition)
-    if reason := asked.beyond(loop):
-        return refusal(asked.name, loop.delta, reason)
-    try:
-        found = asked.required(loop, coupling, multiplier)
-    except SingularLoop as error:
-        return refusal(asked.name, loop.delta, str(error))
-    return replace(found, required=tuple(found.ratio * d for d in found.available))
+    found = named(condition).judge(loop, coupling, multiplier)
+    return found if found.reason else replace(found, required=tuple(found.ratio * d for d in found.available))
 
 
 def _blocks(loop: Loop, coupling: Coupling, condition: Condition, multiplier: Any) -> dict[str, Lti]:
@@ -435,25 +432,34 @@ def _block(demand: Demand[Lti]) -> Lti:
 
 
 def assess(
-    loop: Loop, coupling: Coupling, phi: Array | None = None, known: Certificate | None = None, more: bool = True
+    loop: Loop,
+    coupling: Coupling,
+    phi: Array | None = None,
+    known: Certificate | None = None,
+    more: bool = True,
+    own: Condition | None = None,
 ) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
+
+    Beside those with names that of the user's `own`, if there is one.
 
     this-environment is about the nominal environment alone (design.coverage.RangesFigures asks for the rest of its
     ranges) and the constant theta (sim.switching.DelaysCovered asks for the rest of its range). What `known`, a
     certificate just made, proves is not proved again; without `more` nothing else is proved beside it.
     """
     loop = loop.at(loop.environment).switching(None)
-    asked = ANY_ENVIRONMENT.required(loop, coupling, phi), THIS_ENVIRONMENT.required(loop, coupling)
+    conditions = (*_NAMED.values(), *([named(own)] if own else []))
     proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
 
-    def judged(each: Requirement) -> Requirement:
-        if each.condition == proved or (proved and not more):
-            return replace(each, proof="rational" if each.condition == proved else each.proof)
-        return _with_proof(loop, filed(loop, coupling), named(each.condition), each)
+    asked = [(each, each.judge(loop, coupling, phi if each is ANY_ENVIRONMENT else None)) for each in conditions]
 
-    with within(_LONGEST):  # both proofs together
-        return {each.condition: judged(each) for each in asked}
+    def judged(each: Condition, needs: Requirement) -> Requirement:
+        if each.name == proved:
+            return replace(needs, proof="rational")
+        return _with_proof(loop, filed(loop, coupling), each, needs) if more or not proved else needs
+
+    with within(_LONGEST):  # all proofs together
+        return {each.name: judged(each, needs) for each, needs in asked}
 
 
 SAMPLES = 64  # environments drawn evenly from inside the ranges, beside what the search looks at

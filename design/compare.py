@@ -81,11 +81,8 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Demands:
         demands["this-environment"] = partial(conditions.least_scale, conditions.this_environment_demand(F, loop))
     V = coupling.compliance(loop.T)
     if V is not None and np.isfinite(requirements["any-environment"].ratio):
-        if any(loop.psi):
-            assert phi is not None  # a finite figure had a multiplier
-            demands["any-environment"] = conditions.delayed_demand(V, loop, phi)
-        else:
-            demands["any-environment"] = partial(conditions.least_scale, conditions.any_environment_demand(V, loop))
+        demand = conditions.any_environment_demand(V, loop, phi)
+        demands["any-environment"] = partial(conditions.least_scale, demand)
     return Demands(F, requirements, demands)
 
 

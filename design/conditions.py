@@ -8,7 +8,7 @@ stacks and over sampled responses (maps and designs). docs/theory.md derives the
 
 this-environment   `this_environment_demand`; of forces that latch a fraction of a sample late `_latency_demand`
 any-environment    Lemma 4 of the paper for any passive environment under backward Euler: `v_hat`,
-                   `any_environment_demand`, and where the environment holds delay `delayed_coupling_demand`
+                   `any_environment_demand`; of an environment that holds delay `delayed_environment_demand`
 
 design/environments.py and lmi.py have the two as a `Condition` of a loop and a coupling: which form applies.
 environments.py also has those of this-environment that weigh an error with a multiplier: walls that make and break
@@ -21,8 +21,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from fractions import Fraction
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Generic
 
 import numpy as np
@@ -126,13 +126,30 @@ def v_hat(H: Block) -> tuple[Array, Block]:
     return H1, H1 / 2 - R
 
 
-def any_environment_demand(V: Block, loop: Loop) -> Demand[Block]:
-    """Theorem 4 without psi: He V-hat >= 0, whose Theta-hat is that of the damping s Delta_D; times s.
+def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | None = None) -> Demand[Block]:
+    """Theorem 4 for the damping s Delta_D, times s; with the multiplier phi (m,) [N s/m] that psi >= 1 needs.
 
-    He[(1 - 1/z) V/T] >= diag(|1 - z^-n_i|^2 / (4 s delta_i)), n = theta + 1.
+    V-hat must be Delta_V-OSP with Delta_V^-1 = Phi^-1 - Delta_D^-1 (14), and with Delta_V = 0 where phi is 0. Divided
+    by |1 - 1/z|^2, as `v_hat` is, T He v_hat(H) >= H* Delta_V H for H = V - Theta-hat: by a Schur complement
+    He[[T v_hat(H), 0], [2 H, Delta_V^-1]] >= 0, without rows of the second kind where phi is 0. Damping enters by
+    Theta-hat and Delta_D^-1, in proportion to 1/s. Raises ValueError for a phi that is not a multiplier.
     """
-    (V1, gain) = v_hat(V)
-    _, taken = v_hat(as_like(V, theta_hat(loop.theta, even_damping(loop, V.T), V.T)))
+    T, damping = V.T, even_damping(loop, V.T)
+    shortage = numbers([0] * loop.channels if phi is None else phi, T)
+    if len(shortage) != len(damping) or not ((shortage >= 0) & (shortage < damping)).all():
+        raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
+    paid = np.flatnonzero(shortage)
+
+    def excess(H: Any, limit: Any) -> tuple[Array, Any]:
+        """H(1); the block of H with limit^-1 in its corner, linear in both."""
+        H1, regular = v_hat(H)
+        if not paid.size:
+            return H1, regular
+        corner = np.vstack([np.zeros((loop.channels, paid.size), dtype=int), np.diag(1 / limit[paid])])
+        return H1, hstack(vstack(T * regular, (2 * H).rows(paid)), constant_like(H, corner))
+
+    V1, gain = excess(V, shortage)
+    _, taken = excess(as_like(V, theta_hat(loop.theta, damping, T)), damping)
     return Demand(-taken, gain, {"V(1)": V1})
 
 
@@ -146,31 +163,8 @@ def delayed_environment_demand(delayed: Lti, phi: Sequence[Any]) -> Demand[Lti]:
     return Demand(T * regular_part(delayed), Lti.constant(np.diag(numbers(phi, T)), T), {"E(1)": E1}, ("E(1)",))
 
 
-#: Delta_V^-1 stays this much, relatively, below the limit of (14), which is strict.
-_STRICT = Fraction(1, 10**9)
-#: Delta_V^-1 in units of 1/delta where Phi is 0 and (14) asks only Delta_V > 0.
-_UNLIMITED = 10**6
-
-
-def delayed_coupling_demand(V: Lti, loop: Loop, phi: Sequence[Any]) -> Demand[Lti]:
-    """The excess of V-hat, exactly, for the multiplier phi and the damping itself.
-
-    V-hat must be Delta_V-OSP with Delta_V^-1 = S < Phi^-1 - Delta_D^-1 (14). Divided by |1 - 1/z|^2, as `v_hat` is,
-    T He v_hat(H) > H* S^-1 H: by a Schur complement the Hermitian part of [[T v_hat(H), 0], [2 H, S]]. Raises
-    ValueError for a phi that is not a multiplier.
-    """
-    T, m = V.T, loop.channels
-    damping = even_damping(loop, T)
-    if len(phi) != m or not all(0 <= p < d for p, d in zip(phi, damping, strict=True)):
-        raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
-    H = V - theta_hat(loop.theta, damping, T)
-    H1, regular = v_hat(H)
-    excess = [(1 / p - 1 / d) * (1 - _STRICT) if p else _UNLIMITED / d for p, d in zip(phi, damping, strict=True)]
-    zero = np.zeros((2 * m, m), dtype=object)
-    free = hstack(vstack(T * regular, 2 * H), Lti.constant(zero, T))
-    return Demand(free, Lti.constant(np.diag([0] * m + excess), T), {"H(1)": H1})
-
-
+#: 1 - |a| of a matrix [1, a; a*, 1] below which it is singular in floating point; a diagonal entry that is rounding.
+_SINGULAR, _NOTHING = 1e-12, 1e-15
 _CELLS = 2**19  # entries of a response that are looked at together
 
 
@@ -190,22 +184,23 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
     Where gain is singular, free must be positive on its null space; the rest is a Schur complement.
     """
     own = np.diagonal(gain, axis1=-2, axis2=-1).real
+    known = own > _NOTHING * own.max(axis=-1, keepdims=True)
+    weight = 1 / np.sqrt(np.where(known, own, 1.0))
+    free, gain = (weight[..., :, None] * part * weight[..., None, :] for part in (free, gain))
     diagonal = not (gain * (1 - np.eye(gain.shape[-1]))).any()
-    if diagonal and (own > 0).all():
-        weight = 1 / np.sqrt(own)
-        return largest_eigenvalue(-weight[..., :, None] * free * weight[..., None, :])
+    if known.all() and diagonal:
+        return largest_eigenvalue(-free)
+    if gain.shape[-1] == 2 and known.all() and (np.abs(np.abs(gain[..., 0, 1]) - 1) > _SINGULAR).all():
+        return _of_pairs(free, gain[..., 0, 1])
     if gain.ndim > 2 and (gain == gain[..., :1, :, :]).all():
-        gain, own = gain[..., :1, :, :], own[..., :1, :]  # the same at every frequency: one decomposition
-    if diagonal and own.size == own.shape[-1]:
-        order = np.argsort(own.ravel())
-        eigenvalues, basis, free = own[..., order], None, free[..., order[:, None], order]
-    else:
-        eigenvalues, basis = np.linalg.eigh(gain)
+        gain = gain[..., :1, :, :]  # the same at every frequency: one decomposition
+    eigenvalues, basis = np.linalg.eigh(gain)
     floor = np.maximum(1e-13 * np.abs(eigenvalues).max(axis=-1, keepdims=True), np.finfo(float).tiny)
-    scale = np.where(eigenvalues > floor, 1 / np.sqrt(np.maximum(eigenvalues, floor)), 1.0)
-    if basis is None:
-        H = scale[..., :, None] * free * scale[..., None, :]
+    if diagonal and eigenvalues.size == gain.shape[-1]:
+        order = np.argsort(np.diagonal(gain, axis1=-2, axis2=-1).real.ravel())
+        H = free[..., order[:, None], order]
     else:
+        scale = np.where(eigenvalues > floor, 1 / np.sqrt(np.maximum(eigenvalues, floor)), 1.0)
         whitened = np.conj(np.swapaxes(basis, -1, -2)) * scale[..., :, None]
         H = whitened @ (free @ np.conj(np.swapaxes(whitened, -1, -2)))
     flat, shape = H.reshape(-1, *H.shape[-2:]), H.shape[:-2]
@@ -216,6 +211,16 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
         needed[missing == r] = _beyond_the_null_space(here, r) if r else largest_eigenvalue(-here)
     needed[np.broadcast_to((eigenvalues < -floor).any(axis=-1), shape).ravel()] = np.inf
     return needed.reshape(shape)
+
+
+def _of_pairs(H: Complex, a: Complex) -> Array:
+    """The least s with H + s [1, a; a*, 1] >= 0, (...,), a root of the determinant: LAPACK takes 20 times as long."""
+    room, last = 1 - np.abs(a) ** 2, H[..., 0, 0].real * H[..., 1, 1].real - np.abs(H[..., 0, 1]) ** 2
+    twice = H[..., 0, 0].real + H[..., 1, 1].real - 2 * (H[..., 0, 1] * np.conj(a)).real
+    root = np.sqrt(np.maximum(twice**2 - 4 * room * last, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        least = np.where(twice < 0, (root - twice) / (2 * room), -2 * last / (twice + root))
+    return np.where(room > 0, np.nan_to_num(least, nan=0.0), np.inf)
 
 
 def _beyond_the_null_space(H: Complex, r: int) -> Array:
@@ -233,6 +238,7 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
 
 
 #: What a loop may have beyond even ticks, constant delays of its forces and one linear environment, by its field.
+#: What a loop may have beyond even ticks, constant delays of its forces and one linear environment, by its field.
 BEYOND = ("psi", "T_max", "latency", "varying_delay", "walls", "ranges")
 
 
@@ -245,9 +251,12 @@ class Condition(ABC):
 
     name: str  # in requirements, certificates and reports
     covers: tuple[str, ...] = ()  # of `BEYOND`, what the block is about; a subclass states its own
+    source: str | None = None  # where it is from, for a report
+    separable: bool = False  # whether it judges the channels of a coupling without cross terms one by one
+    limitable: bool = False  # whether forces that are limited have a block of their own, which a file may prove
 
     @abstractmethod
-    def demand(self, loop: Loop, coupling: Coupling, multiplier: Any = None, exact: bool = False) -> Demand[Lti]:
+    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         """The block of this coupling in this loop, over Fractions where `exact`. Raises SingularLoop.
 
         Only a condition that has a `multiplier_name` is given a multiplier.
@@ -258,6 +267,23 @@ class Condition(ABC):
         demands = [self.demand(each, coupling) for each in self._loops(loop)]
         found = [_least_damping(self.name, demand.free, lambda d=demand: d, loop.delta) for demand in demands]
         return max(found, key=lambda requirement: requirement.ratio)
+
+    def judge(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
+        """`required`, and for whom that is; a loop that it says nothing of, or without a solution, is refused."""
+        reason = self.beyond(loop)
+        try:
+            found = refusal(self.name, loop.delta, reason) if reason else self.required(loop, coupling, multiplier)
+        except SingularLoop as error:
+            found = refusal(self.name, loop.delta, str(error))
+        return replace(found, guarantee=self.words(loop), lag=self.lag(loop))
+
+    def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
+        """w (k,) [rad/sample] -> required over available damping there; None for a coupling without such a curve."""
+        return partial(least_scale, self.demand(loop, coupling))
+
+    def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
+        """Required over available damping, (n,), where loop or coupling is a stack; None: ask them one by one."""
+        return None
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         """What is to be proved over the rationals, by the name of the matrix that proves it. Raises NotProved."""
@@ -286,6 +312,14 @@ class Condition(ABC):
         """What a file calls the numbers that the block needs beside the coupling; None for a condition without any."""
         return None
 
+    def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
+        """The one for every coupling, None where none is needed; and why it says nothing of the loop, if so."""
+        return None, self.beyond(loop)
+
+    def not_varied(self, loop: Loop) -> str | None:
+        """Why it is not asked again and again of a loop that is varied; None where it is."""
+        return None
+
     def members(self, loop: Loop) -> tuple[Member, ...]:
         """The environments in which it is proved one by one; P, P1, P2, .. are of these."""
         return loop.members()
@@ -299,6 +333,11 @@ class Condition(ABC):
         """What a matrix is about, as the beginning of a message: which member of the ranges, where there are some."""
         members = self.members(loop)
         return f"{members[int(matrix[1:] or 0)].name}: " if len(members) > 1 else ""
+
+    def words(self, loop: Loop) -> str:
+        """The same in the words of a report."""
+        held = self.guarantee(loop)
+        return loop.environment.here if held == "this environment" else held
 
 
 def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], delta: Sequence[float]) -> Requirement:
@@ -365,8 +404,11 @@ def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array
     return np.abs(F1 - turned).max(axis=(-2, -1)) / scale, least / scale
 
 
-def any_environment(V: Lti, loop: Loop) -> Requirement:
-    """The damping that any-environment asks for psi = 0 and V, whatever passive environment is behind it."""
+def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement:
+    """The damping that any-environment asks for V, whatever passive environment is behind it.
+
+    With phi (m,) [N s/m], as `any_environment_demand` has it, behind the loop's own environment and its delay psi.
+    """
     available = dampings(loop.delta, V.inputs)
 
     def refused(reason: str) -> Requirement:
@@ -374,21 +416,25 @@ def any_environment(V: Lti, loop: Loop) -> Requirement:
 
     if min(available) == 0:
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
-    if reason := too_long(V):
+    if reason := too_long(V) or (phi is not None and too_long(loop.E())):
         return refused(reason)
     if not V.is_stable():
         return refused("the coupling V has a pole on or outside the unit circle")
-    demand = any_environment_demand(V, loop)
+    demand = any_environment_demand(V, loop, phi)
     V1 = demand.static["V(1)"]
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
-    least = lambda w: _scale_beside_zeros(V, demand, w)  # noqa: E731
+    if phi is not None and uncovered(loop.E(), loop.psi, np.diag(phi)) > _ROUNDING * max(even_damping(loop)):
+        return refused("E-hat + Phi is not passive for this multiplier")
+    least = partial(least_scale, demand) if phi is not None else partial(_scale_beside_zeros, V, demand)
     ratio, w = supremum(least, np.concatenate([[0.0], frequencies(V)]))
     if ratio > _NEVER:
         return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz: its damping vanishes there")
     return from_ratio("any-environment", ratio, available, w / (2 * np.pi * V.T))
 
 
+#: What a sweep may find uncovered of an environment, relatively to the damping: rounding.
+_ROUNDING = 1e-6
 #: V is taken to vanish in a direction in which it is smaller than this, beside V(1): nearer to a zero is rounding.
 _VANISHES = 1e-5
 #: What stands there in place of its passivity, beside V(1), and the ratio from which on nothing else does.
@@ -485,40 +531,6 @@ def encoder_friction(F: Lti, steps: Sequence[float]) -> Array:
     return l1_gain(F) @ (q / 2)
 
 
-# any-environment with delay inside the environment (psi >= 1), for a given multiplier Phi
-
-
-#: What a sweep may find uncovered, relatively to the damping: rounding.
-_ROUNDING = 1e-6
-
-
-def any_environment_delayed(V: Lti, loop: Loop, phi: Array) -> Requirement:
-    """Theorem 4 for the coupling V with the diagonal multiplier phi (N,) [N s/m]; phi = 0 is `any_environment`.
-
-    The ratio s is the least for which s Delta_D satisfies, at every frequency, He v_hat(H) >= H* Delta_V H with
-    H = V - Theta-hat/s and Delta_V = Phi + Phi (s Delta_D - Phi)^-1 Phi.
-    """
-    available, environment = dampings(loop.delta, V.inputs), loop.E()
-
-    def refused(reason: str) -> Requirement:
-        return refusal("any-environment", available, reason)
-
-    if reason := too_long(V) or too_long(environment):
-        return refused(reason)
-    if not V.is_stable():
-        return refused("the coupling V has a pole on or outside the unit circle")
-    V1 = V.dc()
-    if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
-        return refused("the static compliance V(1) is not symmetric")
-    if uncovered(environment, loop.psi, np.diag(phi)) > _ROUNDING * max(even_damping(loop)):
-        return refused("E-hat + Phi is not passive for this multiplier")
-    needed = delayed_demand(V, loop, phi)
-    ratio, w = supremum(needed, np.concatenate([[0.0], frequencies(V)]))
-    if np.isinf(ratio):
-        return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz for this multiplier")
-    return from_ratio("any-environment", ratio, available, w / (2 * np.pi * V.T))
-
-
 def uncovered(environment: Lti, psi: Sequence[int], Phi: Array) -> float:
     """sup over frequency of the largest eigenvalue of -He E-hat - Phi [N s/m]; > 0 where Phi is too small."""
     delayed = delay(psi, environment.T) @ environment
@@ -528,34 +540,6 @@ def uncovered(environment: Lti, psi: Sequence[int], Phi: Array) -> float:
         return -np.linalg.eigvalsh(environment.T * hermitian(regular.at(on_circle(w))) + Phi)[:, 0]
 
     return supremum(short, np.concatenate([[0.0], frequencies(delayed)]))[0]
-
-
-def delayed_demand(V: Lti, loop: Loop, phi: Sequence[float] | Array) -> Response:
-    """w (k,) -> the least s of `any_environment_delayed` at each frequency."""
-    response = _delayed_response(V, loop.theta)
-    return lambda w: _delayed_scale(response.at(on_circle(w)), even_damping(loop), np.asarray(phi))
-
-
-def _delayed_response(V: Block, theta: Sequence[int]) -> Block:
-    """[v_hat(V)/T; V/T; 1 + 1/z + ... + z^-theta], what `_delayed_scale` needs."""
-    return vstack(v_hat(V)[1] * (1 / V.T), V * (1 / V.T), as_like(V, moving_sum(theta, V.T)))
-
-
-def _delayed_scale(response: Complex, delta: Array, phi: Array) -> Array:
-    """The least s of `any_environment_delayed`, (...,), from `_delayed_response` (..., 3m, m); inf: no damping will do.
-
-    With S = He v_hat(V)/T - V* Phi V/T^2 and N = (1 + ... + z^-theta)/2 - Phi V/T the inequality is S > 0 and
-    s Delta_D >= Phi + N S^-1 N*: two Schur complements of a matrix that is affine in s.
-    """
-    passivity, VT, window = np.split(response, 3, axis=-2)
-    star = lambda M: np.conj(np.swapaxes(M, -1, -2))  # noqa: E731
-    S = hermitian(passivity) - star(VT) @ (phi[:, None] * VT)
-    N = window / 2 - phi[:, None] * VT
-    sound = -largest_eigenvalue(-S) > 0
-    S = np.where(sound[..., None, None], S, np.eye(phi.size))
-    root = 1 / np.sqrt(delta)
-    needed = np.diag(phi) + N @ np.linalg.solve(S, star(N))
-    return np.where(sound, largest_eigenvalue(root[:, None] * hermitian(needed) * root), np.inf)
 
 
 # Many couplings or environments at once: a row for each, as a map asks for them.
@@ -584,10 +568,7 @@ def any_environment_ratios(V: _Responses, count: int, loop: Loop, phi: Sequence[
     """The same of any-environment for `count` couplings; phi (m,) [N s/m] is the multiplier that psi >= 1 needs."""
 
     def needed(w: Array) -> Array:
-        response = V(on_circle(w))
-        if phi is None:
-            return _least_scales(any_environment_demand(response, loop))
-        return _delayed_scale(_delayed_response(response, loop.theta).G, even_damping(loop), np.asarray(phi))
+        return _least_scales(any_environment_demand(V(on_circle(w)), loop, phi))
 
     return suprema(needed, *frequencies_of_many(np.zeros((count, 0), dtype=np.complex128), max(loop.theta)))
 

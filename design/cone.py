@@ -65,9 +65,11 @@ class Inequality:
 
     @classmethod
     def of(cls, function: Callable[[Array], Array], unknowns: Sequence[int]) -> Inequality:
-        """function(x[unknowns]) >= 0, affine to a symmetric matrix, from its values at 0 and the unit vectors."""
-        constant = function(np.zeros(len(unknowns)))
-        return cls(constant[None], np.stack([function(e) - constant for e in np.eye(len(unknowns))])[:, None], unknowns)
+        """function(x[unknowns]) >= 0, affine to symmetric matrices (k, n, n) or one, from its values at 0 and units."""
+        constant, *values = (function(x) for x in np.eye(len(unknowns) + 1, len(unknowns), k=-1))
+        slopes = np.stack(values) - constant
+        one = constant.ndim == 2
+        return cls(constant[None] if one else constant, slopes[:, None] if one else slopes, unknowns)
 
     @classmethod
     def least(cls, unknowns: Sequence[int], value: float) -> Inequality:

@@ -14,7 +14,7 @@ from design.certificate import RangesCheck, check_limiter, judged, prove_limiter
 from design.conditions import this_environment
 from design.coupling_file import Certificate, LimiterCertificate
 from design.designs import KINDS, design_by_kind
-from design.environments import BETA, LIMITER, SWITCHING, Limiter, worst
+from design.environments import BETA, LIMITER, SWITCHING, THIS_ENVIRONMENT, Limiter, worst
 from design.files import unseen
 from design.result import Design, DesignFailed, NotProved, Requirement
 from design.transparency import decibels, transparency
@@ -75,9 +75,10 @@ def covered_limits(
     """
     if loop.varying_delay:
         return Limits(None, str(LIMITER.beyond(loop)))
-    if requirements["any-environment"].certified and not any(loop.psi):
-        return Limits((0.0,) * loop.channels, "any-environment covers limited forces")
-    if not requirements["this-environment"].certified:
+    for each in requirements.values():
+        if each.certified and each.lag is not None:
+            return Limits(each.lag, f"{each.condition} covers limited forces")
+    if not requirements[THIS_ENVIRONMENT.name].certified:
         return Limits(None, "no guarantee that it could extend")
     if proof:
         try:

@@ -32,7 +32,7 @@ from design.conditions import (
 from design.cone import ConeProgram, Inequality
 from design.exact import require_size
 from design.frequency import frequencies, hermitian, on_circle, peaks, supremum, sweeping
-from design.result import DesignFailed, Requirement, from_ratio, refusal, switching_guarantee
+from design.result import MAKING, DesignFailed, Requirement, from_ratio, refusal, switching_guarantee
 
 # ----------------------------------------------------------------------------------------------------
 # The best multiplier. The block is affine in (s, multiplier), so the least s over all multipliers at some frequencies
@@ -76,7 +76,7 @@ class Multiplied(Condition):
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
         """The block of such a map, in any arithmetic."""
 
-    def demand(self, loop: Loop, coupling: Coupling, multiplier: Any = None, exact: bool = False) -> Demand[Lti]:
+    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         return self.block(self.map(loop, coupling, exact), loop, multiplier)
 
     def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
@@ -220,16 +220,25 @@ class _Search:
 class ThisEnvironment(Multiplied):
     """Safe in the environment of the loop: around its walls, whether they touch or not, and at all of its members."""
 
-    name, covers = "this-environment", BEYOND
+    name, covers, limitable = "this-environment", BEYOND, True
 
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
-        F = loop.walled(coupling, exact) if loop.environment.walls else loop.F(coupling, exact)
+        G = loop.walled(coupling, exact)
         if exact:
-            require_size(F.order)
-        return F
+            require_size(G.order)
+        return G
 
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
-        return this_environment_demand(G, loop) if multiplier is None else walls_demand(G, loop, multiplier)
+        return walls_demand(G, loop, multiplier)
+
+    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
+        """With the multiplier of its walls; without one as if they all touched, where it has some."""
+        if multiplier is not None:
+            return super().demand(loop, coupling, exact, multiplier)
+        F = loop.F(coupling, exact)
+        if exact:
+            require_size(F.order)
+        return this_environment_demand(F, loop)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """The most that any member asks."""
@@ -259,6 +268,9 @@ class ThisEnvironment(Multiplied):
             if np.linalg.eigvalsh((part + part.T) / 2).min() < -_ROUNDING * size.max():
                 return f"{name} has a negative direction: it pushes outwards"
         return None
+
+    def words(self, loop: Loop) -> str:
+        return MAKING if loop.environment.walls else super().words(loop)
 
 
 THIS_ENVIRONMENT = ThisEnvironment()

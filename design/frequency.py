@@ -169,19 +169,24 @@ def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: i
     return grid[(grid >= low) & (grid <= high)]
 
 
-def rounding(G: Lti, z: NDArray[np.complex128]) -> float:
+def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> float:
     """How much rounding may change an entry of the response of y = C x + D u, x+ = A x + B u, at any of the z (k,).
 
     A tick in double precision is one of a system whose coefficients are off by (2n + 8) u relatively, entry by entry
-    (n states, u the unit). With R = (zI - A)^-1 that moves the response by at most the same part of
-    |C R| (|A| |R B| + |B|) + |C| |R B| + |D|: large where big terms cancel.
+    (n states, u the unit), and by what they miss of a system `meant` with the same states. With R = (zI - A)^-1 errors
+    dA, dB, dC, dD move the response by at most |C R| (|dA| |R B| + |dB|) + |dC| |R B| + |dD|: much where big terms
+    cancel. The difference of both responses would say less: beside a sharp resonance it is large as soon as the peak
+    moves by its width, which the Schur form of badly scaled states does by itself.
     """
     part = (2 * G.order + 8) * 2.0**-53
+    dA, dB, dC, dD = (
+        part * np.abs(own) + (0.0 if meant is None else np.abs(own - getattr(meant, name)))
+        for name, own in (("A", G.A), ("B", G.B), ("C", G.C), ("D", G.D))
+    )
     one, zero = np.eye(G.order), np.zeros
     states = np.abs(Lti(G.A, G.B, one, zero(G.B.shape), G.T).at(z))
     outputs = np.abs(Lti(G.A.T, G.C.T, one, zero(G.C.T.shape), G.T).at(z)).swapaxes(1, 2)
-    terms = outputs @ (np.abs(G.A) @ states + np.abs(G.B)) + np.abs(G.C) @ states + np.abs(G.D)
-    return part * float(terms.max(initial=0.0))
+    return float((outputs @ (dA @ states + dB) + dC @ states + dD).max(initial=0.0))
 
 
 def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:

@@ -42,6 +42,11 @@ _Responses = tuple[Complex, Complex, Complex]  # (z-1)/(Tz), Psi E and Theta at 
 _DIFFERENCE = 1e-7
 
 
+def damper_rate(z: Complex, T: float) -> Complex:
+    """(z-1)/(Tz) [1/s], what a damper of 1 N s/m adds to the stiffness of a spring-damper; the shape of z."""
+    return SpringDamper([1.0], [1.0]).sampled(z, T).inverse().G[..., 0, 0] - 1
+
+
 def polynomials(theta: int, w: Array) -> tuple[Array, Array]:
     """1 + ... + z^-theta and 1 - z^-n at exp(jw), complex, (w,) each."""
     n = theta + 1

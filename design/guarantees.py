@@ -10,7 +10,7 @@ import numpy as np
 from controller.coupling import Coupling
 from controller.loop import Loop
 from design.conditions import encoder_friction
-from design.result import Requirement
+from design.result import MAKING, Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # What may be said of a coupling: required against available damping, for which environments, and what is left out.
@@ -20,9 +20,6 @@ ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment
 
 
 _FROZEN = "each frozen contact state of this environment (with ranges, contact that makes and breaks is not covered)"
-
-
-MAKING = "this environment, with walls up to their stiffness and damping that make and break contact"
 
 
 #: What no certificate covers.
@@ -40,15 +37,13 @@ def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_rang
     The multiplier that any-environment takes for psi >= 1 is of one environment. `whole_ranges`: this-environment is
     proved at every vertex of the loop's ranges, and a search has found no violation between them.
     """
-    if requirements["any-environment"].certified and not any(loop.psi):
+    held = [requirement.guarantee for requirement in requirements.values() if requirement.certified]
+    if ANY in held:
         return ANY
     if whole_ranges:
         return RANGES
-    if not any(requirement.certified for requirement in requirements.values()):
-        return None
-    if loop.environment.walls:
-        return MAKING if making_covered(loop) else _FROZEN
-    return loop.environment.here
+    found = next((words for words in held if words), None)
+    return _FROZEN if found == MAKING and not making_covered(loop) else found
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,7 +31,7 @@ from design import conditions
 from design.conditions import Condition, Demand, even_damping, regular_part, uncovered, v_hat
 from design.cone import ConeProgram, Inequality
 from design.exact import require_size
-from design.frequency import frequencies, hermitian, on_circle, supremum
+from design.frequency import Response, frequencies, hermitian, on_circle, supremum
 from design.result import DesignFailed, Guarantee, Infeasible, NotProved, Requirement, refusal
 
 #: Designs ask for (1 - RESERVE) of the available damping, so that they are certified as stored.
@@ -296,9 +297,10 @@ class _AnyEnvironment(Condition):
     Its multiplier is then Phi (m,) [N s/m]. Walls are covered without delay in the environment, and refused with it.
     """
 
-    name, covers = "any-environment", conditions.BEYOND  # what it says nothing of it refuses, see `_refused`
+    name, source, separable = "any-environment", "the paper's Theorem 4", True
+    covers = tuple(name for name in conditions.BEYOND if name != "latency")
 
-    def demand(self, loop: Loop, coupling: Coupling, multiplier: Any = None, exact: bool = False) -> Demand[Lti]:
+    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         V = coupling.compliance(loop.period(exact))
         assert V is not None  # where it is None, `required` refuses
         if exact:
@@ -307,17 +309,29 @@ class _AnyEnvironment(Condition):
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
         """The least Phi, None where none is needed; and why it says nothing of the loop, whatever the coupling."""
-        if (reason := self._refused(loop)) or not any(loop.psi):
+        if (reason := self.beyond(loop)) or not any(loop.psi):
             return None, reason
         try:
             return least_phi(loop), None
         except ValueError as error:
             return None, " ".join(str(error).split())
 
-    def _refused(self, loop: Loop) -> str | None:
+    def beyond(self, loop: Loop) -> str | None:
         if loop.environment.walls and any(loop.psi):
             return "with delay in the environment its multiplier is of a linear one: no walls"
         return LATE if loop.latency else None
+
+    def not_varied(self, loop: Loop) -> str | None:
+        return (
+            "with psi >= 1 every K, T and delay needs a multiplier of its own: not searched" if any(loop.psi) else None
+        )
+
+    def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
+        V = coupling.compliance(loop.T)
+        phi = multiplier if any(loop.psi) else None
+        if V is None or (phi is None and any(loop.psi)):
+            return None
+        return partial(conditions.least_scale, conditions.any_environment_demand(V, loop, phi))
 
     def _without(self, coupling: Coupling) -> str:
         """Why it says nothing of a coupling that has no V(z)."""
@@ -327,7 +341,7 @@ class _AnyEnvironment(Condition):
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """Without a multiplier it takes the least one, where it needs one."""
-        reason, V = self._refused(loop), coupling.compliance(loop.T)
+        reason, V = self.beyond(loop), coupling.compliance(loop.T)
         if reason or V is None:
             return refusal(self.name, loop.delta, reason or self._without(coupling))
         if not any(loop.psi):
@@ -340,8 +354,8 @@ class _AnyEnvironment(Condition):
             return refusal(self.name, loop.delta, str(reason))
         if len(multiplier) != loop.channels:
             raise NotProved("any-environment with psi >= 1 needs a multiplier Phi, one entry per channel")
-        phi = np.array([float(p) for p in multiplier])
-        return replace(conditions.any_environment_delayed(V, loop, phi), multiplier=tuple(multiplier))
+        found = conditions.any_environment(V, loop, np.array([float(p) for p in multiplier]))
+        return replace(found, multiplier=tuple(multiplier))
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         if not any(loop.psi):
@@ -352,7 +366,7 @@ class _AnyEnvironment(Condition):
         require_size(V.order + sum(loop.theta))
         delayed = delay(loop.psi, T) @ loop.E(exact=True)
         return {
-            "P": conditions.delayed_coupling_demand(V, loop, multiplier),
+            "P": conditions.any_environment_demand(V, loop, multiplier),
             "P_E": conditions.delayed_environment_demand(delayed, multiplier),
         }
 

@@ -106,7 +106,7 @@ def this_environment(loop: Loop) -> _Constraint:
     """design.conditions.this_environment_demand with a little of the damping unused, in units of Delta/T."""
 
     def block(G: Sampled, own: Array) -> Sampled:
-        demand = _demand(loop, _late(loop, G))
+        demand = _demand(loop, loop.late(G))
         return demand.free + demand.gain * (1 - MARGIN)
 
     gain = _demand(loop, Lti.constant(np.zeros((loop.channels, loop.channels)), loop.T)).gain
@@ -166,7 +166,7 @@ def most_gain(loop: Loop, cap: float) -> _Constraint:
     E = loop.E()
 
     def block(G: Sampled, own: Array) -> Sampled:
-        return _within(_late(loop, G), E.at(G.z), cap)
+        return _within(loop.late(G), E.at(G.z), cap)
 
     low = min(2 * np.pi * HIGH_HZ * loop.T, np.pi)
     return _Constraint("high-frequency gain", block, np.ones(2 * E.inputs), low=low)
@@ -177,15 +177,10 @@ def worst_mismatch(loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> _Const
     E = loop.E()
 
     def block(G: Sampled, own: Array) -> Sampled:
-        return _within(_late(loop, G) - as_like(G, delay(loop.lam, loop.T) @ E), E.at(G.z), own[0])
+        return _within(loop.late(G) - as_like(G, delay(loop.lam, loop.T) @ E), E.at(G.z), own[0])
 
     low, high = _band(loop, band_hz)
     return _Constraint("mismatch", block, np.ones(2 * E.inputs), low, high, start=(2.0,), cost=(1.0,))
-
-
-def _late(loop: Loop, G: Sampled) -> Sampled:
-    """F = Theta G."""
-    return as_like(G, delay(loop.theta, loop.T)) @ G
 
 
 def _within(M: Sampled, E: Complex, cap: float) -> Sampled:

@@ -24,6 +24,9 @@ CONDITIONS: dict[ConditionName, str] = {
 }
 
 
+#: what this-environment holds for before walls
+MAKING = "this environment, with walls up to their stiffness and damping that make and break contact"
+
 C = TypeVar("C", bound=str)  # a ConditionName, "switching" or "limiter"
 
 
@@ -42,6 +45,8 @@ class Requirement(Generic[C]):
     proof: str = "sampled"
     multiplier: tuple[Any, ...] | None = None  # at which it asks so much, of a condition that has one
     bound: float | None = None  # no multiplier asks a smaller ratio, on the frequencies that its search has looked at
+    guarantee: str | None = None  # for which environments it is, in words, where a condition has judged a loop
+    lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of a limiter that it covers without further proof
 
     @property
     def ratio(self) -> float:
@@ -145,6 +150,7 @@ class Chosen:
     phi: Array | None = field(kw_only=True, default=None)  # (m,) multiplier Phi_E [N s/m] of Theorem 4, if it needs one
     certificate: Any = field(kw_only=True, default=None)  # the file's Certificate, where it was proved in this process
     limiter: Any = field(kw_only=True, default=None)  # LimiterCertificate: what it comes with for limited forces
+    own: Any = field(kw_only=True, default=None)  # the design.conditions.Condition, where that is one of the user's own
     switching: DelayRange | None = field(kw_only=True, default=None)  # its file proves any switching within it
     notes: tuple[str, ...] = field(kw_only=True, default=())  # what a reader should know of its origin
 

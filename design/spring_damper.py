@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -16,125 +17,130 @@ import numpy as np
 
 from controller.coupling import MovingAverage, SpringDamper
 from controller.loop import Loop
-from controller.lti import Array, Lti
-from design.conditions import even_damping, this_environment
+from controller.lti import Array, Lti, hstack, taps, vstack
+from design.conditions import even_damping, theta_hat, this_environment
 from design.cone import ConeProgram, Inequality
 from design.environments import LIMITER
-from design.frequency import peaks, too_long
-from design.gain_search import FEW, LimiterLoop, SampledLoop, SwitchingLoop, least_rms, likeliest_first, polynomials
-from design.lmi import ANY_ENVIRONMENT, RESERVE, Shaping, gain_block, least_phi, usable
+from design.frequency import on_circle, peaks, too_long
+from design.gain_search import FEW, LimiterLoop, SampledLoop, SwitchingLoop, damper_rate, least_rms, likeliest_first
+from design.lmi import (
+    ANY_ENVIRONMENT,
+    RESERVE,
+    Ports,
+    Shaping,
+    gain_block,
+    least_phi,
+    lemma1,
+    packed,
+    symmetric_from,
+    usable,
+)
 from design.result import Design, DesignFailed, Infeasible, Requirement
 from design.transparency import BAND_HZ, transparency
 
 # ----------------------------------------------------------------------------------------------------
 # The convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
 #
-# With D = (z-1)/(Tz), W = K/D + B and N = (1 - z^-n)/(2 delta), n = theta + 1, the transformed coupling (11) is V-hat
-# = 1/W - N (a number per channel), and He V-hat >= Delta_V |V-hat|^2 times |W|^2 reads, in units k = KT/delta, b =
-# B/delta and Sigma = delta/Delta_V,
+# A channel has V = 1/W with W = k + b (1 - 1/z). Multiplied by W and its conjugate, what V brings to the block of
+# `any_environment_demand` is k/2 + b, what the damping takes is |Theta-hat W|^2, and the row of a multiplier is
+# 2 (1 - Theta-hat W): in Schur's form all is affine in (k, b), without conservatism. A test compares it to that block.
 #
-#     k/2 + b >= |y|^2/4 + |1 - y/2|^2 / Sigma    on |z| = 1,    y = k (1 + ... + 1/z^theta) + b (1 - z^-n).
-#
-# y is a polynomial in 1/z, affine in (k, b), so this is one linear matrix inequality, without conservatism. psi = 0
-# needs no excess of passivity in V-hat (Sigma = inf): the last term is absent.
-#
-# Its matrix has theta + 2 rows and half as many unknowns as entries, so beyond _LARGEST_GRAM of these the inequality is
-# imposed frequency by frequency, in the two unknowns alone, and where the solution fails in between, there too
-# (`solve_within`). These sets contain the exact one and the rounds shrink them to it: both ways end at the same gains.
+# `lemma1` makes it one matrix inequality, with half as many unknowns as entries; beyond _MOST_STORED of these it is
+# imposed frequency by frequency, in the two unknowns alone, and where the solution fails in between, there too. These
+# sets contain the exact one and the rounds shrink them to it: both ways end at the same gains.
 
 
-_LARGEST_GRAM = 180  # unknowns besides the gains, of all channels
-_PER_LOBE = 8  # frequencies per ripple of y at which the inequality is imposed first
+_MOST_STORED = 180  # unknowns besides the gains, of all channels
+_PER_LOBE = 8  # frequencies per ripple of a delay at which the inequality is imposed first
 _MISSED = 2e-6  # of the usable damping: what the inequality may miss in between, far less than the reserve of a design
 _MOST_ROUNDS = 12
 
 
-def solve_within(
-    cost: Array,
-    theta: Sequence[int],
-    sigma: Array,
-    what: str,
-    more: Sequence[Inequality] = (),
-    largest_gram: int = _LARGEST_GRAM,
-) -> Array:
-    """The unknowns of least cost: gains (k_1, ..., k_N, b_1, ..., b_N), each channel's in its set, then others.
+@dataclass(frozen=True)
+class _Channel:
+    """The gains (k, b) of one device, in units of its usable damping."""
 
-    `more` inequalities bound these, too. Raises as ConeProgram.solve, and DesignFailed where one still fails after
-    all rounds.
-    """
-    N, own = len(theta), len(cost)
-    both = [(i, N + i) for i in range(N)]
-    blocks = [*more, Inequality.least(range(2 * N), 0.0)]
-    spare = [(n + 1) * (n + 2) // 2 for n in theta]
-    if sum(spare) <= largest_gram:
-        ends = own + np.cumsum([0, *spare])
-        for i in range(N):
-            blocks.append(_gram(theta[i], float(sigma[i]), [*both[i], *range(ends[i], ends[i + 1])]))
-        return ConeProgram(np.append(cost, np.zeros(sum(spare))), blocks).solve(what)[:own]
-    sampled = [_first_frequencies(n) for n in theta]
-    for _ in range(_MOST_ROUNDS):
-        sets = [_sampled(theta[i], float(sigma[i]), both[i], sampled[i]) for i in range(N)]
-        x = ConeProgram(cost, [*blocks, *sets]).solve(what)
-        missed = [_missed_frequencies(x[i], x[N + i], theta[i], float(sigma[i])) for i in range(N)]
-        if not any(w.size for w in missed):
-            return x
-        sampled = [np.union1d(w, further) for w, further in zip(sampled, missed, strict=True)]
-    line = f"{what}: after {_MOST_ROUNDS} rounds Theorem 4 still fails between the frequencies"
-    raise DesignFailed(None, (), line)
+    theta: int
+    shortage: float  # phi of its multiplier, 0 where psi is
 
+    def rows(self, gains: Array) -> Lti:
+        """c with k/2 + b >= |c|^2 on |z| = 1; its C and D are affine in the gains, its A and B are fixed."""
+        k, b = gains
+        late = theta_hat((self.theta,), np.ones(1), 1.0)  # a delay line: D and C are its coefficients
+        taken = taps(np.convolve(np.append(late.D, late.C), [k + b, -b]).tolist(), 1.0)
+        if not self.shortage:
+            return taken
+        return vstack(taken, (np.eye(1) - taken) * (1 / np.sqrt(1 / self.shortage - 1)))
 
-def _gram(theta: int, sigma: float, unknowns: Sequence[int]) -> Inequality:
-    """The exact set of (k, b): r - |c(z)|^2 is non-negative iff c c' <= Q for some Q whose diagonals sum to r and 0.
+    def exactly(self, unknowns: Sequence[int]) -> Inequality:
+        """At all frequencies; the unknowns behind the gains are a storage."""
 
-    c holds the coefficients of 1, 1/z, ..., z^-n; Q is unknown but for the last entry of each diagonal.
-    """
-    n = theta + 1
-    rows, columns = np.array([(j, j + d) for d in range(n + 1) for j in range(n - d)]).T
+        def matrix(x: Array) -> Array:
+            c = self.rows(x[:2])
+            corner = Lti.constant(np.eye(1 + c.outputs)[:, 1:], 1.0)
+            block = hstack(vstack(Lti.constant([[x[0] / 2 + x[1]]], 1.0), 2 * c), corner)
+            zero = np.zeros_like(block.D)
+            return lemma1(Ports.same(block), symmetric_from(x[2:], block.order), zero, zero)
 
-    def matrix(x: Array) -> Array:
-        (k, b), y, one = x[:2], np.full(n + 1, x[0]), np.eye(n + 1)[0]
-        y[0], y[n] = k + b, -b
-        parts = [y / 2] if np.isinf(sigma) else [y / 2, (one - y / 2) / np.sqrt(sigma)]
-        Q, c = np.zeros((n + 1, n + 1)), np.stack(parts, axis=1)
-        Q[rows, columns] = x[2:]
-        for d in range(n + 1):
-            Q[n - d, n] = (k / 2 + b) * (d == 0) - np.trace(Q, d)
-        Q += np.triu(Q, 1).T
-        return np.block([[Q, c], [c.T, np.eye(c.shape[1])]])
+        return Inequality.of(matrix, unknowns)
 
-    return Inequality.of(matrix, unknowns)
+    def sampled(self, unknowns: Sequence[int], w: Array) -> Inequality:
+        """At the frequencies w [rad/sample], as [[k/2 + b, c'], [c, I]] >= 0."""
+        z = on_circle(w)
+
+        def arrows(x: Array) -> Array:
+            c = self.rows(x).at(z)[:, :, 0]
+            c = np.concatenate([c.real, c.imag], axis=1)
+            M = np.eye(1 + c.shape[1]) * np.ones((w.size, 1, 1))
+            M[:, 0, 0], M[:, 0, 1:], M[:, 1:, 0] = x[0] / 2 + x[1], c, c
+            return M
+
+        return Inequality.of(arrows, unknowns)
+
+    def missed(self, gains: Array) -> Array:
+        """Peaks [rad/sample] at which the gains miss the inequality by more than _MISSED."""
+        c, room = self.rows(gains), gains[0] / 2 + gains[1]
+        excess = lambda w: (np.abs(c.at(on_circle(w))) ** 2).sum(axis=(1, 2)) - room  # noqa: E731
+        return peaks(excess, self.grid(2), _MISSED)
+
+    def grid(self, finer: int = 1) -> Array:
+        """_PER_LOBE to each ripple, from 0 to pi [rad/sample]."""
+        return np.linspace(0, np.pi, finer * _PER_LOBE * (self.theta + 1) + 1)
 
 
-def _sampled(theta: int, sigma: float, unknowns: Sequence[int], w: Array) -> Inequality:
-    """The inequality at the frequencies w [rad/sample]: |c|^2 <= r as [[r, c'], [c, I]] >= 0."""
+class GainSet:
+    """The gains of any-environment in units of the usable damping, with phi (m,) [N s/m] where psi >= 1."""
 
-    def arrow(r: float, one: float, y: Any) -> Array:
-        parts = [y / 2] if np.isinf(sigma) else [y / 2, (one - y / 2) / np.sqrt(sigma)]
-        c = np.stack([part for each in parts for part in (each.real, each.imag)], axis=-1)
-        M = np.zeros((w.size, 1 + c.shape[-1], 1 + c.shape[-1]))
-        M[:, 0, 0], M[:, 0, 1:], M[:, 1:, 0] = r, c, c
-        return M
+    def __init__(self, loop: Loop, phi: Array | None = None, most_stored: int = _MOST_STORED) -> None:
+        shortage = np.zeros(loop.channels) if phi is None else phi / usable(loop)
+        self.channels = [_Channel(n, float(p)) for n, p in zip(loop.theta, shortage, strict=True)]
+        stored = np.array([packed(n + 1) for n in loop.theta])
+        self._stored = stored if stored.sum() <= most_stored else None
 
-    of_k, of_b = polynomials(theta, w)
-    constant = arrow(0.0, 1.0, np.zeros(w.size, dtype=complex))
-    constant += np.diag([0.0, *np.ones(constant.shape[-1] - 1)])
-    return Inequality(constant, np.stack([arrow(0.5, 0.0, of_k), arrow(1.0, 0.0, of_b)]), unknowns)
+    def solve(self, cost: Array, what: str, more: Sequence[Inequality] = ()) -> Array:
+        """The unknowns of least cost: gains (k_1, ..., k_N, b_1, ..., b_N), each channel's in its set, then others.
 
-
-def _missed_frequencies(k: float, b: float, theta: int, sigma: float) -> Array:
-    """Peaks [rad/sample] at which the gains miss the inequality by more than MISSED."""
-
-    def excess(w: Array) -> Array:
-        of_k, of_b = polynomials(theta, w)
-        y = k * of_k + b * of_b
-        return np.abs(y) ** 2 / 4 + np.abs(1 - y / 2) ** 2 / sigma - (k / 2 + b)
-
-    return peaks(excess, _first_frequencies(2 * theta + 1), _MISSED)
-
-
-def _first_frequencies(theta: int) -> Array:
-    """PER_LOBE to each ripple of y, from 0 to pi [rad/sample]."""
-    return np.linspace(0, np.pi, _PER_LOBE * (theta + 1) + 1)
+        `more` inequalities bound these, too. Raises as ConeProgram.solve, and DesignFailed where one still fails after
+        all rounds.
+        """
+        N, own = len(self.channels), len(cost)
+        blocks = [*more, Inequality.least(range(2 * N), 0.0)]
+        each = [(channel, (i, N + i)) for i, channel in enumerate(self.channels)]
+        if self._stored is not None:
+            ends = own + np.cumsum([0, *self._stored])
+            for i, (channel, gains) in enumerate(each):
+                blocks.append(channel.exactly([*gains, *range(ends[i], ends[i + 1])]))
+            return ConeProgram(np.append(cost, np.zeros(self._stored.sum())), blocks).solve(what)[:own]
+        w = [channel.grid() for channel in self.channels]
+        for _ in range(_MOST_ROUNDS):
+            sets = [channel.sampled(gains, w[i]) for i, (channel, gains) in enumerate(each)]
+            x = ConeProgram(cost, [*blocks, *sets]).solve(what)
+            missed = [channel.missed(x[list(gains)]) for channel, gains in each]
+            if not any(further.size for further in missed):
+                return x
+            w = [np.union1d(known, further) for known, further in zip(w, missed, strict=True)]
+        line = f"{what}: after {_MOST_ROUNDS} rounds Theorem 4 still fails between the frequencies"
+        raise DesignFailed(None, (), line)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -145,11 +151,11 @@ def _first_frequencies(theta: int) -> Array:
 # keeps what the one before achieved, and mu^2 enters linearly: no bisection.
 
 
-def step(shaping: Shaping, sigma: Array, at: Array, norm: float, w: Array) -> tuple[Array, float]:
+def step(shaping: Shaping, gains: GainSet, at: Array, norm: float, w: Array) -> tuple[Array, float]:
     """(gains, bound on the norm at the frequencies w) of one convex-concave step from the gains `at`."""
     cost = np.append(np.zeros(at.size), 1.0)
     cuts = _tangent(shaping, at, norm, w)
-    x = solve_within(cost, shaping.loop.theta, sigma, "a step of the convex sequence", [cuts])
+    x = gains.solve(cost, "a step of the convex sequence", [cuts])
     return x[:-1], norm * float(np.sqrt(x[-1]))
 
 
@@ -157,9 +163,10 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     """[[g0* g + g* g0 - g0* g0, (W1 L g W2)*], [W1 L g W2, t norm^2]], scaled to order one; t is the last variable."""
     N = shaping.loop.channels
     left, right, late = shaping.parts(w)
-    difference = 1 - np.exp(-1j * w)
     basis = np.eye(N)[:, None, :] * np.ones((w.size, 1))  # (N, k, N): e_i at every frequency
-    g = np.concatenate([basis, basis * difference[:, None]])  # (2N, k, N): diagonals of g by variable
+    g = np.concatenate(
+        [basis, basis * damper_rate(on_circle(w), 1.0)[:, None]]
+    )  # (2N, k, N): diagonals of g by variable
     g0 = np.tensordot(at, g, axes=1)  # (k, N)
     scale = 1 / np.abs(g0)  # columns are divided by |g0|, rows by the norm
     rows = (left * (shaping.loop.T / shaping.usable)) @ right * scale[:, None, :] / norm
@@ -250,12 +257,12 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
 def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design:
     started, loop = time.perf_counter(), shaping.loop
     phi = least_phi(loop)
-    sigma = excess_limits(loop, phi)
-    gains, sdps = _start(loop, sigma, start)
+    certified = GainSet(loop, phi)
+    gains, sdps = _start(loop, certified, start)
     norm, peak = shaping.norm(_coupling(loop, gains).compliance(loop.T))
     frequencies = [peak]
     for _ in range(_MOST_STEPS):
-        gains, bound = step(shaping, sigma, gains, norm, np.array(frequencies))
+        gains, bound = step(shaping, certified, gains, norm, np.array(frequencies))
         sdps += 1
         before, (norm, peak) = norm, shaping.norm(_coupling(loop, gains).compliance(loop.T))
         frequencies.append(peak)
@@ -342,7 +349,7 @@ def stiffest(loop: Loop) -> Design:
     """The gains of largest total stiffness (each channel's own largest) that satisfy Theorem 4; objective in N/m."""
     started = time.perf_counter()
     phi = least_phi(loop)
-    gains, sdps = _start(loop, excess_limits(loop, phi), None)
+    gains, sdps = _start(loop, GainSet(loop, phi), None)
     coupling = _coupling(loop, gains)
     requirement = _verified(loop, coupling, phi)
     total = float(coupling.K.sum())
@@ -390,7 +397,7 @@ def _coupling(loop: Loop, gains: Array) -> SpringDamper:
     return SpringDamper(k * spend / loop.T, np.where(b < _NEGLIGIBLE, 0.0, b) * spend)
 
 
-def _start(loop: Loop, sigma: Array, start: SpringDamper | None) -> tuple[Array, int]:
+def _start(loop: Loop, certified: GainSet, start: SpringDamper | None) -> tuple[Array, int]:
     """The gains of the set nearest to `start`, or the stiffest of the set; and the number of convex problems, one."""
     N, more = loop.channels, []
     cost = np.repeat([-1.0, 0.0], N)
@@ -404,7 +411,7 @@ def _start(loop: Loop, sigma: Array, start: SpringDamper | None) -> tuple[Array,
 
         more = [Inequality.of(near, range(2 * N + 1))]
     try:
-        x = solve_within(cost, loop.theta, sigma, "the set of gains", more)
+        x = certified.solve(cost, "the set of gains", more)
     except Infeasible as error:
         line = f"Theorem 4 admits no spring-damper with theta = {loop.theta}, psi = {loop.psi}, delta = {loop.delta}"
         raise Infeasible(error.problem, error.results, line) from error

@@ -181,11 +181,10 @@ def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
     if (chain := coupling.in_series(loop.T)) is None:
         return _of_whole(loop, coupling, thin)
     E = loop.E()
-    late, delayed = delay(loop.theta, loop.T), delay(loop.psi, loop.T) @ E
+    delayed = delay(loop.psi, loop.T) @ E
 
     def needed(w: Array) -> Array:
-        z = on_circle(w)[None]
-        F = Sampled.of(late, z) @ coupling.around(Sampled.of(delayed, z))
+        F = loop.late(coupling.around(Sampled.of(delayed, on_circle(w)[None])))
         demand = this_environment_demand(F, loop)
         return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
 

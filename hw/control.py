@@ -14,11 +14,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from operator import sub
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from controller.budget import EPS, EnergyBudget
+from controller.budget import BudgetFigures, EnergyBudget, Packets
 from controller.coupling import Coupling
 from controller.law import Law
 from controller.loop import Loop
@@ -29,19 +29,8 @@ from design.files import unseen
 from design.guarantees import guarantee_of
 from design.result import Chosen, Design, DesignFailed, Requirement
 from hw import monitor
-from hw.limits import (
-    Gain,
-    Heat,
-    SafetyLimits,
-    SafetyStop,
-    Units,
-    check_jolt,
-    check_jump,
-    check_range,
-    check_speed,
-    shape,
-)
-from hw.protocol import MAX_THETA, Config, State
+from hw.limits import Gain, Heat, SafetyLimits, Units
+from hw.protocol import MAX_THETA, Config, SafetyStop, State
 from sim.couplings import choose, given, limits_of
 from sim.report import CouplingFigures
 from sim.scenario import InputError, Scenario
@@ -127,10 +116,9 @@ class SentBudget:
 
     def __init__(self, plan: BudgetPlan) -> None:
         m, cap = len(plan.delta), math.inf if plan.cap is None else plan.cap
-        given: dict[str, Any] = {"encoder_step": plan.encoder_step, "start": plan.start, "cap": cap}
-        lo = np.full(m, plan.theta)
+        packets, step = Packets(np.full(m, plan.theta), hold=plan.longer), plan.encoder_step
         self.plan = plan
-        self._budget = EnergyBudget(plan.delta, plan.T, lo, hold=plan.longer, **given)
+        self._budget = EnergyBudget(plan.delta, plan.T, packets, encoder_step=step, start=plan.start, cap=cap)
         self._unit = -np.array(plan.force_step)  # the wire carries -f
         self._before = self._applied = np.zeros(m)
         self._nothing = np.zeros((m, 1))
@@ -150,23 +138,11 @@ class SentBudget:
         whole = np.where(sent == wanted[:, 0], steps, np.trunc(sent / self._unit))
         return tuple(int(n) for n in whole)
 
-    def part(self) -> dict[str, Any]:
-        """What it has done since arming, as plain data."""
-        budget = self._budget
+    def figures(self) -> BudgetFigures:
+        """What it has done since arming."""
         given = f"more than {self.plan.start:g} J" if self.plan.start else "any energy"
-        return {
-            "start_J": self.plan.start,
-            "cap_J": self.plan.cap,
-            "eps": EPS,
-            "guarantee": f"no passive hand is given {given} in an arming beyond what the devices dissipate, "
-            "whatever computes the forces",
-            "ticks": budget.ticks,
-            "limited_ticks": int(budget.limited[0]),
-            "smallest_scale": float(budget.least[0]),
-            "energy_J": float(budget.energy[0]),
-            "reserved_J": float(budget.reserved[0]),
-            "surprises": budget.surprises,
-        }
+        dissipated = "in an arming beyond what the devices dissipate, whatever computes the forces"
+        return self._budget.figures(f"no passive hand is given {given} {dissipated}")
 
 
 class TraceRow(NamedTuple):
@@ -182,36 +158,43 @@ class TraceRow(NamedTuple):
     test: tuple[float, ...] | None = None  # (m,) [N] that encoders are tested with, behind the gain
 
 
+@dataclass(frozen=True, eq=False)
+class Arming:
+    """What forces come from, from one arming to the next end."""
+
+    number: int  # of the session, from 0
+    program: Armable
+    config: Config  # of the device
+    budget: SentBudget | None = None
+
+
 class Drive:
     """The coupling at work, from one arming to the next end."""
 
     def __init__(
         self,
-        controller: Controller,
+        arming: Arming,
         units: Units,
-        config: Config,
         limits: SafetyLimits,
         settings: monitor.LinkSettings,
         counters: monitor.Counters,
         record: Callable[[TraceRow], None],
-        arming: int = 0,
-        budget: SentBudget | None = None,
     ) -> None:
-        self.controller, self.units, self.config, self.limits = controller, units, config, limits
-        self.T = T = controller.T
+        self.controller, config = arming.program.controller(limits.cap), arming.config
+        self.units, self.config, self.limits = units, config, limits
+        self.T = T = self.controller.T
         self.gain = Gain(limits, T)
         self.force = (0.0,) * config.axes  # [N] the last one sent
         self.x: tuple[float, ...] | None = None  # [m] of the last STATE
         self.reference: tuple[int, ...] | None = None  # [counts] that positions are counted from
-        self._budget = budget
         self._rereference = settings.rereference
         self._test = monitor.EncoderTest(limits.cap, T) if settings.test_encoders else None
         self._encoders, self._heat = monitor.EncoderMonitor(units.encoder_step, units.force_step, T), Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] over which a speed is taken
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] tick by tick
         self._before: tuple[float, ...] | None = None  # [m] of the STATE before that, where none is missing
-        self._counters, self._record, self._arming = counters, record, arming
-        self._commands, self._clock = monitor.CommandMonitor(config), monitor.ClockMonitor(limits, T)
+        self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
+        self._commands, self._clock = monitor.CommandMonitor(config), monitor.ClockMonitor(limits.watchdog_us, T)
 
     def step(self, state: State, ticks: int, direction: int, now: int) -> tuple[int, ...]:
         """The force [steps] that answers `state`, which came at `now` [us], `ticks` after the one before.
@@ -222,7 +205,7 @@ class Drive:
         if self.x is None:
             ticks = 1  # what went before does not count
         self._clock.check(state, ticks, now)
-        check_range(state.counts, self.units)
+        self.units.check_range(state.counts)
         if self.reference is None:
             self.reference = state.counts if self._rereference else (0,) * state.axes
         x = self.units.positions(map(sub, state.counts, self.reference))
@@ -240,7 +223,7 @@ class Drive:
             self.gain.rise(ticks)
         elif direction < 0:
             self.gain.fall(ticks)
-        shaped = shape(asked, self.force, self.gain.value, self.limits, self.T, test)
+        shaped = self.limits.shape(asked, self.force, self.gain.value, self.T, test)
         force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap)
         if self._budget:
             whole = self._budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)
@@ -257,16 +240,16 @@ class Drive:
     def _check_motion(self, x: tuple[float, ...], ticks: int) -> None:
         """Raise SafetyStop where no hand moves to x (m,) [m] within so many ticks."""
         if self.x is not None:
-            check_jump(x, self.x, ticks, self.limits)
+            self.limits.check_jump(x, self.x, ticks)
             if ticks == 1 and self._before is not None:
-                check_jolt(x, self.x, self._before, self.limits)
+                self.limits.check_jolt(x, self.x, self._before)
         recent = self._recent
         if ticks == 1 or self.x is None:
             recent.append(x)
         else:
             recent.extend(fill(self.x, x, ticks))
         if (since := len(recent) - 1) >= self._window // 2:
-            check_speed(x, recent[0], since * self.T, self.limits)
+            self.limits.check_speed(x, recent[0], since * self.T)
 
     def _miss(self, state: State, positions: list[tuple[float, ...]]) -> None:
         """The controller moves on through ticks of which no STATE came."""

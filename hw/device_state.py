@@ -6,8 +6,6 @@ The same machine as hw/firmware/haptic_link.h, integer for integer and byte for 
 rules are in docs/protocol.md. Forces are in steps, per axis, as tuples.
 """
 
-from collections.abc import Sequence
-
 from hw import protocol as wire
 
 _SLOTS = 16  # forces that wait for their tick: a power of two above MAX_THETA
@@ -77,7 +75,7 @@ class Device:
         else:
             self.phase, self.held = wire.Phase.ARMED, 0
             self.run = min(self.run + 1, self.config.ramp_in)
-            self.applied = limited(self.config, self.run, self.applied, frame.force)
+            self.applied = self.config.limited(self.run, self.applied, frame.force)
 
     def _ramp_down(self) -> None:
         assert self.config is not None
@@ -181,18 +179,6 @@ class Device:
             (0 in config.slew, wire.Refused.SLEW),
         )
         return next((reason for wrong, reason in reasons if wrong), wire.Refused.ACCEPTED)
-
-
-def limited(config: wire.Config, run: int, last: Sequence[int], asked: Sequence[int]) -> tuple[int, ...]:
-    """Forces within the cap, which has grown from zero for `run` forces since arming, and the slew rate of the last."""
-    caps: Sequence[int] = config.cap
-    if run < config.ramp_in:
-        caps = [cap * run // config.ramp_in for cap in caps]
-    forces = []
-    for force, before, cap, slew in zip(asked, last, caps, config.slew, strict=True):
-        capped = max(-cap, min(cap, force))
-        forces.append(before + max(-slew, min(slew, capped - before)))
-    return tuple(forces)
 
 
 def _scaled(value: int, by: int, over: int) -> int:

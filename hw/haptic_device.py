@@ -1,4 +1,4 @@
-"""What a device must be able to do: four calls that a session needs of them, and the loop that makes these calls.
+"""What a device must be able to do: four calls that a session needs of it (`Driver` in hw/session.py makes them).
 
 A device at a serial port (docs/protocol.md) is one implementation, one that the host clocks another
 (hw/force_dimension.py). None of the calls waits for longer than a tick: keys, signals and time-outs
@@ -8,14 +8,10 @@ are looked at between any two.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Protocol
 
 from hw import protocol as wire
-from hw.control import Armable
-from hw.limits import SafetyStop, Stage
-from hw.monitor import Ages
-from hw.session import Said, Session
 
 _RESEND = 0.1  # [s] after which a question is asked again
 _STOPPING = 0.05  # [s] in which a device that was told to stop must rest
@@ -121,7 +117,7 @@ class SerialDevice:
         if isinstance(message, wire.State) and message.drives:
             self.stop(wire.Reason.FAULT)
             if isinstance(question, wire.Config) and now - self._begun > _STOPPING:
-                raise SafetyStop("the device drives, and nobody asked it to")
+                raise wire.SafetyStop("the device drives, and nobody asked it to")
         return message
 
     def _next(self) -> wire.Message | None:
@@ -131,68 +127,3 @@ class SerialDevice:
 
     def _write(self, data: bytes) -> None:
         self.dropped += len(data) - self._port.write(data)
-
-
-class Driver:
-    """Makes the calls for a session, turn by turn."""
-
-    def __init__(
-        self,
-        session: Session,
-        device: HapticDevice,
-        plan: Callable[[Ages], Sequence[Armable]],
-        clock: Callable[[], int],
-    ) -> None:
-        """`plan` gives couplings for the delay that was measured, `clock` the time [us]."""
-        self.session, self.device, self.plan, self.clock = session, device, plan, clock
-        self._force: wire.Force | None = None
-
-    def do(self, said: Said) -> None:
-        """Carry out what the session asks for."""
-        for message in said:
-            if isinstance(message, wire.Force):
-                self._force = message
-            else:
-                self._force = None
-                self.device.stop(wire.Reason(message.reason))
-
-    def turn(self) -> None:
-        """One call of the device, and what the session makes of it."""
-        session = self.session
-        try:
-            self._call(session)
-            session.counters.host_errors = self.device.errors
-            if said := session.poll(self.clock()):
-                self.do(said)
-            if session.stage == Stage.MEASURED:
-                self.load()
-        except PortLost as lost:
-            session.lost(str(lost), self.clock())
-
-    def _call(self, session: Session) -> None:
-        answer: Any
-        if session.stage == Stage.CONNECTING:
-            if (answer := self.device.info()) is not None:
-                self.do(session.met(answer, self.clock()))
-        elif session.stage == Stage.CONFIGURING:
-            assert session.config
-            try:
-                answer = self.device.configure(session.config)
-            except SafetyStop as fault:
-                return self.do(session.fail(str(fault), self.clock()))
-            if answer is not None:
-                self.do(session.configured(answer, self.clock()))
-        else:
-            force, self._force = self._force, None
-            if (state := self.device.exchange(force)) is not None:
-                self.do(session.take(state, self.clock()))
-        return None
-
-    def load(self) -> None:
-        """Couplings for the measured delay, while the device rests at zero force."""
-        session = self.session
-        try:
-            programs = self.plan(session.measurement.result)
-        except SafetyStop as fault:
-            return self.do(session.refuse(str(fault), self.clock()))
-        return self.do(session.load(programs, self.clock()))

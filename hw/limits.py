@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from hw.protocol import MAX_RELEASE_NS, MAX_THETA, PROTOCOL, Config, Force, Info, State, wire_bytes
+from hw.protocol import MAX_RELEASE_NS, MAX_THETA, PROTOCOL, Config, Force, Info, SafetyStop, State, wire_bytes
 from models.device import require
 from sim.scenario import Scenario
 
@@ -45,8 +45,18 @@ ENDED = frozenset({Stage.FINISHED, Stage.REFUSED, Stage.STOPPED, Stage.LOST, Sta
 DRIVING = frozenset({Stage.ARMING, Stage.ARMED, Stage.DISARMING})
 
 
-class SafetyStop(Exception):
-    """A reason to stop, in the words of the log."""
+class _Shaped(NamedTuple):
+    """A force that may be sent, and what had to be done to it."""
+
+    force: tuple[float, ...]  # (m,) [N]
+    clipped: bool  # at the cap, by the limiter or by being cut here
+    slowed: bool  # at the slew limit
+
+
+def _require_finite(force: Sequence[float]) -> None:
+    """Raise SafetyStop where a force is not a number or infinite."""
+    if not all(map(math.isfinite, force)):
+        raise SafetyStop(f"the controller asked for {', '.join(f'{f:g}' for f in force)} N, which is no force")
 
 
 @dataclass(frozen=True)
@@ -78,91 +88,65 @@ class SafetyLimits:
         for i, (most, cap) in enumerate(zip(self.continuous, self.cap, strict=False), start=1):
             require(f"continuous #{i}", most, 1e-3, cap, "N")
 
+    def shape(
+        self,
+        asked: Sequence[float],
+        previous: Sequence[float],
+        gain: float,
+        T: float,
+        test: Sequence[float] | None = None,
+    ) -> _Shaped:
+        """The force to send in place of `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
 
-class _Shaped(NamedTuple):
-    """A force that may be sent, and what had to be done to it."""
+        `test` (m,) [N] is added behind the gain: what an encoder is tested with.
 
-    force: tuple[float, ...]  # (m,) [N]
-    clipped: bool  # at the cap, by the limiter or by being cut here
-    slowed: bool  # at the slew limit
+        Raises SafetyStop where `asked` is not finite; that is looked at first, and the result is looked at again.
+        """
+        _require_finite(asked)
+        if not 0.0 <= gain <= 1.0:
+            raise SafetyStop(f"the gain is {gain}, expected a number within [0, 1]")
+        wishes = [gain * one for one in asked]
+        if test:
+            wishes = [one + more for one, more in zip(wishes, test, strict=True)]
+            _require_finite(wishes)
+        step, clipped, slowed, force = self.slew * T, False, False, []
+        for wanted, last, cap in zip(wishes, previous, self.cap, strict=True):
+            sent = wanted
+            if not -cap < sent < cap:
+                clipped, sent = True, math.copysign(cap, sent)
+            if not last - step <= sent <= last + step:
+                slowed, sent = True, last + math.copysign(step, sent - last)
+            force.append(sent)
+        _require_finite(force)
+        return _Shaped(tuple(force), clipped, slowed)
 
+    def check_jump(self, x: Sequence[float], previous: Sequence[float], ticks: int) -> None:
+        """Raise SafetyStop where an encoder moved further in `ticks` ticks than a hand can: x, previous (m,) [m]."""
+        most = self.jump * ticks
+        for i, (now, before) in enumerate(zip(x, previous, strict=True), start=1):
+            if not abs(now - before) <= most:
+                allowed = f"{1e3 * most:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
+                raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
-def _require_finite(force: Sequence[float]) -> None:
-    """Raise SafetyStop where a force is not a number or infinite."""
-    if not all(map(math.isfinite, force)):
-        raise SafetyStop(f"the controller asked for {', '.join(f'{f:g}' for f in force)} N, which is no force")
+    def check_jolt(self, x: Sequence[float], previous: Sequence[float], before: Sequence[float]) -> None:
+        """Raise SafetyStop where a speed changed within a tick by more than `jump` per tick, as no mass can.
 
+        x, previous, before: (m,) [m], of three ticks in a row.
+        """
+        for i, (now, last, first) in enumerate(zip(x, previous, before, strict=True), start=1):
+            if not (change := abs(now - 2 * last + first)) <= self.jump:
+                most = f"{1e3 * self.jump:g} mm in a tick"
+                raise SafetyStop(
+                    f"encoder {i} shakes: its speed changed by {1e3 * change:.3g} mm in a tick, allowed are {most}"
+                )
 
-def shape(
-    asked: Sequence[float],
-    previous: Sequence[float],
-    gain: float,
-    limits: SafetyLimits,
-    T: float,
-    test: Sequence[float] | None = None,
-) -> _Shaped:
-    """The force to send in place of `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
-
-    `test` (m,) [N] is added behind the gain: what an encoder is tested with.
-
-    Raises SafetyStop where `asked` is not finite; that is looked at first, and the result is looked at again.
-    """
-    _require_finite(asked)
-    if not 0.0 <= gain <= 1.0:
-        raise SafetyStop(f"the gain is {gain}, expected a number within [0, 1]")
-    wishes = [gain * one for one in asked]
-    if test:
-        wishes = [one + more for one, more in zip(wishes, test, strict=True)]
-        _require_finite(wishes)
-    step, clipped, slowed, force = limits.slew * T, False, False, []
-    for wanted, last, cap in zip(wishes, previous, limits.cap, strict=True):
-        sent = wanted
-        if not -cap < sent < cap:
-            clipped, sent = True, math.copysign(cap, sent)
-        if not last - step <= sent <= last + step:
-            slowed, sent = True, last + math.copysign(step, sent - last)
-        force.append(sent)
-    _require_finite(force)
-    return _Shaped(tuple(force), clipped, slowed)
-
-
-def check_jump(x: Sequence[float], previous: Sequence[float], ticks: int, limits: SafetyLimits) -> None:
-    """Raise SafetyStop where an encoder moved further in `ticks` ticks than a hand can: x, previous (m,) [m]."""
-    most = limits.jump * ticks
-    for i, (now, before) in enumerate(zip(x, previous, strict=True), start=1):
-        if not abs(now - before) <= most:
-            allowed = f"{1e3 * most:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
-            raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
-
-
-def check_jolt(x: Sequence[float], previous: Sequence[float], before: Sequence[float], limits: SafetyLimits) -> None:
-    """Raise SafetyStop where a speed changed within a tick by more than `limits.jump` per tick, as no mass can.
-
-    x, previous, before: (m,) [m], of three ticks in a row.
-    """
-    for i, (now, last, first) in enumerate(zip(x, previous, before, strict=True), start=1):
-        if not (change := abs(now - 2 * last + first)) <= limits.jump:
-            most = f"{1e3 * limits.jump:g} mm in a tick"
-            raise SafetyStop(
-                f"encoder {i} shakes: its speed changed by {1e3 * change:.3g} mm in a tick, allowed are {most}"
-            )
-
-
-def check_speed(x: Sequence[float], before: Sequence[float], seconds: float, limits: SafetyLimits) -> None:
-    """Raise SafetyStop where an axis moved faster than allowed: x now, `before` so many `seconds` ago, (m,) [m]."""
-    most = limits.speed * seconds
-    for i, (now, then) in enumerate(zip(x, before, strict=True), start=1):
-        if not abs(now - then) <= most:
-            speed = abs(now - then) / seconds
-            raise SafetyStop(f"axis {i} moves at {speed:.3g} m/s, allowed are {limits.speed:g} m/s while forces act")
-
-
-def check_range(counts: Sequence[int], units: Units) -> None:
-    """Raise SafetyStop where an encoder (m,) [counts] is outside of what the device can reach."""
-    for i, (now, most) in enumerate(zip(counts, units.range, strict=True)):
-        if not -most <= now <= most:
-            mm = 1e3 * units.encoder_step[i]
-            raise SafetyStop(f"encoder {i + 1} is at {mm * now:.4g} mm, its range is +-{mm * most:.4g} mm")
+    def check_speed(self, x: Sequence[float], before: Sequence[float], seconds: float) -> None:
+        """Raise SafetyStop where an axis moved faster than allowed: x now, `before` so many `seconds` ago, (m,) [m]."""
+        most = self.speed * seconds
+        for i, (now, then) in enumerate(zip(x, before, strict=True), start=1):
+            if not abs(now - then) <= most:
+                speed = abs(now - then) / seconds
+                raise SafetyStop(f"axis {i} moves at {speed:.3g} m/s, allowed are {self.speed:g} m/s while forces act")
 
 
 @dataclass
@@ -236,6 +220,13 @@ class Units:
         """What the motors are to do for the forces fed back f (m,) [N]: whole steps, at most `cap`."""
         each = zip(f, self.force_step, cap, strict=True)
         return tuple([max(-most, min(most, round(-force / step))) for force, step, most in each])
+
+    def check_range(self, counts: Sequence[int]) -> None:
+        """Raise SafetyStop where an encoder (m,) [counts] is outside of what the device can reach."""
+        for i, (now, most) in enumerate(zip(counts, self.range, strict=True)):
+            if not -most <= now <= most:
+                mm = 1e3 * self.encoder_step[i]
+                raise SafetyStop(f"encoder {i + 1} is at {mm * now:.4g} mm, its range is +-{mm * most:.4g} mm")
 
 
 def _wire_time(baud: int, axes: int) -> tuple[float, str]:

@@ -14,9 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from hw.device_state import limited
-from hw.limits import DRIVING, SafetyLimits, SafetyStop, Stage
-from hw.protocol import NO_MARGIN, Config, Phase, State, distance
+from hw.protocol import NO_MARGIN, Config, Phase, SafetyStop, State, distance
 
 _STATES_PER_ANSWER = 8  # at most: a USB frame of 1 ms may bring several FORCEs, of which one margin is told
 _MEASURED_TOLERANCE = 0.01  # of the device's clock against T, over the measurement
@@ -282,11 +280,11 @@ class _ClockDrift:
 class ClockMonitor:
     """Both clocks, and the number of the tick, while forces act."""
 
-    def __init__(self, limits: SafetyLimits, T: float) -> None:
+    def __init__(self, watchdog_us: int, T: float) -> None:
         T_us = 1e6 * T
-        self.most = max(1, int(limits.watchdog_us / T_us))  # [ticks] that may be missing at once
-        self._device = _ClockDrift("its own", T_us, _DEVICE_TOLERANCE, limits.watchdog_us)
-        self._host = _ClockDrift("the host's", T_us, _HOST_TOLERANCE, limits.watchdog_us)
+        self.most = max(1, int(watchdog_us / T_us))  # [ticks] that may be missing at once
+        self._device = _ClockDrift("its own", T_us, _DEVICE_TOLERANCE, watchdog_us)
+        self._host = _ClockDrift("the host's", T_us, _HOST_TOLERANCE, watchdog_us)
 
     def check(self, state: State, ticks: int, now: int) -> None:
         """Raise SafetyStop where the STATE that came at `now` [us] cannot be `ticks` after the one before."""
@@ -296,24 +294,7 @@ class ClockMonitor:
         self._host.note(now, ticks)
 
 
-# obedience: the state of the device, and the force that it says it applies
-
-
-def check_state(state: State, config: Config, stage: Stage, gain: float) -> None:
-    """Raise SafetyStop where the device is in a wrong phase, or has a force that cannot have been asked for."""
-    for force, cap in zip(state.applied, config.cap, strict=True):
-        if not -cap <= force <= cap:
-            raise SafetyStop(f"the device applies {state.applied} steps, the cap is {config.cap}")
-    phase = state.phase
-    if phase in (Phase.STOPPED, Phase.RAMP, Phase.SILENT):
-        raise SafetyStop(f"the device is in {phase.name.lower()}, cause {state.cause.name.lower()}")
-    armed = phase in (Phase.ARMED, Phase.HOLDING)
-    if armed and stage not in DRIVING:
-        raise SafetyStop("the device is armed, and nobody asked it to")
-    if not armed and (stage in (Stage.ARMED, Stage.DISARMING) or gain > 0):
-        raise SafetyStop("the device has disarmed itself")
-    if not armed and any(state.applied):
-        raise SafetyStop(f"the device is disarmed and applies {state.applied} steps")
+# obedience: the force that the device says it applies
 
 
 class CommandMonitor:
@@ -364,10 +345,10 @@ class CommandMonitor:
         if told is None:
             return False
         fewest, most = self._run
-        right = limited(self._config, most, last, told)
+        right = self._config.limited(most, last, told)
         if state.applied == right:
             return True
-        other = limited(self._config, fewest, last, told)
+        other = self._config.limited(fewest, last, told)
         return all(
             min(one, two) - _ROUNDING <= force <= max(one, two) + _ROUNDING
             for force, one, two in zip(state.applied, right, other, strict=True)

@@ -9,6 +9,7 @@ COBS costs exactly one byte and the size of a frame does not depend on its conte
 from __future__ import annotations
 
 import operator
+from collections.abc import Sequence
 from enum import IntEnum
 from itertools import chain
 from struct import Struct, error
@@ -81,6 +82,10 @@ class Reason(IntEnum):
     ESTOP = 3
 
 
+class SafetyStop(Exception):
+    """A reason to stop, in the words of the log."""
+
+
 class Hello(NamedTuple):
     """Host to device: who are you?"""
 
@@ -123,6 +128,20 @@ class Config(NamedTuple):
     def due(self) -> int:
         """Ticks after its sample until which a force may come, and after which a STATE shows it."""
         return max(1, self.theta)
+
+    def limited(self, run: int, last: Sequence[int], asked: Sequence[int]) -> tuple[int, ...]:
+        """What the device makes of the forces asked for, after the `last` ones, the `run`-th time since arming [steps].
+
+        They are within the cap, which grows from zero as it is armed, and within the slew rate of the last.
+        """
+        caps: Sequence[int] = self.cap
+        if run < self.ramp_in:
+            caps = [cap * run // self.ramp_in for cap in caps]
+        forces = []
+        for force, before, cap, slew in zip(asked, last, caps, self.slew, strict=True):
+            capped = max(-cap, min(cap, force))
+            forces.append(before + max(-slew, min(slew, capped - before)))
+        return tuple(forces)
 
 
 class Ack(NamedTuple):

@@ -22,12 +22,12 @@ from design.guarantees import guarantee_of
 from design.result import Design, Requirement
 from hw.control import Armable, CertifiedCoupling, certified_coupling, certified_couplings, timed
 from hw.emulator import Emulator, FaultInjection, Line
-from hw.haptic_device import Driver, PortLost, SerialDevice
+from hw.haptic_device import PortLost, SerialDevice
 from hw.limits import ENDED, Stage
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import Phase
 from hw.recording import Recorder, result_of
-from hw.session import Operator, Said, Session, session_for
+from hw.session import Driver, Operator, Said, Session, session_for
 from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from sim.trace import Trace
 

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from hw import protocol as wire
-from hw.control import Armable, BudgetPlan, Drive, SentBudget, TraceRow
+from hw.control import Armable, Arming, BudgetPlan, Drive, SentBudget, TraceRow
+from hw.haptic_device import HapticDevice, PortLost
 from hw.limits import (
     DRIVING,
     ENDED,
     SafetyLimits,
-    SafetyStop,
     Stage,
     Units,
     configuration,
@@ -27,7 +27,7 @@ from hw.limits import (
     probe_delay,
     watchdog_for,
 )
-from hw.monitor import Counters, LinkMonitor, LinkSettings, Measurement, check_state
+from hw.monitor import Ages, Counters, LinkMonitor, LinkSettings, Measurement
 from sim.scenario import InputError, Scenario
 
 _PATIENCE_US = 2_000_000  # after which a question is given up
@@ -71,8 +71,7 @@ class Session:
         self.programs: tuple[Armable, ...] = ()
         self.program: Armable | None = None
         self.drive: Drive | None = None  # the coupling at work, from one arming to the next end
-        self.armings: list[tuple[Armable, wire.Config]] = []  # what forces came from, arming by arming
-        self.budgets: list[SentBudget] = []  # arming by arming, where the settings ask for one
+        self.armings: list[Arming] = []
         self.record: Callable[[TraceRow], None] = lambda row: None
         self.listen: Callable[[_Event], None] = lambda event: None
         self.missed_while_driving = 0  # ticks
@@ -142,30 +141,18 @@ class Session:
         elif self.stage == Stage.DISARMED:
             assert self.program
             assert self.config
-            self.drive = Drive(
-                self.program.controller(self.limits.cap),
-                self.units,
-                self.config,
-                self.limits,
-                self.settings,
-                self.counters,
-                self.record,
-                len(self.armings),
-                self._fresh_budget(),
-            )
-            self.armings.append((self.program, self.config))
+            arming = Arming(len(self.armings), self.program, self.config, self._fresh_budget(self.config))
+            self.armings.append(arming)
+            self.drive = Drive(arming, self.units, self.limits, self.settings, self.counters, self.record)
             self._enter(Stage.ARMING, "asked to")
         return ()
 
-    def _fresh_budget(self) -> SentBudget | None:
+    def _fresh_budget(self, config: wire.Config) -> SentBudget | None:
         if self.settings.energy_budget is None:
             return None
-        assert self.config
         scenario = self.scenario
         longest = max(scenario.T_max or 0.0, 1e-6 * self.measurement.result.longest_tick(1e6 * scenario.T))
-        plan = BudgetPlan.of(*self.settings.energy_budget, scenario.delta, self.units, self.config, longest)
-        self.budgets.append(SentBudget(plan))
-        return self.budgets[-1]
+        return SentBudget(BudgetPlan.of(*self.settings.energy_budget, scenario.delta, self.units, config, longest))
 
     def stop(self, cause: str, now: int) -> Said:
         """The planned end: by a ramp where forces act, at once where none do."""
@@ -215,7 +202,7 @@ class Session:
         self.now = now
         try:
             return understand(heard)
-        except SafetyStop as fault:
+        except wire.SafetyStop as fault:
             return self.fail(str(fault), now)
         except Exception as error:  # whatever it is: first the force to zero, then the explanation
             return self.fail(f"{type(error).__name__} in the bridge: {error}", now)
@@ -283,7 +270,7 @@ class Session:
         if state.phase == wire.Phase.ESTOP:
             return self.estop(f"pressed, {state.cause.name.lower()}", self.now)
         assert self.config is not None
-        check_state(state, self.config, self.stage, self.gain)
+        _check_state(state, self.config, self.stage, self.gain)
         if self.stage in DRIVING:
             ended = () if self.held else self.stop("the deadman at the device was let go", self.now)
             return ended or self._on_driving(state, ticks)
@@ -328,7 +315,7 @@ class Session:
         try:
             if not self.measurement.note(state, self.link.margin, self.link.missed):
                 return self._answer(state, wire.Command.IDLE)
-        except SafetyStop as fault:
+        except wire.SafetyStop as fault:
             return self._end(Stage.REFUSED, str(fault))
         ages = self.measurement.result
         self._enter(Stage.MEASURED, f"{len(ages.values)} answers, median age {ages.median} us")
@@ -366,6 +353,23 @@ class Session:
         self._shutdown = _Shutdown(reason, bool(self.armings), self.now, self.scenario.T)
         self._enter(stage, cause)
         return (wire.Stop(reason),)
+
+
+def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: float) -> None:
+    """Raise SafetyStop where the device is in a wrong phase, or has a force that cannot have been asked for."""
+    for force, cap in zip(state.applied, config.cap, strict=True):
+        if not -cap <= force <= cap:
+            raise wire.SafetyStop(f"the device applies {state.applied} steps, the cap is {config.cap}")
+    phase = state.phase
+    if phase in (wire.Phase.STOPPED, wire.Phase.RAMP, wire.Phase.SILENT):
+        raise wire.SafetyStop(f"the device is in {phase.name.lower()}, cause {state.cause.name.lower()}")
+    armed = phase in (wire.Phase.ARMED, wire.Phase.HOLDING)
+    if armed and stage not in DRIVING:
+        raise wire.SafetyStop("the device is armed, and nobody asked it to")
+    if not armed and (stage in (Stage.ARMED, Stage.DISARMING) or gain > 0):
+        raise wire.SafetyStop("the device has disarmed itself")
+    if not armed and any(state.applied):
+        raise wire.SafetyStop(f"the device is disarmed and applies {state.applied} steps")
 
 
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
@@ -462,3 +466,68 @@ class Operator:
             return session.refuse(f"nobody to arm the softer coupling, {softer}", now)
         self._asked = True
         return session.arm(now)
+
+
+class Driver:
+    """Makes the calls for a session, turn by turn."""
+
+    def __init__(
+        self,
+        session: Session,
+        device: HapticDevice,
+        plan: Callable[[Ages], Sequence[Armable]],
+        clock: Callable[[], int],
+    ) -> None:
+        """`plan` gives couplings for the delay that was measured, `clock` the time [us]."""
+        self.session, self.device, self.plan, self.clock = session, device, plan, clock
+        self._force: wire.Force | None = None
+
+    def do(self, said: Said) -> None:
+        """Carry out what the session asks for."""
+        for message in said:
+            if isinstance(message, wire.Force):
+                self._force = message
+            else:
+                self._force = None
+                self.device.stop(wire.Reason(message.reason))
+
+    def turn(self) -> None:
+        """One call of the device, and what the session makes of it."""
+        session = self.session
+        try:
+            self._call(session)
+            session.counters.host_errors = self.device.errors
+            if said := session.poll(self.clock()):
+                self.do(said)
+            if session.stage == Stage.MEASURED:
+                self.load()
+        except PortLost as lost:
+            session.lost(str(lost), self.clock())
+
+    def _call(self, session: Session) -> None:
+        answer: Any
+        if session.stage == Stage.CONNECTING:
+            if (answer := self.device.info()) is not None:
+                self.do(session.met(answer, self.clock()))
+        elif session.stage == Stage.CONFIGURING:
+            assert session.config
+            try:
+                answer = self.device.configure(session.config)
+            except wire.SafetyStop as fault:
+                return self.do(session.fail(str(fault), self.clock()))
+            if answer is not None:
+                self.do(session.configured(answer, self.clock()))
+        else:
+            force, self._force = self._force, None
+            if (state := self.device.exchange(force)) is not None:
+                self.do(session.take(state, self.clock()))
+        return None
+
+    def load(self) -> None:
+        """Couplings for the measured delay, while the device rests at zero force."""
+        session = self.session
+        try:
+            programs = self.plan(session.measurement.result)
+        except wire.SafetyStop as fault:
+            return self.do(session.refuse(str(fault), self.clock()))
+        return self.do(session.load(programs, self.clock()))

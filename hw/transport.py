@@ -17,10 +17,11 @@ from contextlib import contextmanager, suppress
 from typing import Self
 
 from hw.control import Armable
-from hw.haptic_device import Driver, HapticDevice, PortLost
-from hw.limits import ENDED, SafetyStop, Stage
+from hw.haptic_device import HapticDevice, PortLost
+from hw.limits import ENDED, Stage
 from hw.monitor import Ages
-from hw.session import Operator, Session
+from hw.protocol import SafetyStop
+from hw.session import Driver, Operator, Session
 from sim.scenario import InputError
 
 _CHUNK = 4096  # bytes read at once; a tick brings a few dozen
@@ -108,7 +109,6 @@ def _stalls() -> str:
 
 def _scheduling() -> str:
     with suppress(OSError):
-        # the dashboard and other children do without
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(10))
     policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
     if policy in (os.SCHED_FIFO, os.SCHED_RR):
@@ -162,15 +162,13 @@ class Live(Driver):
         session: Session,
         device: HapticDevice,
         plan: Callable[[Ages], Sequence[Armable]],
-        auto_arm: bool,
-        seconds: float,
+        operator: Operator,
         keyboard: int | None = None,  # a file descriptor with single keys
         glance: Callable[[Session], None] = lambda session: None,  # called a few times a second
         pace: float = 1.0,  # seconds of the session per second; 1 with any real device
-        deadman: Callable[[], bool] | None = None,  # whether the user gave a sign since the last call
     ) -> None:
-        super().__init__(session, device, plan, lambda: int(time.monotonic_ns() * pace) // 1000)
-        self._operator = Operator(auto_arm, seconds, deadman)
+        super().__init__(session, device, self._designed, lambda: int(time.monotonic_ns() * pace) // 1000)
+        self._design, self._operator = plan, operator
         self._keyboard, self._glance = keyboard, glance
         self.signals: list[int] = []
         self._glanced = 0
@@ -215,22 +213,20 @@ class Live(Driver):
             self._glanced = now
             self._glance(session)
 
-    def load(self) -> None:
+    def _designed(self, ages: Ages) -> Sequence[Armable]:
         """A design may be interrupted, and what was typed meanwhile is read before its coupling can be armed."""
         self._glance(self.session)  # for it takes a while
         try:
             with _interruptible():
-                programs = self.plan(self.session.measurement.result)
-        except SafetyStop as fault:
-            return self.do(self.session.refuse(str(fault), self.clock()))
+                programs = self._design(ages)
         except KeyboardInterrupt:
             self.signals.append(signal.SIGINT)
-            return self.do(self.session.refuse("SIGINT during the design", self.clock()))
+            raise SafetyStop("SIGINT during the design") from None
         if self._typed():
             self._pressed()
         gc.collect()  # the solver is loaded now
         gc.freeze()
-        return self.do(self.session.load(programs, self.clock()))
+        return programs
 
     def _typed(self) -> bool:
         return self._keyboard is not None and bool(select.select([self._keyboard], [], [], 0)[0])

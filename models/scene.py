@@ -46,7 +46,7 @@ _Array = NDArray[np.floating[Any]]
 #: MuJoCo's friction constraint creeps while it sticks; this hard it stops a 0.25 kg device within 1.5e-6 m of where
 #: Coulomb's law does, and creeps at 1e-7 m/s under half its force (MuJoCo's defaults: 7e-5 m and 6e-4 m/s)
 _STICK, _HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
-FILES = Path(__file__).parent  # of the devices
+_FILES = Path(__file__).parent  # of the devices
 APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] between devices, between the bodies of one, and above the rail
 DRAWN = "drawn transmission"
 _SKY: dict[str, Any] = {"name": "sky", "width": 32, "height": 192, "rgb1": [0.93] * 3, "rgb2": [0.93] * 3}
@@ -103,7 +103,7 @@ def build(devices: Sequence[Device], humans: Sequence[Hand], persons: Sequence[P
 
 
 def plant(model: mujoco.MjModel) -> Plant:
-    """The linear plant that `model` simulates: its mass, damping, stiffness and actuation matrices, no friction.
+    """The linear plant that `model` simulates: its mass, damping, stiffness and _actuation matrices, no friction.
 
     With the humans' impedances, which MuJoCo itself leaves out.
     """
@@ -113,12 +113,12 @@ def plant(model: mujoco.MjModel) -> Plant:
     mujoco.mj_forward(model, data)
     mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
-    across = tendon_jacobian(model)
+    across = _tendon_jacobian(model)
     stiffness = np.diag(model.jnt_stiffness.astype(float)) + across.T * model.tendon_stiffness @ across
     damping = np.diag(model.dof_damping) + across.T * model.tendon_damping @ across
     inverse = np.linalg.inv(mass)
     return _plant(
-        lambda matrix: inverse @ matrix, stiffness, damping, actuation(model), _motors(model), _impedances(model)
+        lambda matrix: inverse @ matrix, stiffness, damping, _actuation(model), _motors(model), _impedances(model)
     )
 
 
@@ -193,7 +193,7 @@ def from_mjcf(xml: str, handle: str = "handle", pull: str | None = None) -> Port
     for j, b in enumerate(model.jnt_bodyid):
         slides[j, point[int(b)]] = 1.0
         slides[j, point[int(model.body_weldid[model.body_parentid[b]])]] = -1.0
-    across = np.vstack([slides, tendon_jacobian(model) @ slides])
+    across = np.vstack([slides, _tendon_jacobian(model) @ slides])
     damping = np.concatenate([model.dof_damping, model.tendon_damping])
     stiffness = np.concatenate([model.jnt_stiffness, model.tendon_stiffness])
     labels = [*(model.joint(j).name for j in range(model.njnt)), *(model.tendon(t).name for t in range(model.ntendon))]
@@ -229,7 +229,7 @@ def _check_linear(model: mujoco.MjModel, data: mujoco.MjData) -> None:
             raise ValueError(f"MJCF of a hand: it has {what}, expected masses, springs and dampers along x, at rest")
 
 
-def tendon_jacobian(model: mujoco.MjModel) -> _Array:
+def _tendon_jacobian(model: mujoco.MjModel) -> _Array:
     """How each tendon lengthens when a joint moves, shape (tendons, n)."""
     import mujoco
 
@@ -242,11 +242,11 @@ def tendon_jacobian(model: mujoco.MjModel) -> _Array:
     return rows
 
 
-def actuation(model: mujoco.MjModel) -> _Array:
+def _actuation(model: mujoco.MjModel) -> _Array:
     """Force on each joint per unit of each input, shape (n, outside + m)."""
     import mujoco
 
-    columns, across = np.zeros((model.nv, model.nu)), tendon_jacobian(model)
+    columns, across = np.zeros((model.nv, model.nu)), _tendon_jacobian(model)
     for a in range(model.nu):
         target, gain = model.actuator_trnid[a, 0], model.actuator_gear[a, 0] * model.actuator_gainprm[a, 0]
         if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:
@@ -426,7 +426,7 @@ def _file(name: str) -> mujoco.MjSpec:
     """A device's file as the scene takes it: without actuators, which have an order there."""
     import mujoco
 
-    spec = mujoco.MjSpec.from_file(str(FILES / f"{name}.xml"))
+    spec = mujoco.MjSpec.from_file(str(_FILES / f"{name}.xml"))
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     return spec
@@ -583,7 +583,7 @@ class Variants:
     def plants(self) -> Plant:
         """All plants at once, A (nsim, 2n, 2n) and B (nsim, 2n, inputs): the same matrices as of each one's model."""
         model = self.scene.model
-        across, mass = tendon_jacobian(model), self.fields["body_mass"][:, model.jnt_bodyid]
+        across, mass = _tendon_jacobian(model), self.fields["body_mass"][:, model.jnt_bodyid]
 
         def matrix(joint: str, tendon: str) -> _Array:
             between = across.T * self.fields[tendon][:, None, :] @ across
@@ -591,7 +591,7 @@ class Variants:
 
         K, D = matrix("jnt_stiffness", "tendon_stiffness"), matrix("dof_damping", "tendon_damping")
         return _plant(
-            lambda matrix: matrix / mass[:, :, None], K, D, actuation(model), self.scene.channels, self.impedances
+            lambda matrix: matrix / mass[:, :, None], K, D, _actuation(model), self.scene.channels, self.impedances
         )
 
 

@@ -15,10 +15,10 @@ it does not need.
 
 from __future__ import annotations
 
+import os
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
-
-from sim.mujoco_gl import set_aside
 
 if TYPE_CHECKING:
     from sim.api import simulate, validate
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from sim.plots import plot_run
     from sim.scenario import InputError, Scenario, load, parse
     from sim.trace import Trace
-
-set_aside()
 
 __all__ = ["Findings", "InputError", "Scenario", "Trace", "load", "parse", "plot_run", "simulate", "validate"]
 
@@ -38,6 +36,22 @@ _HOMES = {
     "plot_run": "sim.plots",
     "Trace": "sim.trace",
 }
+
+
+def _command_starts() -> bool:
+    """Whether this process is one of our commands that Python is still looking for."""
+    words = sys.orig_argv
+    module = words[words.index("-m") + 1] if "-m" in words[:-1] else ""
+    if sys.argv[:1] == ["-m"]:
+        return module.split(".")[0] in ("design", "sim", "hw", "cli")
+    started = sys.argv[0] if sys.argv else ""
+    return os.path.basename(started) == "haptic-loop" or started.endswith(os.path.join("cli", "__main__.py"))
+
+
+# MuJoCo cannot be imported where what MUJOCO_GL names is not there, and no command of ours draws by it; a script's own
+# MuJoCo keeps what it was given
+if _command_starts():
+    os.environ.pop("MUJOCO_GL", None)
 
 
 def __getattr__(name: str) -> Any:

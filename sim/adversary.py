@@ -12,21 +12,18 @@ with long delays bind). Closer than that no search has succeeded, and just outsi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from controller.coupling import Coupling, NoCoupling
 from controller.lti import Array, Lti
-from design.environments import THIS_ENVIRONMENT
 from models.human import Hand, Person
 from models.scene import Crowd, HumanSets, variants
-from sim.couplings import choose
 from sim.run import Progress
-from sim.scenario import Scenario, load
+from sim.scenario import Scenario
 from sim.stability import ClosedLoop, dominant_mode, exact_loops
 
 if TYPE_CHECKING:
@@ -153,38 +150,6 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
     return ranked
 
 
-@dataclass(frozen=True)
-class _Attack:
-    """A search against a loop placed short of its required damping."""
-
-    name: str
-    short: float  # share of the required damping that is missing
-    worst: Worst
-
-
-def attempts(
-    loops: dict[str, tuple[Scenario, Coupling]],
-    shortages: Array,
-    seed: int = 0,
-    generations: int = 150,
-    attempted: Callable[[_Attack], None] = lambda attempt: None,
-) -> list[_Attack]:
-    """_Attack every loop at every shortage: devices get (1 - short) times the damping that `this_environment` requires.
-
-    A negative shortage gives the devices more than required: there the search must fail. `attempted` is called
-    with each.
-    """
-    rows = []
-    for name, (scenario, coupling) in loops.items():
-        loop = scenario.loop("I")  # the reference does not matter
-        F, required = loop.F(coupling), np.array(THIS_ENVIRONMENT.required(loop, coupling).required)
-        for short in shortages:
-            placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
-            rows.append(_Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))
-            attempted(rows[-1])
-    return rows
-
-
 def _ladders(x: Array, channels: int, kind: _Pass) -> Crowd:
     """Logs of masses and stiffnesses, (2 channels links, nsim), as lossless humans.
 
@@ -223,47 +188,3 @@ def _worst(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets, evaluated: int)
     mode = dominant_mode(_loops(scenario, F, crowd))
     radius, growth, frequency = (float(a[0]) for a in (mode.spectral_radius, mode.growth, mode.frequency_hz))
     return Worst(crowd.humans(0), crowd.persons(0), radius, growth, frequency, evaluated)
-
-
-# ----------------------------------------------------------------------------------------------------
-# How tight the condition is.
-
-
-@dataclass(frozen=True)
-class Shortage:
-    """Whether a passive human destabilises a loop whose devices lack a share of the damping that is required."""
-
-    loop: str
-    short: float
-    found: bool
-    growth_rate_per_s: float
-    frequency_hz: float
-    held_together: bool  # by one person
-    evaluated: int
-
-    @property
-    def holds(self) -> bool:
-        """Whether the row is as the theory says: with the required damping no human makes the loop unstable."""
-        return self.short > 0 or not self.found
-
-
-def shortages(
-    couplings: Sequence[str], short: Sequence[float], generations: int, **changes: Any
-) -> Callable[[int], Iterator[Shortage]]:
-    """From a seed: the search against the default loop with these couplings, by name, at these shortages.
-
-    Where it succeeds close to the required damping, the condition is tight.
-    """
-
-    def rows(seed: int) -> Iterator[Shortage]:
-        scenario = load().replace(**changes)
-        for name in couplings:
-            coupling = NoCoupling() if name == "none" else choose(scenario, "I", name).coupling
-            loop = {"no coupling" if name == "none" else f"{name}, case I": (scenario, coupling)}
-            for share in short:
-                (attempt,) = attempts(loop, np.array([share]), seed, generations)
-                worst, found = attempt.worst, (attempt.worst.destabilises, attempt.worst.growth)
-                about = worst.frequency_hz, bool(worst.persons), worst.evaluated
-                yield Shortage(attempt.name, attempt.short, *found, *about)
-
-    return rows

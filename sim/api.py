@@ -15,6 +15,7 @@ from design.files import plain
 from design.result import Design
 from sim.accuracy import EngineChoice, compare_engines, pick
 from sim.couplings import given, limits_of
+from sim.engines import Engine
 from sim.mujoco_engines import INTEGRATORS
 from sim.passivity_layer import EnergyNet, Plugged, Wanted, netted
 from sim.run import ENGINES, AnyEngine, Progress, Simulation, assemble, engine_name, make_engine, run
@@ -152,7 +153,7 @@ def simulate(
         "limiter": plain(limits),
         "stability": None if scenario.switches or environment else plain(stability_of(done.simulation, trace)),
         "remarks": done.remarks,
-        "energy_budget": trace.net.part() if trace.net else None,
+        "energy_budget": plain(trace.net.figures()) if trace.net else None,
     }
     return replace(trace, meta=meta)
 
@@ -162,7 +163,7 @@ def validate(
     coupling: Coupling | Design | None = None,
     humans: int = 1000,
     seed: int = 0,
-    engine: str = "both",
+    engine: str | Callable[[Simulation], Engine] = "both",
     duration: float = 2.0,
     shards: int = 1,
     progress: Progress = lambda done, total: None,
@@ -171,8 +172,9 @@ def validate(
     """Let `humans` random passive humans (one per device each time) hold the devices, without voluntary motion.
 
     They are drawn from `scenario.population`; number i depends on `seed` and i alone. `engine` is "exact", "mujoco" or
-    "both"; `duration` [s] of the traces, 0 for none (then growth rates are those of the period maps alone); `shards`
-    local processes (a script that asks for more than 1 needs `if __name__ == "__main__"`); `progress` is
+    "both", or a class of your own (sim.engines.Engine), of which one is made for each set of humans and compared with
+    the exact one; `duration` [s] of the traces, 0 for none (then growth rates are those of the period maps alone);
+    `shards` local processes (a script that asks for more than 1 needs `if __name__ == "__main__"`); `progress` is
     called with the parts done and all of them; `limiter` as of `simulate`.
 
     Returns Findings, n = humans: `exact` and `mujoco` (n,) growth rates [1/s], positive where a human makes the loop
@@ -191,7 +193,8 @@ def validate(
     require_linear(scenario, "validate", walls=True)
     humans, seed = whole("humans", humans, 1, _MOST_HUMANS), whole("seed", seed, 0)
     shards = whole("shards", shards, 1)
-    one_of("engine", engine, crowds.ENGINES)
+    if not callable(engine):
+        one_of("engine", engine, crowds.ENGINES)
     duration = number("duration", duration, "a number of seconds")
     if not (duration == 0 or duration >= 4 * scenario.T):
         raise InputError(f"duration is {duration:g}, allowed are 0 and {4 * scenario.T:g} s or more")

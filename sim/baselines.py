@@ -123,7 +123,7 @@ def _judged(
     # of the force within its limits: what acted, whatever computed it
     error = force_error(with_net, trace, scenario.loop(case).lam)
     apart = _apart(trace.f, error.ideal) if not scenario.environment.walls else None
-    part = trace.net.part() if trace.net else {"limited_ticks": 0}
+    acted = trace.net.figures().limited_ticks if trace.net else 0
     moving, fastest = _left_alone(with_net)
     name, guarantee, source = (net.name, net.guarantee, net.source) if net else ("none, clipped", None, None)
     if design:
@@ -137,7 +137,7 @@ def _judged(
         apart,
         _fast(trace.f, scenario.T),
         float(np.abs(trace.f).max(initial=0.0)),
-        100 * part["limited_ticks"] / max(1, len(trace.t)),
+        100 * acted / max(1, len(trace.t)),
         moving,
         fastest,
         "walls have no linear ideal to compare with" if apart is None else None,

@@ -13,6 +13,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,9 @@ from controller.timing import Timing
 from models.hold import hold
 from models.human import Population
 from models.scene import Crowd, HumanSets, Variants, variants
-from sim.engines import ExactEngine
-from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine
-from sim.run import Simulation, assemble
+from sim.engines import Engine, ExactEngine, OneByOne
+from sim.mujoco_engines import EXPONENTIAL, LEAST, MujocoBatchEngine
+from sim.run import Simulation, assemble, engine_name, make_engine
 from sim.scenario import Scenario
 from sim.stability import (
     Balance,
@@ -42,6 +43,7 @@ from sim.stability import (
     impulse_test,
     mujoco_loops,
 )
+from sim.step_choice import simulated_growth
 from sim.switching import Switched, switched_crowd
 
 ENGINES = ("exact", "mujoco", "both")
@@ -117,7 +119,7 @@ class Validation:
     seed: int
     humans: int
     links: int
-    engine: str  # exact | mujoco | both
+    engine: str | Callable[[Simulation], Engine]  # exact | mujoco | both, or what makes one of a user's own
     duration: float  # [s] of the traces; 0 for none
     threads: int = 0  # of MuJoCo; 0 for all
     environments: tuple[Member, ...] = ()  # that the humans are spread over; empty: all meet the scenario's own
@@ -145,7 +147,7 @@ class Validation:
             self.seed,
             self.humans,
             self.links,
-            self.engine,
+            self.engine if isinstance(self.engine, str) else engine_name(self.engine),
             self.ticks,
             self.environments,
             self.lag,
@@ -177,8 +179,8 @@ class Findings:
     radius: Array  # (n,) spectral radius of the exact loop
     exact: Array  # (n,) [1/s] growth, exact loop
     frequency: Array  # (n,) [Hz] of that mode
-    mujoco: Array  # (n,) [1/s] growth, MuJoCo's period map
-    trace: Array  # (n,) [1/s] growth on MuJoCo's trace, or on the exact one where MuJoCo is not asked
+    mujoco: Array  # (n,) [1/s] growth, the period map of MuJoCo, or of a user's own engine
+    trace: Array  # (n,) [1/s] growth on its trace, or on the exact one where no other is asked
     clipped: NDArray[np.int64]  # (n,) ticks with a force at its limit, on that trace
     energy: Array  # (n,) [J] least W(N) on the exact trace
     audited: Array  # (n,) [J] magnitudes that W adds up
@@ -241,15 +243,21 @@ def _group(
     loops = exact_loops(held_by, simulation.F, late=late)
     frozen = [replace(simulation.process, law=Law(F)) for F in simulation.process.law.frozen().values()]
     mode = Mode.worst([dominant_mode(exact_loops(held_by, process.F, late=late)) for process in frozen])
-    if validation.engine != "exact":
+    other: _Other | None = None
+    if not isinstance(validation.engine, str):
+        each = [simulation.held_by(crowd.humans(i), crowd.persons(i)) for i in range(len(crowd))]
+        make = validation.engine
+        mujoco = np.array([simulated_growth(one, None, None, make) for one in each])
+        other = lambda integrator, timing: OneByOne([make_engine(one, make) for one in each])  # noqa: E731
+    elif validation.engine != "exact":
         maps = (mujoco_loops(held_by, process, nthread=validation.threads, late=late) for process in frozen)
         mujoco = Mode.worst([dominant_mode(loop) for loop in maps]).growth
-    exact, last = _tests(validation, simulation, held_by, loops, ticked) if validation.ticks else (None, None)
+        other = partial(_batch, held_by, scenario.T, validation.threads)
+    exact, last = _tests(validation, simulation, held_by, loops, other, ticked) if validation.ticks else (None, None)
     switched = Switched(nowhere, nowhere)
     if scenario.switches or scenario.uneven:
-        with_mujoco = validation.engine != "exact" and validation.ticks > 0
-        asked = (validation.seed, validation.duration, with_mujoco, validation.threads)
-        switched = switched_crowd(simulation, held_by, index, *asked)
+        also = partial(other, "RK4") if other and validation.ticks else None
+        switched = switched_crowd(simulation, held_by, index, validation.seed, validation.duration, also)
     return Findings(
         index=index,
         radius=mode.spectral_radius,
@@ -270,6 +278,13 @@ def _group(
     )
 
 
+_Other = Callable[[str, Timing | None], Engine]  # MuJoCo's integrator, timing -> what is compared with the exact engine
+
+
+def _batch(held_by: Variants, T: float, threads: int, integrator: str, timing: Timing | None) -> Engine:
+    return MujocoBatchEngine(held_by, T, integrator, 1 if integrator == EXPONENTIAL else LEAST, threads, timing)
+
+
 def _geometric_mean(values: Array) -> Array:
     """Over the channels, (n, channels) -> (n,); 0 where one of them is."""
     with np.errstate(divide="ignore"):
@@ -281,9 +296,10 @@ def _tests(
     simulation: Simulation,
     held_by: Variants,
     loops: ClosedLoop,
+    other: _Other | None,
     ticked: Callable[[int], None],
 ) -> tuple[ImpulseTest, ImpulseTest]:
-    """The exact engine's impulse test, which costs next to nothing, and MuJoCo's, or again the first.
+    """The exact engine's impulse test, which costs next to nothing, and the other's, or again the first.
 
     In even periods, with forces that latch in the middle of their range: what their spread does is `switched_crowd`'s.
     """
@@ -292,9 +308,7 @@ def _tests(
     settings = held_by.scene, loops, Balance.of(held_by, simulation.loop, late), validation.ticks
     engine = ExactEngine(hold(held_by.plants(), T, late))
     exact = impulse_test(process, engine, *settings)
-    if validation.engine == "exact":
+    if not other:
         return exact, exact
-    threads, n = validation.threads, len(held_by)
     timing = Timing(np.array([T]), np.array([late])) if late else None
-    engine = MujocoBatchEngine(held_by.scene, T, EXPONENTIAL, 1, n, threads, held_by, timing)
-    return exact, impulse_test(process, engine, *settings, ticked)
+    return exact, impulse_test(process, other(EXPONENTIAL, timing), *settings, ticked)

@@ -10,7 +10,8 @@ forces that the actuators hold are the last entries of the plant's state.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Protocol
 
@@ -83,6 +84,33 @@ class ExactEngine(_Exact):
                     product(now, then)
 
         return stretch
+
+
+class OneByOne:
+    """An engine for each simulation of a buffer, as one engine of all."""
+
+    def __init__(self, engines: Sequence[Engine]) -> None:
+        self._engines = engines
+
+    def start(self, buffer: StepBuffer) -> None:
+        process = replace(buffer.process, delays=None, net=None)  # which stand before the forces of a row
+        shape = buffer.ticks, buffer.s.shape[1], buffer.w.shape[1]
+        self._all, self._each = buffer, [StepBuffer(process, *shape) for _ in self._engines]
+        for j, (engine, own) in enumerate(zip(self._engines, self._each, strict=True)):
+            own.calm = False
+            own.s[0] = buffer.s[0, :, j : j + 1]
+            engine.start(own)
+        self._moves = [engine.advance for engine in self._engines]
+
+    def advance(self, k: int, /) -> None:
+        row, state = self._all.plant_row[k], self._all.plant_state[k + 1]
+        for j, (own, move) in enumerate(zip(self._each, self._moves, strict=True)):
+            own.plant_row[k][:, 0] = row[:, j]
+            move(k)
+            state[:, j] = own.plant_state[k + 1][:, 0]
+
+    def troubled(self) -> bool:
+        return any(engine.troubled() for engine in self._engines)
 
 
 class ExactTimedEngine(_Exact):

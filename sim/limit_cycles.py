@@ -313,7 +313,7 @@ def _simulate(
         buffer.z[0] = starts[n:]
     seen, kept, done = list(_motors_and_handles(scene)), [], 0
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
-        engine = MujocoBatchEngine(scene, T, substeps=substeps, nsim=len(trials), humans=held_by, timing=timing)
+        engine = MujocoBatchEngine(held_by, T, substeps=substeps, timing=timing)
         engine.start(buffer)
         while done < ticks:
             count = min(buffer.ticks, ticks - done)

@@ -205,7 +205,7 @@ class MujocoEngine:
     ) -> None:
         import mujoco
 
-        self.model = discretised(scene, T, integrator, substeps)
+        self.model = _discretised(scene, T, integrator, substeps)
         self.data = mujoco.MjData(self.model)
         self._warnings = self.data.warning.number
         self.stretch: Stretch | None = None
@@ -292,7 +292,7 @@ class MujocoEngine:
 
 
 class MujocoBatchEngine:
-    """All simulations of a buffer in one mujoco.batch.Batch.
+    """All simulations of a buffer in one mujoco.batch.Batch: one for every set of humans.
 
     Steps are those of MujocoEngine for each one, bit for bit; the exponential integrator's products are summed in
     another order, so they differ by rounding.
@@ -300,36 +300,31 @@ class MujocoBatchEngine:
 
     def __init__(
         self,
-        scene: Scene,
+        held_by: Variants,
         T: float,
         integrator: str = "RK4",
         substeps: int = 4,
-        nsim: int = 1,
         nthread: int = 0,
-        humans: Variants | None = None,
         timing: Timing | None = None,
     ) -> None:
-        """With `humans` every simulation has its own, nsim of them."""
         import mujoco
         from mujoco.batch import Batch
 
-        model = discretised(scene, T, integrator, substeps)
-        self.batch = batch = Batch(model, nsim, nthread)
-        for name, rows in (humans.fields if humans else {}).items():
+        model = _discretised(held_by.scene, T, integrator, substeps)
+        self.batch = batch = Batch(model, len(held_by), nthread)
+        for name, rows in held_by.fields.items():
             batch.expand(name)[...] = rows
-        if humans:
-            batch.set_const()
+        batch.set_const()
         parts, before = mujoco.mjtState, int(mujoco.mjtState.mjSTATE_TIME)
         moved = before | int(parts.mjSTATE_QPOS) | int(parts.mjSTATE_QVEL)
         time, motion = (mujoco.mj_stateSize(model, part) for part in (before, moved))
 
         # Runge-Kutta asks for no matrix of bodies alone
-        asked = humans and (integrator == EXPONENTIAL or humans.impedances)
-        plants = _stacked(humans.plants() if humans and asked else scene.plant)
+        asked = integrator == EXPONENTIAL or held_by.impedances
+        plants = held_by.plants() if asked else _stacked(held_by.scene.plant)
 
         def move(h: float) -> Product:
-            moves = exponential_step(plants.A, h, model.nv, plants.felt)
-            return product_of(moves if humans else moves[0])
+            return _product_of_each(exponential_step(plants.A, h, model.nv, plants.felt))
 
         self.advance: Callable[[int], None]  # from `start` on
         self._timing = timing
@@ -377,13 +372,17 @@ def _kicks(plants: Plant) -> Callable[[float], Product] | None:
 
     @cache
     def kick(h: float) -> Product:
-        step = expm_each(h * felt)
-        return product_of(step if len(step) > 1 else step[0])
+        return _product_of_each(expm_each(h * felt))
 
     return kick
 
 
-def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
+def _product_of_each(steps: Array) -> Product:
+    """Of a stack of matrices with as many states, one for all where it is the only one."""
+    return product_of(steps if len(steps) > 1 else steps[0])
+
+
+def _discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
     """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T."""
     import mujoco
 

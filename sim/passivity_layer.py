@@ -1,6 +1,6 @@
 """Passivity layers under a simulated controller: the energy budget, and the classics that it is compared with.
 
-    traced = run(netted(simulation, EnergyNet(0.01)), "exact").net.part()
+    traced = run(netted(simulation, EnergyNet(0.01)), "exact").net.figures()
 
 With a net, Theta is no part of a tick's block: the forces of G = (I + Psi E V)^-1 Psi E go through the net, then
 through a line that holds them, constant delays or not. The budget and energy bounding stand before the line, and see
@@ -16,7 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from controller.budget import EPS, EnergyBounding, EnergyBudget, PassivityControl, Shell
+from controller.budget import (
+    EPS,
+    BudgetFigures,
+    EnergyBounding,
+    EnergyBudget,
+    NetFigures,
+    Packets,
+    PassivityControl,
+    Shell,
+    ShellFigures,
+)
 from controller.delay import LOST, Ticks, ages
 from controller.lti import Array
 from controller.tick import Net, Process
@@ -36,6 +46,14 @@ BASELINES = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class BaselineFigures(NetFigures):
+    """What one of the classics has done."""
+
+    name: str
+    what: str
+
+
 @dataclass(frozen=True)
 class EnergyNet:
     """The energy budget as a run is asked for it."""
@@ -48,23 +66,21 @@ class EnergyNet:
     @property
     def guarantee(self) -> str:
         """In one line."""
-        given = f"more than {self.start:g} J" if self.start else "any energy"
-        return f"no passive hand is given {given} beyond what the devices dissipate, whatever computes the forces"
+        return f"no passive hand is given {_more_than(self.start)}, whatever computes the forces"
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
         """A fresh one."""
         assert process.delays is not None
         loop, lost = simulation.loop, bool((process.delays == LOST).any())
         hold, span = _HELD if lost else 0, loop.delays
-        given: dict[str, Any] = {"eps": EPS, "start": self.start, "cap": self.cap, "nsim": nsim, "hold": hold}
-        given["encoder_step"] = process.encoder_step
-        longest = loop.T_max or loop.T  # the most that a held force can lose grows with the period
+        packets, longest = Packets(span.lo, span.hi, hold), loop.T_max or loop.T  # a longer tick may lose more
+        given: dict[str, Any] = {"start": self.start, "cap": self.cap, "nsim": nsim}
         try:
-            budget = EnergyBudget(loop.delta, longest, span.lo, span.hi, **given)
+            budget = EnergyBudget(loop.delta, longest, packets, encoder_step=process.encoder_step, **given)
         except ValueError as error:
             raise InputError(f"energy budget: {error}") from None
         late = ages(process.delays) if lost else None
-        return _Budgeted(budget, self, process, late, np.array(span.hi) + hold)
+        return _Budgeted(budget, self.guarantee, process, late, np.array(span.hi) + hold)
 
 
 @dataclass(frozen=True)
@@ -83,9 +99,9 @@ class Classic:
         """A fresh one."""
         delta, T = np.array(simulation.loop.delta), simulation.loop.T
         if self.name == "eba":
-            return _Bounded(EnergyBounding(delta, T, nsim=nsim), self.name, process)
+            return _Baseline(EnergyBounding(delta, T, nsim=nsim), self.name, process, False)
         credit = delta if self.name.endswith(":delta") else None
-        return _Damped(PassivityControl(len(delta), T, delta=credit, nsim=nsim), self.name, process)
+        return _Baseline(PassivityControl(len(delta), T, delta=credit, nsim=nsim), self.name, process, True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +119,10 @@ class Plugged:
         if (process.encoder_step > 0).any():
             raise ValueError("an environment of your own needs ideal encoders: no shell is known for coarse ones")
         return _Shelled(Shell(V, start=self.start, nsim=nsim), self, process)
+
+
+def _more_than(start: float) -> str:
+    return f"{f'more than {start:g} J' if start else 'any energy'} beyond what the devices dissipate"
 
 
 Wanted = EnergyNet | Classic | Plugged
@@ -126,11 +146,11 @@ def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> 
     return replace(simulation, process=replace(process, net=make))
 
 
-def idle(simulation: Simulation, any_environment: Requirement, part: dict[str, Any]) -> str | None:
+def idle(simulation: Simulation, any_environment: Requirement, budget: BudgetFigures) -> str | None:
     """Why the budget never acts in this run from rest; None where it may, or where no proof says so."""
     scenario = simulation.scenario
     if (
-        part["cap_J"] is not None
+        budget.cap_J is not None
         or any(scenario.psi)
         or scenario.switches
         or (simulation.process.encoder_step > 0).any()
@@ -159,10 +179,10 @@ class _Budgeted(_InLoop):
     """The budget; behind it devices that let go of a force that is too old."""
 
     def __init__(
-        self, budget: EnergyBudget, asked: EnergyNet, process: Process, late: Ticks | None, oldest: Array
+        self, budget: EnergyBudget, guarantee: str, process: Process, late: Ticks | None, oldest: Array
     ) -> None:
         super().__init__(process)
-        self._budget, self._asked, self._late, self._oldest = budget, asked, late, oldest[:, None]
+        self._budget, self._guarantee, self._late, self._oldest = budget, guarantee, late, oldest[:, None]
         self._acted: Array | None = None
         self._dropped = 0
 
@@ -176,21 +196,8 @@ class _Budgeted(_InLoop):
             force[gone] = 0.0
         self._acted = force.copy()
 
-    def part(self) -> dict[str, Any]:
-        budget, cap = self._budget, self._asked.cap
-        return {
-            "start_J": self._asked.start,
-            "cap_J": cap if np.isfinite(cap) else None,
-            "eps": EPS,
-            "guarantee": self._asked.guarantee,
-            "ticks": budget.ticks,
-            "limited_ticks": int(budget.limited.max()),
-            "smallest_scale": float(budget.least.min()),
-            "energy_J": float(budget.energy.min()),
-            "reserved_J": float(budget.reserved.max()),
-            "dropped_ticks": self._dropped,
-            "surprises": budget.surprises,
-        }
+    def figures(self) -> BudgetFigures:
+        return replace(self._budget.figures(self._guarantee), dropped_ticks=self._dropped)
 
 
 class _Shelled(_InLoop):
@@ -208,62 +215,26 @@ class _Shelled(_InLoop):
     def apply(self, k: int, force: Array, /) -> None:
         pass
 
-    def part(self) -> dict[str, Any]:
-        shell, start = self._shell, self._asked.start
-        given = f"more than {start:g} J" if start else "any energy"
-        return {
-            "start_J": start,
-            "cap_J": None,
-            "guarantee": f"behind a coupling certified for any environment, no passive hand is given {given} "
-            "beyond what the devices dissipate, whatever computes the force",
-            "ticks": shell.ticks,
-            "limited_ticks": int(shell.limited.max()),
-            "smallest_scale": float(shell.least.min()),
-            "energy_J": float(shell.energy.min()),
-        }
+    def figures(self) -> ShellFigures:
+        given = f"no passive hand is given {_more_than(self._asked.start)}, whatever computes the force"
+        return self._shell.figures(f"behind a coupling certified for any environment, {given}")
 
 
-class _Bounded(_InLoop):
-    """Energy bounding, at the computer."""
+class _Baseline(_InLoop):
+    """One of the classics: energy bounding at the computer, or the passivity controller at the devices."""
 
-    def __init__(self, bounding: EnergyBounding, name: str, process: Process) -> None:
+    def __init__(self, net: PassivityControl | EnergyBounding, name: str, process: Process, at_device: bool) -> None:
         super().__init__(process)
-        self._net, self._name = bounding, name
-
-    def send(self, x: Array, force: Array, /) -> None:
-        force[...] = self._net.limit(self._within(force), self._moved(x))
-
-    def apply(self, k: int, force: Array, /) -> None:
-        pass
-
-    def part(self) -> dict[str, Any]:
-        return _classic_part(self._name, self._net)
-
-
-class _Damped(_InLoop):
-    """The passivity controller, at the devices."""
-
-    def __init__(self, control: PassivityControl, name: str, process: Process) -> None:
-        super().__init__(process)
-        self._net, self._name = control, name
+        self._net, self._name, self._at_device = net, name, at_device
         self._dx: Array = np.zeros(())
 
     def send(self, x: Array, force: Array, /) -> None:
-        self._dx = self._moved(x)
-        force[...] = self._within(force)
+        self._dx, within = self._moved(x), self._within(force)
+        force[...] = within if self._at_device else self._net.limit(within, self._dx)
 
     def apply(self, k: int, force: Array, /) -> None:
-        force[...] = self._net.limit(force, self._dx)
+        if self._at_device:
+            force[...] = self._net.limit(force, self._dx)
 
-    def part(self) -> dict[str, Any]:
-        return _classic_part(self._name, self._net)
-
-
-def _classic_part(name: str, net: PassivityControl | EnergyBounding) -> dict[str, Any]:
-    return {
-        "name": name,
-        "what": BASELINES[name],
-        "guarantee": None,
-        "ticks": net.ticks,
-        "limited_ticks": int(net.limited.max()),
-    }
+    def figures(self) -> BaselineFigures:
+        return BaselineFigures(**vars(self._net.figures()), name=self._name, what=BASELINES[self._name])

@@ -28,7 +28,6 @@ from sim.trace import Trace
 if TYPE_CHECKING:  # whose figures are drawn
     from design.compare import Limit, Sweep
     from sim.accuracy import Row
-    from sim.adversary import Shortage
     from sim.baselines import Baselines
     from sim.compare_report import Comparison, LimitCurves
 
@@ -430,26 +429,6 @@ def plot_population(mass: Array, damping: Array, growth: Array, path: Path, titl
     axes[0, 0].set_ylabel("growth rate [1/s]")
     _plain_numbers(axes)
     _legend(figure, _entries(axes[0, 0]), 2)
-    return save(figure, path)
-
-
-def plot_tightness(rows: Sequence[Shortage], path: Path) -> Path:
-    """Growth rate with the first destabilising human found, over the share of the required damping that was missing."""
-    figure, axes = _panels("", 1, 1, (7, 4.2))
-    axis = axes[0, 0]
-    for name, style in zip(dict.fromkeys(row.loop for row in rows), STYLES, strict=False):
-        mine = [row for row in rows if row.loop == name]
-        points = [(100 * row.short, row.growth_rate_per_s if row.found else 0.0) for row in mine]
-        axis.plot(*zip(*points, strict=True), label=name, **style)
-        for row, point in zip(mine, points, strict=True):
-            axis.plot(*point, "^" if row.found else "o", color=style["color"])
-    axis.plot([], [], "k^", label="unstable with the human found")
-    axis.plot([], [], "ko", label="no such human found")
-    axis.set(
-        xlabel="damping missing of what the condition for this environment requires [%]",
-        ylabel="growth with the first human found [1/s]",
-    )
-    axis.legend()
     return save(figure, path)
 
 

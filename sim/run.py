@@ -27,6 +27,7 @@ from controller.tick import Net, Process, StepBuffer
 from controller.timing import Timing
 from design.own import called
 from models.hold import HeldPlant, hold
+from models.human import Hand, Person
 from models.scene import Scene, build
 from sim.engines import Engine, ExactEngine, ExactTimedEngine
 from sim.mujoco_engines import EXPONENTIAL, LEAST, MujocoEngine, default_integrator, profiler_off, quiet_warnings
@@ -36,7 +37,7 @@ from sim.trace import Trace
 ENGINES = ("mujoco", "exact")
 AnyEngine = str | Engine | Callable[["Simulation"], Engine]  # a name, one of a user's own, or what makes it
 
-Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the hands (ticks, outside) [N]
+_Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the hands (ticks, outside) [N]
 _AfterBlock = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
 Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 
@@ -87,6 +88,14 @@ class Simulation:
         scenario = self.scenario.replace(device=devices)
         return replace(self, scenario=scenario, scene=build(devices, scenario.human, scenario.person))
 
+    def held_by(self, humans: tuple[Hand, ...], persons: tuple[Person, ...]) -> Simulation:
+        """The same in the hands of others, who do not move by themselves."""
+        scene = build(self.scenario.device, humans, persons)
+        scenario = msgspec.structs.replace(self.scenario, human=humans, person=persons)
+        return replace(
+            self, scenario=scenario, scene=scene, plant=hold(scene.plant, scenario.T, scenario.usual_latency)
+        )
+
     @property
     def even(self) -> Simulation:
         """The same in periods T, with forces that latch at ticks: what integrators and their steps are judged on."""
@@ -119,7 +128,7 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
 def run(
     simulation: Simulation,
     engine: AnyEngine = "mujoco",
-    outside: Outside | None = None,
+    outside: _Outside | None = None,
     ticks: int | None = None,
     start: Array | None = None,
     progress: Progress = lambda done, ticks: None,
@@ -212,7 +221,7 @@ def _free_memory() -> float:
 def run_blocks(
     process: Process,
     engine: Engine,
-    outside: Outside,
+    outside: _Outside,
     ticks: int,
     start: Array,
     each_block: _AfterBlock,
@@ -265,7 +274,7 @@ def beginnings(T: float, timing: Timing | None, first: int, ticks: int) -> Array
 def outside_forces(
     scenario: Scenario, scene: Scene, first: int, ticks: int, voluntary: bool = True, timing: Timing | None = None
 ) -> Array:
-    """Outside forces [N] at ticks first .. first + ticks - 1, sampled as they begin, shape (ticks, outside).
+    """_Outside forces [N] at ticks first .. first + ticks - 1, sampled as they begin, shape (ticks, outside).
 
     The voluntary motion reaches the end of each human, the tap reaches one handle.
     """

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
+from controller.budget import BudgetFigures
 from controller.lti import Array
 from design.files import unseen
 from design.guarantees import ANY, CAVEATS, MAKING, EncoderSteps
@@ -15,7 +15,7 @@ from sim import accuracy
 from sim.alternatives import Alternative
 from sim.api import ScenarioRun
 from sim.judged import Judged
-from sim.passivity_layer import idle
+from sim.passivity_layer import BaselineFigures, idle
 from sim.report import (
     PaperRow,
     UnevenTicks,
@@ -71,8 +71,8 @@ class RunReport:
     error: accuracy.PositionError
     credible: accuracy.Credible
     ideal_force: accuracy.ForceError
-    energy_budget: dict[str, Any] | None
-    baseline: dict[str, Any] | None
+    energy_budget: BudgetFigures | None
+    baseline: BaselineFigures | None
     nearby: Nearby = unseen("beside", default=Nearby())
     alternatives: list[Alternative] = field(default_factory=list)
     reproducibility: tuple[PaperRow, ...]
@@ -134,8 +134,8 @@ def run_report(
         grows = stability.verdict == "unstable"
     else:
         stability = stability_of(simulation, trace)
-    net = trace.net.part() if trace.net else None
-    budget, any_environment = net if net and net["guarantee"] else None, judged.requirements["any-environment"]
+    net = trace.net.figures() if trace.net else None
+    budget = net if isinstance(net, BudgetFigures) else None
     felt = transparency(simulation.felt, simulation.E, loop.lam, band_hz)
     found = RunReport(
         case=case,
@@ -150,8 +150,8 @@ def run_report(
         error=accuracy.position_error(trace, run.exact, simulation, grows),
         credible=accuracy.credible(simulation, trace),
         ideal_force=accuracy.force_error(run.ran, trace, loop.lam),
-        energy_budget=budget and budget | {"idle": idle(simulation, any_environment, budget)},
-        baseline=None if budget else net,
+        energy_budget=budget and replace(budget, idle=idle(simulation, judged.requirements["any-environment"], budget)),
+        baseline=net if isinstance(net, BaselineFigures) else None,
         reproducibility=beside_the_paper(simulation.scenario, case, stability, judged.coupling),
         remarks=(*run.remarks, *chosen.notes),
     )

@@ -150,7 +150,7 @@ def mujoco_loops(
     buffer.s[0], buffer.f[0] = basis[:n], basis[n:]
     with profiler_off(), quiet_warnings():
         each = variants.repeated(n + m)
-        engine = MujocoBatchEngine(variants.scene, T, integrator, substeps, nsim * (n + m), nthread, each, timing)
+        engine = MujocoBatchEngine(each, T, integrator, substeps, nthread, timing)
         engine.start(buffer)
         engine.advance(0)
     columns = buffer.s[1].reshape(n, nsim, n + m).transpose(1, 0, 2) / unit

@@ -12,7 +12,7 @@ worst period found: a proof of instability where it exceeds 1.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
@@ -24,13 +24,13 @@ from controller.delay import LOST, Ticks, VaryingDelay, realising
 from controller.loop import DelayRange
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
+from controller.timing import Timing
 from design.coverage import Switching
 from design.files import unseen
 from design.result import Chosen, switching_guarantee
 from models.hold import HeldPlant, hold
 from models.scene import Scene, Variants
 from sim.engines import Engine, ExactEngine, ExactTimedEngine
-from sim.mujoco_engines import MujocoBatchEngine
 from sim.run import Simulation
 from sim.scenario import Scenario
 from sim.stability import impulse_forces, impulse_growth
@@ -186,7 +186,7 @@ class Switched:
     """Growth [1/s] of the handles' speeds after an impulse, (nsim,) each."""
 
     exact: Array  # of the linear loop
-    mujoco: Array  # of MuJoCo's; nan where it was not asked for, or a force reached its limit
+    mujoco: Array  # of the other engine's; nan where it was not asked for, or a force reached its limit
 
 
 def switched_crowd(
@@ -195,10 +195,11 @@ def switched_crowd(
     index: NDArray[np.intp],
     seed: int,
     duration: float,
-    mujoco: bool,
-    threads: int = 0,
+    other: Callable[[Timing | None], Engine] | None,
 ) -> Switched:
     """The impulse test for every set of humans, under the delays of its index: of (seed, index) and the loop only.
+
+    `other` makes the engine that is compared with the exact one.
 
     Periods that vary and forces that latch late are the same for all of them, of the seed only.
     """
@@ -215,10 +216,9 @@ def switched_crowd(
         else:
             moved = ExactEngine(plants)
         exact, _ = impulse_growth(process.unlimited, moved, scene, states, ticks, nsim)
-        if not mujoco:
+        if not other:
             return Switched(exact, np.full(nsim, np.nan))
-        engine = MujocoBatchEngine(scene, scenario.T, nsim=nsim, nthread=threads, humans=held_by, timing=timing)
-        own, clipped = impulse_growth(process, engine, scene, states, ticks, nsim)
+        own, clipped = impulse_growth(process, other(timing), scene, states, ticks, nsim)
         return Switched(exact, np.where(clipped, np.nan, own))
 
     ticks = round(max(duration, _SHORTEST_CROWD) / scenario.T)

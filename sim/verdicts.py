@@ -15,6 +15,7 @@ from design.result import finite
 from models.human import Human
 from sim.adversary import Worst
 from sim.crowds import Findings, Validation
+from sim.run import engine_name
 from sim.stability import unstable
 
 _SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be slower in its last quarter than before
@@ -27,9 +28,20 @@ class Unstable:
 
     exact: int
     mujoco: int | None
+    own: int | None = unseen("given", None)  # by an engine of the user's own
+    others: str = unseen("no", "")
+
+    @classmethod
+    def of(cls, question: Validation, exact: int, other: int | None) -> Unstable:
+        """`other` is the count of the engine that the question compares with the exact one."""
+        if other is None or question.engine == "exact":
+            return cls(exact, None)
+        if isinstance(question.engine, str):
+            return cls(exact, other, others=f"{other} MuJoCo")
+        return cls(exact, None, other, f"{other} {engine_name(question.engine)}")
 
     def __str__(self) -> str:
-        return f"{self.exact} exact" + ("" if self.mujoco is None else f", {self.mujoco} MuJoCo")
+        return ", ".join(filter(None, (f"{self.exact} exact", self.others)))
 
 
 @dataclass(frozen=True)
@@ -178,17 +190,17 @@ class Growing(Generic[_Met]):
     holds: bool = unseen()
 
     @classmethod
-    def of(cls, findings: Findings, met: _Met, covered: bool) -> Growing[_Met]:
+    def of(cls, question: Validation, findings: Findings, met: _Met, covered: bool) -> Growing[_Met]:
         exact, mujoco = findings.switching, findings.switching_mujoco
         seen, mujoco = ~np.isnan(exact), mujoco[~np.isnan(mujoco)]
-        grow = Unstable(int((exact > 0).sum()), int((mujoco > 0).sum()) if mujoco.size else None)
+        grow = Unstable.of(question, int((exact > 0).sum()), int((mujoco > 0).sum()) if mujoco.size else None)
         worst = int(np.nanargmax(exact)) if seen.any() else None
         figures = (None, None) if worst is None else (float(exact[worst]), int(findings.index[worst]))
         return cls(met, covered, grow, int(seen.sum()), mujoco.size, *figures, not (covered and grow.exact))
 
     def row(self, what: str) -> tuple[str, str | None]:
-        mujoco, growth = self.unstable.mujoco, self.largest_growth_per_s
-        also = "" if mujoco is None else f", MuJoCo {mujoco} of {self.mujoco_unclipped} unclipped"
+        others, growth = self.unstable.others, self.largest_growth_per_s
+        also = f", {others} of {self.mujoco_unclipped} unclipped" if others else ""
         worst = "" if growth is None else f"; worst {growth:+.4g} 1/s (index {self.worst_index})"
         grow = f"{self.unstable.exact} of {self.humans} exact{also}{worst}"
         return f"grow while {what} vary", grow if self.humans else None

@@ -23,11 +23,10 @@ from numpy.typing import NDArray
 from controller import environment
 from controller.arithmetic import SingularLoop
 from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
-from controller.delay import delay
 from controller.law import Law
 from controller.limiter import Limiter
 from controller.loop import Loop
-from controller.lti import Array, Complex, Lti, Sampled, as_like
+from controller.lti import Array, Lti
 from controller.tick import Process
 from design import conditions
 from design.audit import check_loop, edge
@@ -59,13 +58,8 @@ class _Sweep:
 
     def _ratios(self, loop: Loop, coupling: Coupling) -> Array:
         """this-environment's ratios, (n,), of a loop and a coupling of which one is a stack."""
-        theta = delay(loop.theta, loop.T)
-
-        def at(z: Complex) -> Sampled:
-            G = loop.sent_at(coupling, z)
-            return as_like(G, theta) @ G
-
-        return conditions.this_environment_ratios(at, loop.F(coupling).poles(), loop)
+        poles = loop.F(coupling).poles()
+        return conditions.this_environment_ratios(lambda z: loop.late(loop.sent_at(coupling, z)), poles, loop)
 
     def _limits(self, devices: Sequence[Device]) -> tuple[Array, Array]:
         """Force limits [N] and encoder steps [m], (m,) each."""
@@ -166,7 +160,7 @@ class CouplingSweep(_Sweep):
         if condition == "this-environment":
             states = [conditions.this_environment(s.F(coupling), loop) for s in self._states]
             return max(states, key=lambda requirement: requirement.ratio)
-        return ANY_ENVIRONMENT.required(loop, coupling, self.multiplier[0])
+        return ANY_ENVIRONMENT.judge(loop, coupling, self.multiplier[0])
 
     def _coupling(self, K: float, B: float) -> SpringDamper:
         return SpringDamper([K] * self.loop.channels, [B] * self.loop.channels, self.cutoff)

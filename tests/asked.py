@@ -30,8 +30,8 @@ def this_environment(F, delta, T_max=None, latency=None):
     return conditions.this_environment(F, loop(F.T, delta, T_max=T_max, latency=latency))
 
 
-def any_environment_demand(V, theta, delta, T_max=None):
-    return conditions.any_environment_demand(V, loop(V.T, delta, theta, T_max=T_max))
+def any_environment_demand(V, theta, delta, T_max=None, phi=None):
+    return conditions.any_environment_demand(V, loop(V.T, delta, theta, T_max=T_max), phi)
 
 
 def any_environment(V, theta, delta, T_max=None):
@@ -40,14 +40,6 @@ def any_environment(V, theta, delta, T_max=None):
 
 def any_environment_per_channel(V, theta, delta):
     return conditions.any_environment_per_channel(V, loop(V[0].T, delta, theta))
-
-
-def delayed_demand(V, theta, delta, phi):
-    return conditions.delayed_demand(V, loop(V.T, delta, theta), phi)
-
-
-def delayed_coupling_demand(V, theta, phi, delta):
-    return conditions.delayed_coupling_demand(V, loop(V.T, delta, theta), phi)
 
 
 def walls_demand(G, delta, slopes, g, lam=None):

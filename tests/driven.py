@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.tick import Process, StepBuffer
+from models.scene import Scene, Variants
 from sim.engines import Engine
-from sim.run import Outside, run_blocks
+from sim.run import _Outside, run_blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +20,7 @@ class Driven:
 
 
 def driven(
-    process: Process, engine: Engine, outside: Outside, ticks: int, start: np.ndarray, last: int | None = None
+    process: Process, engine: Engine, outside: _Outside, ticks: int, start: np.ndarray, last: int | None = None
 ) -> Driven:
     """Close the loop from the plant states `start`, (2n, nsim); only the blocks of the last ticks are kept."""
     kept = []
@@ -80,3 +81,9 @@ def growing(steps: np.ndarray, energy: np.ndarray, mean: int | None, rng: np.ran
         if k == ticks // 10:
             early = log.copy()
     return int((log > early + np.log(100)).sum())
+
+
+def alike(scene: Scene, count: int) -> Variants:
+    """So many copies of one scene, as a batch takes them."""
+    names = ("body_mass", "jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping")
+    return Variants(scene, {name: np.tile(getattr(scene.model, name), (count, 1)) for name in names})

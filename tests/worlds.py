@@ -6,8 +6,18 @@ import numpy as np
 
 from controller.coupling import ForceFilter, InternalModel, SpringDamper
 from controller.delay import delay
-from controller.environment import FIGURE_4, Network, Spring
+from controller.environment import Network, Spring
 from controller.loop import Loop
+
+#: Figure 4 as we read it: contact 1 -(K1, B1)- M -(K2, B2)- contact 2, the mass free.
+FIGURE_4 = Network(
+    contacts=("contact 1", "contact 2"),
+    springs=(
+        Spring(("contact 1", "mass"), stiffness=800.0, damping=1.0),
+        Spring(("mass", "contact 2"), stiffness=700.0, damping=1.0),
+    ),
+    masses={"mass": 1.0},
+)
 
 T = 1.2e-3  # [s]
 DELTA = (1.37, 1.37)  # [N s/m]

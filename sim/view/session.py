@@ -1,6 +1,6 @@
-"""The running loop behind the window: a clock, keys, pushes and the mouse go in, frames come out. It knows no display.
+"""The running loop behind the window: keys, scripts, the mouse and a clock go in, frames come out. It knows no display.
 
-When the coupling or a delay is changed while the loop runs, the plant goes on from where it is, position and velocity.
+When the coupling or a delay is _changed while the loop runs, the plant goes on from where it is, position and velocity.
 The new process begins at rest with the devices held where they are, z = A z + B x: its delay lines hold the
 force F(1) x, and nothing starts with a step in x. The force changes to what the new coupling makes of that
 position; what the environment's masses had of motion is lost.
@@ -13,6 +13,8 @@ such hand: it comes too late, and sets a certified loop in motion by itself.
 
 from __future__ import annotations
 
+import math
+import re
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
@@ -20,20 +22,210 @@ from queue import Empty, SimpleQueue
 import numpy as np
 
 from controller.arithmetic import SingularLoop
+from controller.coupling import Coupling
 from controller.lti import Array
 from controller.tick import StepBuffer
-from design.result import DesignFailed
+from design.certificate import assess
+from design.coverage import Limits
+from design.designs import KINDS
+from design.guarantees import guarantee_of
+from design.result import Chosen, DesignFailed, Requirement
 from models.hold import HeldPlant, hold
 from models.scene import Plant, Scene
+from sim.couplings import NAMES, choose, limits_of
 from sim.engines import ExactEngine
-from sim.run import outside_forces, run_block
-from sim.scenario import InputError
-from sim.view.events import Couple, Delay, Event, PreparedLoop, Push, Restart, Script, changed, words
+from sim.run import Simulation, assemble, outside_forces, run_block
+from sim.scenario import LONGEST_DELAY, InputError, Scenario
+from sim.stability import Mode, worst_mode
+
+# ----------------------------------------------------------------------------------------------------
+# What may happen to a running loop, by a key or by a script.
+
+
+#: what a user calls a coupling -> what sim.couplings calls it
+COUPLINGS = {"designed" if name == "spring-damper" else name: name for name in NAMES}
+#: the other way round: a user may say it as the other commands do
+LABELS = {kind: label for label, kind in COUPLINGS.items()}
+GIVEN = "given"  # the coupling of --coupling FILE.json
+_STRONGEST = 100.0  # [N] a push
+
+
+@dataclass(frozen=True)
+class Couple:
+    """Another coupling, made for the delays as they are now."""
+
+    name: str  # one of COUPLINGS, or GIVEN
+
+
+@dataclass(frozen=True)
+class _Delay:
+    """More or fewer samples of delay on every channel; the coupling stays as it is."""
+
+    which: str  # theta or psi
+    samples: int
+
+
+@dataclass(frozen=True)
+class _Push:
+    """A force on a handle, until the next one."""
+
+    channel: int  # counted from 1
+    force: float  # [N]
+
+
+@dataclass(frozen=True)
+class _Restart:
+    """The plant and the process from rest."""
+
+
+_Event = Couple | _Delay | _Push | _Restart
+
+#: GLFW's key codes, left free by the viewer itself: 0 to 5 and the letters show and hide parts of the scene
+KEYS: dict[int, tuple[str, _Event]] = {
+    ord("6"): ("6", Couple("none")),
+    ord("7"): ("7", Couple("published")),
+    ord("8"): ("8", Couple("designed")),
+    ord("9"): ("9", Couple("optimal")),
+    260: ("Insert", Couple(GIVEN)),
+    265: ("Up", _Delay("theta", 1)),
+    264: ("Down", _Delay("theta", -1)),
+    268: ("Home", _Delay("psi", 1)),
+    269: ("End", _Delay("psi", -1)),
+    259: ("Backspace", _Restart()),
+}
+
+Script = tuple[tuple[float, _Event], ...]  # (time [s], event), in order of time
+
+
+def parse_script(text: str, channels: int) -> Script:
+    """'0:none 5:designed 7:theta+1 8:push1=3' as events in order of time. Raises InputError."""
+    script = []
+    for entry in text.split():
+        when, colon, what = entry.partition(":")
+        time = _number(when)
+        if not colon or not 0 <= time <= 3600:
+            raise InputError(f"--script: {entry!r}, expected SECONDS:EVENT with 0 to 3600 s")
+        script.append((time, _event(entry, what, channels)))
+    if not script:
+        raise InputError("--script is empty, expected entries like 0:none 5:designed")
+    return tuple(sorted(script, key=lambda item: item[0]))
+
+
+def words(event: _Event) -> str:
+    """The event as a script spells it."""
+    match event:
+        case Couple(name):
+            return name
+        case _Delay(which, samples):
+            return f"{which}{samples:+d}"
+        case _Push(channel, force):
+            return f"push{channel}={force:g}"
+        case _Restart():
+            return "restart"
+
+
+def _event(entry: str, what: str, channels: int) -> _Event:
+    if (label := LABELS.get(what, what)) in (*COUPLINGS, GIVEN):
+        return Couple(label)
+    if what == "restart":
+        return _Restart()
+    if delay := re.fullmatch(r"(theta|psi)([+-]\d{1,4})", what):
+        return _Delay(delay[1], int(delay[2]))
+    if push := re.fullmatch(r"push(\d{1,3})=([+-]?[\d.]+)", what):
+        channel, force = int(push[1]), _number(push[2])
+        if 1 <= channel <= channels and abs(force) <= _STRONGEST:
+            return _Push(channel, force)
+        raise InputError(f"--script: {entry!r}, allowed are push1 to push{channels} with up to {_STRONGEST:g} N")
+    allowed = ", ".join((*COUPLINGS, GIVEN, "theta+1", "theta-1", "psi+1", "psi-1", "push1=3", "restart"))
+    raise InputError(f"--script: {entry!r} is no event, allowed are {allowed}")
+
+
+def _number(text: str) -> float:
+    """What the text says, infinite where it is no number: that is never allowed."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.inf
+
+
+# ----------------------------------------------------------------------------------------------------
+# A loop ready to be entered while another one runs: what a key asks for, with its growth rate and certificates.
+
+
+@dataclass(frozen=True)
+class Menu:
+    """What the keys choose from."""
+
+    case: str
+    condition: str | None = None  # what a coupling is designed for, by default its own
+    given: str | None = None  # the file of --coupling
+    limiter: bool | None = None  # False: forces are clipped
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedLoop:
+    """A loop, and what can be said of it before it runs."""
+
+    menu: Menu
+    label: str  # as the user calls the coupling
+    chosen: Chosen
+    simulation: Simulation
+    mode: Mode  # of the exact linear loop; before walls, of the worst contact state
+    requirements: dict[str, Requirement]
+    guarantee: str | None
+    limits: Limits
+
+    @property
+    def scenario(self) -> Scenario:
+        return self.simulation.scenario
+
+    @property
+    def coupling(self) -> Coupling:
+        return self.chosen.coupling
+
+
+def first_loop(menu: Menu, scenario: Scenario, label: str) -> PreparedLoop:
+    """The loop to begin with. Raises InputError, DesignFailed or SingularLoop."""
+    return _prepare(menu, scenario, label, _choose(menu, scenario, label))
+
+
+def _changed(prepared: PreparedLoop, event: Couple | _Delay) -> PreparedLoop:
+    """The loop after an event. Raises InputError, DesignFailed or SingularLoop; the old loop can go on."""
+    if isinstance(event, Couple):
+        chosen = _choose(prepared.menu, prepared.scenario, event.name)
+        return _prepare(prepared.menu, prepared.scenario, event.name, chosen)
+    delays = tuple(n + event.samples for n in getattr(prepared.scenario, event.which))
+    if not 0 <= min(delays) <= max(delays) <= LONGEST_DELAY:
+        raise InputError(f"{event.which} would be {list(delays)}, allowed are 0 to {LONGEST_DELAY} samples")
+    scenario = prepared.scenario.replace(None, **{event.which: delays})
+    return _prepare(prepared.menu, scenario, prepared.label, prepared.chosen)
+
+
+def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
+    if label == GIVEN:
+        if menu.given is None:
+            raise InputError("there is no coupling from a file (start with --coupling FILE.json)")
+        return choose(scenario, menu.case, menu.given)
+    name = COUPLINGS[label]
+    return choose(scenario, menu.case, name, menu.condition if name in KINDS else None, menu.limiter)
+
+
+def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> PreparedLoop:
+    loop = scenario.loop(menu.case)
+    requirements = assess(loop, chosen.coupling, chosen.phi)
+    limits = limits_of(scenario, chosen, requirements, menu.limiter)
+    simulation, guarantee = assemble(scenario, chosen.coupling, limits.rho), guarantee_of(requirements, loop)
+    return PreparedLoop(menu, label, chosen, simulation, worst_mode(simulation), requirements, guarantee, limits)
+
+
+# ----------------------------------------------------------------------------------------------------
+# The session.
+
 
 HISTORY = 4.0  # [s] of forces that are kept for the picture
 _STRETCH = 64  # ticks between two looks at what is due
 LONGEST_LAG = 0.1  # [s] what a window may make up in one go; more is dropped and counted
-STIFFNESS, DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand: as firm as the hands of the default scenario
+_STIFFNESS, _DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand: as firm as the hands of the default scenario
 
 
 @dataclass
@@ -74,20 +266,20 @@ class Grip:
     @property
     def pull(self) -> float:
         """Force [N] of the hand on a handle that rests at 0."""
-        return STIFFNESS * self.target
+        return _STIFFNESS * self.target
 
     def force(self, scene: Scene, s: Array) -> float:
         """Force [N] of the hand on the handle in the plant state s, positions and velocities."""
         joint, n = scene.handles[self.channel], scene.model.nq
-        return self.pull - STIFFNESS * float(s[joint]) - DAMPING * float(s[n + joint])
+        return self.pull - _STIFFNESS * float(s[joint]) - _DAMPING * float(s[n + joint])
 
 
 def _gripped(scene: Scene, channel: int, T: float) -> HeldPlant:
     """The plant with the hand's spring and damper on a handle, its end at rest."""
     free, joint, n = scene.plant, scene.handles[channel], scene.model.nq
     A, at_handle = free.A.copy(), free.B[:, scene.tapped[channel]]
-    A[:, joint] -= STIFFNESS * at_handle
-    A[:, n + joint] -= DAMPING * at_handle
+    A[:, joint] -= _STIFFNESS * at_handle
+    A[:, n + joint] -= _DAMPING * at_handle
     return hold(Plant(A, free.B, free.C), T)
 
 
@@ -120,18 +312,18 @@ class LiveLoop:
 
         The clock begins at 0; what it runs ahead by more than `patience` [s] is not made up.
 
-        Raises what `changed` raises where an event of the script is impossible.
+        Raises what `_changed` raises where an event of the script is impossible.
         """
         self.prepared = prepared
         self.pace = _Pace(prepared.scenario.T, patience)
-        self.keys: SimpleQueue[Event] = SimpleQueue()
+        self.keys: SimpleQueue[_Event] = SimpleQueue()
         self.clipped = 0  # ticks, since the start
         self.log: list[tuple[float, str, PreparedLoop]] = [
             (0.0, "start", prepared)
         ]  # time [s], what was asked for, the loop
         self.script_ends = script[-1][0] if script else 0.0  # [s]
         self._executor, self._latest = executor, prepared
-        self._wanted: list[tuple[Event, Future[PreparedLoop | str]]] = []
+        self._wanted: list[tuple[_Event, Future[PreparedLoop | str]]] = []
         self._script = _rehearsed(prepared, script)
         self._tick = 0
         self._pushed = np.zeros(prepared.scenario.channels)  # by the script
@@ -186,16 +378,16 @@ class LiveLoop:
                 event = self.keys.get_nowait()
             except Empty:
                 return
-            if isinstance(event, Couple | Delay):
+            if isinstance(event, Couple | _Delay):
                 self._note = f"{words(event)}: being made"
                 self._wanted.append((event, self._executor.submit(self._make, event)))
             else:
                 self._happen(event)
 
-    def _make(self, event: Couple | Delay) -> PreparedLoop | str:
+    def _make(self, event: Couple | _Delay) -> PreparedLoop | str:
         """The loop after an event, or why there is none. The executor makes them in turn."""
         try:
-            self._latest = changed(self._latest, event)
+            self._latest = _changed(self._latest, event)
         except (InputError, DesignFailed, SingularLoop) as error:  # the old loop goes on
             return " ".join(str(error).split())
         return self._latest
@@ -234,7 +426,7 @@ class LiveLoop:
             run_block(buffer, self._engine, count)
         self._tick += count
         if not (np.isfinite(buffer.s[: count + 1]).all() and np.isfinite(buffer.z[: count + 1]).all()):
-            self._happen(Restart())
+            self._happen(_Restart())
             self._note = "the process itself ran away, beyond all numbers: restarted from rest"
             return
         f = buffer.f[:count, :, 0]
@@ -242,14 +434,14 @@ class LiveLoop:
         self._history = np.concatenate([self._history[count:], f])[-len(self._history) :]
         buffer.rewind(count)
 
-    def _happen(self, event: Event) -> None:
-        if isinstance(event, Push):
+    def _happen(self, event: _Event) -> None:
+        if isinstance(event, _Push):
             self._pushed[event.channel - 1] = event.force
-        elif isinstance(event, Restart):
+        elif isinstance(event, _Restart):
             self._enter(self.prepared, np.zeros_like(self.state))
         self._note = words(event)
 
-    def _switch(self, event: Event, prepared: PreparedLoop) -> None:
+    def _switch(self, event: _Event, prepared: PreparedLoop) -> None:
         self._enter(prepared, self.state)
         self._note = words(event)
         self.log.append((self.t, words(event), prepared))
@@ -278,12 +470,12 @@ class LiveLoop:
         self._engine.start(self._buffer)
 
 
-def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, Event, PreparedLoop | None]]:
+def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, _Event, PreparedLoop | None]]:
     """The script with the tick of each event and the loop that it leads to."""
     made = []
     for time, event in script:
         into = None
-        if isinstance(event, Couple | Delay):
-            into = prepared = changed(prepared, event)
+        if isinstance(event, Couple | _Delay):
+            into = prepared = _changed(prepared, event)
         made.append((round(time / prepared.scenario.T), event, into))
     return made

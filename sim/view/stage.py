@@ -1,27 +1,44 @@
 """What a picture shows, in the window and in a film: places, colours, text, arrows and plots.
 
-The scene as it is shown is a dressed copy. What is simulated stays as small as models.scene builds it; the shapes have
-no mass and touch nothing, so both models have the same matrices.
+The window is MuJoCo's own viewer, passive: it shows what the session has made, and hands over keys and the mouse. The
+scene that it shows is a dressed copy. What is simulated stays as small as models.scene builds it; the shapes have
+no mass and touch nothing, so both models have the same matrices. A film is drawn by Pillow, a GIF, or an MP4 by ffmpeg
+where that is installed.
 """
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
+import tempfile
 import textwrap
+import threading
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
 from controller.lti import Array
+from design.files import InputError, check_file, write
 from design.result import Requirement
 from models.scene import APART, DRAWN, STEP, Scene
-from sim.view.events import GIVEN, KEYS, Couple, PreparedLoop, words
-from sim.view.session import HISTORY, Frame, Grip
+from sim.view.session import GIVEN, HISTORY, KEYS, Couple, Frame, Grip, LiveLoop, PreparedLoop, words
 
-Colour = tuple[float, float, float]
+if TYPE_CHECKING:
+    from mujoco import viewer
+
+Picture = NDArray[np.uint8]  # (height, width, 3)
+_Colour = tuple[float, float, float]
 _Lines = list[tuple[str, str]]
 
 #: Okabe and Ito's palette, one colour per device
-PALETTE: tuple[Colour, ...] = (
+_PALETTE: tuple[_Colour, ...] = (
     (0.0, 0.45, 0.70),
     (0.84, 0.37, 0.0),
     (0.0, 0.62, 0.45),
@@ -29,15 +46,15 @@ PALETTE: tuple[Colour, ...] = (
     (0.34, 0.71, 0.91),
     (0.9, 0.6, 0.0),
 )
-GREY: Colour = (0.55, 0.55, 0.58)
-ALARM: Colour = (1.0, 0.15, 0.15)  # a force at its limit
+_GREY: _Colour = (0.55, 0.55, 0.58)
+_ALARM: _Colour = (1.0, 0.15, 0.15)  # a force at its limit
 
-LONGEST = 0.12  # [m] arrow of a force at its limit
-SIZE = (640, 640)  # pixels of a video
-WORDS = 0.40  # share of a video's height, at its top, that is left to words
-PLOT = 0.25  # share of the picture's height, at its bottom, that the forces take
+_LONGEST = 0.12  # [m] arrow of a force at its limit
+_SIZE = (640, 640)  # pixels of a video
+_WORDS = 0.40  # share of a video's height, at its top, that is left to words
+_PLOT = 0.25  # share of the picture's height, at its bottom, that the forces take
 _WIDTH = 60  # characters of a line of words
-COLUMNS = 250  # spans of the plotted forces, each with its least and largest
+_COLUMNS = 250  # spans of the plotted forces, each with its least and largest
 
 _BOX, _SPHERE, _ARROW, _BAR = (
     getattr(mujoco.mjtGeom, f"mjGEOM_{name}") for name in ("BOX", "SPHERE", "ARROW", "CAPSULE")
@@ -45,12 +62,12 @@ _BOX, _SPHERE, _ARROW, _BAR = (
 _MASSLESS = {"mass": 0, "contype": 0, "conaffinity": 0}
 
 
-def colour(channel: int) -> Colour:
+def _colour(channel: int) -> _Colour:
     """The colour of a device, counted from 0."""
-    return PALETTE[channel % len(PALETTE)]
+    return _PALETTE[channel % len(_PALETTE)]
 
 
-def channels(scene: Scene) -> tuple[int, ...]:
+def _channels(scene: Scene) -> tuple[int, ...]:
     """The channel (from 0) that each joint belongs to; of a person's body, the first that the person holds."""
     owner = {motor: motor for motor in range(scene.channels)}
     for i, (_, *own) in enumerate(scene.points[: scene.channels]):
@@ -60,7 +77,7 @@ def channels(scene: Scene) -> tuple[int, ...]:
     return tuple(owner[joint] for joint in range(scene.model.njnt))
 
 
-def places(scene: Scene) -> tuple[int, ...]:
+def _places(scene: Scene) -> tuple[int, ...]:
     """How many steps behind its handle each joint's body stands: 0 the handle, -1 a motor, 1.. a human's arm."""
     place = dict.fromkeys(range(scene.channels), -1)
     for points in scene.points[: scene.channels]:
@@ -69,12 +86,12 @@ def places(scene: Scene) -> tuple[int, ...]:
     return tuple(place.get(joint, behind) for joint in range(scene.model.njnt))
 
 
-def scale(history: Array) -> float:
+def _scale(history: Array) -> float:
     """A power of two [N] above every force."""
     return float(2.0 ** np.ceil(np.log2(max(1.0, 1.05 * np.abs(history).max(initial=0.0)))))
 
 
-def envelope(history: Array, columns: int, ticks: int) -> tuple[Array, Array]:
+def _envelope(history: Array, columns: int, ticks: int) -> tuple[Array, Array]:
     """Least and largest force in `columns` equal spans of the last `ticks` ticks, (columns, m) each.
 
     Where the history is shorter than that, the spans before it are not-a-number.
@@ -86,7 +103,7 @@ def envelope(history: Array, columns: int, ticks: int) -> tuple[Array, Array]:
     return np.fmin.reduceat(padded, first, axis=0), np.fmax.reduceat(padded, first, axis=0)
 
 
-def overlay(frame: Frame, live: bool) -> _Lines:
+def _overlay(frame: Frame, live: bool) -> _Lines:
     """Labels and values; `live` adds the clock, which a video has none of."""
     prepared, scenario = frame.prepared, frame.prepared.scenario
     delays = f"theta {_list(scenario.theta)}, psi {_list(scenario.psi)} samples of {1e3 * scenario.T:g} ms"
@@ -132,13 +149,13 @@ def keys_help(given: bool) -> _Lines:
     return [*keys, ("double click", "take a body"), ("Ctrl+right", "draw it")]
 
 
-def apart(lines: _Lines) -> tuple[_Lines, _Lines]:
+def _apart(lines: _Lines) -> tuple[_Lines, _Lines]:
     """The lines, and the last refusal, which may take several lines."""
     at = next((i for i, (label, _) in enumerate(lines) if label == "last"), len(lines))
     return (lines[:at], lines[at:]) if len(lines) - at > 1 else (lines, [])
 
 
-def columns(lines: _Lines) -> tuple[str, str]:
+def _columns(lines: _Lines) -> tuple[str, str]:
     """Labels and values as MuJoCo's overlays take them."""
     return "\n".join(label for label, _ in lines), "\n".join(value for _, value in lines)
 
@@ -150,11 +167,11 @@ def _list(values: tuple[int, ...]) -> str:
 class ShownScene:
     """A scene that can be looked at, and pushed with the mouse."""
 
-    def __init__(self, scene: Scene, force_limit: Array, size: tuple[int, int] = SIZE) -> None:
+    def __init__(self, scene: Scene, force_limit: Array, size: tuple[int, int] = _SIZE) -> None:
         self.scene, self.force_limit = scene, force_limit
         self.model = _dressed(scene, size)
         self.data = mujoco.MjData(self.model)
-        self.channel = channels(scene)  # joint -> channel; bodies and joints have the same order
+        self.channel = _channels(scene)  # joint -> channel; bodies and joints have the same order
 
     def show(self, q: Array) -> None:
         """Put the joints at q [m]."""
@@ -176,23 +193,23 @@ class ShownScene:
     def draw(self, drawn: mujoco.MjvScene, frame: Frame) -> None:
         """Arrows: the mean force on each device, the range it has had since the last frame, and what pushes."""
         for i, handle in enumerate(self.scene.handles):
-            own, reach = colour(i), LONGEST / self.force_limit[i]
+            own, reach = _colour(i), _LONGEST / self.force_limit[i]
             at = self.data.xpos[self.model.jnt_bodyid[handle]] + np.array([0, 0, 0.045])
             clipped = max(-frame.low[i], frame.high[i]) >= self.force_limit[i]
-            band = (*ALARM, 0.6) if clipped else (*own, 0.35)
+            band = (*_ALARM, 0.6) if clipped else (*own, 0.35)
             # the device feels -f
             left, right = (np.array([-f * reach, 0, 0]) for f in (frame.high[i], frame.low[i]))
             _connect(drawn, _BAR, 0.010, at + left, at + right, band)
             _arrow(drawn, at, -frame.mean[i] * reach, (*own, 1.0))
-            pushed = float(np.clip(frame.push[i] * reach, -LONGEST, LONGEST))
+            pushed = float(np.clip(frame.push[i] * reach, -_LONGEST, _LONGEST))
             _arrow(drawn, at + np.array([0, 0, 0.03]), pushed, (0.1, 0.1, 0.1, 1.0))
 
     def figures(self, frame: Frame, picture: mujoco.MjrRect) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
         """The forces of the last seconds, side by side at the bottom of a picture."""
         m = self.scene.channels
-        width, height = picture.width // m, round(PLOT * picture.height)
-        low, high = envelope(frame.history, COLUMNS, round(HISTORY / frame.prepared.scenario.T))
-        top, drawn = scale(frame.history), []
+        width, height = picture.width // m, round(_PLOT * picture.height)
+        low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
+        top, drawn = _scale(frame.history), []
         for i in range(m):
             place = mujoco.MjrRect(picture.left + i * width, picture.bottom, width, height)
             drawn.append((place, _figure(i, low[:, i], high[:, i], top)))
@@ -205,20 +222,20 @@ class ShownScene:
         camera.azimuth, camera.elevation = 90.0, -35.0
 
 
-def _dressed(scene: Scene, size: tuple[int, int] = SIZE) -> mujoco.MjModel:
+def _dressed(scene: Scene, size: tuple[int, int] = _SIZE) -> mujoco.MjModel:
     """The scene's model with shapes, places, a camera's distance and colours, but the same dynamics."""
     spec = mujoco.MjSpec.from_string(scene.xml)
     _undress(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = size
     spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
-    where = places(scene)
-    for joint, (place, channel) in enumerate(zip(where, channels(scene), strict=True)):
+    where = _places(scene)
+    for joint, (place, channel) in enumerate(zip(where, _channels(scene), strict=True)):
         body = spec.body(scene.model.joint(joint).name)
         body.pos = [place * STEP, channel * -APART, 0.03]
         if place == 0:
-            body.add_geom(type=_SPHERE, size=[0.024] * 3, rgba=(*colour(channel), 1.0), **_MASSLESS)
+            body.add_geom(type=_SPHERE, size=[0.024] * 3, rgba=(*_colour(channel), 1.0), **_MASSLESS)
         else:
-            body.add_geom(type=_BOX, size=[0.022, 0.026, 0.022], rgba=(*GREY, 1.0), **_MASSLESS)
+            body.add_geom(type=_BOX, size=[0.022, 0.026, 0.022], rgba=(*_GREY, 1.0), **_MASSLESS)
     deepest = max(1, *where)
     middle = [(deepest - 1) * STEP / 2, -APART * (scene.channels - 1) / 2, 0.03]
     for channel in range(scene.channels):
@@ -252,7 +269,7 @@ def _figure(channel: int, low: Array, high: Array, top: float) -> mujoco.MjvFigu
     points = np.stack([t, low, t, high], axis=1)[seen].reshape(-1)
     figure.linedata[0, : points.size] = points
     figure.linepnt[0] = points.size // 2
-    figure.linergb[0] = colour(channel)
+    figure.linergb[0] = _colour(channel)
     return figure
 
 
@@ -270,3 +287,238 @@ def _connect(
     mujoco.mjv_initGeom(geom, shape, np.zeros(3), np.zeros(3), np.zeros(9), np.array(rgba, dtype=np.float32))
     mujoco.mjv_connector(geom, shape, width, np.asarray(a, dtype=float), np.asarray(b, dtype=float))
     drawn.ngeom += 1
+
+
+# ----------------------------------------------------------------------------------------------------
+# The window.
+
+_RATE = 60.0  # frames per second
+_PATIENCE = 30  # [s] for the display to answer
+
+# without a display the viewer's thread dies and its caller waits for ever: a process of its own asks first
+_PROBE = (
+    "import glfw, sys; glfw.init() or sys.exit(1); glfw.window_hint(glfw.VISIBLE, 0); "
+    "sys.exit(0 if glfw.create_window(64, 64, '', None, None) else 1)"
+)
+
+
+class NoWindow(Exception):
+    """The viewer cannot open a window here."""
+
+
+def _display() -> bool:
+    """Whether a window can be opened here."""
+    try:
+        done = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, timeout=_PATIENCE, check=False)
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
+
+
+def show(session: LiveLoop, stage: ShownScene, until: float | None = None) -> None:
+    """Run the session in a window until that is closed, or until it is `until` [s] old.
+
+    Raises NoWindow where there is no display, or on macOS without MuJoCo's own launcher.
+    """
+    if not _display():
+        raise NoWindow("no window can be opened: there is no display, or none with OpenGL")
+    threads = set(threading.enumerate())
+    try:
+        from mujoco import viewer  # asks for a display's library
+
+        window = viewer.launch_passive(
+            stage.model, stage.data, key_callback=_typed(session), show_left_ui=False, show_right_ui=False
+        )
+    except RuntimeError as error:
+        raise NoWindow(str(error)) from None
+    try:
+        with window:
+            with window.lock():
+                stage.aim(window.cam, (0.0, 0.0, 0.2), 3.0)  # between the words and the plots
+            _loop(session, stage, window, time.perf_counter, time.sleep, until)
+    finally:  # the viewer must have left OpenGL before Python ends
+        for thread in set(threading.enumerate()) - threads:
+            thread.join(_PATIENCE)
+
+
+def _loop(
+    session: LiveLoop,
+    stage: ShownScene,
+    window: viewer.Handle,
+    clock: Callable[[], float],
+    sleep: Callable[[float], None],
+    until: float | None = None,
+) -> None:
+    """Frame after frame: the mouse to the session, the session to the window."""
+    start = clock()
+    grip = None
+    while window.is_running():
+        begun = clock()
+        grip = _shown(stage, window, session.frame(begun - start, grip))
+        if until is not None and begun - start >= until:
+            return
+        sleep(max(0.0, 1 / _RATE - (clock() - begun)))
+
+
+def _shown(stage: ShownScene, window: viewer.Handle, frame: Frame) -> Grip | None:
+    """Show a frame, and return what the mouse holds afterwards."""
+    with window.lock():
+        stage.show(frame.q)
+        grip = stage.grip(window.perturb)
+        if window.user_scn is not None:
+            window.user_scn.ngeom = 0
+            stage.draw(window.user_scn, frame)
+    window.sync()
+    (said, refused), keys = _apart(_overlay(frame, live=True)), keys_help(frame.prepared.menu.given is not None)
+    font, grid = mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos
+    places = {grid.mjGRID_TOPLEFT: said, grid.mjGRID_TOPRIGHT: keys, grid.mjGRID_BOTTOMLEFT: refused}
+    window.set_texts([(font, place, *_columns(lines)) for place, lines in places.items() if lines])
+    if window.viewport is not None:
+        window.set_figures(stage.figures(frame, window.viewport))
+    return grip
+
+
+def _typed(session: LiveLoop) -> Callable[[int], None]:
+    """The viewer's callback for a key, in the viewer's own thread."""
+
+    def key(code: int) -> None:
+        if code in KEYS:
+            session.keys.put(KEYS[code][1])
+
+    return key
+
+
+# ----------------------------------------------------------------------------------------------------
+# Films: flat pictures, and the file.
+
+_FORMATS = (".gif", ".mp4")
+_COLOURS = 48  # of a GIF: few, so that it stays small
+_BLACK, _LIGHT = (0, 0, 0), (205, 205, 205)
+
+
+class FlatPictures:
+    """Frames of a scene as shapes on their rails, seen from above, and the forces, by Pillow: pictures of a film."""
+
+    def __init__(self, scene: Scene, force_limit: Array) -> None:
+        self.scene, self.force_limit = scene, force_limit
+        self._font = ImageFont.load_default(12)
+        self._places, self._channels = _places(scene), _channels(scene)
+
+    def picture(self, frame: Frame) -> Picture:
+        """(height, width, 3): what is said of the loop, the bodies, the forces, from top to bottom."""
+        image = Image.new("RGB", _SIZE, "white")
+        pen = ImageDraw.Draw(image)
+        height = _SIZE[1]
+        below = round((1 - _PLOT) * height)
+        top = 8
+        for label, value in _overlay(frame, live=False):
+            pen.text((8, top), label, _BLACK, self._font)
+            pen.text((130, top), value, _BLACK, self._font)
+            top += 15
+        self._bodies(pen, frame, max(top, round(_WORDS * height)), below)
+        self._forces(pen, frame, below + 18, height - 18)
+        return np.asarray(image)
+
+    def _bodies(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
+        steps = max(self._places) + 2
+        per_metre = (_SIZE[0] - 120) / (steps * STEP + 2 * _LONGEST)
+        origin, row = 60 + (_LONGEST + STEP) * per_metre, (bottom - top) / self.scene.channels
+        size = min(14.0, 0.3 * row)
+        for i in range(self.scene.channels):
+            y = top + (i + 0.5) * row
+            pen.line((30, y, _SIZE[0] - 30, y), _LIGHT, 2)
+        for place, i, q in zip(self._places, self._channels, frame.q, strict=True):
+            x, y = origin + (place * STEP + q) * per_metre, top + (i + 0.5) * row
+            corners = (x - size, y - size, x + size, y + size)
+            if place == 0:
+                pen.ellipse(corners, _rgb(_colour(i)))
+                self._force(pen, frame, i, x, y - 0.45 * row, per_metre)
+            else:
+                pen.rectangle(corners, _rgb(_GREY))
+
+    def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, i: int, x: float, y: float, per_metre: float) -> None:
+        """The range of the force since the last frame, and its mean; the device feels -f."""
+        reach = per_metre * _LONGEST / self.force_limit[i]
+        clipped = max(-frame.low[i], frame.high[i]) >= self.force_limit[i]
+        shade = _ALARM if clipped else _colour(i)
+        pen.line((x - frame.high[i] * reach, y, x - frame.low[i] * reach, y), _rgb(shade), 3)
+        pen.line((x, y + 4, x - frame.mean[i] * reach, y + 4), _rgb(_colour(i)), 4)
+        if frame.push[i]:
+            pen.line((x, y + 9, x + frame.push[i] * reach, y + 9), _BLACK, 4)
+
+    def _forces(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
+        """One plot per device, side by side."""
+        m, most, middle = self.scene.channels, _scale(frame.history), (top + bottom) / 2
+        low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
+        width = (_SIZE[0] - 20) / m
+        for i in range(m):
+            left, right = 50 + i * width, (i + 1) * width - 2
+            for value in (-most, 0.0, most):
+                y = middle - value / most * (bottom - top) / 2
+                pen.line((left, y, right, y), _LIGHT)
+                pen.text((left - 40, y - 7), f"{value:+g}" if value else "0", _BLACK, self._font)
+            pen.text((left, bottom + 2), f"force on device {i + 1} [N], last {HISTORY:g} s", _BLACK, self._font)
+            x = np.linspace(left, right, _COLUMNS)
+            for j in np.flatnonzero(np.isfinite(low[:, i])):
+                ends = middle - np.array([low[j, i], high[j, i]]) / most * (bottom - top) / 2
+                pen.line((x[j], ends[0], x[j], ends[1] - 1), _rgb(_colour(i)), 2)
+
+
+def _rgb(parts: _Colour) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * part) for part in parts)
+    return red, green, blue
+
+
+def check_film(path: Path) -> None:
+    """Whether such a film can be written, before any work is done. Raises InputError."""
+    if path.suffix not in _FORMATS:
+        raise InputError(f"--video {path}: the name must end in {' or '.join(_FORMATS)}")
+    check_file("--video", path)
+    if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
+        raise InputError(f"--video {path}: MP4 needs ffmpeg, which is not on the PATH; a .gif needs nothing")
+
+
+def save_film(path: Path, pictures: Iterable[Picture], fps: float) -> int:
+    """Write the film and return its number of pictures. Raises InputError where ffmpeg refuses."""
+    return _gif(path, pictures, fps) if path.suffix == ".gif" else _mp4(path, pictures, fps)
+
+
+def _gif(path: Path, pictures: Iterable[Picture], fps: float) -> int:
+    images: list[Image.Image] = []
+    palette: Image.Image | None = None
+    for picture in pictures:
+        # one palette for all: colours do not flicker, and what stands still costs nothing
+        palette = palette or _palette(picture)
+        images.append(Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE))
+
+    def content(file: BinaryIO) -> None:
+        images[0].save(file, "GIF", save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
+
+    write(path, content)
+    return len(images)
+
+
+def _palette(first: Picture) -> Image.Image:
+    """The colours of the first picture, and of what may appear later: forces, in light and in shade."""
+    shades = [np.multiply(shade, light) for shade in (*_PALETTE, _ALARM) for light in (1.0, 0.75, 0.5)]
+    strip = np.repeat(np.array(shades) * 255, -(-first.shape[1] // len(shades)), axis=0)[: first.shape[1]]
+    later = np.repeat(strip[None].astype(np.uint8), first.shape[0] // 4, axis=0)
+    return Image.fromarray(np.concatenate([first, later])).quantize(_COLOURS, dither=Image.Dither.NONE)
+
+
+def _mp4(path: Path, pictures: Iterable[Picture], fps: float) -> int:
+    """ffmpeg writes elsewhere; the film is put in its place when it is complete."""
+    with tempfile.TemporaryDirectory() as folder:
+        raw, whole, count = Path(folder) / "film.rgb", Path(folder) / "film.mp4", 0
+        with raw.open("wb") as file:
+            for picture in pictures:
+                file.write(picture.tobytes())
+                count += 1
+        size = "{}x{}".format(*_SIZE)
+        source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{fps:g}", "-i", str(raw)]
+        command = ["ffmpeg", "-loglevel", "error", "-y", *source, "-pix_fmt", "yuv420p", str(whole)]
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise InputError(f"--video {path}: ffmpeg: {done.stderr.strip() or done.returncode}")
+        write(path, whole.read_bytes())
+    return count

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator
 import msgspec
 import numpy as np
 
-from controller.budget import EnergyBounding, EnergyBudget, PassivityControl, Shell
+from controller.budget import EnergyBounding, EnergyBudget, Packets, PassivityControl, Shell
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.delay import delay
 from controller.environment import Networks, environment
@@ -146,12 +146,12 @@ def moved(scenario: Scenario, F: Lti, nets: tuple[Net, Net], seconds: float) -> 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    for name, value in (("seconds", 8.0), ("eps", 0.05), ("start", 0.0), ("cap", np.inf)):
+    for name, value in (("seconds", 8.0), ("start", 0.0), ("cap", np.inf)):
         parser.add_argument(f"--{name}", type=float, default=value)
     args = parser.parse_args()
     scenario = load()
     T, delta, theta, network = scenario.T, scenario.delta, scenario.theta, scenario.environment
-    given = {"eps": args.eps, "start": args.start, "cap": args.cap}
+    given = {"start": args.start, "cap": args.cap}
 
     def none(nsim: int, step: float) -> Limit:
         return pass_on
@@ -159,14 +159,15 @@ def main() -> None:
     def observer(**options: object) -> tuple[Net, Net]:
         return none, lambda n, step: PassivityControl(2, T, nsim=n, **options).limit
 
+    def budget(nsim: int, step: float) -> Limit:
+        return EnergyBudget(delta, T, Packets(theta), nsim=nsim, encoder_step=step, **given).limit
+
     nets = {
         "clipped": (none, none),
         "PO/PC at each device": observer(),
         "PO/PC at each device, with delta": observer(delta=delta),
-        "PO/PC for both devices": observer(together=True),
-        "PO/PC for both devices, with delta": observer(together=True, delta=delta),
         "energy bounding": (lambda n, step: EnergyBounding(delta, T, nsim=n).limit, none),
-        "energy budget": (lambda n, q: EnergyBudget(delta, T, theta, nsim=n, encoder_step=q, **given).limit, none),
+        "energy budget": (budget, none),
     }
     made: dict[str, Coupling] = {}
     for name, kind, condition in (

@@ -78,7 +78,7 @@ def estimated(c: Case) -> Estimate:
     for force in applied:
         x.append(c.step * np.round(plant.s[0] / c.step + origin + c.noise * draw.standard_normal()))
         plant.advance(-force)
-    return identify(np.array(x), applied[:, 0], np.ones(len(x), dtype=bool), base.T, c.step, c.rigid)
+    return identify(np.array(x), applied[:, 0], base.T, c.step, c.rigid)
 
 
 def judged(seed: int) -> tuple[Case, Estimate | str, float]:

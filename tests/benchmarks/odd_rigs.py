@@ -161,7 +161,7 @@ def judged(rig: Rig, x: Array, signal: Array) -> tuple[Friction | str, float]:
     begin = time.perf_counter()
     found: Friction | str
     try:
-        found = identify(x, signal, np.ones(len(x), dtype=bool), T, rig.step, rigid=True).friction
+        found = identify(x, signal, T, rig.step, rigid=True).friction
     except ValueError as error:
         found = str(error)
     return found, time.perf_counter() - begin

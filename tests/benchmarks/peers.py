@@ -19,9 +19,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from controller.coupling import CASE_I
+from controller.coupling import PUBLISHED
 from controller.lti import Array
-from models.scene import actuation, tendon_jacobian
+from models.scene import _actuation, _tendon_jacobian
 from sim.mujoco_engines import EXPONENTIAL
 from sim.run import Simulation, assemble, make_engine, outside_forces, run
 from sim.scenario import load
@@ -107,7 +107,7 @@ def drake(step: str, substeps: int) -> Peer:
             integrator.set_fixed_step_mode(True)
         held = plant.get_applied_generalized_force_input_port().FixValue(context, np.zeros(model.nv))
         simulator.Initialize()
-        forces, limit, m = actuation(model), simulation.process.force_limit, F.outputs
+        forces, limit, m = _actuation(model), simulation.process.force_limit, F.outputs
         z, s = np.zeros(F.order), np.zeros(2 * model.nv)
         zs, ss, fs = [], [], []
         for k, pushed in enumerate(w):
@@ -141,7 +141,7 @@ def _drake_plant(simulation: Simulation, time_step: float):
         joint = plant.AddJoint(PrismaticJoint(f"joint_{j}", world, frame, [1, 0, 0], damping=float(damping)))
         if stiffness[j]:
             plant.AddForceElement(PrismaticSpring(joint, 0.0, float(stiffness[j])))
-    tendons = zip(tendon_jacobian(model), model.tendon_stiffness, model.tendon_damping, strict=True)
+    tendons = zip(_tendon_jacobian(model), model.tendon_stiffness, model.tendon_damping, strict=True)
     for across, spring, damper in tendons:
         a, b = (bodies[int(np.flatnonzero(across == sign)[0])].body_frame() for sign in (-1.0, 1.0))
         along = [np.array([float(np.ravel(value)[0]), 0.0, 0.0]) for value in (spring, damper)]
@@ -167,7 +167,7 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=15.0, metavar="SECONDS")
     parser.add_argument("--rounds", type=int, default=3, metavar="N")
     args = parser.parse_args()
-    simulation = assemble(load().replace(duration=args.duration), CASE_I)
+    simulation = assemble(load().replace(duration=args.duration), PUBLISHED["I"])
     scenario, m = simulation.scenario, simulation.scene.channels
     w = outside_forces(scenario, simulation.scene, 0, scenario.samples)
     used, traces, missing = {name: [] for name in PEERS}, {}, {}

@@ -15,7 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from controller.coupling import CASE_I, SpringDamper
+from controller.coupling import PUBLISHED, SpringDamper
 from controller.loop import Loop
 from design import certify, design_coupling
 from design.certificate import prove_limiter
@@ -107,7 +107,7 @@ def hands() -> None:
     """Verdicts by both engines, without traces and with 2 s of them."""
     for count in (1000, 10_000):
         for duration in (0.0, 2.0) if count == 1000 else (0.0,):
-            question = Validation(load(), CASE_I, 0, count, MIXED, "both", duration)
+            question = Validation(load(), PUBLISHED["I"], 0, count, MIXED, "both", duration)
             found, used = cpu(lambda question=question: validate(question))
             print(f"| {count} hands, {duration:g} s | {used:.2f} | {int(found.disagreements.sum())} disagreements |")
 
@@ -115,7 +115,7 @@ def hands() -> None:
 def duration() -> None:
     """The memory is the most that the process has had so far."""
     for seconds in (15, 150, 600):
-        simulation = assemble(load().replace(duration=seconds), CASE_I)
+        simulation = assemble(load().replace(duration=seconds), PUBLISHED["I"])
         _, used = cpu(lambda simulation=simulation: run(simulation))
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(f"| {seconds} s | {used:.2f} | {peak:.0f} MiB |")

@@ -10,8 +10,8 @@ import sys
 
 import numpy as np
 
-from hw.limits import SafetyStop
 from hw.monitor import EncoderMonitor
+from hw.protocol import SafetyStop
 
 T, TICKS, SUBSTEPS = 1.2e-3, 1000, 8
 FORCE_STEP = 4e-4  # [N]

@@ -5,7 +5,7 @@ make bench
 
 import pytest
 
-from controller.coupling import CASE_I
+from controller.coupling import PUBLISHED
 from design import fixed_order as ccl
 from design import optimal, spring_damper
 from design.audit import audit
@@ -61,13 +61,13 @@ def test_a_stored_proof_is_checked_again(benchmark):
 
 
 def test_a_refusal(benchmark):
-    requirements = benchmark.pedantic(lambda: assess(LOOP, CASE_I), rounds=5, warmup_rounds=1)
+    requirements = benchmark.pedantic(lambda: assess(LOOP, PUBLISHED["I"]), rounds=5, warmup_rounds=1)
     print(f"\npublished gains refused: any-environment needs {requirements['any-environment'].required}")
     assert not any(r.certified for r in requirements.values())
 
 
 def test_audit(benchmark):
-    outcome = benchmark.pedantic(lambda: audit(LOOP, CASE_I), rounds=5, warmup_rounds=1)
+    outcome = benchmark.pedantic(lambda: audit(LOOP, PUBLISHED["I"]), rounds=5, warmup_rounds=1)
     needs = outcome.conditions["this-environment"].certificate["required_damping"][0]
     print(f"\naudit of (27): this-environment needs {needs:.6f} N s/m")
     assert abs(needs - 1.39871) < 1e-5

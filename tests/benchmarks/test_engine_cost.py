@@ -14,14 +14,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from controller.coupling import CASE_I
+from controller.coupling import PUBLISHED
 from controller.tick import StepBuffer
 from models.device import CompliantDevice
 from models.hold import hold
 from models.scene import plant, variants
 from sim.crowds import crowds
 from sim.engines import ExactEngine
-from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, discretised, profiler_off
+from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, _discretised, profiler_off
 from sim.run import assemble, make_engine, run, run_block
 from sim.scenario import load
 from sim.stability import exact_growth
@@ -53,7 +53,7 @@ def raw(simulation, integrator, substeps, record, view=np.asarray) -> float:
 
     Numbers are copied between arrays, or, with `view` memoryview, in the least time that Python can.
     """
-    model = discretised(simulation.scene, simulation.scenario.T, integrator, substeps)
+    model = _discretised(simulation.scene, simulation.scenario.T, integrator, substeps)
     move = make_engine(simulation, "mujoco", EXPONENTIAL, substeps)._access.move(simulation.scenario.T / substeps)
     every = slice(None) if view is memoryview else ...
     nq, inputs = model.nq, [view(row) for row in np.concatenate([record.w, record.f], axis=1)]
@@ -87,7 +87,7 @@ def raw(simulation, integrator, substeps, record, view=np.asarray) -> float:
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_speed_and_error_side_by_side(benchmark, scene):
-    simulation = assemble(SCENES[scene], CASE_I)
+    simulation = assemble(SCENES[scene], PUBLISHED["I"])
     substeps = default_substeps(simulation, "RK4")
     settings = {
         "exact": ("exact", None, None),
@@ -123,7 +123,7 @@ def test_speed_and_error_side_by_side(benchmark, scene):
 
 def test_what_a_force_evaluation_is_made_of(benchmark):
     """Skipping the position stage saves a part of one call, and leaves spring forces of an old position behind."""
-    simulation = assemble(load(), CASE_I)
+    simulation = assemble(load(), PUBLISHED["I"])
     model, calls = simulation.scene.model, 20_000
     data, position = mujoco.MjData(model), mujoco.mjtStage.mjSTAGE_POS
     parts = {
@@ -153,14 +153,14 @@ def test_what_a_force_evaluation_is_made_of(benchmark):
 def test_many_hands(benchmark):
     """CPU time per simulation and tick, one thread, 125 hands as in a batch of sim.validate."""
     scenario, nsim, ticks = load(), 125, 320
-    simulation = assemble(scenario, CASE_I)
+    simulation = assemble(scenario, PUBLISHED["I"])
     ((_, crowd),) = crowds(scenario.population, scenario.channels, 0, range(nsim), 1)
     held_by = variants(scenario.device, crowd)
     plants = hold(held_by.plants(), scenario.T)
     batches = {
         "exact": ExactEngine(plants),
-        "exponential x 1": MujocoBatchEngine(held_by.scene, scenario.T, EXPONENTIAL, 1, nsim, 1, held_by),
-        "RK4 x 4": MujocoBatchEngine(held_by.scene, scenario.T, "RK4", 4, nsim, 1, held_by),
+        "exponential x 1": MujocoBatchEngine(held_by, scenario.T, EXPONENTIAL, 1, 1),
+        "RK4 x 4": MujocoBatchEngine(held_by, scenario.T, "RK4", 4, 1),
     }
     used, after = {name: [] for name in batches}, {}
     start = 1e-4 * np.random.default_rng(0).normal(size=(plants.A.shape[1], nsim))
@@ -189,7 +189,7 @@ def test_many_hands(benchmark):
 
 def test_how_long_a_period_may_be(benchmark):
     """The map over 0.1 s of a plant whose fastest mode turns 497 rad in it: one step, against scipy's exponential."""
-    simulation = assemble(SCENES["transmission of 1.45e6 N/m"], CASE_I)
+    simulation = assemble(SCENES["transmission of 1.45e6 N/m"], PUBLISHED["I"])
     T, turns = 0.1, pace(plant(simulation.scene.model).A).mode * 0.1
     step = benchmark.pedantic(
         lambda: measured_hold(simulation, "mujoco", EXPONENTIAL, 1, T), rounds=3, iterations=1, warmup_rounds=1

@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import replace
 
 from controller.complementarity import BoxProblem
-from controller.coupling import CASE_I, SpringDamper
+from controller.coupling import PUBLISHED, SpringDamper
 from sim.run import assemble, run
 from sim.scenario import load
 
@@ -25,7 +25,7 @@ def seconds(call) -> float:
 
 
 def test_exact_engine(benchmark):
-    simulation = assemble(load(), CASE_I)
+    simulation = assemble(load(), PUBLISHED["I"])
     benchmark.pedantic(lambda: run(simulation, "exact"), rounds=9, iterations=1, warmup_rounds=1)
     median = benchmark.stats.stats.median if benchmark.stats else float("nan")
     print(f"\nexact: {simulation.scenario.duration / median:.0f} x real time, the reference for errors")

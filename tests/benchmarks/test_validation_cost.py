@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from asked import this_environment
 
-from controller.coupling import CASE_I, NoCoupling
+from controller.coupling import PUBLISHED, NoCoupling
 from controller.tick import StepBuffer
 from models.hold import hold
 from models.scene import Variants, variants
-from sim.adversary import attempts
 from sim.crowds import crowds
 from sim.engines import ExactEngine
 from sim.mujoco_engines import MujocoBatchEngine, profiler_off
 from sim.run import assemble, run_block
 from sim.scenario import load
 from sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
+from tests.checks.tightness import attempts
 
 pytestmark = pytest.mark.benchmark(group="validation")
 HUMANS = 1000
@@ -32,7 +32,7 @@ def held_by():
     return variants(scenario.device, crowd)
 
 
-@pytest.mark.parametrize("coupling", [NoCoupling(), CASE_I], ids=["no coupling", "published"])
+@pytest.mark.parametrize("coupling", [NoCoupling(), PUBLISHED["I"]], ids=["no coupling", "published"])
 def test_verdicts(benchmark, held_by, coupling, request):
     name = request.node.callspec.id
     simulation = assemble(load(), coupling)
@@ -55,7 +55,7 @@ def test_verdicts(benchmark, held_by, coupling, request):
 
 def test_batched_exact_engine(benchmark, held_by):
     """CPU seconds for the whole loop: process, limits and plant of every simulation."""
-    simulation, ticks, short = assemble(load(), CASE_I), 960, 32
+    simulation, ticks, short = assemble(load(), PUBLISHED["I"]), 960, 32
     plants = hold(held_by.plants(), simulation.scenario.T)
     engine = ExactEngine(plants)
     buffer = StepBuffer(simulation.process, short, plants.A.shape[1], held_by.scene.outside, HUMANS)
@@ -85,9 +85,9 @@ def test_batched_exact_engine(benchmark, held_by):
 @pytest.mark.parametrize("substeps", [2, 4])
 def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
     """The loop around the batch against the batch's own steps, alternating, on all cores."""
-    simulation, ticks, short, nsim = assemble(load(), CASE_I), 160, 32, 200
+    simulation, ticks, short, nsim = assemble(load(), PUBLISHED["I"]), 160, 32, 200
     T, some = simulation.scenario.T, Variants(held_by.scene, {n: rows[:nsim] for n, rows in held_by.fields.items()})
-    engine, bare = (MujocoBatchEngine(held_by.scene, T, "RK4", substeps, nsim, humans=some) for _ in range(2))
+    engine, bare = (MujocoBatchEngine(some, T, "RK4", substeps) for _ in range(2))
     buffer = StepBuffer(simulation.process, short, 2 * held_by.scene.model.nv, held_by.scene.outside, nsim)
     buffer.s[0] = 1e-4
     engine.start(buffer)
@@ -120,7 +120,7 @@ def test_how_tight_the_certificate_is(benchmark):
     """The adversary against loops 1 to 20 % short of their required damping."""
     scenario = load()
     shortages = np.array([0.01, 0.02, 0.05, 0.1, 0.2])
-    loops = {"none": (scenario, NoCoupling()), "published": (scenario, CASE_I)}
+    loops = {"none": (scenario, NoCoupling()), "published": (scenario, PUBLISHED["I"])}
     rows = benchmark.pedantic(lambda: attempts(loops, shortages, generations=40), rounds=1, iterations=1)
     for short in shortages:
         found = [row.worst.destabilises for row in rows if row.short == short]

@@ -17,7 +17,6 @@ import sys
 import time
 from collections import defaultdict
 
-from cli.checks.faults import _lively
 from hw.control import certified_couplings
 from hw.emulator import Emulator, Terminal
 from hw.haptic_device import SerialDevice
@@ -25,9 +24,10 @@ from hw.limits import ENDED, Stage
 from hw.monitor import LinkSettings
 from hw.protocol import Command, Decoder, Force, State, encode
 from hw.recording import Recorder
-from hw.session import session_for
+from hw.session import Operator, session_for
 from hw.transport import Live, SerialPort
 from sim.scenario import load
+from tests.checks.faults import _lively
 
 BLOCK = 200
 PATIENCE = 5.0  # [s] for bytes on their way through the terminal, which a thread of the kernel's moves
@@ -88,7 +88,7 @@ def tick_cost(ticks: int) -> dict[str, list[float]]:
     """Times [us] of `ticks` whole ticks at full gain, of as many bare ones, and of writing a FORCE."""
     with _Bench() as port:
         session = port.session
-        live = Live(session, SerialDevice(port), lambda ages: port.made, True, 3600.0)
+        live = Live(session, SerialDevice(port), lambda ages: port.made, Operator(True, 3600.0))
         live.clock = lambda: port.clock  # that of the ticks: what is measured here takes longer than they do
         session.start(0)
         gc.collect()

@@ -10,25 +10,29 @@ from importlib import import_module
 
 import pytest
 
-from cli import suite, suite_report
-from cli.checks import endurance
+from cli import suite
 from cli.options import Parser
 from cli.suite import CHECKS, Check, main
 from sim.scenario import InputError
+from tests.checks import endurance, ours
 
-HARD = next(check for check in CHECKS if check.name == "hard")
-COMMANDS = [check for check in CHECKS if isinstance(check.answer, str)]
+HARD = next(check for check in ours.CHECKS if check.name == "hard")
 QUICK = "sim.validate --case none --humans {humans} --links mixed --duration 0.3 --engine exact --seed {seed}"
+
+
+def only(monkeypatch, *checks):
+    """The suite has these checks alone."""
+    monkeypatch.setattr(suite, "CHECKS", checks)
+    monkeypatch.setattr(suite, "_OURS", ())
 
 
 @pytest.fixture
 def quick(monkeypatch):
     """Two checks of a second."""
-    checks = (Check("none", "No coupling?", QUICK, suite_report.verdicts), HARD)
-    monkeypatch.setattr(suite, "CHECKS", checks)
+    only(monkeypatch, Check("none", "No coupling?", QUICK, suite._verdicts), HARD)
 
 
-@pytest.mark.parametrize("check", COMMANDS, ids=lambda check: check.name)
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
 def test_every_check_is_a_command_with_its_options(check, monkeypatch):
     module, *options = shlex.split(check.command(3, 1))
     parse = Parser.parse_args
@@ -45,8 +49,9 @@ def test_every_check_is_a_command_with_its_options(check, monkeypatch):
 
 
 def test_names_of_checks_are_folders_of_their_own():
-    assert len({check.name for check in CHECKS}) == len(CHECKS)
-    assert {"I", "II", "none", "tightness", "accuracy", "hard"} <= {check.name for check in CHECKS}
+    names = suite._names()
+    assert len(set(names)) == len(names)
+    assert [check.name for check in suite._checks(names)] == names  # those of ours too
 
 
 def test_the_report_begins_with_verdicts_and_every_number_has_its_command(tmp_path, quick):
@@ -72,7 +77,7 @@ def test_the_report_begins_with_verdicts_and_every_number_has_its_command(tmp_pa
 
 
 def test_a_check_that_fails_fails_the_suite_and_the_rest_is_done(tmp_path, quick, monkeypatch):
-    monkeypatch.setattr("sim.checks.hard.CLOSE", 0.0)  # as if the rule were wrong
+    monkeypatch.setattr("tests.checks.hard.CLOSE", 0.0)  # as if the rule were wrong
     assert main(["--humans", "5", "--out", str(tmp_path)]) == 1
     text = (tmp_path / "report.md").read_text()
     assert "**1 of 2 checks hold; not: hard.**" in text
@@ -80,8 +85,8 @@ def test_a_check_that_fails_fails_the_suite_and_the_rest_is_done(tmp_path, quick
 
 
 def test_a_check_that_cannot_run_is_no_success(tmp_path, monkeypatch, capsys):
-    broken = Check("broken", "Nothing there?", "sim.validate --scenario missing.toml", suite_report.verdicts)
-    monkeypatch.setattr(suite, "CHECKS", (broken,))
+    broken = Check("broken", "Nothing there?", "sim.validate --scenario missing.toml", suite._verdicts)
+    only(monkeypatch, broken)
     # what an earlier run left behind is not this one's
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "report.json").write_text('{"stale": true}')
@@ -125,7 +130,7 @@ def test_long_work_is_done_by_a_process_of_its_own(monkeypatch):
     assert (died.result, died.holds) == ("broke off", False)
     assert ran.result == "0 of 125 unstable"
     assert ran.holds
-    parts = suite_report.memory_table({"rows": [vars(died), vars(ran)]})
+    parts = ours.memory_table({"rows": [vars(died), vars(ran)]})
     assert parts[0].rows[0][2:] == ("-", "-")
     assert parts[0].answer == "1 of 2 end as they must, with flat memory"
 
@@ -135,9 +140,9 @@ def test_ctrl_c_keeps_the_checks_that_are_done(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     other = replace(HARD, name="other", asks="Never asked?")
-    first = Check("none", "No coupling?", QUICK, suite_report.verdicts)
-    monkeypatch.setattr(suite, "CHECKS", (first, HARD, other))
-    monkeypatch.setattr(suite, "measure", interrupted)
+    first = Check("none", "No coupling?", QUICK, suite._verdicts)
+    only(monkeypatch, first, HARD, other)
+    monkeypatch.setattr("tests.checks.hard.measure", interrupted)
     assert main(["--humans", "5", "--out", str(tmp_path)]) == 130
     outcome = json.loads((tmp_path / "report.json").read_text())
     assert outcome["interrupted"]

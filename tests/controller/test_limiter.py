@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 from driven import drive, wander
-from worlds import STIFF, T, loop_of
+from worlds import FIGURE_4, STIFF, T, loop_of
 
 from controller.arithmetic import SingularLoop
 from controller.complementarity import BoxProblem
 from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall
+from controller.environment import GROUND, Network, Spring, Wall
 from controller.limiter import Limiter
 from controller.lti import Lti
 from controller.tick import Process, StepBuffer

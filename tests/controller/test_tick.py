@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from worlds import force_map, loop_of
+from worlds import FIGURE_4, force_map, loop_of
 
 from controller.coupling import Compliance, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall, environment
+from controller.environment import GROUND, Network, Spring, Wall, environment
 from controller.law import Law
 from controller.lti import Lti
 from controller.tick import Process, StepBuffer

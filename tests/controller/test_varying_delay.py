@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from worlds import force_map
+from worlds import FIGURE_4, force_map
 
 from controller.coupling import SpringDamper
-from controller.delay import LOST, HeldLine, VaryingDelay, ages, newest, packet_delays, realising
-from controller.environment import FIGURE_4, environment
+from controller.delay import LOST, HeldLine, VaryingDelay, _newest, ages, packet_delays, realising
+from controller.environment import environment
 from controller.law import Law
 from controller.tick import Process, StepBuffer
 
@@ -41,7 +41,7 @@ def test_hold_last_by_hand():
     age        -    1    2    1    2     2    0
     """
     delays = column(1, 3, 1, 2, LOST, 1, 0)
-    assert newest(delays).ravel().tolist() == [-1, 0, 0, 2, 2, 3, 6]
+    assert _newest(delays).ravel().tolist() == [-1, 0, 0, 2, 2, 3, 6]
     assert ages(delays).ravel().tolist() == [-1, 1, 2, 1, 2, 2, 0]
     assert carried(delays, range(10, 17)) == [0, 10, 10, 12, 12, 13, 16]
 

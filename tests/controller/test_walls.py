@@ -8,14 +8,14 @@ import pytest
 from asked import this_environment
 from driven import drive, wander
 from scipy.optimize import brentq
-from worlds import SOFT, force_map, loop_of
+from worlds import FIGURE_4, SOFT, force_map, loop_of
 
 from cli.accuracy import main as accuracy
 from cli.run import main
 from controller.arithmetic import SingularLoop
 from controller.complementarity import Complementarity
 from controller.coupling import Coupling, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
+from controller.environment import GROUND, Network, Wall, environment, held
 from controller.law import Law
 from controller.lti import Lti, taps
 from controller.tick import Process
@@ -198,10 +198,8 @@ def test_random_hands_on_walls_come_to_rest_under_any_environment(name, humans, 
     loop = assemble(scenario, SOFT)
     ((_, crowd),) = crowds(Population(damping=(0.3, 30.0)), 2, 0, range(humans), 1)
     sets = variants(scenario.device, crowd)
-    if name == "exact":
-        engine = ExactEngine(hold(sets.plants(), scenario.T))
-    else:
-        engine = MujocoBatchEngine(sets.scene, scenario.T, nsim=humans, humans=sets)
+    exact = name == "exact"
+    engine = ExactEngine(hold(sets.plants(), scenario.T)) if exact else MujocoBatchEngine(sets, scenario.T)
     n = sets.scene.model.nv
     start = np.zeros((2 * n, humans))
     start[n:] = np.random.default_rng(1).uniform(-0.3, 0.3, (n, humans))

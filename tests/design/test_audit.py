@@ -7,12 +7,12 @@ import sys
 import msgspec
 import numpy as np
 import pytest
-from worlds import PAIR, SOFT
+from worlds import FIGURE_4, PAIR, SOFT
 
 from cli.audit import main
 from cli.options import execute
-from controller.coupling import CASE_I, Compliance, Coupling, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, RIGID_WALL, Network, Spring
+from controller.coupling import PUBLISHED, Compliance, Coupling, NoCoupling, SpringDamper
+from controller.environment import GROUND, RIGID_WALL, Network, Spring
 from controller.loop import Loop
 from controller.lti import Lti
 from controller.ranges import Ranges
@@ -123,7 +123,7 @@ def test_the_largest_period_before_a_wall_is_colgates():
 
 
 def test_the_papers_gains_and_their_figures():
-    outcome = report(*pair(CASE_I))
+    outcome = report(*pair(PUBLISHED["I"]))
     assert outcome["this-environment"]["required_damping"] == pytest.approx([1.39871] * 2, rel=1e-5)
     assert outcome["any-environment"]["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
     assert not outcome["certified"]
@@ -176,7 +176,10 @@ def test_figures_that_do_not_exist_say_why():
     assert "largest T tried" in found.reason
     assert "no scale of K" in stiffest(*wall(5000, 30), "this-environment").reason
     assert "stiffest K tried" in stiffest(*pair(SAFE, delta=(3.0, 3.0)), "this-environment").reason
-    assert "nothing to lose" in sensitivity(*pair(CASE_I), requirement(*pair(CASE_I), "this-environment")).reason
+    assert (
+        "nothing to lose"
+        in sensitivity(*pair(PUBLISHED["I"]), requirement(*pair(PUBLISHED["I"]), "this-environment")).reason
+    )
 
 
 def test_remedies_are_tried_and_mild():

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 from asked import any_environment, this_environment
-from worlds import DELTA, SOFT_NETWORK, T, force_map
+from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
 
 from controller.coupling import SpringDamper
-from controller.environment import FIGURE_4
 from controller.loop import Loop
 from controller.lti import Lti
 from design import fixed_order as ccl

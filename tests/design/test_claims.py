@@ -12,15 +12,15 @@ import pytest
 from asked import any_environment, this_environment
 from driven import driven
 from scipy.signal import dlsim, lfilter
-from worlds import SOFT, STIFF, force_map
+from worlds import FIGURE_4, SOFT, STIFF, force_map
 
-from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from controller.environment import GROUND, Network, Spring, environment
 from controller.loop import Loop
 from controller.lti import Lti
 from design.environments import Limiter
 from design.lmi import Infeasible, Shaping, least_multiplier
-from design.spring_damper import step
+from design.spring_damper import GainSet, step
 from models.device import RigidDevice
 from models.human import Human, Link, Population
 from sim.report import _PRINTED_TAU_DB
@@ -32,7 +32,7 @@ T, THETA, DELTA = 1.2e-3, (1, 2), 1.37
 W = np.unique(np.concatenate([np.geomspace(1e-5, np.pi, 40_001), np.linspace(1e-4, np.pi, 40_001)]))
 Z = np.exp(1j * W)
 RATE = 2j * np.sin(W / 2) * np.exp(-0.5j * W) / T  # (z-1)/(Tz), without cancellation at low frequency
-LOOPS = {"I": (CASE_I, (1, 2)), "II": (CASE_II, (0, 0))}
+LOOPS = {"I": (PUBLISHED["I"], (1, 2)), "II": (PUBLISHED["II"], (0, 0))}
 
 
 def window(theta):
@@ -78,7 +78,7 @@ def test_sampled_energy_balance_of_devices_and_hands():
     E_N <= E_0 + sum -f'dx + sum w'dh - sum (1/T) dx' Delta dx, hence (a) of docs/theory.md where w = 0.
     """
     rng = np.random.default_rng(1)
-    simulation = assemble(load(), CASE_I)
+    simulation = assemble(load(), PUBLISHED["I"])
     masses = np.array([0.06, 0.06, 0.19 + 0.3, 0.19 + 0.3])  # motors, then handles with the hands
     for pushing in (0.0, 3.0):
         w = pushing * rng.normal(size=(3000, 2))
@@ -113,7 +113,7 @@ def test_a_certified_force_map_never_gives_more_than_the_devices_dissipate():
             dx = 1e-4 * (slow @ rng.normal(size=(1, 2)) + rng.normal(size=(1500, 2)))
             assert supplied(F, dx).min() >= -1e-12
     # a map that is not certified: the worst direction at the frequency where the condition binds takes energy out
-    F = force_map(E, CASE_I, THETA, (0, 0))
+    F = force_map(E, PUBLISHED["I"], THETA, (0, 0))
     hz = this_environment(F, (DELTA, DELTA)).frequency_hz
     z = np.exp(2j * np.pi * hz * T)
     H = F.at(z) / (z - 1) + DELTA / T * np.eye(2)
@@ -148,7 +148,7 @@ def test_without_coupling_only_the_compliant_device_oscillates():
 
 
 def test_figure_6_is_quiet_with_the_printed_gains():
-    for coupling in (CASE_I, CASE_II):
+    for coupling in (PUBLISHED["I"], PUBLISHED["II"]):
         record = run(assemble(load(), coupling), "exact")
         assert np.abs(record.f).max() < 0.7
         assert 0.0155 < np.abs(record.s[:, :2]).max() < 0.016
@@ -156,7 +156,7 @@ def test_figure_6_is_quiet_with_the_printed_gains():
         assert np.abs(fast).max() < 0.01  # no oscillation left in the last 4.8 s, only the motion of the hands
 
 
-@pytest.mark.parametrize(("coupling", "expected"), [(CASE_I, (7.63, 7.84)), (CASE_II, (7.04, 3.89))])
+@pytest.mark.parametrize(("coupling", "expected"), [(PUBLISHED["I"], (7.63, 7.84)), (PUBLISHED["II"], (7.04, 3.89))])
 def test_the_printed_gains_fail_the_papers_condition(coupling, expected):
     found = [line(K, B, n).max() for K, B, n in zip(coupling.K, coupling.B, THETA, strict=True)]
     assert found == pytest.approx(expected, abs=0.005)
@@ -307,7 +307,7 @@ def test_the_loop_shaping_premise_cannot_hold_under_theorem_4():
         assert np.linalg.norm(E1 @ (np.diag(floor * T / (2 * DELTA)) + root @ root.T), 2) >= 0.8175 - 1e-9
     hz = np.unique(np.concatenate([np.geomspace(0.01, 80, 4000), np.linspace(6.1, 6.3, 4001)]))
     z = np.exp(2j * np.pi * hz * T)
-    for coupling, low, high in ((SOFT, 1.130, 11.30), (STIFF, 0.181, 1.782), (CASE_I, 0.238, 2.959)):
+    for coupling, low, high in ((SOFT, 1.130, 11.30), (STIFF, 0.181, 1.782), (PUBLISHED["I"], 0.238, 2.959)):
         V = np.stack([1 / (K + B * (z - 1) / (T * z)) for K, B in zip(coupling.K, coupling.B, strict=True)], axis=1)
         size = np.linalg.norm(figure_4_at(z) * V[:, None, :], 2, axis=(1, 2))
         assert (size.min(), size.max()) == (pytest.approx(low, abs=1e-3), pytest.approx(high, abs=5e-3))
@@ -432,7 +432,7 @@ def test_every_step_of_the_convex_sequence_improves():
     for _ in range(5):
         k, b = np.split(np.maximum(gains, 0) * np.tile(shaping.usable, 2), 2)
         norms.append(shaping.gain(SpringDamper(k / T, b).compliance(T), w).max())
-        gains, bound = step(shaping, np.full(2, np.inf), gains, norms[-1], w)
+        gains, bound = step(shaping, GainSet(shaping.loop), gains, norms[-1], w)
         assert bound <= norms[-1] * (1 + 1e-6)
     assert all(after <= before * (1 + 1e-6) for before, after in itertools.pairwise(norms))
     assert norms[-1] < 0.8 * norms[0]

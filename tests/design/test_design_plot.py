@@ -4,11 +4,11 @@ import json
 
 import numpy as np
 import pytest
-from worlds import PAIR, SOFT
+from worlds import FIGURE_4, PAIR, SOFT
 
 from cli.compare import main
-from controller.coupling import CASE_I, Compliance, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Spring
+from controller.coupling import PUBLISHED, Compliance, NoCoupling, SpringDamper
+from controller.environment import GROUND, Network, Spring
 from controller.loop import Loop
 from design.compare import curves, grid, ideal, judge
 from design.result import DesignFailed
@@ -30,7 +30,7 @@ def by_hand(hz):
         Z = np.diag([800 + s, 700 + s])
         one = np.ones((2, 1))
         E = Z - Z @ one @ one.T @ Z / (s**2 + (one.T @ Z @ one))
-        V = np.diag(1 / (CASE_I.K + CASE_I.B * s))
+        V = np.diag(1 / (PUBLISHED["I"].K + PUBLISHED["I"].B * s))
         theta = np.diag([1 / z, 1 / z**2])
         yield E, theta @ np.linalg.inv(np.eye(2) + E @ V) @ E, theta
 
@@ -42,7 +42,7 @@ def wall(K, B=0.0, theta=0):
 
 
 def test_singular_values_and_effective_impedance_by_hand():
-    lines = curves(PAIR, judge(PAIR, CASE_I), HZ)
+    lines = curves(PAIR, judge(PAIR, PUBLISHED["I"]), HZ)
     sigma_E, undelayed = ideal(PAIR, HZ)
     for k, (E, F, theta) in enumerate(by_hand(HZ)):
         np.testing.assert_allclose(sigma_E[k], np.linalg.svd(E)[1], rtol=ROUNDING)
@@ -77,20 +77,20 @@ def test_a_delayed_spring_feeds_and_a_damper_dissipates():
 
 def test_demand_by_hand():
     """This environment: -T He[F/(z-1)] / delta; any, by channel: (1 - cos n w) / (2 delta Re[(z-1) V/(Tz)])."""
-    demands = curves(PAIR, judge(PAIR, CASE_I), HZ).demands
+    demands = curves(PAIR, judge(PAIR, PUBLISHED["I"]), HZ).demands
     for k, (_, F, _) in enumerate(by_hand(HZ)):
         z = np.exp(2j * np.pi * HZ[k] * T)
         H = F / (z - 1)
         worst = -np.linalg.eigvalsh(H + H.conj().T)[0] * T / (2 * DELTA)
         assert demands["this-environment"][k] == pytest.approx(worst, rel=1e-7)  # H loses digits near z = 1
         s = (z - 1) / (T * z)
-        V = 1 / (CASE_I.K + CASE_I.B * s)
+        V = 1 / (PUBLISHED["I"].K + PUBLISHED["I"].B * s)
         window = 1 - np.cos(np.array([2, 3]) * np.angle(z))
         assert demands["any-environment"][k] == pytest.approx((window / (2 * DELTA * (s * V).real)).max(), rel=1e-7)
 
 
 @pytest.mark.parametrize(
-    "coupling", [NoCoupling(), CASE_I, SOFT, Compliance(SOFT.compliance(T))], ids=lambda c: str(c)[:9]
+    "coupling", [NoCoupling(), PUBLISHED["I"], SOFT, Compliance(SOFT.compliance(T))], ids=lambda c: str(c)[:9]
 )
 def test_the_curve_reaches_the_required_damping_and_no_more(coupling):
     judged = judge(PAIR, coupling)

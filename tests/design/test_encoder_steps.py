@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from asked import this_environment
+from worlds import FIGURE_4
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
-from controller.environment import FIGURE_4
 from controller.loop import Loop
 from controller.lti import Lti, taps
 from design.conditions import encoder_friction, l1_gain

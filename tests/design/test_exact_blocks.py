@@ -14,18 +14,17 @@ import numpy as np
 import pytest
 from asked import (
     any_environment_demand,
-    delayed_coupling_demand,
     limiter_demand,
     switching_demand,
     this_environment_demand,
     walls_demand,
 )
 from scipy.optimize import minimize_scalar
-from worlds import SOFT, STIFF, T
+from worlds import FIGURE_4, SOFT, STIFF, T
 
 from controller.arithmetic import rational
 from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, Network, Spring, Wall
+from controller.environment import Network, Spring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti
 from controller.ranges import Ranges, UncertainSpring
@@ -212,7 +211,7 @@ def test_a_spring_behind_delay_with_its_multiplier(share):
     phi = share * K * T / 2
     least = min(a * (T / phi - 2 * a) / (4 * T / phi - 6 * a), (T / phi - 2 * a) / 2)
     V, multiplier = SpringDamper([K], [0.0]).compliance(rational(T)), [rational(phi)]
-    assert_limit(lambda d: certificate._block(delayed_coupling_demand(V, (1,), multiplier, [d])), T / (2 * least))
+    assert_limit(lambda d: certificate._block(any_environment_demand(V, (1,), [d], phi=multiplier)), T / (2 * least))
 
 
 def test_a_spring_damper_behind_delay_with_its_multiplier():
@@ -230,7 +229,7 @@ def test_a_spring_damper_behind_delay_with_its_multiplier():
         middle = (low + high) / 2
         low, high = (low, middle) if holds(middle) else (middle, high)
     V, multiplier = SpringDamper([K], [B]).compliance(rational(T)), [rational(phi)]
-    assert_limit(lambda d: certificate._block(delayed_coupling_demand(V, (theta,), multiplier, [d])), high)
+    assert_limit(lambda d: certificate._block(any_environment_demand(V, (theta,), [d], phi=multiplier)), high)
 
 
 # switching
@@ -448,7 +447,7 @@ def test_an_asymmetry_of_1e_12_is_refused_behind_delay_and_for_switching_too():
 
     made = prove(asked, crossed(1e-4), "any-environment", phi)
     skew = crossed(1e-4 * (1 + 1e-12))
-    assert forged(asked, skew, made) == "H(1) is not exactly symmetric"
+    assert forged(asked, skew, made) == "V(1) is not exactly symmetric"
     switching = change(asked, psi=(0, 0)).switching(DelayRange((0, 0), (1, 1)))
     limited = change(asked, psi=(0, 0))
     for there, condition, multiplier in ((switching, SWITCHING, ALPHA), (limited, Limiter(0.01, 0), ())):

@@ -9,12 +9,12 @@ import sys
 
 import numpy as np
 import pytest
-from worlds import PAIR, SOFT, T, force_map
+from worlds import FIGURE_4, PAIR, SOFT, T, force_map
 
 from cli.export import main
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.coupling import SpringDamper as Gains
-from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.environment import GROUND, Network, Spring, environment
 from controller.law import Law
 from controller.loop import Loop
 from controller.lti import Lti

@@ -6,11 +6,12 @@ import pytest
 from asked import latency_demand, this_environment, this_environment_demand
 from driven import growing
 from scipy.linalg import expm
+from worlds import FIGURE_4
 
 from controller.arithmetic import numbers
 from controller.coupling import SpringDamper
 from controller.delay import delay
-from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall
+from controller.environment import GROUND, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled, hstack, vstack
 from design.api import design_coupling, transparency_of

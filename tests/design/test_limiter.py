@@ -9,7 +9,7 @@ from asked import limiter, limiter_demand, this_environment
 from worlds import DELTA, PAIR, STIFF, T
 
 from cli.design import main as design_main
-from controller.coupling import CASE_I, NoCoupling, SpringDamper
+from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from controller.environment import Network, Wall
 from controller.loop import DelayRange
 from controller.lti import Lti, Sampled, taps
@@ -113,7 +113,7 @@ def test_the_coupling_designed_with_the_block():
     ("coupling", "expected"),
     [
         (NoCoupling(), 1.74600),
-        (CASE_I, 1.41600),
+        (PUBLISHED["I"], 1.41600),
         (SpringDamper((879.0, 552.0), (0.39, 0.52)), 0.72345),
         (STIFF, 1.38533),
         (BUILT, 1.32327),

@@ -11,7 +11,7 @@ from worlds import force_map
 
 from cli import compare as command
 from cli.compare import main
-from controller.coupling import CASE_I
+from controller.coupling import PUBLISHED
 from controller.environment import environment
 from design import compare as limit_curve
 from design.compare import AXES, LADDERS, SHORT, Point, Sweep, ladder_row, measured, optimum, points_along, remembered
@@ -219,7 +219,7 @@ def test_rungs_are_the_designs_that_they_name():
     by_name = {entry.name: entry for entry in SHORT}
     published = ladder_row("I", LOOP, by_name["published"], unasked)
     E = environment(LOOP.environment, LOOP.T)
-    expected = this_environment(force_map(E, CASE_I, LOOP.theta, LOOP.psi), LOOP.delta)
+    expected = this_environment(force_map(E, PUBLISHED["I"], LOOP.theta, LOOP.psi), LOOP.delta)
     assert published.design == "published (27)"
     assert published.required_damping == expected.required
     assert not published.certified

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from analysis import analysis, solve
 from asked import any_environment
-from worlds import DELTA, T
+from worlds import DELTA, FIGURE_4, T
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
-from controller.environment import FIGURE_4, Network, Spring, environment
+from controller.environment import Network, Spring, environment
 from controller.lti import Lti
 from design.conditions import v_hat
 from design.frequency import frequencies, hermitian, on_circle

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from asked import any_environment, any_environment_per_channel, delayed_demand, this_environment
+from asked import any_environment, any_environment_demand, any_environment_per_channel, this_environment
 from scipy.linalg import eig, eigh
-from worlds import STIFF, force_map
+from worlds import FIGURE_4, STIFF, force_map
 
-from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from controller.environment import GROUND, Network, Spring, environment
 from controller.lti import Lti
-from design.conditions import least_multiple, regular_part
+from design.conditions import least_multiple, least_scale, regular_part
 from design.frequency import frequencies, hermitian, on_circle, supremum
 
 T, THETA, DELTA = 1.2e-3, (1, 2), (1.37, 1.37)
@@ -25,8 +25,8 @@ def default(coupling) -> Lti:
     ("coupling", "required"),
     [
         (NoCoupling(), 1.7229),
-        (CASE_I, 1.39871),
-        (CASE_II, 1.29778),
+        (PUBLISHED["I"], 1.39871),
+        (PUBLISHED["II"], 1.29778),
         (SpringDamper([879.0, 552.0], [0.39, 0.52]), 0.714344),
         (STIFF, 1.36326),
     ],
@@ -38,10 +38,10 @@ def test_this_environment_figures(coupling, required):
 
 
 def test_any_environment_figures():
-    assert any_environment_per_channel(CASE_I.channels(T), THETA, DELTA).required == pytest.approx(
+    assert any_environment_per_channel(PUBLISHED["I"].channels(T), THETA, DELTA).required == pytest.approx(
         (7.63, 7.84), abs=0.005
     )
-    assert any_environment_per_channel(CASE_II.channels(T), THETA, DELTA).required == pytest.approx(
+    assert any_environment_per_channel(PUBLISHED["II"].channels(T), THETA, DELTA).required == pytest.approx(
         (7.04, 3.89), abs=0.005
     )
     best = SpringDamper([878.86, 551.94], [0.3865, 0.5220])
@@ -105,7 +105,7 @@ def test_the_sweep_misses_no_peak(seed):
 
 def test_unequal_devices_need_a_common_factor():
     """Scaling delta scales the ratio: required damping is along the direction of what is available."""
-    F = default(CASE_I)
+    F = default(PUBLISHED["I"])
     one, two = this_environment(F, (1.0, 2.0)), this_environment(F, (2.0, 4.0))
     assert one.required == pytest.approx(two.required, rel=1e-9)
     assert one.ratio == pytest.approx(2 * two.ratio, rel=1e-9)
@@ -138,10 +138,10 @@ def test_moving_a_delay_between_force_and_measurement_changes_nothing():
     """Remark 3 of the paper, for stability: only the sum of the two delays of a channel matters."""
     from controller.delay import delay
 
-    inner = CASE_I.around(E)
+    inner = PUBLISHED["I"].around(E)
     split = delay((1, 0), T) @ inner @ delay((0, 2), T)
     assert this_environment(split, DELTA).ratio == pytest.approx(
-        this_environment(default(CASE_I), DELTA).ratio, rel=1e-9
+        this_environment(default(PUBLISHED["I"]), DELTA).ratio, rel=1e-9
     )
 
 
@@ -151,19 +151,19 @@ def test_refusals_say_why():
     twisted = Lti.constant([[1.0, 0.5], [0.0, 1.0]], T)
     assert "not symmetric" in this_environment(twisted, (1.0, 1.0)).reason
     assert "pushes outwards" in this_environment(Lti.constant([[-1.0]], T), [1.0]).reason
-    assert "no damping" in this_environment(default(CASE_I), (0.0, 1.0)).reason
+    assert "no damping" in this_environment(default(PUBLISHED["I"]), (0.0, 1.0)).reason
     assert "no damping" in any_environment(Lti.constant([[1.0, 0.0], [0.0, 1.0]], T), [0, 0], (1.0, 0.0)).reason
     assert "V(1) is not symmetric" in any_environment(twisted, [0, 0], (1.0, 1.0)).reason
     assert "not passive enough" in any_environment(Lti.constant([[0.0]], T), [0], [1.0]).reason
     with pytest.raises(ValueError, match="delta has 1 entries for 2 channels"):
-        this_environment(default(CASE_I), [1.0])
+        this_environment(default(PUBLISHED["I"]), [1.0])
     with pytest.raises(ValueError, match="expected dampings >= 0"):
-        this_environment(default(CASE_I), (-1.0, 1.0))
+        this_environment(default(PUBLISHED["I"]), (-1.0, 1.0))
 
 
 def test_the_frequency_at_which_a_condition_binds():
     """Against a dense grid of the definition, -He[F/(z-1)] T/delta."""
-    F, w = default(CASE_I), np.linspace(1e-3, np.pi, 200_001)
+    F, w = default(PUBLISHED["I"]), np.linspace(1e-3, np.pi, 200_001)
     z = np.exp(1j * w)
     G = F.at(z) / (z - 1)[:, None, None]
     needed = np.linalg.eigvalsh(-(G + np.conj(np.swapaxes(G, -1, -2))) / 2)[:, -1] * T
@@ -172,9 +172,10 @@ def test_the_frequency_at_which_a_condition_binds():
     assert found.frequency_hz == pytest.approx(w[needed.argmax()] / (2 * np.pi * T), rel=1e-3)
 
 
-def test_the_least_multiple_is_a_generalised_eigenvalue():
-    free, half = RNG.normal(size=(5, 3, 3)), RNG.normal(size=(5, 3, 3))
-    free, gain = free + np.swapaxes(free, 1, 2), half @ np.swapaxes(half, 1, 2) + 0.1 * np.eye(3)
+@pytest.mark.parametrize("n", [2, 3])
+def test_the_least_multiple_is_a_generalised_eigenvalue(n):
+    free, half = (RNG.normal(size=(9, n, n)) + 1j * RNG.normal(size=(9, n, n)) for _ in range(2))
+    free, gain = hermitian(free), half @ np.conj(np.swapaxes(half, 1, 2)) + 0.1 * np.eye(n)
     expected = [eigh(-one, other, eigvals_only=True)[-1] for one, other in zip(free, gain, strict=True)]
     np.testing.assert_allclose(least_multiple(free, gain), expected, rtol=1e-9)
 
@@ -208,7 +209,7 @@ def test_with_a_multiplier_the_factor_is_the_least_by_definition():
         H = V.at(z) / T - (vt / (2 * s[:, None] * delta))[:, :, None] * np.eye(2)
         return np.linalg.eigvalsh(hermitian(H / (1 - z)[:, None, None]) - star(H) @ (covered[:, :, None] * H))[:, 0]
 
-    s = delayed_demand(V, theta, delta, np.array(phi))(w)
+    s = least_scale(any_environment_demand(V, theta, delta, phi=phi), w)
     scale = np.abs(least(2 * s))
     assert (np.abs(least(s)) < 1e-9 * scale).all()
     assert (least(1.001 * s) > 0).all()

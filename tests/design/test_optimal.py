@@ -19,7 +19,7 @@ from controller.coupling import ForceFilter, NoCoupling, SpringDamper, basis
 from controller.environment import Network, Spring
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
-from design.barrier import MatrixInequality, Program, centre
+from design.barrier import EntryInequality, MatrixInequality, Program, centre
 from design.bound import BoundBeside, _causal, bound
 from design.certificate import verify
 from design.coupling_file import Stored, save
@@ -425,6 +425,22 @@ def test_the_barrier_finds_what_a_cone_solver_finds():
     assert program.value(y) == pytest.approx(value, abs=1e-5)
     assert program.value(y) >= value - 1e-6
     assert Program(A, b, c, (block,)).feasible(np.linalg.solve(U, y))
+
+
+def test_an_inequality_by_entries_is_the_one_that_is_written_out():
+    """He[root X root], each entry of X a sum of two functions, and a further unknown that makes it positive."""
+    rng = np.random.default_rng(4)
+    k, r, root = 5, 3, np.array([1.0, 2.0, 0.5])
+    functions = rng.normal(size=(k, 2)) + 1j * rng.normal(size=(k, 2))
+    units = np.eye(r * r).reshape(r * r, 1, r, r) * np.outer(root, root)
+    entries = hermitian((functions[:, None, :, None, None] * units).reshape(k, -1, r, r))
+    further = np.tile(np.eye(r, dtype=complex), (k, 1, 1, 1))
+    dense = MatrixInequality.of(np.zeros((k, r, r), dtype=complex), np.concatenate([entries, further], axis=1))
+    split = EntryInequality(functions, root, dense.slope[:, :, -1:])
+    x = np.append(rng.normal(size=2 * r * r), 30.0)
+    np.testing.assert_allclose(split.at(x), dense.at(x), atol=1e-12)
+    for one, other in zip(split.newton(x), dense.newton(x), strict=True):
+        np.testing.assert_allclose(np.triu(one), np.triu(other), atol=1e-12)
 
 
 ORDINARY = {

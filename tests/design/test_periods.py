@@ -10,10 +10,11 @@ from asked import any_environment, any_environment_demand, this_environment_dema
 from asked import loop as loop_of
 from driven import growing
 from scipy.linalg import expm
+from worlds import FIGURE_4
 
 from cli.design import main as cli_design
 from controller.coupling import SpringDamper
-from controller.environment import FIGURE_4, Network, Spring
+from controller.environment import Network, Spring
 from controller.loop import DelayRange, Loop
 from design.certificate import assess, prove, prove_limiter, required_damping, verify
 from design.conditions import even_damping

@@ -7,7 +7,7 @@ from itertools import combinations, pairwise, product
 import msgspec
 import numpy as np
 import pytest
-from worlds import environment_by_hand, filter_by_hand, force_map
+from worlds import FIGURE_4, environment_by_hand, filter_by_hand, force_map
 
 from cli.audit import main as audit_main
 from cli.check import main as check_main
@@ -17,7 +17,7 @@ from cli.validate import main as validate_main
 from controller.coupling import SpringDamper
 from controller.coupling import SpringDamper as StoredSpringDamper
 from controller.delay import VaryingDelay
-from controller.environment import FIGURE_4, Network, Spring, environment
+from controller.environment import Network, Spring, environment
 from controller.loop import Loop
 from controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices
 from design import optimal

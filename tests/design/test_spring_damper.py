@@ -3,26 +3,27 @@
 import re
 
 import cvxpy as cp
+import msgspec
 import numpy as np
 import pytest
 from analysis import analysis, solve
 from asked import any_environment, this_environment
 from scipy.optimize import brentq
-from worlds import DELTA, SOFT_NETWORK, T, force_map
+from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
-from controller.environment import FIGURE_4, Network, Spring
+from controller.environment import Network, Spring
 from controller.loop import Loop
 from controller.lti import Lti
-from design import gain_search, spring_damper
+from design import conditions, gain_search, spring_damper
 from design.api import instead, transparency_of
-from design.conditions import any_environment_delayed
 from design.designs import design_by_kind
+from design.frequency import hermitian
 from design.gain_search import LimiterLoop, SampledLoop
 from design.lmi import RESERVE, Shaping, check_passive
 from design.result import DesignFailed, Infeasible
-from design.spring_damper import design, solve_within, stiffest
+from design.spring_damper import GainSet, design, stiffest
 from design.transparency import decibels
 from sim.scenario import load
 
@@ -129,13 +130,32 @@ def gains_of_least(cost, theta, sigma):
     return solve(cp.Problem(cp.Minimize(cost[0] * k + cost[1] * b), [cones, k >= 0, b >= 0]))
 
 
-@pytest.mark.parametrize("largest_gram", [1000, 0])
+@pytest.mark.parametrize("most_stored", [1000, 0])
 @pytest.mark.parametrize(("theta", "sigma"), [(0, np.inf), (1, np.inf), (12, np.inf), (0, 3.0), (2, 5.0), (7, 3.0)])
-def test_the_gain_set_is_exact(theta, sigma, largest_gram):
+def test_the_gain_set_is_exact(theta, sigma, most_stored):
     """Its furthest points, by one matrix inequality and by many, against cvxpy: 5e-6, since the many miss 2e-6."""
+    loop = asked((0,), WALL, (theta,), (0,), (1 / (1 - RESERVE),), 1.0)
+    certified = GainSet(loop, None if np.isinf(sigma) else np.array([1 / (1 + sigma)]), most_stored)
     for cost in (np.array([-1.0, -0.2]), np.array([-0.2, -1.0]), np.array([-1.0, 1.0])):
-        found = solve_within(cost, [theta], np.array([sigma]), "a test", largest_gram=largest_gram)
+        found = certified.solve(cost, "a test")
         assert cost @ found == pytest.approx(gains_of_least(cost, theta, sigma), rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.3])
+@pytest.mark.parametrize("theta", [0, 1, 4])
+def test_the_gain_set_is_the_block_of_its_condition(theta, phi):
+    """k/2 + b - |c|^2 is |W|^2 times the block of any-environment for V = 1/W, less its row of the multiplier."""
+    loop = Loop(1.0, (theta,), (0,), (0,), (1 / (1 - RESERVE),), WALL)
+    unit, z = loop.channel(0).at(WALL), np.exp(1j * np.linspace(1e-3, np.pi, 50))[None]
+    unit = msgspec.structs.replace(unit, delta=(1.0,))
+    for k, b in np.random.default_rng(theta).uniform(0.05, 2, (5, 2)):
+        (channel,) = GainSet(loop, np.array([phi]) if phi else None).channels
+        V = SpringDamper([k], [b]).sampled(z, 1.0)
+        demand = conditions.any_environment_demand(V, unit, [phi])
+        block = hermitian((demand.free + demand.gain).G[0])
+        whole = block[:, 0, 0].real - (np.abs(block[:, 1, 0]) ** 2 / block[:, 1, 1].real if phi else 0)
+        found = k / 2 + b - (np.abs(channel.rows(np.array([k, b])).at(z[0])) ** 2).sum(axis=(1, 2))
+        np.testing.assert_allclose(found, whole / np.abs(V.G[0, :, 0, 0]) ** 2, rtol=1e-8, atol=1e-9)
 
 
 def test_three_channels_with_different_devices():
@@ -174,7 +194,7 @@ def test_without_a_multiplier_the_delayed_condition_is_the_plain_one():
     for gains in random_starts(10, seed=4):
         V = gains.compliance(T)
         plain = any_environment(V, (1, 2), DELTA)
-        same = any_environment_delayed(V, asked(), np.zeros(2))
+        same = conditions.any_environment(V, asked(), np.zeros(2))
         assert same.ratio == pytest.approx(plain.ratio, rel=1e-6)
 
 

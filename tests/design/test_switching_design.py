@@ -53,7 +53,7 @@ def test_no_lossless_human_grows_under_the_worst_switching(made):
     for share in (1.0, 0.7):
         placed = scenario.replace(delta=tuple(share * d for d in scenario.delta))
         loop, held_by = assemble(placed, coupling), variants(placed.device, Crowd(links))
-        grown = switched_crowd(loop, held_by, np.arange(60), 0, 2.0, mujoco=False).exact
+        grown = switched_crowd(loop, held_by, np.arange(60), 0, 2.0, None).exact
         growing.append(int((grown > 0).sum()))
     assert growing[0] == 0
     assert growing[1] > 0
@@ -98,4 +98,4 @@ def test_an_optimal_coupling_for_switching_delays():
     links[..., 1] = 0.0
     loop = assemble(load().replace(varying_delay=VaryingDelay(*RANGE, "adversarial")), made.coupling)
     held_by = variants(loop.scenario.device, Crowd(links))
-    assert not (switched_crowd(loop, held_by, np.arange(60), 0, 2.0, mujoco=False).exact > 0).any()
+    assert not (switched_crowd(loop, held_by, np.arange(60), 0, 2.0, None).exact > 0).any()

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from asked import switching_demand, switching_sweep, this_environment
-from worlds import DELTA, PAIR, SOFT, STIFF, T, force_map
+from worlds import DELTA, FIGURE_4, PAIR, SOFT, STIFF, T, force_map
 
 from cli.audit import main as audit_main
 from cli.check import main as check_main
@@ -17,7 +17,7 @@ from cli.validate import main as validate_main
 from controller import coupling as built
 from controller.coupling import SpringDamper
 from controller.delay import LOST, VaryingDelay, ages
-from controller.environment import FIGURE_4, environment
+from controller.environment import environment
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
 from controller.ranges import Ranges, UncertainSpring

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from analysis import solve
 from asked import switching_demand, switching_sweep, this_environment
-from worlds import DELTA, SOFT, STIFF, T, force_map
+from worlds import DELTA, FIGURE_4, SOFT, STIFF, T, force_map
 
 from cli.audit import main
 from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.environment import GROUND, Network, Spring, environment
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
 from design.certificate import judged, prove

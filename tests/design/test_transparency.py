@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from worlds import SOFT, STIFF, force_map
+from worlds import FIGURE_4, SOFT, STIFF, force_map
 
-from controller.coupling import CASE_I, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from controller.environment import GROUND, Network, Spring, environment
 from controller.lti import Lti
 from design.frequency import integral
 from design.transparency import decibels, transparency
@@ -18,8 +18,8 @@ E = environment(FIGURE_4, T)
 @pytest.mark.parametrize(
     ("coupling", "lam", "sup", "rms"),
     [
-        (CASE_I, (1, 2), 7.70, -7.24),
-        (CASE_I, (0, 0), 7.91, -5.97),
+        (PUBLISHED["I"], (1, 2), 7.70, -7.24),
+        (PUBLISHED["I"], (0, 0), 7.91, -5.97),
         (NoCoupling(), (0, 0), 0.34, -10.98),
         (SpringDamper([878.86, 551.94], [0.3865, 0.5220]), (1, 2), 18.55, -0.08),
         (SpringDamper([878.86, 551.94], [0.3865, 0.5220]), (0, 0), 18.60, 0.15),
@@ -32,7 +32,7 @@ def test_agreed_figures(coupling, lam, sup, rms):
 
 
 def test_against_a_dense_sweep():
-    F = force_map(E, CASE_I, THETA, (0, 0))
+    F = force_map(E, PUBLISHED["I"], THETA, (0, 0))
     hz = np.geomspace(0.5, 80, 400_001)
     z = np.exp(2j * np.pi * hz * T)
     target = z[:, None, None] ** -np.array([1.0, 2.0])[None, :, None] * E.at(z)
@@ -98,7 +98,7 @@ def test_a_map_that_is_the_environment_itself_has_no_mismatch():
 
 def test_what_needs_no_force_makes_tau_infinite():
     """E(1) of Figure 4 has rank one, so (25) divides by zero."""
-    assert transparency(force_map(E, CASE_I, THETA, (0, 0)), E, THETA).tau == np.inf
+    assert transparency(force_map(E, PUBLISHED["I"], THETA, (0, 0)), E, THETA).tau == np.inf
 
 
 def test_tau_of_a_spring_is_its_relative_error():

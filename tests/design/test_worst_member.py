@@ -6,11 +6,11 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
-from worlds import VERTICES_ONLY, environment_by_hand, filter_by_hand
+from worlds import FIGURE_4, VERTICES_ONLY, environment_by_hand, filter_by_hand
 
 from cli.check import main as check_main
 from controller.coupling import ForceFilter, InternalModel
-from controller.environment import FIGURE_4, Network, Spring
+from controller.environment import Network, Spring
 from controller.ranges import Member, Ranges, Region, UncertainSpring, members, regions
 from design import optimal
 from design.api import certify, store

@@ -2,9 +2,9 @@
 
 import pytest
 
-from cli.checks.faults import _lively
 from hw.control import certified_couplings
 from sim.scenario import load as scenario_of
+from tests.checks.faults import _lively
 
 
 @pytest.fixture(scope="session")

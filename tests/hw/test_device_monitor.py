@@ -10,9 +10,9 @@ from worlds import FakePort
 from design.files import plain
 from hw.device_state import Device
 from hw.emulator import Emulator, FaultInjection, info_of, nobody
-from hw.haptic_device import Driver, SerialDevice
+from hw.haptic_device import SerialDevice
 from hw.identify import chirp
-from hw.limits import SafetyLimits, SafetyStop, Stage
+from hw.limits import SafetyLimits, Stage
 from hw.monitor import (
     _BLOCK,
     _PATIENCE,
@@ -22,12 +22,12 @@ from hw.monitor import (
     LinkSettings,
     Measurement,
     _ClockDrift,
-    check_state,
 )
-from hw.protocol import NO_MARGIN, Command, Config, Force, Phase, Reason, Refused, State, Stop, encode
-from hw.recording import Recorder, outcome, result_of
+from hw.protocol import NO_MARGIN, Command, Config, Force, Phase, Reason, Refused, SafetyStop, State, Stop, encode
+from hw.recording import Recorder, result_of
 from hw.rehearsal import Rehearsal
-from hw.session import Session
+from hw.session import Driver, Session, _check_state
+from hw.session_report import outcome
 from sim.scenario import load as scenario_of
 from sim.trace import growths
 
@@ -93,8 +93,8 @@ def test_a_device_that_is_wrong_every_other_tick_is_found_out_later():
 
 def test_a_disarmed_device_has_no_force():
     with pytest.raises(SafetyStop, match=r"is disarmed and applies \(1, 0\) steps"):
-        check_state(state(0, (1, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
-    check_state(state(0, (0, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
+        _check_state(state(0, (1, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
+    _check_state(state(0, (0, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
 
 
 def test_a_session_stops_where_a_disarmed_device_pushes(scenario, rungs):
@@ -268,7 +268,7 @@ def test_one_freeze_is_no_drift_and_many_are():
 
 
 def test_gaps_within_the_watchdog_are_allowed():
-    clock = ClockMonitor(SafetyLimits((12.0,)), 1e-6 * T_US)
+    clock = ClockMonitor(SafetyLimits((12.0,)).watchdog_us, 1e-6 * T_US)
     for n in (0, 5, 6, 11, 12):
         clock.check(state(n, t_us=n * T_US), 5 if n in (5, 11) else 1, n * T_US)
     with pytest.raises(SafetyStop, match="leapt by 6"):

@@ -8,8 +8,9 @@ import pytest
 from msgspec.structs import replace
 
 from hw.emulator import Emulator, FaultInjection, nobody
-from hw.limits import SafetyLimits, SafetyStop, Stage
+from hw.limits import SafetyLimits, Stage
 from hw.monitor import EncoderMonitor, EncoderTest, LinkSettings
+from hw.protocol import SafetyStop
 from hw.rehearsal import Rehearsal
 from hw.session import Session
 from sim.scenario import InputError

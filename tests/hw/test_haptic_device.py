@@ -19,8 +19,9 @@ from hw.haptic_device import PortLost, SerialDevice
 from hw.limits import SafetyLimits, Stage
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import Command, Config, Decoder, Force, Hello, Phase, Reason, Refused, State, encode
-from hw.recording import Recorder, save
-from hw.session import Session
+from hw.recording import Recorder
+from hw.session import Operator, Session
+from hw.session_report import save
 from hw.transport import Live
 from models.scene import build, plant
 from sim.scenario import InputError
@@ -129,7 +130,7 @@ def held_session(scenario, sdk, seconds=0.5, cap=12.0, glance=lambda session: No
             made.extend(certified_couplings(judged, "I", None, None, link, spare=0))
             return made
 
-        live = Live(session, device, plan, True, seconds, glance=glance)
+        live = Live(session, device, plan, Operator(True, seconds), glance=glance)
         live.clock = lambda: round(1e6 * sdk.now)
         live.run()
     return session, recorder, made
@@ -273,7 +274,7 @@ def test_the_emergency_stop_is_at_once(scenario):
         def plan(ages):
             return certified_couplings(timed(scenario, ages, 0.99, 50.0, True)[0], "I", None, None, 0, spare=0)
 
-        live = Live(session, device, plan, True, 3.0, glance=glance)
+        live = Live(session, device, plan, Operator(True, 3.0), glance=glance)
         live.clock = lambda: round(1e6 * sdk.now)
         live.run()
     assert (session.stage, session.cause) == (Stage.ESTOP, "asked to")

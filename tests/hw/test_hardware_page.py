@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import pytest
 
 from cli import bridge
-from cli.checks.faults import CASES, _rehearse_case
 from hw.monitor import LinkSettings
 from hw.transport import SerialPort, _no_collections
+from tests.checks.faults import CASES, _rehearse_case
 
 PAGE = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")
 TABLE = re.search(r"^\| fault \| ends in .*\n\|[-|]+\n((?:\|.*\n)+)", PAGE, flags=re.MULTILINE)[1]

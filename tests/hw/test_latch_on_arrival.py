@@ -11,8 +11,8 @@ from cli.bridge import main as bridge
 from cli.replay import main as replay
 from hw.control import certified_couplings, overlong_tick, timed
 from hw.emulator import Emulator
-from hw.limits import SafetyStop
 from hw.monitor import Ages, LinkSettings
+from hw.protocol import SafetyStop
 from hw.recording import Recorder
 from hw.rehearsal import Rehearsal
 from hw.session import Stage, session_for

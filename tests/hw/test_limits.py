@@ -12,22 +12,17 @@ from hw.limits import (
     Gain,
     Heat,
     SafetyLimits,
-    SafetyStop,
     Stage,
     Units,
     _wire_time,
-    check_jolt,
-    check_jump,
-    check_range,
-    check_speed,
     configuration,
     objections,
     probe_delay,
-    shape,
     watchdog_for,
 )
-from hw.monitor import CommandMonitor, check_state
-from hw.protocol import MAX_RELEASE_NS, PROTOCOL, Config, Force, Info, Phase, State, encode
+from hw.monitor import CommandMonitor
+from hw.protocol import MAX_RELEASE_NS, PROTOCOL, Config, Force, Info, Phase, SafetyStop, State, encode
+from hw.session import _check_state
 from sim.scenario import load
 
 LIMITS = SafetyLimits((12.0, 6.0))
@@ -44,9 +39,9 @@ def test_no_force_leaves_that_is_not_finite_and_within_the_cap(asked, previous, 
     )
     if not all(map(math.isfinite, asked)):
         with pytest.raises(SafetyStop, match="which is no force"):
-            shape(asked, before, gain, LIMITS, T)
+            LIMITS.shape(asked, before, gain, T)
         return
-    shaped = shape(asked, before, gain, LIMITS, T)
+    shaped = LIMITS.shape(asked, before, gain, T)
     for force, last, cap in zip(shaped.force, before, LIMITS.cap, strict=True):
         assert abs(force) <= cap
         assert abs(force - last) <= LIMITS.slew * T * (1 + 1e-12)  # one rounding of last +- step
@@ -55,11 +50,11 @@ def test_no_force_leaves_that_is_not_finite_and_within_the_cap(asked, previous, 
 def test_the_trap_that_the_order_of_checks_avoids():
     assert max(-12.0, min(12.0, math.nan)) == 12.0
     with pytest.raises(SafetyStop, match="asked for nan, 0 N, which is no force"):
-        shape((math.nan, 0.0), (0.0, 0.0), 0.0, LIMITS, T)
+        LIMITS.shape((math.nan, 0.0), (0.0, 0.0), 0.0, T)
 
 
 def test_a_force_within_the_limits_is_left_alone():
-    shaped = shape((1.0, -2.0), (0.5, -1.0), 1.0, LIMITS, T)
+    shaped = LIMITS.shape((1.0, -2.0), (0.5, -1.0), 1.0, T)
     assert shaped.force == (1.0, -2.0)
     assert (shaped.clipped, shaped.slowed) == (False, False)
 
@@ -67,7 +62,7 @@ def test_a_force_within_the_limits_is_left_alone():
 @pytest.mark.parametrize("gain", [math.nan, -0.01, 1.01])
 def test_an_impossible_gain_is_a_fault(gain):
     with pytest.raises(SafetyStop, match="the gain is"):
-        shape((1.0, 1.0), (0.0, 0.0), gain, LIMITS, T)
+        LIMITS.shape((1.0, 1.0), (0.0, 0.0), gain, T)
 
 
 @pytest.mark.parametrize(
@@ -117,25 +112,25 @@ def test_no_cap_above_twelve_newtons():
 def test_jumps_are_measured_per_tick(moved, ticks, fault):
     if fault:
         with pytest.raises(SafetyStop, match=r"encoder 2 jumped by 3\.1 mm, allowed are 3 mm in 1 tick"):
-            check_jump((0.0, moved), (0.0, 0.0), ticks, LIMITS)
+            LIMITS.check_jump((0.0, moved), (0.0, 0.0), ticks)
     else:
-        check_jump((0.0, moved), (0.0, 0.0), ticks, LIMITS)
+        LIMITS.check_jump((0.0, moved), (0.0, 0.0), ticks)
 
 
 @pytest.mark.parametrize("x", [math.nan, math.inf])
 def test_a_displacement_that_is_no_number_never_passes(x):
     with pytest.raises(SafetyStop):
-        check_jump((x,), (0.0,), 1, LIMITS)
+        LIMITS.check_jump((x,), (0.0,), 1)
     with pytest.raises(SafetyStop):
-        check_speed((x,), (0.0,), 1, LIMITS)
+        LIMITS.check_speed((x,), (0.0,), 1)
 
 
 def test_what_is_just_at_a_limit_is_within_it():
-    check_speed((1e-3, 0.0), (0.0, 0.0), 1e-3, LIMITS)
-    check_jump((3e-3, 0.0), (0.0, 0.0), 1, LIMITS)
-    check_jolt((3e-3, 0.0), (0.0, 0.0), (0.0, 0.0), LIMITS)
-    check_range((10**5, -(10**5)), Units.of(INFO))
-    assert shape((12.0, 0.0), (12.0, 0.0), 1.0, LIMITS, T).clipped  # the limiter leaves its forces there
+    LIMITS.check_speed((1e-3, 0.0), (0.0, 0.0), 1e-3)
+    LIMITS.check_jump((3e-3, 0.0), (0.0, 0.0), 1)
+    LIMITS.check_jolt((3e-3, 0.0), (0.0, 0.0), (0.0, 0.0))
+    Units.of(INFO).check_range((10**5, -(10**5)))
+    assert LIMITS.shape((12.0, 0.0), (12.0, 0.0), 1.0, T).clipped  # the limiter leaves its forces there
 
 
 def test_the_gain_stays_within_its_ends():
@@ -246,12 +241,12 @@ def test_a_force_step_is_never_more_than_the_slew_limit():
 
 def test_an_encoder_that_shakes_is_found_though_no_step_is_too_large():
     limits = SafetyLimits((12.0,))
-    check_jolt((2e-3,), (0.0,), (0.0,), limits)  # a jump that the other check allows, too
-    check_jolt((4e-3,), (2e-3,), (0.0,), limits)  # at constant speed
+    limits.check_jolt((2e-3,), (0.0,), (0.0,))  # a jump that the other check allows, too
+    limits.check_jolt((4e-3,), (2e-3,), (0.0,))  # at constant speed
     with pytest.raises(SafetyStop, match=r"encoder 1 shakes: its speed changed by 5\.8 mm in a tick, allowed are 3 mm"):
-        check_jolt((2.9e-3,), (0.0,), (2.9e-3,), limits)
+        limits.check_jolt((2.9e-3,), (0.0,), (2.9e-3,))
     with pytest.raises(SafetyStop, match="shakes"):
-        check_jolt((float("nan"),), (0.0,), (0.0,), limits)
+        limits.check_jolt((float("nan"),), (0.0,), (0.0,))
 
 
 # every check, on every channel and for both signs
@@ -267,13 +262,13 @@ def on(channel, value, rest=0.0):
 @pytest.mark.parametrize(("channel", "sign"), MIRRORED)
 def test_every_motion_check_is_for_both_channels_and_signs(channel, sign):
     for name, inside, outside, check in (
-        (f"encoder {channel + 1} jumped by", 2.9e-3, 3.1e-3, lambda x: check_jump(x, (0.0, 0.0), 1, LIMITS)),
-        (f"encoder {channel + 1} shakes", 2.9e-3, 3.1e-3, lambda x: check_jolt(x, (0.0, 0.0), (0.0, 0.0), LIMITS)),
-        (f"encoder {channel + 1} shakes", 1.4e-3, 1.6e-3, lambda x: check_jolt((0.0, 0.0), x, (0.0, 0.0), LIMITS)),
-        (f"encoder {channel + 1} shakes", 2.9e-3, 3.1e-3, lambda x: check_jolt((0.0, 0.0), (0.0, 0.0), x, LIMITS)),
-        (f"encoder {channel + 1} is at", 10**5, 10**5 + 1, lambda n: check_range(n, Units.of(INFO))),
-        (f"axis {channel + 1} moves at", 9.9e-3, 10.1e-3, lambda x: check_speed(x, (0.0, 0.0), 0.01, LIMITS)),
-        (f"axis {channel + 1} moves at", 9.9e-3, 10.1e-3, lambda x: check_speed((0.0, 0.0), x, 0.01, LIMITS)),
+        (f"encoder {channel + 1} jumped by", 2.9e-3, 3.1e-3, lambda x: LIMITS.check_jump(x, (0.0, 0.0), 1)),
+        (f"encoder {channel + 1} shakes", 2.9e-3, 3.1e-3, lambda x: LIMITS.check_jolt(x, (0.0, 0.0), (0.0, 0.0))),
+        (f"encoder {channel + 1} shakes", 1.4e-3, 1.6e-3, lambda x: LIMITS.check_jolt((0.0, 0.0), x, (0.0, 0.0))),
+        (f"encoder {channel + 1} shakes", 2.9e-3, 3.1e-3, lambda x: LIMITS.check_jolt((0.0, 0.0), (0.0, 0.0), x)),
+        (f"encoder {channel + 1} is at", 10**5, 10**5 + 1, lambda n: Units.of(INFO).check_range(n)),
+        (f"axis {channel + 1} moves at", 9.9e-3, 10.1e-3, lambda x: LIMITS.check_speed(x, (0.0, 0.0), 0.01)),
+        (f"axis {channel + 1} moves at", 9.9e-3, 10.1e-3, lambda x: LIMITS.check_speed((0.0, 0.0), x, 0.01)),
     ):
         check(on(channel, sign * inside))
         with pytest.raises(SafetyStop, match=name):
@@ -290,10 +285,10 @@ def test_the_cap_and_the_slew_limit_are_for_both_channels_and_signs(channel, sig
         (-3.0, 0.0, -step, False, True),
         (cap + 0.1, 0.0, step, True, True),
     ):
-        shaped = shape(on(channel, sign * asked), on(channel, sign * last), 1.0, LIMITS, T)
+        shaped = LIMITS.shape(on(channel, sign * asked), on(channel, sign * last), 1.0, T)
         assert shaped.force == on(channel, sign * sent)
         assert (shaped.clipped, shaped.slowed) == (clipped, slowed)
-    half = shape(on(channel, sign * 2.0), (0.0, 0.0), 0.5, LIMITS, T, on(channel, sign * 0.25))
+    half = LIMITS.shape(on(channel, sign * 2.0), (0.0, 0.0), 0.5, T, on(channel, sign * 0.25))
     assert half.force == on(channel, sign * 1.25)  # the gain is for the controller, not for the test of an encoder
 
 
@@ -301,9 +296,9 @@ def test_the_cap_and_the_slew_limit_are_for_both_channels_and_signs(channel, sig
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_force_that_is_none_is_found_on_both_channels(channel, value):
     with pytest.raises(SafetyStop, match="which is no force"):
-        shape(on(channel, value), (0.0, 0.0), 0.0, LIMITS, T)
+        LIMITS.shape(on(channel, value), (0.0, 0.0), 0.0, T)
     with pytest.raises(SafetyStop, match="which is no force"):
-        shape((0.0, 0.0), (0.0, 0.0), 0.0, LIMITS, T, on(channel, math.nan))
+        LIMITS.shape((0.0, 0.0), (0.0, 0.0), 0.0, T, on(channel, math.nan))
 
 
 @pytest.mark.parametrize(("channel", "sign"), MIRRORED)
@@ -339,11 +334,11 @@ def test_what_the_device_says_is_checked_on_both_channels_and_signs(channel, sig
         return State(phase, tick, 0, 100, 0, 0, 0, (0, 0), on(channel, sign * steps, 0))
 
     cap = config.cap[channel]
-    check_state(said(0, cap), config, Stage.ARMED, 1.0)
+    _check_state(said(0, cap), config, Stage.ARMED, 1.0)
     with pytest.raises(SafetyStop, match=r"the device applies .* the cap is"):
-        check_state(said(0, cap + 1), config, Stage.ARMED, 1.0)
+        _check_state(said(0, cap + 1), config, Stage.ARMED, 1.0)
     with pytest.raises(SafetyStop, match="is disarmed and applies"):
-        check_state(said(0, 1, Phase.DISARMED), config, Stage.DISARMED, 0.0)
+        _check_state(said(0, 1, Phase.DISARMED), config, Stage.DISARMED, 0.0)
     for told, applied, wrong in ((500, 500, False), (500, 501, False), (500, 502, True), (500, 498, True)):
         monitor = CommandMonitor(config)
         monitor.unlike(said(0, 0), 1)

@@ -17,12 +17,12 @@ from cli.bridge import _parser
 from cli.session_cli import limits_from, touched
 from hw import transport
 from hw.emulator import Emulator, FaultInjection
-from hw.haptic_device import Driver, SerialDevice
+from hw.haptic_device import SerialDevice
 from hw.limits import SafetyLimits, Stage
 from hw.monitor import LinkSettings
-from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
-from hw.session import Operator, Session, session_for
+from hw.session import Driver, Operator, Session, session_for
+from hw.session_report import IncidentLog
 from sim.scenario import InputError
 
 ROOT = Path(__file__).parent.parent.parent
@@ -149,7 +149,8 @@ def test_the_incident_log_survives_sigkill(tmp_path):
     """A session in a process of its own, killed while forces act: every stage up to then is on the disk."""
     code = (
         "import time; from pathlib import Path\n"
-        "from hw.recording import IncidentLog; from hw.limits import SafetyLimits; from hw.session import Session\n"
+        "from hw.session_report import IncidentLog\n"
+        "from hw.limits import SafetyLimits; from hw.session import Session\n"
         "from sim.scenario import load\n"
         f"session, log = Session(load(), SafetyLimits((2.0, 2.0))), IncidentLog(Path({str(tmp_path / 'log')!r}))\n"
         "log.attach(session); session.start(0); session.now = 1_500_000; log.glance(session)\n"

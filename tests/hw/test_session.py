@@ -9,23 +9,24 @@ from sessions import AT_REST, FAST, rehearsal_of, session_with
 from worlds import FakePort
 
 from cli import bridge
-from cli.checks.faults import CASES, Fault, _rehearse_case, at, person
 from controller.law import Law
 from design.coupling_file import Stored
 from design.coupling_file import save as save_coupling
 from hw.control import HostController, certified_coupling, certified_couplings, link_delay
 from hw.emulator import Emulator, FaultInjection
-from hw.haptic_device import Driver, SerialDevice
-from hw.limits import SafetyLimits, SafetyStop, Stage
+from hw.haptic_device import SerialDevice
+from hw.limits import SafetyLimits, Stage
 from hw.monitor import Ages, LinkSettings
-from hw.protocol import Command, Decoder, Force, Hello, Phase, State, Stop, encode
-from hw.recording import Recorder, _recipes_of, load, outcome, replay, result_of, save
+from hw.protocol import Command, Decoder, Force, Hello, Phase, SafetyStop, State, Stop, encode
+from hw.recording import Recorder, _recipes_of, load, replay, result_of
 from hw.rehearsal import Rehearsal
-from hw.session import Session
+from hw.session import Driver, Session
+from hw.session_report import outcome, save
 from models.hold import hold
 from models.scene import plant
 from sim.run import assemble, outside_forces, run
 from sim.scenario import InputError
+from tests.checks.faults import CASES, Fault, _rehearse_case, at, person
 
 # faults
 
@@ -387,10 +388,10 @@ def test_a_budget_under_the_bridge_stands_by_while_the_coupling_is_certified_and
     run = rehearsal_of(scenario, rungs, recorder=recorder, settings=settings)
     run.run_to_the_end(5.0)
     (part,) = outcome("I", run.session, recorder, 0).energy_budget
-    assert part["limited_ticks"] == part["surprises"] == 0
-    assert part["ticks"] == len(recorder)
-    assert "no passive hand is given more than 0.05 J" in part["guarantee"]
-    assert part["reserved_J"] <= part["energy_J"]
+    assert part.limited_ticks == part.surprises == 0
+    assert part.ticks == len(recorder)
+    assert "no passive hand is given more than 0.05 J" in part.guarantee
+    assert part.reserved_J <= part.energy_J
 
 
 @pytest.mark.parametrize("faults", [(), ("down:drop=0.02@0.5",)], ids=["clean", "lossy"])
@@ -414,7 +415,7 @@ def test_a_thief_under_the_bridge_is_limited_and_hands_get_no_more_than_the_budg
         dx = np.diff(trace.x, axis=0)
         lost = (dx**2 * np.array(scenario.delta)).sum(axis=1) / scenario.T
         taken[budget] = np.cumsum(-(trace.f[:-1] * dx).sum(axis=1) - lost).max()
-        assert part["surprises"] == 0
-        assert part["limited_ticks"] > 50 or budget > 1
+        assert part.surprises == 0
+        assert part.limited_ticks > 50 or budget > 1
         assert taken[budget] <= budget + 1e-5
     assert taken[10.0] > 2 * 0.01

@@ -7,7 +7,7 @@ from scipy.linalg import expm
 
 from models.device import CompliantDevice, RigidDevice, passivity_level, with_damping
 from models.human import Cross, Human, Link, Person, Population, Voluntary
-from models.scene import FILES, build, plant
+from models.scene import _FILES, build, plant
 
 HAND = Human((Link(0.3, 3.0, 200.0),))
 ARM = Human((Link(0.1, 5.0, 800.0), Link(1.0, 8.0, 150.0)))
@@ -233,7 +233,7 @@ def test_impossible_bodies_cannot_be_built(call, message):
 @pytest.mark.parametrize(("name", "device"), [("compliant", CompliantDevice()), ("rigid", RigidDevice())])
 def test_the_file_of_a_device_is_the_scene_that_is_assembled_from_it(name, device):
     """What a viewer opens has the matrices, the limit and the names of one device with an everyday hand."""
-    drawn = mujoco.MjModel.from_xml_path(str(FILES / f"{name}.xml"))
+    drawn = mujoco.MjModel.from_xml_path(str(_FILES / f"{name}.xml"))
     assembled = build([device], [Human((Link(0.3, 3.0, 200.0),))])
     ours, theirs = plant(assembled.model), plant(drawn)
     np.testing.assert_array_equal(theirs.A, ours.A)

@@ -10,22 +10,23 @@ import pytest
 from cli import run as run_command
 from cli.suite import Check
 from cli.suite import main as suite
-from cli.suite_report import tightness
 from cli.validate import main
-from controller.coupling import CASE_I, NoCoupling, SpringDamper
+from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from design.environments import ThisEnvironment
 from models.device import RigidDevice
 from models.hold import hold
 from models.scene import build, plant
 from sim import adversary
-from sim.adversary import _DESTABILISED, attempts, search, shortages
+from sim.adversary import _DESTABILISED, search
 from sim.run import assemble
 from sim.scenario import load
 from sim.stability import close, dominant_mode
+from tests.checks.ours import tightness
+from tests.checks.tightness import attempts, plot_tightness, shortages
 
 SCENARIO = load()
 DESIGNED = SpringDamper([878.7, 551.8], [0.3864, 0.5219])
-LOOPS = {"none": (SCENARIO, NoCoupling()), "published": (SCENARIO, CASE_I), "designed": (SCENARIO, DESIGNED)}
+LOOPS = {"none": (SCENARIO, NoCoupling()), "published": (SCENARIO, PUBLISHED["I"]), "designed": (SCENARIO, DESIGNED)}
 
 
 def test_it_finds_what_random_humans_do_not():
@@ -132,7 +133,7 @@ def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypa
 
 
 def test_the_rate_by_shortage():
-    rows = list(shortages(("none", "spring-damper"), (0, 0.2), 10)(1))
+    rows = list(shortages(1, ("none", "spring-damper"), (0, 0.2), 10))
     whole, _ = tightness({"rows": [vars(row) | {"holds": row.holds} for row in rows]})
     assert whole.rows == (("0.0%", "2", "0%"), ("20.0%", "2", "100%"))
     assert {row.loop for row in rows} == {"no coupling", "spring-damper, case I"}
@@ -146,11 +147,11 @@ def test_a_human_who_destabilises_a_loop_with_enough_damping_fails_the_check(tmp
         def required(self, loop, coupling, multiplier=None):
             return replace(super().required(loop, coupling), required=(0.5, 0.5))
 
-    monkeypatch.setattr("sim.adversary.THIS_ENVIRONMENT", Third())
-    check = Check(
-        "tightness", "How tight?", shortages(("none",), (0,), 5), tightness, lambda plots: plots.plot_tightness
-    )
+    monkeypatch.setattr("tests.checks.tightness.THIS_ENVIRONMENT", Third())
+    rows = lambda seed: shortages(seed, ("none",), (0,), 5)  # noqa: E731
+    check = Check("tightness", "How tight?", rows, tightness, plot_tightness)
     monkeypatch.setattr("cli.suite.CHECKS", (check,))
+    monkeypatch.setattr("cli.suite._OURS", ())
     assert suite(["--out", str(tmp_path)]) == 1
     assert (tmp_path / "tightness" / "tightness.png").stat().st_size > 10_000
     assert "| no coupling | 0.0% |" in (tmp_path / "report.md").read_text()

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sim.checks.challenges import ENOUGH, GUARANTEES, challenges
+from tests.checks.challenges import ENOUGH, GUARANTEES, challenges
 
 
 @pytest.mark.parametrize("name", GUARANTEES)

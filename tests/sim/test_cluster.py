@@ -15,7 +15,7 @@ import pytest
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra `dask`)")
 
-from controller.coupling import CASE_I  # noqa: E402
+from controller.coupling import PUBLISHED  # noqa: E402
 from sim import shards  # noqa: E402
 from sim.crowds import _BATCH, MIXED, Findings, Validation  # noqa: E402
 from sim.scenario import (  # noqa: E402
@@ -25,7 +25,9 @@ from sim.scenario import (  # noqa: E402
 from sim.shards import Table, validate, validate_on_cluster  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
-QUESTION = Validation(load(), CASE_I, 0, 4 * _BATCH, MIXED, "both", 0.25)  # 0.25 s: just enough for growth rates
+QUESTION = Validation(
+    load(), PUBLISHED["I"], 0, 4 * _BATCH, MIXED, "both", 0.25
+)  # 0.25 s: just enough for growth rates
 
 
 class Cluster:

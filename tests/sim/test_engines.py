@@ -9,9 +9,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from driven import driven
+from driven import alike, driven
 
-from controller.coupling import CASE_I, NoCoupling
+from controller.coupling import PUBLISHED, NoCoupling
 from models.scene import plant
 from sim import mujoco_engines as mujoco_engine
 from sim import run as loop
@@ -25,7 +25,7 @@ SHORT = load().replace(duration=0.6)
 
 @pytest.fixture(scope="module")
 def simulation():
-    return assemble(SHORT, CASE_I)
+    return assemble(SHORT, PUBLISHED["I"])
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def test_order_of_convergence(simulation, exact, integrator, substeps, order):
 
 def test_the_default_is_exact_to_1e_8(simulation):
     """With the voluntary motion alone: the agreed accuracy of RK4 x 4, far from reached."""
-    quiet = assemble(load().replace(tap=None, duration=3.0), CASE_I)
+    quiet = assemble(load().replace(tap=None, duration=3.0), PUBLISHED["I"])
     assert error(run(quiet), run(quiet, "exact")) <= 1e-8
 
 
@@ -96,8 +96,8 @@ def test_batch_and_single_agree_bit_for_bit(simulation):
 
     alone = [follow(MujocoEngine(scene, scenario.T), start[:, [i]]) for i in range(3)]
     # one buffer of three would sum the tick's product in another order, so each simulation runs its own
-    batched = [follow(MujocoBatchEngine(scene, scenario.T, nthread=1), start[:, [i]]) for i in range(3)]
-    together = follow(MujocoBatchEngine(scene, scenario.T, nsim=3, nthread=2), start)
+    batched = [follow(MujocoBatchEngine(alike(scene, 1), scenario.T, nthread=1), start[:, [i]]) for i in range(3)]
+    together = follow(MujocoBatchEngine(alike(scene, 3), scenario.T, nthread=2), start)
     for i in range(3):
         np.testing.assert_array_equal(alone[i].s, batched[i].s)
         np.testing.assert_allclose(together.s[:, :, i], alone[i].s[:, :, 0], rtol=1e-9, atol=1e-12)
@@ -106,7 +106,7 @@ def test_batch_and_single_agree_bit_for_bit(simulation):
 def test_saturation_is_the_same_in_both_engines():
     """Limits far below what the motion asks for: clipped from the start, without an instability to amplify."""
     devices = tuple(d.__class__(force_limit=0.05) for d in SHORT.device)
-    loop = assemble(SHORT.replace(device=devices), CASE_I)
+    loop = assemble(SHORT.replace(device=devices), PUBLISHED["I"])
     a, b = run(loop), run(loop, "exact")
     assert (np.abs(b.f) >= 0.05).any()
     assert np.abs(b.f).max() <= 0.05

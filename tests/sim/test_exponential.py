@@ -7,10 +7,10 @@ the position that the fastest spring turns it into.
 import mujoco
 import numpy as np
 import pytest
-from driven import Driven, driven, tick_by_tick
+from driven import Driven, alike, driven, tick_by_tick
 from scipy.linalg import expm
 
-from controller.coupling import CASE_I, NoCoupling
+from controller.coupling import PUBLISHED, NoCoupling
 from controller.tick import Process, StepBuffer
 from models.device import CompliantDevice
 from models.hold import expm_each, exponential_step, hold
@@ -33,7 +33,9 @@ RESTING = SCENARIO.replace(human=(Human((Link(0.3, 3.0, 200.0),)),) * 2, tap=Non
 
 
 def stiff(transmission: float):
-    return assemble(SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=transmission),) * 2), CASE_I)
+    return assemble(
+        SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=transmission),) * 2), PUBLISHED["I"]
+    )
 
 
 def knocked(simulation, engine: Engine, ticks: int, start=None) -> Driven:
@@ -50,7 +52,7 @@ def knocked(simulation, engine: Engine, ticks: int, start=None) -> Driven:
 
 @pytest.fixture(scope="module")
 def simulation():
-    return assemble(SCENARIO, CASE_I)
+    return assemble(SCENARIO, PUBLISHED["I"])
 
 
 # ---- exactness
@@ -87,20 +89,20 @@ def test_one_step_is_exact_whatever_the_stiffness(stiffness, T):
     assert np.abs(own - scipys[:states]).max() <= 10 * allowed * np.abs(exact[:states]).max()
 
 
-@pytest.mark.parametrize("coupling", [NoCoupling(), CASE_I], ids=["no coupling", "published"])
+@pytest.mark.parametrize("coupling", [NoCoupling(), PUBLISHED["I"]], ids=["no coupling", "published"])
 @pytest.mark.parametrize("stiffness", [14500.0, 1.45e6])
 def test_growth_is_the_exact_loops(stiffness, coupling):
     loop = assemble(SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=stiffness),) * 2), coupling)
     assert simulated_growth(loop, EXPONENTIAL, 1) == pytest.approx(exact_growth(loop), abs=1e-9)
     # the agreed accuracy of four Runge-Kutta steps is five decades behind, where they are enough at all
-    if stiffness == 14500.0 and coupling is CASE_I:
+    if stiffness == 14500.0 and coupling is PUBLISHED["I"]:
         assert abs(simulated_growth(loop, "RK4", 4) - exact_growth(loop)) > 1e-5
 
 
 def test_a_run_is_the_exact_engines_through_saturation_and_all():
     """Half the devices' forces are clipped here; what MuJoCo clips and what the exact engine clips is the same."""
     devices = tuple(device.__class__(force_limit=0.05) for device in SCENARIO.device)
-    loop = assemble(SCENARIO.replace(device=devices), CASE_I)
+    loop = assemble(SCENARIO.replace(device=devices), PUBLISHED["I"])
     own, exact = (knocked(loop, make_engine(loop, name), 500) for name in ("mujoco", "exact"))
     assert (np.abs(exact.f) >= 0.05).any()
     np.testing.assert_allclose(own.s, exact.s, rtol=1e-9, atol=1e-13)
@@ -144,7 +146,7 @@ def _one_period(process: Process, engine: Engine, outside: int):
 
 def test_of_first_order_where_devices_rub():
     """Against 64 Runge-Kutta steps. Coulomb friction switches within a step: 9e-6 m at 8 steps, where RK4 has 2e-9."""
-    loop = assemble(RUBBING, CASE_I)
+    loop = assemble(RUBBING, PUBLISHED["I"])
 
     def positions(integrator, substeps):
         return knocked(loop, make_engine(loop, "mujoco", integrator, substeps), 800).s[:, :2]
@@ -181,7 +183,7 @@ def test_a_batch_is_a_loop_over_single_engines(simulation):
     start = 1e-3 * np.random.default_rng(0).normal(size=(8, 3))
 
     def batch(nsim, nthread=1):
-        return MujocoBatchEngine(simulation.scene, SCENARIO.T, EXPONENTIAL, 1, nsim, nthread)
+        return MujocoBatchEngine(alike(simulation.scene, nsim), SCENARIO.T, EXPONENTIAL, 1, nthread)
 
     single = [tick_by_tick(make_engine(simulation, "mujoco")) for _ in range(3)]
     alone = [knocked(simulation, engine, 300, start[:, [i]]).s for i, engine in enumerate(single)]
@@ -197,12 +199,12 @@ def test_many_hands_are_each_their_own_scene(substeps):
     """Against an engine for each one's own compiled scene, and against the exact batch."""
     crowd = hands(5)
     held_by = variants(SCENARIO.device, crowd)
-    loop = assemble(SCENARIO, CASE_I)
+    loop = assemble(SCENARIO, PUBLISHED["I"])
     start = 1e-3 * np.random.default_rng(1).normal(size=(8, 5))
-    batch = MujocoBatchEngine(held_by.scene, SCENARIO.T, EXPONENTIAL, substeps, 5, humans=held_by)
+    batch = MujocoBatchEngine(held_by, SCENARIO.T, EXPONENTIAL, substeps)
     together = knocked(loop, batch, 300, start).s
     for i in range(5):
-        own = assemble(SCENARIO.replace(human=crowd.humans(i)), CASE_I)
+        own = assemble(SCENARIO.replace(human=crowd.humans(i)), PUBLISHED["I"])
         alone = knocked(own, make_engine(own, "mujoco", EXPONENTIAL, substeps), 300, start[:, [i]]).s
         np.testing.assert_allclose(together[:, :, [i]], alone, rtol=1e-9, atol=1e-13)
     exact = ExactEngine(hold(held_by.plants(), SCENARIO.T))
@@ -223,7 +225,7 @@ def test_many_sampled_plants_are_as_exact_as_one():
 
 
 def test_the_default_follows_from_the_scene(simulation):
-    rubbing = assemble(RUBBING, CASE_I)
+    rubbing = assemble(RUBBING, PUBLISHED["I"])
     assert (default_integrator(simulation.scene), default_substeps(simulation, EXPONENTIAL)) == (EXPONENTIAL, 1)
     assert (default_integrator(rubbing.scene), default_substeps(rubbing, "RK4")) == ("RK4", 4)
     # no rule asks for more on a stiff linear scene, where Runge-Kutta takes 32
@@ -237,7 +239,7 @@ def test_the_default_follows_from_the_scene(simulation):
 
 
 def test_an_engine_without_a_name_of_its_integrator_takes_the_default(simulation):
-    rubbing = assemble(RUBBING, CASE_I)
+    rubbing = assemble(RUBBING, PUBLISHED["I"])
     for loop, integrator, substeps in ((simulation, EXPONENTIAL, 1), (rubbing, "RK4", 4)):
         named = knocked(loop, make_engine(loop, "mujoco", integrator, substeps), 100).s
         np.testing.assert_array_equal(knocked(loop, make_engine(loop, "mujoco"), 100).s, named)
@@ -249,7 +251,10 @@ def test_an_engine_without_a_name_of_its_integrator_takes_the_default(simulation
         (lambda a: make_engine(a, "drake"), "engine is 'drake', allowed are mujoco, exact"),
         (lambda a: make_engine(a, "mujoco", "Euler2"), f"integrator is 'Euler2', allowed are {', '.join(INTEGRATORS)}"),
         (lambda a: make_engine(a, "mujoco", EXPONENTIAL, 0), "substeps is 0, allowed are whole numbers from 1"),
-        (lambda a: make_engine(assemble(RUBBING, CASE_I), "exact"), "have Coulomb friction, which the exact engine"),
+        (
+            lambda a: make_engine(assemble(RUBBING, PUBLISHED["I"]), "exact"),
+            "have Coulomb friction, which the exact engine",
+        ),
     ],
 )
 def test_what_is_refused_is_named(simulation, call, message):
@@ -261,7 +266,7 @@ def test_a_heavy_hand_on_a_light_handle_needs_no_substeps():
     """The hard case of the rule: a 1 g handle without human damping, where Runge-Kutta asks for 24 steps at least."""
     device = CompliantDevice(handle_mass=1e-3)
     human = Human((Link(0.0, 0.0, 300.0),))
-    loop = assemble(SCENARIO.replace(device=(device,) * 2, human=(human,) * 2), CASE_I)
+    loop = assemble(SCENARIO.replace(device=(device,) * 2, human=(human,) * 2), PUBLISHED["I"])
     assert pace(plant(loop.scene.model).A).substeps(SCENARIO.T) >= 24
     assert simulated_growth(loop, EXPONENTIAL, 1) == pytest.approx(exact_growth(loop), abs=1e-9)
 
@@ -282,7 +287,7 @@ def test_the_cheapest_on_a_smooth_scene_is_one_exponential_step(simulation):
 
 def test_where_devices_rub_the_asked_error_is_kept_with_the_fewest_steps():
     """The reference knows 64 steps, which the search does not look at."""
-    loop, ticks = assemble(RUBBING, CASE_I), 500
+    loop, ticks = assemble(RUBBING, PUBLISHED["I"]), 500
 
     def positions(integrator, substeps):
         return run(loop, make_engine(loop, "mujoco", integrator, substeps), ticks=ticks).s[:, :2]
@@ -324,7 +329,7 @@ def test_what_the_finest_run_misses_is_no_chance():
 )
 def test_errors_that_nothing_keeps(scenario, error, message):
     with pytest.raises(InputError, match=message):
-        cheapest(assemble(scenario, CASE_I), error, 100)
+        cheapest(assemble(scenario, PUBLISHED["I"]), error, 100)
 
 
 def test_what_would_take_minutes_is_refused_after_two_runs(monkeypatch):
@@ -333,7 +338,7 @@ def test_what_would_take_minutes_is_refused_after_two_runs(monkeypatch):
     monkeypatch.setattr("sim.accuracy.time.process_time", lambda: float(next(clock)))
     moved = []
     with pytest.raises(InputError, match="asks for RK4 with about 256 substeps, 512 CPU s; allowed are 120"):
-        compare_engines(assemble(RUBBING, CASE_I), 1e-12, 100, lambda done, ticks: moved.append((done, ticks)))
+        compare_engines(assemble(RUBBING, PUBLISHED["I"]), 1e-12, 100, lambda done, ticks: moved.append((done, ticks)))
     assert moved.count((100, 100)) == 2
 
 
@@ -359,7 +364,7 @@ def test_speed_against_error_is_of_the_run_with_its_budget_and_its_delays():
 
 def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
     """The exponential engine with a J that is off by one part in a thousand; RK4 knows no J."""
-    loop = assemble(SCENARIO.replace(duration=0.5), CASE_I)
+    loop = assemble(SCENARIO.replace(duration=0.5), PUBLISHED["I"])
     sound = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), "mujoco", EXPONENTIAL, 1)
     assert (sound.integrator, sound.substeps, sound.agrees) == ("RK4", 4, True)
     assert sound.position_relative_rms < 1e-6  # of RK4 x 4 here

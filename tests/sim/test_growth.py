@@ -8,12 +8,12 @@ import pytest
 from cli import run as command
 from cli import trace
 from controller.coupling import NoCoupling
-from sim.checks.random_loops import traces
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, load
 from sim.stability import close, dominant_mode, stability_of
 from sim.step_choice import settle
 from sim.trace import Trace, growth, growths
+from tests.checks.random_loops import traces
 
 T, STEP = 1.2e-3, np.full(2, 1e-6)
 

@@ -8,17 +8,17 @@ import pytest
 from driven import driven
 from worlds import STIFF
 
-from controller.coupling import CASE_I, NoCoupling
+from controller.coupling import PUBLISHED, NoCoupling
 from design.certificate import assess
 from models.device import CompliantDevice
 from models.human import Human, Link
 from sim.accuracy import _limit_cycle
-from sim.checks.hard import cases, devices, measure, nominal
 from sim.mujoco_engines import EXPONENTIAL
 from sim.run import assemble, make_engine, outside_forces, run, run_blocks
 from sim.scenario import InputError, load
 from sim.stability import exact_growth
 from sim.step_choice import default_substeps, simulated_growth
+from tests.checks.hard import cases, devices, measure, nominal
 
 
 @pytest.mark.parametrize("hard", cases(), ids=lambda hard: hard.name)
@@ -111,13 +111,13 @@ def test_encoder_steps_move_the_trace_by_less_than_a_step():
     """Steps of 1e-5 m: both engines stay within one of the ideal encoder; left alone the devices come to rest."""
     scenario = load().replace(duration=5.0)
     coarse = scenario.replace(device=tuple(CompliantDevice(encoder_step=1e-5) for _ in range(2)))
-    ideal, stepped = (run(assemble(s, CASE_I), "exact") for s in (scenario, coarse))
+    ideal, stepped = (run(assemble(s, PUBLISHED["I"]), "exact") for s in (scenario, coarse))
     distance = np.abs(ideal.s[:, :2] - stepped.s[:, :2]).max()
     print(f"encoder steps of 1e-5 m: at most {distance:.1e} m from the ideal encoder")
     assert 0 < distance < 1e-5
     # rounding is discontinuous: a difference of 1e-9 m between engines can become one step, not more
-    assert np.abs(run(assemble(coarse, CASE_I)).s[:, :2] - stepped.s[:, :2]).max() < 1e-5
-    alone = assemble(coarse, CASE_I)
+    assert np.abs(run(assemble(coarse, PUBLISHED["I"])).s[:, :2] - stepped.s[:, :2]).max() < 1e-5
+    alone = assemble(coarse, PUBLISHED["I"])
     free = run(alone, "exact", partial(outside_forces, coarse, alone.scene, voluntary=False)).s[-1000:]
     print(f"left alone: {np.abs(free[:, :2]).max():.1e} m, {free[:, 4:].std():.1e} m/s")
     assert np.abs(free[:, :2]).max() < 1e-5
@@ -125,7 +125,7 @@ def test_encoder_steps_move_the_trace_by_less_than_a_step():
 
 def test_one_simulated_hour_does_not_drift():
     """0.6 Hz at 1.2 ms repeats every 12500 ticks exactly: the last period is the one of the first minute."""
-    loop = assemble(load().replace(tap=None), CASE_I)
+    loop = assemble(load().replace(tap=None), PUBLISHED["I"])
     period, ticks = 12_500, 3_000_000
     outside, rest, kept = partial(outside_forces, loop.scenario, loop.scene), np.zeros((loop.plant.A.shape[0], 1)), {}
 
@@ -148,13 +148,13 @@ def test_one_simulated_hour_does_not_drift():
 def test_a_rule_that_cannot_be_met_says_so():
     extreme = devices(motor_mass=1e-6, transmission_stiffness=1e9)
     with pytest.raises(InputError, match="even with 10000 substeps: use --engine exact"):
-        default_substeps(assemble(extreme, CASE_I))
-    assert math.isfinite(exact_growth(assemble(extreme, CASE_I)))
+        default_substeps(assemble(extreme, PUBLISHED["I"]))
+    assert math.isfinite(exact_growth(assemble(extreme, PUBLISHED["I"])))
 
 
 def test_the_loop_runs_from_any_state():
     """Both engines agree from a random start under the rule's setting, for the stiffest transmission."""
-    loop = assemble(devices(transmission_stiffness=1e6), CASE_I)
+    loop = assemble(devices(transmission_stiffness=1e6), PUBLISHED["I"])
     start = 1e-3 * np.random.default_rng(0).normal(size=(loop.plant.A.shape[0], 1))
 
     engines = (make_engine(loop, "mujoco", "RK4", default_substeps(loop, "RK4")), make_engine(loop, "exact"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cli.run import main
-from controller.coupling import CASE_I, NoCoupling, SpringDamper
+from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from design.files import plain
 from sim.accuracy import ForceError, force_error, response
 from sim.run import Simulation, assemble, run
@@ -41,7 +41,7 @@ def record_of(simulation: Simulation, seconds: float) -> Trace:
 
 @pytest.mark.parametrize(("case", "late"), [("I", (1, 2)), ("II", (0, 0))])
 def test_the_ideal_force_is_the_networks_for_the_measured_motion(case, late):
-    simulation = assemble(SCENARIO, CASE_I)
+    simulation = assemble(SCENARIO, PUBLISHED["I"])
     record = record_of(simulation, 2.0)
     alike = force_error(simulation, record, SCENARIO.loop(case).lam)
     expected = by_hand(SCENARIO.T, record.x, late)

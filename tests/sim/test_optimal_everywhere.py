@@ -32,7 +32,7 @@ from sim.run import assemble
 from sim.run import run as close_loop
 from sim.scenario import load
 from sim.view import session as live
-from sim.view.events import GIVEN, Menu, first_loop
+from sim.view.session import GIVEN, Menu, first_loop
 
 FREE_MASS = next((Path(__file__).parents[1] / "loops").glob("n4*.toml"))
 SMALL = ((4, 3),)

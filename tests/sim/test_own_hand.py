@@ -9,7 +9,7 @@ import pytest
 
 from cli.run import main
 from cli.validate import main as validate_command
-from controller.coupling import CASE_I, NoCoupling
+from controller.coupling import PUBLISHED, NoCoupling
 from controller.timing import Periods
 from design import design_coupling
 from models.hold import hold
@@ -76,7 +76,7 @@ def rms(a, b):
 
 def test_both_engines_simulate_it_and_agree():
     scenario = held_by(Muscle(), Muscle(elastic=900.0, tissue=0.03))
-    exact, mujoco = (simulate(scenario, CASE_I, engine=engine) for engine in ("exact", "mujoco"))
+    exact, mujoco = (simulate(scenario, PUBLISHED["I"], engine=engine) for engine in ("exact", "mujoco"))
     assert np.abs(exact.x).max() > 2e-3  # the muscles move the devices
     assert rms(mujoco.x, exact.x) < AGREE
     for record in (exact, mujoco):
@@ -85,7 +85,9 @@ def test_both_engines_simulate_it_and_agree():
 
 def test_its_matrices_give_the_run_that_its_bodies_give():
     """No body, but the same hand: the same trace to rounding."""
-    bodies, space = (simulate(held_by(hand, hand), CASE_I, engine="exact") for hand in (Muscle(), MuscleBySpace()))
+    bodies, space = (
+        simulate(held_by(hand, hand), PUBLISHED["I"], engine="exact") for hand in (Muscle(), MuscleBySpace())
+    )
     # the sum of 1250 ticks' rounding
     assert rms(space.x, bodies.x) < 1e-9
     assert rms(space.v_handle, bodies.v_handle) < 1e-9
@@ -94,9 +96,9 @@ def test_its_matrices_give_the_run_that_its_bodies_give():
 
 def test_the_tissue_s_mass_goes_to_nothing():
     """Half the mass, half the difference to the hand without it."""
-    light = simulate(held_by(Light(), Light()), CASE_I, engine="exact").x
+    light = simulate(held_by(Light(), Light()), PUBLISHED["I"], engine="exact").x
     off = [
-        rms(simulate(held_by(h, h), CASE_I, engine="exact").x, light)
+        rms(simulate(held_by(h, h), PUBLISHED["I"], engine="exact").x, light)
         for h in (Muscle(tissue=1e-3), Muscle(tissue=5e-4))
     ]
     assert off[0] < 1e-2
@@ -104,7 +106,7 @@ def test_the_tissue_s_mass_goes_to_nothing():
 
 
 def test_an_impedance_runs_in_mujoco_exactly_by_exponentials_and_to_second_order_by_runge_kutta():
-    simulation = assemble(held_by(Light(), MuscleBySpace()), CASE_I)
+    simulation = assemble(held_by(Light(), MuscleBySpace()), PUBLISHED["I"])
     exact = run(simulation, "exact")
     assert rms(run(simulation).s, exact.s) < 1e-10  # rounding
     coarse, fine = (rms(run(simulation, make_engine(simulation, "mujoco", "RK4", n)).x, exact.x) for n in (4, 8))
@@ -114,7 +116,7 @@ def test_an_impedance_runs_in_mujoco_exactly_by_exponentials_and_to_second_order
 
 def test_an_impedance_runs_in_uneven_ticks_with_forces_that_latch_late():
     uneven = {"period": Periods(1e-3, 1.2e-3), "latency": ((1e-4, 5e-4), (0.0, 3e-4)), "duration": 0.3}
-    simulation = assemble(held_by(Light(), MuscleBySpace()).replace(**uneven), CASE_I)
+    simulation = assemble(held_by(Light(), MuscleBySpace()).replace(**uneven), PUBLISHED["I"])
     exact = run(simulation, "exact")
     for integrator, least in (("exponential", 1e-10), ("RK4", 1e-5)):
         assert rms(run(simulation, make_engine(simulation, "mujoco", integrator)).x, exact.x) < least
@@ -123,7 +125,7 @@ def test_an_impedance_runs_in_uneven_ticks_with_forces_that_latch_late():
 def test_where_devices_rub_runge_kutta_moves_an_impedance():
     rubbing = held_by(Light(), Light())
     devices = tuple(msgspec.structs.replace(device, friction=0.2) for device in rubbing.device)
-    simulation = assemble(rubbing.replace(device=devices), CASE_I)
+    simulation = assemble(rubbing.replace(device=devices), PUBLISHED["I"])
     with pytest.raises(InputError, match=r"a human has an impedance .* and a device rubs: use integrator RK4"):
         make_engine(simulation, "mujoco", "exponential")
     coarse, fine = (run(simulation, make_engine(simulation, "mujoco", "RK4", n)).x for n in (4, 16))
@@ -186,7 +188,7 @@ class Mixed:
 def test_the_adversary_finds_nobody_where_there_is_enough_damping():
     """The published gains need 1.3987 N s/m."""
     scenario = SCENARIO.replace(delta=(1.42, 1.42), population=Mixed())
-    worst = search_population(scenario, assemble(scenario, CASE_I).F, generations=5)
+    worst = search_population(scenario, assemble(scenario, PUBLISHED["I"]).F, generations=5)
     assert not worst.destabilises
 
 
@@ -225,19 +227,19 @@ def test_the_command_s_adversary_takes_a_population_from_a_file(tmp_path):
 
 def test_its_verdicts_are_those_of_each_hand_alone():
     scenario = SCENARIO.replace(population=Muscles(Light))
-    found = validate(scenario, CASE_I, humans=6, duration=0.0, engine="exact")
+    found = validate(scenario, PUBLISHED["I"], humans=6, duration=0.0, engine="exact")
     for i in (0, 5):
-        hands = Validation(scenario, CASE_I, 0, 20, 1, "exact", 0.0).crowd(i).humans(0)
-        simulation = assemble(scenario.replace(human=hands), CASE_I)
+        hands = Validation(scenario, PUBLISHED["I"], 0, 20, 1, "exact", 0.0).crowd(i).humans(0)
+        simulation = assemble(scenario.replace(human=hands), PUBLISHED["I"])
         assert found.exact[i] == pytest.approx(dominant_mode(close(simulation.plant, simulation.F)).growth, abs=1e-9)
 
 
 def test_a_person_may_hold_with_such_hands():
     person = Person((1, 2), 20.0, 15.0, 900.0)
     scenario = held_by(Muscle(), Human((Link(0.3, 3.0, 200.0),))).replace(person=(person,))
-    exact, mujoco = (simulate(scenario, CASE_I, engine=engine) for engine in ("exact", "mujoco"))
+    exact, mujoco = (simulate(scenario, PUBLISHED["I"], engine=engine) for engine in ("exact", "mujoco"))
     assert rms(mujoco.x, exact.x) < AGREE
-    alone = simulate(scenario.replace(person=()), CASE_I, engine="exact")
+    alone = simulate(scenario.replace(person=()), PUBLISHED["I"], engine="exact")
     assert rms(exact.x, alone.x) > 1e-3
 
 
@@ -278,7 +280,7 @@ def test_a_measured_hand_and_a_population_from_files(tmp_path):
     file.write_text(space.format(C=200.0) + chain)
     people = _load_humans(file, 2).human
     assert people[0].port().impedance.order == 1
-    run = simulate(SCENARIO.replace(human=people, duration=0.5), CASE_I, engine="exact")
+    run = simulate(SCENARIO.replace(human=people, duration=0.5), PUBLISHED["I"], engine="exact")
     assert run.meta["stability"]["exact_verdict"] == "stable"
     for text, message in [
         (space.format(C=-200.0) + chain, "human #1: impedance: not passive"),
@@ -306,7 +308,7 @@ def test_a_measured_hand_and_a_population_from_files(tmp_path):
 
 def test_a_state_space_is_no_coupling():
     with pytest.raises(TypeError, match=r"wrap it in Compliance\(\.\.\.\)"):
-        simulate(SCENARIO, CASE_I.compliance(SCENARIO.T))
+        simulate(SCENARIO, PUBLISHED["I"].compliance(SCENARIO.T))
 
 
 def test_a_population_on_a_wall():

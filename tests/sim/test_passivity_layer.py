@@ -64,11 +64,11 @@ def test_no_hand_is_given_more_than_the_budget_by_a_hostile_loop(start, vary):
         simulation = replace(simulation, process=replace(simulation.process, delays=packet_delays(delays[:, :, None])))
     guarded = netted(simulation, EnergyNet(start))
     trace = run(guarded, "exact")
-    part = trace.net.part()
-    assert part["limited_ticks"] > 100
-    assert part["surprises"] == 0
+    part = trace.net.figures()
+    assert part.limited_ticks > 100
+    assert part.surprises == 0
     assert given(guarded, trace) <= start + 1e-9
-    assert (part["dropped_ticks"] > 0) == vary
+    assert (part.dropped_ticks > 0) == vary
     if not vary:
         assert given(simulation, run(simulation, "exact")) > 0.1
         assert np.abs(trace.f).max() < 0.5 * np.abs(run(simulation, "exact").f).max()
@@ -105,7 +105,7 @@ def test_the_shell_bounds_what_an_environment_of_ones_own_gives():
         simulation = assemble(SHORT, coupling)
         trace = run(netted(simulation, Plugged(thief(), start)), "exact")
         energies[start] = given(simulation, trace)
-        assert trace.net.part()["limited_ticks"] > 100 or start > 1
+        assert trace.net.figures().limited_ticks > 100 or start > 1
     assert V is not None
     assert energies[0.002] <= 0.002
     assert energies[1e9] > 10 * 0.002
@@ -188,7 +188,7 @@ def test_no_hand_is_given_more_than_the_budget_in_uneven_periods():
         lost = (dx**2 * np.array(scenario.delta)).sum(axis=1) / ticks
         taken = np.cumsum(-(trace.f[:-1] * dx).sum(axis=1) - lost)
         assert taken.max() <= start + 1e-9
-        assert trace.net.part()["limited_ticks"] > 10
+        assert trace.net.figures().limited_ticks > 10
 
 
 def test_a_net_counts_forces_that_latch_at_ticks():

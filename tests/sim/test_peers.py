@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.coupling import CASE_I
+from controller.coupling import PUBLISHED
 from sim.run import assemble, outside_forces
 from sim.scenario import load
 
@@ -31,7 +31,7 @@ ALLOWED = {
 
 @pytest.fixture(scope="module")
 def loop():
-    simulation = assemble(load().replace(duration=0.3), CASE_I)
+    simulation = assemble(load().replace(duration=0.3), PUBLISHED["I"])
     w = outside_forces(simulation.scenario, simulation.scene, 0, simulation.scenario.samples)
     w[5:30, simulation.scene.tapped[0]] += 1.0
     return simulation, w, peers.PEERS["exact"](simulation, w)

@@ -8,6 +8,7 @@ import pytest
 
 from sim import map_plot, plots
 from sim.trace import Trace
+from tests.checks.tightness import plot_tightness
 
 
 @pytest.fixture
@@ -157,7 +158,7 @@ def test_every_human_is_a_point(drawn):
 def test_who_was_found_is_told_from_who_was_not(drawn):
     rows = [("a", 0.01, False, None), ("a", 0.05, True, 0.3), ("b", 0.02, True, 0.1)]
     names = "loop", "short", "found", "growth_rate_per_s"
-    (axis,) = drawn(plots.plot_tightness, [SimpleNamespace(**dict(zip(names, row, strict=True))) for row in rows]).axes
+    (axis,) = drawn(plot_tightness, [SimpleNamespace(**dict(zip(names, row, strict=True))) for row in rows]).axes
     marks = [(line.get_marker(), *line.get_xydata()[0]) for line in axis.lines if len(line.get_xydata()) == 1]
     assert ("o", 1.0, 0.0) in marks
     assert ("^", 5.0, 0.3) in marks

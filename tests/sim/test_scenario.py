@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from worlds import FIGURE_4
 
 from controller.coupling import NoCoupling
-from controller.environment import FIGURE_4
 from sim.run import assemble, run
 from sim.scenario import SCENARIOS, InputError, built_in, load, parse
 

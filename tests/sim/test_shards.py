@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from cli.validate import main
-from controller.coupling import CASE_I
+from controller.coupling import PUBLISHED
 from sim import shards
 from sim.crowds import _BATCH, MIXED, Findings, Validation
 from sim.scenario import InputError, load
 from sim.shards import Table, validate
 
 ROOT = Path(__file__).parents[2]
-QUESTION = Validation(load(), CASE_I, 0, 3 * _BATCH + 10, MIXED, "exact", 0.0)
+QUESTION = Validation(load(), PUBLISHED["I"], 0, 3 * _BATCH + 10, MIXED, "exact", 0.0)
 OPTIONS = ["--humans", str(3 * _BATCH), "--engine", "exact", "--duration", "0", "--no-plot"]
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from controller.coupling import CASE_I, CASE_II, NoCoupling
+from controller.coupling import PUBLISHED, NoCoupling
 from sim.run import assemble, run
 from sim.scenario import load
 from sim.stability import NOT_EXCITED, Mode, _left_eigenvector, _measured_growth, close, dominant_mode, verdict
@@ -11,7 +11,7 @@ from sim.stability import NOT_EXCITED, Mode, _left_eigenvector, _measured_growth
 
 @pytest.mark.parametrize(
     ("coupling", "growth", "frequency"),
-    [(NoCoupling(), 1.481, 83.98), (CASE_I, -0.939, 83.83), (CASE_II, -1.718, 1.93)],
+    [(NoCoupling(), 1.481, 83.98), (PUBLISHED["I"], -0.939, 83.83), (PUBLISHED["II"], -1.718, 1.93)],
 )
 def test_exact_and_measured_growth(coupling, growth, frequency):
     simulation = assemble(load(), coupling)
@@ -26,7 +26,7 @@ def test_exact_and_measured_growth(coupling, growth, frequency):
 
 def test_the_this_environment_matrix_is_the_loop():
     """Stepping the matrix by hand gives the loop's own record."""
-    simulation = assemble(load().replace(theta=(3, 0), psi=(1, 2), duration=0.5), CASE_I)
+    simulation = assemble(load().replace(theta=(3, 0), psi=(1, 2), duration=0.5), PUBLISHED["I"])
     record = run(simulation, "exact")
     loop = close(simulation.plant, simulation.F)
     xi = np.zeros(loop.A.shape[0])
@@ -43,7 +43,7 @@ def test_left_eigenvector():
 
 
 def test_a_trace_that_says_nothing_gives_a_reason():
-    simulation = assemble(load().replace(duration=0.1), CASE_I)
+    simulation = assemble(load().replace(duration=0.1), PUBLISHED["I"])
     loop = close(simulation.plant, simulation.F)
     limit = simulation.process.force_limit
     growth, reason = _measured_growth(loop, run(simulation), limit)

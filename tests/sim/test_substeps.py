@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cli.run import main
-from controller.coupling import CASE_I, NoCoupling
+from controller.coupling import PUBLISHED, NoCoupling
 from models.device import CompliantDevice
 from models.human import Human, Link, Person
 from models.scene import plant
@@ -30,7 +30,7 @@ STIFF = SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=1e6),) *
 
 @pytest.fixture(scope="module")
 def simulation():
-    return assemble(SCENARIO, CASE_I)
+    return assemble(SCENARIO, PUBLISHED["I"])
 
 
 def test_pace_of_known_matrices():
@@ -86,7 +86,7 @@ def test_a_default_that_would_be_wrong_is_doubled_or_refused():
 
 
 def test_outside_the_stable_region_is_refused_with_what_to_use():
-    loop = assemble(STIFF, CASE_I)
+    loop = assemble(STIFF, PUBLISHED["I"])
     with pytest.raises(InputError, match=r"the mode at 688.* outside the stable region of RK4; use --substeps 26"):
         check_substeps(loop, "RK4", 1)
     (remark,) = check_substeps(loop, "RK4", 4)
@@ -99,18 +99,18 @@ def test_edges_of_the_stable_regions(integrator, edge):
     """An almost undamped 1 kg oscillator: the textbook edges, mode times step."""
     device = CompliantDevice(transmission_stiffness=1e4, motor_mass=1.0, handle_mass=1.0, damping=0.0, delta=None)
     human = Human((Link(0.0, 0.0, 0.0),))
-    loop = assemble(SCENARIO.replace(device=(device,) * 2, human=(human,) * 2, T=0.02), CASE_I)
+    loop = assemble(SCENARIO.replace(device=(device,) * 2, human=(human,) * 2, T=0.02), PUBLISHED["I"])
     mode = np.sqrt(2e4)
     for factor, stable in ((0.99, True), (1.01, False)):
         h = factor * edge / mode
-        shorter = assemble(loop.scenario.replace(T=h), CASE_I)
+        shorter = assemble(loop.scenario.replace(T=h), PUBLISHED["I"])
         assert (step_radius(shorter, integrator, 1) <= 1 + 1e-6) == stable
 
 
 def test_the_rule_knows_who_holds_devices_that_rub():
     """Coulomb friction is taken out of the scene for the rule; a person who holds both devices stays in it."""
     person, device = Person((1, 2), 20.0, 1.0, 100.0), CompliantDevice(friction=0.5)
-    loop = assemble(SCENARIO.replace(person=(person,), device=(device,) * 2), CASE_I)
+    loop = assemble(SCENARIO.replace(person=(person,), device=(device,) * 2), PUBLISHED["I"])
     assert loop.smooth.scene.model.nv == loop.scene.model.nv == 5
     assert default_substeps(loop, "RK4") == 4
 

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from controller.tick import StepBuffer
 from design import coupling_file
 from models.hold import HeldPlant
 from models.scene import Crowd, plant, variants
-from sim.crowds import draw
+from sim.crowds import _batch, draw
 from sim.engines import ExactEngine
 from sim.run import assemble
 from sim.run import run as close_loop
@@ -256,7 +257,7 @@ def test_both_engines_see_the_population_grow_alike():
     loop = assemble(scenario, STIFF)
     links = np.stack([draw(scenario.population, 2, 0, i, 1) for i in range(4)])
     held_by = variants(scenario.device, Crowd(links))
-    seen = switched_crowd(loop, held_by, np.arange(4), 0, 2.0, mujoco=True, threads=1)
+    seen = switched_crowd(loop, held_by, np.arange(4), 0, 2.0, partial(_batch, held_by, loop.scenario.T, 1, "RK4"))
     kept = ~np.isnan(seen.mujoco)
     assert kept.any()
     np.testing.assert_allclose(seen.mujoco[kept], seen.exact[kept], atol=1e-2)

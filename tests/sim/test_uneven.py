@@ -6,6 +6,7 @@ import weakref
 
 import numpy as np
 import pytest
+from driven import alike
 from scipy.linalg import expm
 
 from cli.run import main
@@ -17,11 +18,11 @@ from design.files import InputError
 from models.hold import at_the_latch, hold
 from models.scene import Plant, plant
 from sim import load
-from sim.checks import uneven
 from sim.crowds import Validation, examine
 from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
 from sim.run import assemble, make_engine, run
 from sim.stability import close, dominant_mode
+from tests.checks import uneven
 
 SOFT = SpringDamper([879.0, 552.0], [0.39, 0.52])
 PAIR = load("omega-pair").replace(duration=0.3)
@@ -234,8 +235,8 @@ def test_no_cycle_keeps_an_engine(integrator, timed):
     simulation = assemble(PAIR.replace(period=DRAWN, latency=LATE) if timed else PAIR, SOFT)
     gc.disable()
     try:
-        for make in (MujocoEngine, MujocoBatchEngine):
-            engine = make(simulation.scene, simulation.scenario.T, integrator, timing=simulation.timing)
+        for make, scene in ((MujocoEngine, simulation.scene), (MujocoBatchEngine, alike(simulation.scene, 1))):
+            engine = make(scene, simulation.scenario.T, integrator, timing=simulation.timing)
             run(simulation, engine, ticks=3)
             kept = weakref.ref(engine._access)  # all that holds MuJoCo's memory
             del engine

@@ -14,7 +14,8 @@ from driven import driven
 
 from cli import run as run_command
 from cli.validate import main
-from controller.coupling import CASE_I, NoCoupling, SpringDamper
+from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from controller.delay import VaryingDelay
 from models.device import RigidDevice
 from models.hold import hold
 from models.human import Person
@@ -61,7 +62,7 @@ def test_stacked_plants_are_those_of_each_model(devices, links):
 
 
 def asked(scenario):
-    return Validation(scenario, CASE_I, 7, 20, 2, "exact", 0.0)
+    return Validation(scenario, PUBLISHED["I"], 7, 20, 2, "exact", 0.0)
 
 
 HELD = SCENARIO.replace(person=(Person((2, 1), 20.0, 1.0, 100.0),))
@@ -78,7 +79,7 @@ def test_people_in_both_hands_are_stacked_and_simulated_alike(devices):
         alone = plant(build(devices, people.humans(i), people.persons(i)).model)
         np.testing.assert_allclose(stacked.A[i], alone.A, rtol=1e-12, atol=1e-12 * np.abs(alone.A).max())
         np.testing.assert_allclose(stacked.B[i], alone.B, rtol=1e-13, atol=0)
-    simulation = assemble(scenario, CASE_I)
+    simulation = assemble(scenario, PUBLISHED["I"])
     exact = dominant_mode(exact_loops(held_by, simulation.F)).growth
     np.testing.assert_allclose(dominant_mode(mujoco_loops(held_by, simulation.process)).growth, exact, atol=1e-3)
     # the arms are the same as of people who hold one device each
@@ -88,7 +89,7 @@ def test_people_in_both_hands_are_stacked_and_simulated_alike(devices):
 def test_both_engines_simulate_a_person_who_moves_both_hands():
     """RK4 x 4 against the exact solution, voluntary motion and its reaction on the body included."""
     scenario = HELD.replace(duration=1.5)
-    simulation = assemble(scenario, CASE_I)
+    simulation = assemble(scenario, PUBLISHED["I"])
     mujoco, exact = run(simulation), run(simulation, "exact")
     assert np.abs(exact.s[:, :2]).max() > 1e-3
     positions, n = slice(simulation.scene.model.nq), simulation.scene.model.nq
@@ -114,7 +115,7 @@ def test_a_scenario_with_a_person_is_validated_with_random_people(tmp_path):
 
 
 @pytest.mark.parametrize("links", [1, 2])
-@pytest.mark.parametrize("coupling", [CASE_I, NoCoupling()], ids=["published", "none"])
+@pytest.mark.parametrize("coupling", [PUBLISHED["I"], NoCoupling()], ids=["published", "none"])
 def test_batched_eigenvalues_are_those_of_each_loop(coupling, links):
     people = crowd(20, links)
     F = assemble(SCENARIO, coupling).F
@@ -131,7 +132,7 @@ def test_batched_eigenvalues_are_those_of_each_loop(coupling, links):
 def test_mujoco_maps_are_the_exact_maps(devices):
     """RK4 x 4 is within 1e-3 1/s of the exact growth for every human: a verdict cannot change but at zero."""
     scenario = SCENARIO.replace(device=devices)
-    simulation = assemble(scenario, CASE_I)
+    simulation = assemble(scenario, PUBLISHED["I"])
     held_by = variants(devices, crowd(40, 2))
     exact = dominant_mode(exact_loops(held_by, simulation.F)).growth
     mujoco = dominant_mode(mujoco_loops(held_by, simulation.process)).growth
@@ -169,7 +170,7 @@ def test_a_human_depends_on_seed_and_index_only():
 
 def test_shards_repeat_the_single_run_bit_for_bit():
     """Verdicts and MuJoCo's traces, long enough for a growth rate on each."""
-    question = Validation(SCENARIO, CASE_I, 0, 2 * _BATCH + 10, MIXED, "both", 0.3)
+    question = Validation(SCENARIO, PUBLISHED["I"], 0, 2 * _BATCH + 10, MIXED, "both", 0.3)
     assert len(question.batches()) > 2
     alone, shared = validate(question), validate(question, shards=2)
     for field in fields(Findings):
@@ -300,7 +301,7 @@ def test_hands_that_had_no_time_to_rest_are_no_verdict(duration):
     [
         (["--humans", "0"], "--humans is 0, allowed are 1 to 1000000"),
         (["--humans", "many"], "--humans is 'many', expected a whole number"),
-        (["--engine", "drake"], "--engine: invalid choice: 'drake'"),
+        (["--engine", "drake"], "--engine is 'drake', allowed are exact, mujoco, both and package"),
         (["--links", "9"], "--links: invalid choice: '9'"),
         (["--shards", "2", "--dask", "here:8786"], "--shards 2 with --dask: the cluster decides"),
         (["--shards", "0"], "--shards is 0, allowed are 1 to 256"),
@@ -359,3 +360,27 @@ def test_without_dask_the_command_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match="--dask needs Dask: pip install 'distributed"):
         main(["--dask", "127.0.0.1:9", "--humans", "5", "--out", str(tmp_path)])
+
+
+class OwnEngine(ExactEngine):
+    """The exact one, as somebody else would write it: of one simulation."""
+
+    def __init__(self, simulation):
+        super().__init__(simulation.plant)
+
+
+@pytest.mark.parametrize("delays", [None, VaryingDelay((1, 2), (2, 3), "random")])
+def test_an_engine_of_one_s_own_decides_of_everyone(delays):
+    """Made anew for each set of humans, it says of the period and of the traces what the stacked exact engine says."""
+    scenario = load().replace(varying_delay=delays)
+    found = examine_module.examine(Validation(scenario, PUBLISHED["I"], 0, 6, MIXED, OwnEngine, 0.5), range(6))
+    np.testing.assert_allclose(found.mujoco, found.exact, rtol=1e-6)
+    np.testing.assert_allclose(found.trace, found.exact, rtol=1e-5)
+    np.testing.assert_allclose(found.switching_mujoco, found.switching, rtol=1e-6)
+    assert not found.disagreements.any()
+
+
+def test_an_engine_of_one_s_own_needs_even_ticks():
+    question = Validation(load().replace(latency=((0.0, 1e-4),) * 2), PUBLISHED["I"], 0, 2, 1, OwnEngine, 0.5)
+    with pytest.raises(InputError, match=r"OwnEngine: uneven ticks \(period, latency\) run in mujoco and exact"):
+        examine_module.examine(question, range(2))

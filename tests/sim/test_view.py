@@ -23,12 +23,40 @@ from models.scene import build, plant
 from sim.run import run as close_loop
 from sim.scenario import InputError, load
 from sim.stability import close, dominant_mode
-from sim.view import film
-from sim.view.events import GIVEN, KEYS, Delay, Menu, Push, Restart, changed, first_loop, parse_script, words
-from sim.view.film import Flat
-from sim.view.session import DAMPING, STIFFNESS, Grip, LiveLoop, _gripped, _Pace
-from sim.view.stage import COLUMNS, ShownScene, _dressed, apart, channels, envelope, keys_help, overlay, places, scale
-from sim.view.window import loop, typed
+from sim.view import stage as drawing
+from sim.view.session import (
+    _DAMPING,
+    _STIFFNESS,
+    GIVEN,
+    KEYS,
+    Grip,
+    LiveLoop,
+    Menu,
+    _changed,
+    _Delay,
+    _gripped,
+    _Pace,
+    _Push,
+    _Restart,
+    first_loop,
+    parse_script,
+    words,
+)
+from sim.view.stage import (
+    _COLUMNS,
+    FlatPictures,
+    ShownScene,
+    _apart,
+    _channels,
+    _dressed,
+    _envelope,
+    _loop,
+    _overlay,
+    _places,
+    _scale,
+    _typed,
+    keys_help,
+)
 
 SCENARIO = load()
 
@@ -74,7 +102,7 @@ def session(prepared, script="", patience=np.inf):
 def press(running, *names):
     codes = {name: code for code, (name, _) in KEYS.items()}
     for name in names:
-        typed(running)(codes[name])
+        _typed(running)(codes[name])
 
 
 # the loop itself
@@ -145,7 +173,7 @@ def test_a_process_that_runs_away_starts_again():
     """Soft springs and dampers against an environment with delay are unstable by themselves: radius 1.63."""
     soft = SpringDamper(np.array([879.0, 552.0]), np.array([0.39, 0.52]))  # the design for psi = 0
     before = first_loop(Menu("I"), SCENARIO, "published")
-    prepared = changed(replace(before, chosen=Chosen(soft, "any-environment", kind="spring-damper")), Delay("psi", 1))
+    prepared = _changed(replace(before, chosen=Chosen(soft, "any-environment", kind="spring-damper")), _Delay("psi", 1))
     assert np.abs(prepared.simulation.F.poles()).max() > 1.6
     running = session(prepared)
     noted = [running.frame(t).note for t in (1.0, 2.0, 3.0)]  # 1.63^k passes 1e308 at k = 1450, 1.7 s
@@ -166,7 +194,7 @@ def test_keys_leave_the_viewer_its_own():
 def test_events_are_spelt_as_they_are_read():
     for _, event in KEYS.values():
         assert parse_script(f"2.5:{words(event)}", 2) == ((2.5, event),)
-    assert parse_script("3:push2=-1.5 1:restart", 2) == ((1.0, Restart()), (3.0, Push(2, -1.5)))
+    assert parse_script("3:push2=-1.5 1:restart", 2) == ((1.0, _Restart()), (3.0, _Push(2, -1.5)))
 
 
 def test_keys_that_cannot_be_met_leave_the_loop_running(none):
@@ -239,7 +267,7 @@ def test_what_is_too_late_is_lost_and_said():
 def test_the_mouse_is_one_more_passive_hand(none):
     """A hand of one mass, spring and damper, with the mouse's spring and damper added to its own."""
     human = SCENARIO.human[0].links[0]
-    firmer = Human((Link(human.mass, human.damping + DAMPING, human.stiffness + STIFFNESS),))
+    firmer = Human((Link(human.mass, human.damping + _DAMPING, human.stiffness + _STIFFNESS),))
     scene = build(SCENARIO.device, (firmer, SCENARIO.human[1]))
     expected, held = hold(plant(scene.model), SCENARIO.T), _gripped(none.simulation.scene, 0, SCENARIO.T)
     # both are one matrix exponential of the same matrix, whose entries reach 1e5
@@ -296,7 +324,7 @@ def test_shapes_change_nothing_that_moves(name):
 def test_every_body_has_its_place():
     scene = build(SCENARIO.device, [Human((Link(0.3, 3, 200), Link(1, 2, 300))), SCENARIO.human[1]])
     names = [scene.model.joint(j).name for j in range(scene.model.njnt)]
-    found = dict(zip(names, zip(channels(scene), places(scene), strict=True), strict=True))
+    found = dict(zip(names, zip(_channels(scene), _places(scene), strict=True), strict=True))
     assert found == {
         "device_1/motor": (0, -1),
         "device_2/motor": (1, -1),
@@ -310,17 +338,17 @@ def test_a_person_s_body_stands_behind_both_arms():
     arm = Human((Link(0.3, 3, 200), Link(1, 2, 300)))
     scene = build(SCENARIO.device, [arm, SCENARIO.human[1]], [Person((1, 2), 30.0, 80.0, 900.0)])
     body = scene.model.joint("body_1").id
-    assert (channels(scene)[body], places(scene)[body]) == (0, 2)
+    assert (_channels(scene)[body], _places(scene)[body]) == (0, 2)
     assert np.array_equal(plant(_dressed(scene)).A, plant(scene.model).A)
 
 
 def test_the_overlay_says_growth_and_certificates(none, published):
-    said = dict(overlay(session(none).frame(0.1), live=True))
+    said = dict(_overlay(session(none).frame(0.1), live=True))
     assert said["growth"] == "+1.48 1/s at 84.0 Hz: unstable"
     assert said["this environment"] == "needs 1.723 of 1.37 N s/m: NOT certified"
     assert said["any environment"] == "no certificate"
     assert "0 overruns" in said["clock"]
-    said = dict(overlay(session(published).frame(0.1), live=False))
+    said = dict(_overlay(session(published).frame(0.1), live=False))
     assert said["this environment"] == "needs 1.399 of 1.37 N s/m: NOT certified"
     assert said["any environment"] == "needs 7.843 of 1.37 N s/m: NOT certified"
     assert said["time"] == "0.1 s"
@@ -334,23 +362,23 @@ def test_a_refusal_is_said_whole_and_once(none):
     frame = running.frame(0.1)
     assert frame.note == "given: there is no coupling from a file (start with --coupling FILE.json)"
     long = replace(frame, note=" ".join(["reason"] * 60))
-    rest_of_it, refused = apart(overlay(long, live=True))
+    rest_of_it, refused = _apart(_overlay(long, live=True))
     assert " ".join(value for _, value in refused) == long.note
     assert "last" not in dict(rest_of_it)
-    short = overlay(replace(frame, note="theta+1"), live=True)
-    assert apart(short) == (short, [])
+    short = _overlay(replace(frame, note="theta+1"), live=True)
+    assert _apart(short) == (short, [])
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 700, 3333])
 def test_the_envelope_holds_every_force(ticks):
     history = np.random.default_rng(2).normal(size=(ticks, 2))
-    low, high = envelope(history, COLUMNS, 3333)
-    assert low.shape == high.shape == (COLUMNS, 2)
+    low, high = _envelope(history, _COLUMNS, 3333)
+    assert low.shape == high.shape == (_COLUMNS, 2)
     if ticks:
         assert np.array_equal(np.nanmin(low, axis=0), history.min(axis=0))
         assert np.array_equal(np.nanmax(high, axis=0), history.max(axis=0))
-    assert np.isnan(low).any() == (ticks < 3333 - 3333 // COLUMNS)
-    assert scale(history) >= np.abs(history).max(initial=0)
+    assert np.isnan(low).any() == (ticks < 3333 - 3333 // _COLUMNS)
+    assert _scale(history) >= np.abs(history).max(initial=0)
 
 
 class FakeWindow:
@@ -392,7 +420,7 @@ def test_the_window_s_loop_without_the_window(none):
             window.perturb.active = int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
             window.perturb.refselpos[:] = stage.data.xpos[window.perturb.select] + (0.05, 0, 0)
 
-    loop(running, stage, window, lambda: time[0], sleep)
+    _loop(running, stage, window, lambda: time[0], sleep)
     assert window.synced == len(window.said) == 40
     assert running.t == pytest.approx(39 / 60, abs=SCENARIO.T)
     assert running.pace.overruns == 0
@@ -413,7 +441,7 @@ def test_the_window_s_loop_ends_when_it_should(none):
     def sleep(seconds):
         time[0] += 0.1
 
-    loop(LiveLoop(none, Inline()), stage, window, lambda: time[0], sleep, until=0.55)
+    _loop(LiveLoop(none, Inline()), stage, window, lambda: time[0], sleep, until=0.55)
     assert window.synced == 7
 
 
@@ -433,7 +461,7 @@ def run(*words, code=0):
 
 
 def test_a_film_is_the_same_every_time(tmp_path, capsys):
-    words = ("--script", "0:none 0.3:theta+1 0.5:published", "--duration", "1", "--draw", "flat")
+    words = ("--script", "0:none 0.3:theta+1 0.5:published", "--duration", "1")
     for name in ("a", "b"):
         run("--video", str(tmp_path / f"{name}.gif"), *words, "--json", str(tmp_path / f"{name}.json"))
     assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
@@ -448,13 +476,13 @@ def test_a_film_is_the_same_every_time(tmp_path, capsys):
     assert [round(e["exact_growth_rate_per_s"], 2) for e in told["events"]] == [1.48, 3.13, 0.69]
     assert [round(e["t_s"], 2) for e in told["events"]] == [0, 0.3, 0.5]
     assert told["simulated_s"] == pytest.approx(1.0, abs=SCENARIO.T)
-    assert told["video"] == {"file": str(tmp_path / "a.gif"), "pictures": 11, "fps": 10, "drawn": "flat"}
+    assert told["video"] == {"file": str(tmp_path / "a.gif"), "pictures": 11, "fps": 10}
     assert "NOT certified" in capsys.readouterr().out
 
 
 def test_flat_pictures_show_where_things_are(none):
     """The first device's handle, by its colour: it moves as many pixels as its position says."""
-    painter = Flat(none.simulation.scene, none.simulation.process.force_limit)
+    painter = FlatPictures(none.simulation.scene, none.simulation.process.force_limit)
     frame = session(none).frame(0.05)
 
     def middle(q):
@@ -467,52 +495,8 @@ def test_flat_pictures_show_where_things_are(none):
     assert middle(0.05) - middle(0.0) == pytest.approx(0.05 * 520 / 0.42, abs=1.0)
 
 
-@pytest.fixture(scope="module")
-def backend():
-    try:
-        return film.backend()
-    except film._NoOffscreen as error:
-        pytest.skip(str(error))
-
-
-def test_pictures_by_opengl(backend, none):
-    """The scene above, the forces below; the handles move with the positions."""
-    stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
-    painter = film._Offscreen(stage, backend)
-    try:
-        frame = session(none).frame(0.05)
-        one, again = painter.picture(frame), painter.picture(frame)
-        moved = painter.picture(replace(frame, q=frame.q + 0.05))
-    finally:
-        painter.close()
-    assert one.shape == (640, 640, 3)
-    assert np.array_equal(one, again)
-    changed = (one != moved).any(axis=2)
-    assert changed[256:480].sum() > 1000
-    assert not changed[:256].any()  # no body reaches into the words,
-    assert not changed[480:].any()  # nor into the plots
-
-
-def test_without_opengl_there_are_flat_pictures_and_a_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(film, "_failure", lambda name: "absent")
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    where = str(tmp_path / "a.gif")
-    run("--coupling", "none", "--video", where, "--duration", "0.2")
-    said = "no OpenGL without a display here (egl: absent; osmesa: absent)"
-    assert f"{said}: the bodies are drawn flat" in capsys.readouterr().out
-    with pytest.raises(InputError, match=r"--draw gl: no OpenGL without a display here \(egl: absent"):
-        run("--coupling", "none", "--video", where, "--duration", "0.2", "--draw", "gl")
-
-
-def test_a_driver_that_fails_says_why(monkeypatch):
-    monkeypatch.setattr(film, "_PROBE", "import sys; sys.exit('no such driver: {}')")
-    monkeypatch.setenv("MUJOCO_GL", "osmesa")  # asked for: nothing else is tried
-    with pytest.raises(film._NoOffscreen, match=r"here \(osmesa: no such driver: osmesa\)"):
-        film.backend()
-
-
 def test_an_interrupted_film_is_as_long_as_it_got(tmp_path, monkeypatch):
-    made, picture = [], Flat.picture
+    made, picture = [], FlatPictures.picture
 
     def interrupted(self, frame):
         if len(made) == 4:
@@ -520,9 +504,9 @@ def test_an_interrupted_film_is_as_long_as_it_got(tmp_path, monkeypatch):
         made.append(frame)
         return picture(self, frame)
 
-    monkeypatch.setattr(Flat, "picture", interrupted)
+    monkeypatch.setattr(FlatPictures, "picture", interrupted)
     where = tmp_path / "a.gif"
-    run("--coupling", "none", "--video", str(where), "--duration", "2", "--draw", "flat", code=130)
+    run("--coupling", "none", "--video", str(where), "--duration", "2", code=130)
     with Image.open(where) as image:
         assert image.n_frames == 4
 
@@ -536,18 +520,18 @@ def test_mp4_is_what_ffmpeg_makes_of_the_pictures(tmp_path, monkeypatch):
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
     pictures = np.random.default_rng(3).integers(0, 255, (3, 480, 640, 3), dtype=np.uint8)
-    film.check_film(tmp_path / "a.mp4")
-    assert film.save_film(tmp_path / "a.mp4", iter(pictures), 10) == 3
+    drawing.check_film(tmp_path / "a.mp4")
+    assert drawing.save_film(tmp_path / "a.mp4", iter(pictures), 10) == 3
     assert (tmp_path / "a.mp4").read_bytes() == pictures.tobytes()
     tool.write_text(f"#!{sys.executable}\nimport sys\nsys.exit('no codec')\n")
     with pytest.raises(InputError, match="ffmpeg: no codec"):
-        film.save_film(tmp_path / "b.mp4", iter(pictures), 10)
+        drawing.save_film(tmp_path / "b.mp4", iter(pictures), 10)
 
 
 def test_case_none_begins_without_a_coupling_and_takes_one_later(tmp_path):
     """Nothing designed for "none" exists: what is asked for later is designed for case I."""
     where, told = str(tmp_path / "a.gif"), tmp_path / "a.json"
-    words = ("--case", "none", "--script", "0.1:designed", "--duration", "0.3", "--draw", "flat", "--fps", "5")
+    words = ("--case", "none", "--script", "0.1:designed", "--duration", "0.3", "--fps", "5")
     run(*words, "--video", where, "--json", str(told))
     assert [e["coupling"] for e in json.loads(told.read_text())["events"]] == ["none", "designed"]
 

@@ -23,7 +23,7 @@ from models.scene import build, variants
 from sim import zwidth as zwidth_map
 from sim.crowds import crowds
 from sim.limit_cycles import Effects, HeldDevices, Plan
-from sim.mujoco_engines import discretised
+from sim.mujoco_engines import _discretised
 from sim.scenario import InputError, load
 from sim.stability import dominant_mode, exact_loops
 from sim.trace import oscillation, slowest_seen
@@ -294,7 +294,7 @@ def test_coulomb_friction_stops_a_device_where_coulomb_says():
     """m v' = -b v - F stops after m/b log(1 + b v0/F); MuJoCo's constraint, 1.5e-6 m off when measured, may be 3e-6."""
     device, force, v0 = RigidDevice(friction=0.3), 0.3, 0.2
     scene = build([device], [Human((Link(0, 0, 0),))])
-    model = discretised(scene, T, "RK4", 4)
+    model = _discretised(scene, T, "RK4", 4)
     data = mujoco.MjData(model)
     data.qvel[0] = v0
     mujoco.mj_step(model, data, 4 * 500)

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from cli.checks.faults import person
 from hw.control import certified_couplings
 from hw.emulator import Emulator
 from hw.limits import Stage
@@ -24,6 +23,7 @@ from sim.crowds import Validation
 from sim.scenario import load
 from sim.shards import as_worker, validate
 from sim.stability import unstable
+from tests.checks.faults import person
 
 
 @dataclass(frozen=True)

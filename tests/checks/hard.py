@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
-from controller.coupling import CASE_I, Coupling, SpringDamper
+from controller.coupling import PUBLISHED, Coupling, SpringDamper
 from models.device import CompliantDevice
 from models.human import Human, Link
 from sim.accuracy import position_error
@@ -33,7 +34,7 @@ class _Hard:
     scenario: Scenario
     fails: _Setting | None  # a setting that does not hold, None where all of TRIED do
     how: str  # what is wrong with it: "refused", "verdict", "growth" or "position"
-    coupling: Coupling = CASE_I
+    coupling: Coupling = PUBLISHED["I"]
     substeps: int | None = None  # of RK4, which hold; default: what the rule picks
 
 
@@ -105,6 +106,11 @@ def faults(loop: Simulation, integrator: str, substeps: int) -> dict[str, float]
     if (apart := error.position_relative_rms) is not None and apart > POSITION:
         found["position"] = apart
     return found
+
+
+def hard_loops(seed: int) -> Iterator[_Row]:
+    """What was measured of all of them; nothing is drawn."""
+    return map(measure, cases())
 
 
 def measure(hard: _Hard) -> _Row:

@@ -72,8 +72,8 @@ class _Case:
     def limited(self, buffer: StepBuffer, ticks: int) -> float:
         """The share of the ticks in which forces were limited, or a wall touched."""
         if buffer.net:
-            part = buffer.net.part()
-            return part["limited_ticks"] / part["ticks"]
+            done = buffer.net.figures()
+            return done.limited_ticks / done.ticks
         law, z = buffer.process.law, buffer.z
         hit = law.limited(z, buffer.f[:-1], np.array(np.inf)) if law.bounds else law.depths(z) > 0
         return float(hit[:ticks].any(axis=1).mean())

@@ -43,6 +43,7 @@ class _UnevenTicks:
     energy: float  # largest mechanical energy over that at the start, with ENOUGH
     balance: float  # least sum f'dx + dissipation over the sum of its magnitudes, with ENOUGH
     grow: int  # hands that grow, with SHORT
+    hands: int
 
     @property
     def holds(self) -> bool:
@@ -63,7 +64,9 @@ def uneven_ticks(seed: int, loops: int = 8, ticks: int = _TICKS) -> Iterator[_Un
             name = f"{index}: {m} channel{'s'[: m - 1]}, theta = {list(loop.theta)}"
             (energy, _, balance), (_, end, _) = runs
             grown = int((end > _GROWN).sum())
-            yield _UnevenTicks(name, kind, drawn, float(required[0]), float(energy.max()), float(balance.min()), grown)
+            yield _UnevenTicks(
+                name, kind, drawn, float(required[0]), float(energy.max()), float(balance.min()), grown, HANDS
+            )
 
 
 def _draw(rng: np.random.Generator, kind: str) -> tuple[Loop, SpringDamper]:

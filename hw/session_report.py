@@ -1,0 +1,184 @@
+"""The report of a session: how far it came, what the link did, what grew; and a log that survives a crash."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from controller.budget import BudgetFigures
+from design.files import plain, unseen, write_json
+from hw.control import CertifiedCoupling, ProgramFigures
+from hw.protocol import NO_MARGIN
+from hw.recording import Recipe, Recorder, result_of, save_npz, steady_ticks
+from hw.session import Session
+from sim.scenario import InputError
+from sim.trace import Growth, growths
+
+_PERCENTILES = (50, 90, 99, 100)
+
+
+class IncidentLog:
+    """A log that is complete up to the last second however the process ends: it is appended to, not kept in memory.
+
+    One JSON object a line: every change of the stage at once, and every second where things stand. What was written
+    survives SIGKILL, though not a power failure.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises InputError where the file cannot be written."""
+        self.path = path
+        try:
+            self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror}") from None
+        self._told = 0  # [us]
+
+    def attach(self, session: Session) -> None:
+        """Record from now on."""
+        self._write({"at": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "scenario": session.scenario.name, "pid": os.getpid()})
+        session.listen = lambda event: self._write({"t_us": event.t_us, "stage": event.stage, "cause": event.cause})
+
+    def glance(self, session: Session) -> None:
+        """Write the session's state, once a second."""
+        if session.now - self._told < 1_000_000:
+            return
+        self._told, drive = session.now, session.drive
+        force, x = (list(drive.force), list(drive.x or ())) if drive else ([], [])
+        standing = {"t_us": session.now, "stage": session.stage, "gain": session.gain, "x_m": x, "f_n": force}
+        self._write(standing | {"counters": asdict(session.counters)})
+
+    def _write(self, line: dict[str, Any]) -> None:
+        with suppress(OSError):  # a full disk is no reason to drop the forces
+            os.write(self._file, (json.dumps(line) + "\n").encode())
+
+    def close(self) -> None:
+        os.close(self._file)
+
+
+@dataclass(frozen=True)
+class _Event:
+    """A change of the stage, and why."""
+
+    t_s: float  # since the session began
+    stage: str
+    cause: str
+
+
+@dataclass(frozen=True)
+class _Ended:
+    """How far the session came."""
+
+    stage: str
+    cause: str
+    armed: bool
+    log: list[_Event]
+
+
+@dataclass(frozen=True)
+class _Link:
+    """What the link did: when it was measured, and while forces acted (None where they never did)."""
+
+    measured_age_us: dict[str, float] | None
+    measured_missing: int
+    measured_tick_us: dict[str, float] | None
+    counters: dict[str, int]
+    age_us: dict[str, float] | None = None
+    rate_hz: float | None = None
+    missed_percent: float | None = None
+
+    @classmethod
+    def of(cls, session: Session, recorder: Recorder, dropped: int) -> _Link:
+        measured, T = session.measurement, session.scenario.T
+        counters = asdict(session.counters) | {"host_dropped_bytes": dropped}
+        ages, ticks = (_percentiles(np.array(times)) for times in (measured.ages, measured.result.ticks))
+        found = cls(ages, measured.missing, ticks, counters)
+        if not (len(recorder) and session.config):
+            return found
+        arrays = recorder.link()
+        received = arrays["received"]
+        margins, answered = arrays["margin_us"][received & (arrays["margin_us"] != NO_MARGIN)], received.sum()
+        return replace(
+            found,
+            age_us=_percentiles(session.config.due * 1e6 * T - margins),
+            rate_hz=float(received.mean() / T),
+            missed_percent=float(100 * session.missed_while_driving / answered) if answered else None,
+        )
+
+
+@dataclass(frozen=True)
+class _Ran:
+    """The ticks in which forces acted."""
+
+    samples: int
+    duration_s: float
+    T_s: float
+    scenario_digest: str
+    pace: float  # below 1: slow motion, in which a link looks faster than it is
+    encoder_step_m: list[float] | None
+    steady_ticks: list[list[int]]
+
+
+@dataclass(frozen=True)
+class SessionReport:
+    """What a session came to, without a verdict: the coupling with its certificates, the log, the link."""
+
+    case: str
+    scenario: str
+    program: ProgramFigures = unseen("beside")
+    session: _Ended = unseen()
+    link: _Link = unseen()
+    run: _Ran = unseen()
+    growth: list[Growth] = unseen()
+    energy_budget: list[BudgetFigures] | None = unseen()  # arming by arming
+
+
+def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:
+    """The report of a session that has ended."""
+    begin = session.log[0].t_us if session.log else 0
+    log = [_Event(1e-6 * (e.t_us - begin), str(e.stage), e.cause) for e in session.log]
+    program = ProgramFigures()
+    steady, ticks, T = list[list[int]](), len(recorder), session.scenario.T
+    if coupled := isinstance(session.program, CertifiedCoupling):
+        program = session.program.figures(session.limits.cap)
+        steady = steady_ticks(recorder, session.units.force_step, session.limits.cap) if ticks else []
+    step = list(session.units.encoder_step) if ticks else None
+    ran = _Ran(ticks, ticks * T, T, session.scenario.digest, pace, step, steady)
+    trace = result_of(recorder, session.units, T, {"run": asdict(ran)}) if coupled and ticks else None
+    return SessionReport(
+        case,
+        session.scenario.name,
+        program,
+        _Ended(str(session.stage), session.cause, ticks > 0, log),
+        _Link.of(session, recorder, dropped),
+        ran,
+        growths(trace) if trace else [],
+        [arming.budget.figures() for arming in session.armings if arming.budget] or None,
+    )
+
+
+def _percentiles(values: np.ndarray) -> dict[str, float] | None:
+    return {f"p{q}": float(np.percentile(values, q)) for q in _PERCENTILES} if values.size else None
+
+
+def save(out: Path, session: Session, recorder: Recorder, report: SessionReport, plot: bool) -> list[Path]:
+    """The trace (where forces acted), its picture, and the report."""
+    files = []
+    if len(recorder):
+        replay = [Recipe.of(arming, session.limits, session.units) for arming in session.armings]
+        result = result_of(recorder, session.units, session.scenario.T, plain(report) | {"replay": replay})
+        files += [save_npz(out / "trace.npz", result, recorder), result.save_csv(out / "trace.csv")]
+        if plot:
+            from sim.plots import plot_run
+
+            title = f"{report.scenario}, case {report.case}: a session that ended {session.stage}"
+            files.append(plot_run(result, out / "figure.png", title, 10.0))
+    files.append(out / "report.json")
+    write_json(files[-1], plain(report) | {"files": [str(p) for p in files]})
+    return files

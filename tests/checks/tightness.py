@@ -1,0 +1,111 @@
+"""How tight the condition is: the search for the worst hand against loops that lack some of the damping required.
+
+`python -m sim.suite --only tightness,delayed` runs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from controller.coupling import Coupling, NoCoupling
+from controller.lti import Array
+from design.environments import THIS_ENVIRONMENT
+from sim import plots
+from sim.adversary import Worst, search
+from sim.couplings import choose
+from sim.scenario import Scenario, load
+
+
+@dataclass(frozen=True)
+class _Attack:
+    """A search against a loop placed short of its required damping."""
+
+    name: str
+    short: float  # share of the required damping that is missing
+    worst: Worst
+
+
+def attempts(
+    loops: dict[str, tuple[Scenario, Coupling]],
+    shortages: Array,
+    seed: int = 0,
+    generations: int = 150,
+) -> list[_Attack]:
+    """Every loop at every shortage: devices get (1 - short) times the damping that `this_environment` requires.
+
+    A negative shortage gives the devices more than required: there the search must fail.
+    """
+    rows = []
+    for name, (scenario, coupling) in loops.items():
+        loop = scenario.loop("I")  # the reference does not matter
+        F, required = loop.F(coupling), np.array(THIS_ENVIRONMENT.required(loop, coupling).required)
+        for short in shortages:
+            placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
+            rows.append(_Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))
+    return rows
+
+
+@dataclass(frozen=True)
+class Shortage:
+    """Whether a passive human destabilises a loop whose devices lack a share of the damping that is required."""
+
+    loop: str
+    short: float
+    found: bool
+    growth_rate_per_s: float
+    frequency_hz: float
+    held_together: bool  # by one person
+    evaluated: int
+
+    @property
+    def holds(self) -> bool:
+        """Whether the row is as the theory says: with the required damping no human makes the loop unstable."""
+        return self.short > 0 or not self.found
+
+
+def shortages(
+    seed: int, couplings: Sequence[str], short: Sequence[float], generations: int, theta: tuple[int, int] | None = None
+) -> Iterator[Shortage]:
+    """The search against the default loop with these couplings, by name, at these shortages.
+
+    Where it succeeds close to the required damping, the condition is tight.
+    """
+    scenario = load().replace(theta=theta) if theta else load()
+    for name in couplings:
+        coupling = NoCoupling() if name == "none" else choose(scenario, "I", name).coupling
+        loop = {"no coupling" if name == "none" else f"{name}, case I": (scenario, coupling)}
+        for share in short:
+            (attempt,) = attempts(loop, np.array([share]), seed, generations)
+            worst, found = attempt.worst, (attempt.worst.destabilises, attempt.worst.growth)
+            about = worst.frequency_hz, bool(worst.persons), worst.evaluated
+            yield Shortage(attempt.name, attempt.short, *found, *about)
+
+
+#: from a seed: at short delays, and at long ones
+usual = partial(shortages, couplings=("none", "spring-damper"), short=(0, 0.01, 0.02, 0.05, 0.1, 0.2), generations=25)
+delayed = partial(shortages, couplings=("none",), short=(0, 0.002, 0.005, 0.01, 0.02), generations=40, theta=(4, 9))
+
+
+def plot_tightness(rows: Sequence[Shortage], path: Path) -> Path:
+    """Growth rate with the first destabilising human found, over the share of the required damping that was missing."""
+    figure, axes = plots._panels("", 1, 1, (7, 4.2))
+    axis = axes[0, 0]
+    for name, style in zip(dict.fromkeys(row.loop for row in rows), plots.STYLES, strict=False):
+        mine = [row for row in rows if row.loop == name]
+        points = [(100 * row.short, row.growth_rate_per_s if row.found else 0.0) for row in mine]
+        axis.plot(*zip(*points, strict=True), label=name, **style)
+        for row, point in zip(mine, points, strict=True):
+            axis.plot(*point, "^" if row.found else "o", color=style["color"])
+    axis.plot([], [], "k^", label="unstable with the human found")
+    axis.plot([], [], "ko", label="no such human found")
+    axis.set(
+        xlabel="damping missing of what the condition for this environment requires [%]",
+        ylabel="growth with the first human found [1/s]",
+    )
+    axis.legend()
+    return plots.save(figure, path)
