@@ -10,7 +10,7 @@ from cli.judged import chosen_by
 from controller.coupling import NoCoupling
 from sim.accuracy import Row, measure_all
 from sim.couplings import NAMES, limits_of
-from sim.mujoco_engines import EXPONENTIAL
+from sim.engines import EXPONENTIAL
 from sim.run import assemble
 from sim.scenario import InputError, require_even_ticks, require_linear
 from sim.step_choice import default_substeps
@@ -69,12 +69,12 @@ def main(argv: list[str]) -> int:
 def _parser() -> options.Parser:
     example = "python -m sim.accuracy --duration 5"
     parser = options.Parser("sim.accuracy", "Speed against error, engine by engine.", example)
-    options.add_loop_options(parser)
-    options.add_coupling_options(parser, ", ".join(NAMES))
-    options.add_limiter_option(parser)
+    parser.add_loop()
+    parser.add_coupling(", ".join(NAMES))
+    parser.add_limiter()
     duration = "of each run (default: the scenario's)"
     parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help=duration)
-    options.add_output_options(parser, picture=True)
+    parser.add_output(picture=True)
     return parser
 
 

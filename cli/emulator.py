@@ -59,7 +59,7 @@ def _parser() -> argparse.ArgumentParser:
         "python -m hw.emulator --fault up:drop=0.05 --fault unplug@3",
     )
     add, number = parser.add_argument, options.number
-    options.add_loop_options(parser)
+    parser.add_loop()
     what = "KIND[=VALUE][@START[+DURATION]], times in seconds after arming; in front up: or down: for one direction, "
     what += f"axis2: for an axis; KIND is {', '.join((*LINE, *DEVICE, *AXIS))}"
     add("--fault", action="append", default=[], metavar="FAULT", help=what)

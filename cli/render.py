@@ -254,6 +254,11 @@ def certified(need: Requirement, proof: bool = True) -> str:
     return "[green]certified[/]" + (", proved exactly" if proof and need.proof == "rational" else "")
 
 
+def short(condition: str) -> str:
+    """Its name as the head of a narrow column: this-env., any-env."""
+    return condition.replace("environment", "env.")
+
+
 def needs(need: Requirement, digits: int = 6) -> str:
     """Required of available damping."""
     return f"{listed(need.required, digits)} of {listed(need.available, digits)} N s/m"

@@ -264,7 +264,7 @@ def _parser() -> options.Parser:
     parser.add_argument("--only", type=_picked, metavar="NAME,..", help=f"of {','.join(_names())} (default all)")
     humans, count = "random humans per loop (default 300)", options.whole(1, 1_000_000)
     parser.add_argument("--humans", type=count, default=300, metavar="N", help=humans)
-    options.add_output_options(parser, what="folder for the report (default out/validate)")
+    parser.add_output(what="folder for the report (default out/validate)")
     return parser
 
 

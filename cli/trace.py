@@ -53,5 +53,5 @@ def _parser() -> options.Parser:
     )
     parser.add_argument("trace", metavar="TRACE.npz", help="written by sim.run or hw.bridge")
     parser.add_argument("--plot", metavar="FILE.png", help="draw the trace")
-    options.add_json_option(parser)
+    parser.add_json()
     return parser

@@ -66,11 +66,11 @@ def _parser() -> options.Parser:
         "python -m sim.validate --case I --humans 200 --adversary",
     )
     add, whole = parser.add_argument, options.whole
-    options.add_loop_options(parser)
-    options.add_varying_delay_options(parser)
-    options.add_coupling_options(parser, ", ".join(NAMES))
-    options.add_human_option(parser, " and `population`, whose draw(rng, n) gives n hands,")
-    options.add_limiter_option(parser)
+    parser.add_loop()
+    parser.add_varying_delays()
+    parser.add_coupling(", ".join(NAMES))
+    parser.add_human(" and `population`, whose draw(rng, n) gives n hands,")
+    parser.add_limiter()
     add("--humans", type=whole(1, 1_000_000), default=1000, metavar="N", help="random humans per device (default 1000)")
     add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
     who = f"who decides: {', '.join(ENGINES)} (default both), or package.module:Class, beside the exact one"
@@ -84,7 +84,7 @@ def _parser() -> options.Parser:
     add("--generations", type=whole(1, 10_000), metavar="N", help="length of that search (default 150)")
     met = "nominal (default), or ranges: in turn all vertices of the scenario's ranges and as many others inside"
     add("--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
-    options.add_output_options(parser, picture=True)
+    parser.add_output(picture=True)
     parser.only("with --adversary", lambda args: args.adversary, "generations")
     return parser
 

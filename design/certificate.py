@@ -113,7 +113,7 @@ def prove(
             scenario=digest(loop, coupling.form()),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
             switching=switching,
-            limiter=msgspec.UNSET if limiter is None or asked is not THIS_ENVIRONMENT else limiter,
+            limiter=limiter if limiter and asked.extensible else msgspec.UNSET,
         )
     )
 
@@ -297,7 +297,7 @@ def _check(loop: Loop, coupling: Coupling, condition: Condition, certificate: Ce
         multiplier = _fractions(name, matrices.pop(name, None))
     _check_part(loop, coupling, condition, certificate, multiplier, matrices)
     if certificate.limiter is not msgspec.UNSET:
-        if condition is not THIS_ENVIRONMENT:
+        if not condition.extensible:
             raise NotProved(f"limiter: {condition.name} needs no proof of its own, and one is on file")
         check_limiter(loop, coupling, certificate.limiter)
     delays = certificate.switching
@@ -394,7 +394,9 @@ def named(condition: str | Condition) -> Condition:
             raise ValueError(f"{own}, expected one of its own, not {', '.join(sorted(taken))}")
         return condition
     if condition not in _NAMED:
-        raise ValueError(f"condition is {condition!r}, allowed are {', '.join(_NAMED)}, or a Condition of your own")
+        raise ValueError(
+            f"condition is {condition!r}, allowed are {', '.join(_NAMED)}, or one of your own (FILE.py:NAME)"
+        )
     return _NAMED[condition]
 
 

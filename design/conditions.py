@@ -12,7 +12,7 @@ any-environment    Lemma 4 of the paper for any passive environment under backwa
 
 design/environments.py and lmi.py have the two as a `Condition` of a loop and a coupling: which form applies.
 environments.py also has those of this-environment that weigh an error with a multiplier: walls that make and break
-contact, delays that switch, forces that leave through the limiter of controller.limiter.
+contact, delays that switch, forces that leave through the limiter of controller.law.
 
 The period may vary from tick to tick, up to T_max, in all of them: `even_damping` is where it enters.
 """
@@ -119,8 +119,7 @@ def v_hat(H: Block) -> tuple[Array, Block]:
 
     V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) carries the compliance V and what the delays add. It vanishes at
     z = 1, where nothing can be strict, so it is divided by |1 - 1/z|^2: (1 - 1/z) becomes 1/(1 - z), whose pole has
-    the Hermitian part 1/2. It is linear in H, so V and Theta-hat may come one by one. design.lmi.v_hat_ports states it
-    in the paper's ports, for realisations whose quotient is known, as a test compares.
+    the Hermitian part 1/2. It is linear in H, so V and Theta-hat may come one by one.
     """
     H1, R = H.split_at_one()
     return H1, H1 / 2 - R
@@ -253,7 +252,7 @@ class Condition(ABC):
     covers: tuple[str, ...] = ()  # of `BEYOND`, what the block is about; a subclass states its own
     source: str | None = None  # where it is from, for a report
     separable: bool = False  # whether it judges the channels of a coupling without cross terms one by one
-    limitable: bool = False  # whether forces that are limited have a block of their own, which a file may prove
+    extensible: bool = False  # whether limited forces and delays that switch have blocks beside it, in the same file
 
     @abstractmethod
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
@@ -276,6 +275,10 @@ class Condition(ABC):
         except SingularLoop as error:
             found = refusal(self.name, loop.delta, str(error))
         return replace(found, guarantee=self.words(loop), lag=self.lag(loop))
+
+    def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
+        """Required over available damping; with `thin` it may be by every thin-th frequency alone."""
+        return self.judge(loop, coupling).ratio
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         """w (k,) [rad/sample] -> required over available damping there; None for a coupling without such a curve."""
@@ -334,6 +337,11 @@ class Condition(ABC):
         members = self.members(loop)
         return f"{members[int(matrix[1:] or 0)].name}: " if len(members) > 1 else ""
 
+    @property
+    def claim(self) -> str:
+        """What is said of one of the user's own."""
+        return f"the block of {self.name} is what is proved; that it keeps this loop safe is yours to show"
+
     def words(self, loop: Loop) -> str:
         """The same in the words of a report."""
         held = self.guarantee(loop)
@@ -388,6 +396,38 @@ def this_environment(F: Lti, loop: Loop) -> Requirement:
     return _least_damping("this-environment", F, lambda: this_environment_demand(F, loop), loop.delta)
 
 
+def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
+    """The damping that this-environment requires over the available damping, by a refined sweep of a stable coupling.
+
+    With `thin` by every `thin`-th frequency of its grid alone. Of one in series, a force filter, the responses of
+    environment and filter are multiplied: the poles of their series are defective and cost digits, and time.
+    """
+    if (chain := coupling.in_series(loop.T)) is None:
+        return _of_whole(loop, coupling, thin)
+    E = loop.E()
+    delayed = delay(loop.psi, loop.T) @ E
+
+    def needed(w: Array) -> Array:
+        F = loop.late(coupling.around(Sampled.of(delayed, on_circle(w)[None])))
+        demand = this_environment_demand(F, loop)
+        return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
+
+    grid = frequencies(E, chain, low=_LOWEST)
+    return float(needed(grid[::thin]).max()) if thin > 1 else supremum(needed, grid)[0]
+
+
+def _of_whole(loop: Loop, coupling: Coupling, thin: int) -> float:
+    try:
+        F = loop.F(coupling)
+        if thin == 1:
+            return this_environment(F, loop).ratio
+        demand = this_environment_demand(F, loop)
+    except SingularLoop:
+        return np.inf
+    return float(least_scale(demand, frequencies(F)[::thin]).max()) if F.is_stable() else np.inf
+
+
+_LOWEST = 1e-6  # [rad/sample]: below it nothing changes
 _W_ZERO = 1e-10  # [rad/sample] stands for F(1) of many, whose real part is even: sampled, a network may be 0/0 there
 #: rounding that F(1) may miss of symmetry and of positive semidefiniteness
 _STATIC = 1e-9

@@ -24,8 +24,10 @@ from design.conditions import (
     Demand,
     even_damping,
     least_scale,
+    ratio_in,
     this_environment,
     this_environment_demand,
+    this_environment_ratios,
     unsound,
     unsound_static,
 )
@@ -220,7 +222,7 @@ class _Search:
 class ThisEnvironment(Multiplied):
     """Safe in the environment of the loop: around its walls, whether they touch or not, and at all of its members."""
 
-    name, covers, limitable = "this-environment", BEYOND, True
+    name, covers, extensible = "this-environment", BEYOND, True
 
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
         G = loop.walled(coupling, exact)
@@ -268,6 +270,13 @@ class ThisEnvironment(Multiplied):
             if np.linalg.eigvalsh((part + part.T) / 2).min() < -_ROUNDING * size.max():
                 return f"{name} has a negative direction: it pushes outwards"
         return None
+
+    def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
+        return ratio_in(loop, coupling, thin)
+
+    def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
+        poles = loop.F(coupling).poles()
+        return this_environment_ratios(lambda z: loop.late(loop.sent_at(coupling, z)), poles, loop)
 
     def words(self, loop: Loop) -> str:
         return MAKING if loop.environment.walls else super().words(loop)

@@ -20,14 +20,16 @@ from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design import program
 from design.certificate import prove, prove_limiter, required_damping
+from design.conditions import Condition, ratio_in
 from design.conditions import this_environment as requirement_of
 from design.coupling_file import Certificate, LimiterCertificate
-from design.environments import BETA, LIMITER, Limiter, in_each, worst
+from design.environments import BETA, LIMITER, THIS_ENVIRONMENT, Limiter, in_each, worst
+from design.guarantees import ANY
 from design.result import Design, DesignFailed, NotProved, from_ratio
 from design.robustness import Nearby, Spread, at, robustness_nearby, vertices
 from design.spring_damper import design as design_spring_damper
 from design.transparency import Transparency, decibels, transparency
-from design.worst_member import Searched, ratio_in, search_ranges
+from design.worst_member import Searched, search_ranges
 
 _PRICED = 15.0  # [s] of the processor: what the price of a range may take, a third of it for proofs
 _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
@@ -456,13 +458,22 @@ def spread(
     return Spread(db, db - before, found.g, max(needs[1:], default=needs[0]), found.states, len(needs), proved)
 
 
-def nearby(loop: Loop, coupling: Coupling, options: program.Options = program.DEFAULT) -> Nearby:
-    """What a coupling needs within ten percent, and what a design for that would cost.
+def nearby(
+    loop: Loop,
+    coupling: Coupling,
+    options: program.Options = program.DEFAULT,
+    condition: Condition = THIS_ENVIRONMENT,
+) -> Nearby:
+    """What the condition asks of a coupling within ten percent, and what a design for that would cost.
 
-    Without the design before walls, with ranges, for an environment that is no network of springs, and for a coupling
-    that is no optimal one.
+    Empty where it holds in any environment. Without the design for a condition of the user's own, before walls, with
+    ranges, for an environment that is no network of springs, and for a coupling that is no optimal one.
     """
-    known, there = robustness_nearby(loop, coupling), loop.environment
-    if known is None or loop.ranges or there.one_period or not isinstance(coupling, ForceFilter | NoCoupling):
+    if condition.guarantee(loop) == ANY or condition.not_varied(loop):
+        return Nearby()
+    known, there = robustness_nearby(loop, coupling, condition), loop.environment
+    if known is None or loop.ranges or there.one_period or not condition.extensible:
+        return Nearby(known)
+    if not isinstance(coupling, ForceFilter | NoCoupling):
         return Nearby(known)
     return Nearby(known, spread(loop, coupling, options))

@@ -15,14 +15,12 @@ from itertools import product
 
 import numpy as np
 
-from controller.arithmetic import SingularLoop
 from controller.coupling import Coupling
-from controller.delay import delay
 from controller.loop import Loop
-from controller.lti import Array, Sampled
+from controller.lti import Array
 from controller.ranges import Member, Region, regions
-from design.conditions import least_multiple, least_scale, this_environment, this_environment_demand
-from design.frequency import MOST_SECONDS, frequencies, hermitian, on_circle, supremum
+from design.conditions import ratio_in
+from design.frequency import MOST_SECONDS
 
 _Ratio = Callable[[Member], float]  # required over available damping
 
@@ -40,9 +38,6 @@ _MANY = 7  # parameters from which on vertices and edges are drawn, too
 
 
 _STARTS, _APART, _SAME = 4, 0.2, 0.05  # of the compass search in a region; least distance of starts, and of tops
-
-
-_LOWEST = 1e-6  # [rad/sample]: below it nothing changes
 
 
 _FIRST, _LAST = 1 / 16, 1 / 128  # its steps, in widths of the ranges
@@ -170,34 +165,3 @@ def search_ranges(
     assert loop.ranges
     parts = regions(loop.network, loop.ranges)
     return search(parts, lambda member: ratio_in(loop.at(member.network), coupling), progress, seconds)
-
-
-def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
-    """The damping that this-environment requires over the available damping, by a refined sweep of a stable coupling.
-
-    With `thin` by every `thin`-th frequency of its grid alone. Of one in series, a force filter, the responses of
-    environment and filter are multiplied: the poles of their series are defective and cost digits, and time.
-    """
-    if (chain := coupling.in_series(loop.T)) is None:
-        return _of_whole(loop, coupling, thin)
-    E = loop.E()
-    delayed = delay(loop.psi, loop.T) @ E
-
-    def needed(w: Array) -> Array:
-        F = loop.late(coupling.around(Sampled.of(delayed, on_circle(w)[None])))
-        demand = this_environment_demand(F, loop)
-        return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
-
-    grid = frequencies(E, chain, low=_LOWEST)
-    return float(needed(grid[::thin]).max()) if thin > 1 else supremum(needed, grid)[0]
-
-
-def _of_whole(loop: Loop, coupling: Coupling, thin: int) -> float:
-    try:
-        F = loop.F(coupling)
-        if thin == 1:
-            return this_environment(F, loop).ratio
-        demand = this_environment_demand(F, loop)
-    except SingularLoop:
-        return np.inf
-    return float(least_scale(demand, frequencies(F)[::thin]).max()) if F.is_stable() else np.inf

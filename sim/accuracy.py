@@ -17,7 +17,7 @@ from controller.delay import delay
 from controller.lti import Array, Lti
 from design.files import unseen
 from models.device import credible_force
-from sim.mujoco_engines import EXPONENTIAL, default_integrator
+from sim.engines import EXPONENTIAL, default_integrator
 from sim.run import AnyEngine, Progress, Simulation, make_engine, run
 from sim.scenario import InputError
 from sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode

@@ -15,8 +15,7 @@ from design.files import plain
 from design.result import Design
 from sim.accuracy import EngineChoice, compare_engines, pick
 from sim.couplings import given, limits_of
-from sim.engines import Engine
-from sim.mujoco_engines import INTEGRATORS
+from sim.engines import INTEGRATORS, Engine
 from sim.passivity_layer import EnergyNet, Plugged, Wanted, netted
 from sim.run import ENGINES, AnyEngine, Progress, Simulation, assemble, engine_name, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear

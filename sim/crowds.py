@@ -21,15 +21,14 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from controller.coupling import Coupling
+from controller.delay import Timing
 from controller.law import Law
 from controller.lti import Array
 from controller.ranges import Member
-from controller.timing import Timing
 from models.hold import hold
 from models.human import Population
 from models.scene import Crowd, HumanSets, Variants, variants
-from sim.engines import Engine, ExactEngine, OneByOne
-from sim.mujoco_engines import EXPONENTIAL, LEAST, MujocoBatchEngine
+from sim.engines import EXPONENTIAL, LEAST, Engine, ExactEngine, MujocoBatchEngine, OneByOne
 from sim.run import Simulation, assemble, engine_name, make_engine
 from sim.scenario import Scenario
 from sim.stability import (

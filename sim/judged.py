@@ -71,6 +71,6 @@ def judge(
 ) -> Judged:
     """The coupling in the scenario's loop; conditions are asked of `met`, one environment of its ranges."""
     whole = check_ranges(scenario.loop(case), chosen.coupling, seed, progress=progress)
-    requirements = assess(met.loop(case), chosen.coupling, chosen.phi, chosen.certificate)
+    requirements = assess(met.loop(case), chosen.coupling, chosen.phi, chosen.certificate, own=chosen.own)
     limits = limits_of(met, chosen, requirements, limiter)
     return Judged.of(chosen, met.loop(case), requirements, whole, limits)

@@ -8,8 +8,7 @@ from typing import Self
 import numpy as np
 
 from controller.coupling import PUBLISHED, Coupling
-from controller.delay import LOST, VaryingDelay, ages
-from controller.timing import Timing
+from controller.delay import LOST, Timing, VaryingDelay, ages
 from design.certificate import assess
 from design.files import unseen
 from design.guarantees import EncoderSteps

@@ -17,7 +17,7 @@ import numpy as np
 from controller.lti import Array
 from controller.tick import StepBuffer
 from models.hold import HeldPlant
-from sim.mujoco_engines import EXPONENTIAL, LEAST, default_integrator, quiet_warnings
+from sim.engines import EXPONENTIAL, LEAST, default_integrator, quiet_warnings
 from sim.run import AnyEngine, Simulation, engine_name, make_engine
 from sim.scenario import InputError
 from sim.stability import close, disagree, dominant_mode, exact_growth

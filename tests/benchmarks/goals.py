@@ -25,7 +25,7 @@ from test_engine_cost import SCENES, cpu_seconds, looped, raw
 
 from sim.accuracy import position_error
 from sim.couplings import choose, limits_of
-from sim.mujoco_engines import EXPONENTIAL
+from sim.engines import EXPONENTIAL
 from sim.run import assemble
 from sim.stability import exact_growth
 from sim.step_choice import simulated_growth

@@ -20,8 +20,7 @@ from models.device import CompliantDevice
 from models.hold import hold
 from models.scene import plant, variants
 from sim.crowds import crowds
-from sim.engines import ExactEngine
-from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, _discretised, profiler_off
+from sim.engines import EXPONENTIAL, ExactEngine, MujocoBatchEngine, _discretised, profiler_off
 from sim.run import assemble, make_engine, run, run_block
 from sim.scenario import load
 from sim.stability import exact_growth

@@ -27,8 +27,7 @@ from models.hold import hold
 from models.human import Population
 from models.scene import variants
 from sim.crowds import crowds
-from sim.engines import ExactEngine
-from sim.mujoco_engines import MujocoBatchEngine
+from sim.engines import ExactEngine, MujocoBatchEngine
 from sim.run import assemble, run, run_blocks
 from sim.scenario import SCENARIOS, InputError, load, parse
 

@@ -22,6 +22,7 @@ from controller.lti import Lti, Sampled
 from design.barrier import EntryInequality, MatrixInequality, Program, centre
 from design.bound import BoundBeside, _causal, bound
 from design.certificate import verify
+from design.conditions import ratio_in
 from design.coupling_file import Stored, save
 from design.coupling_file import load as load_file
 from design.frequency import hermitian, on_circle
@@ -29,7 +30,6 @@ from design.optimal import design, spread
 from design.program import MARGIN, Options, Problem, Span, span_of, static_weight
 from design.robustness import ranges_around, robustness, vertices
 from design.transparency import transparency
-from design.worst_member import ratio_in
 from sim.scenario import load
 
 LOOPS = Path(__file__).parents[1] / "loops"

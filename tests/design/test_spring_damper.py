@@ -264,7 +264,7 @@ def test_an_active_environment_is_refused():
 
 
 def test_an_unknown_condition_is_refused():
-    with pytest.raises(ValueError, match="condition is 'both', expected 'any-environment' or 'this-environment'"):
+    with pytest.raises(ValueError, match="condition is 'both', allowed are any-environment, this-environment"):
         design(asked(), "both")
 
 

@@ -13,7 +13,7 @@ from design.certificate import assess
 from models.device import CompliantDevice
 from models.human import Human, Link
 from sim.accuracy import _limit_cycle
-from sim.mujoco_engines import EXPONENTIAL
+from sim.engines import EXPONENTIAL
 from sim.run import assemble, make_engine, outside_forces, run, run_blocks
 from sim.scenario import InputError, load
 from sim.stability import exact_growth

@@ -10,7 +10,7 @@ from controller.coupling import PUBLISHED, NoCoupling
 from models.device import CompliantDevice
 from models.human import Human, Link, Person
 from models.scene import plant
-from sim.mujoco_engines import INTEGRATORS
+from sim.engines import INTEGRATORS
 from sim.run import assemble, make_engine, run
 from sim.scenario import SCENARIOS, InputError, load
 from sim.stability import exact_growth
