@@ -395,7 +395,7 @@ def half_widths(loop: Loop) -> Array:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Forces that leave through the limiter of controller.limiter. any-environment without delay in the environment needs no
+# Forces that leave through the limiter of controller.law. any-environment without delay in the environment needs no
 # proof of its own: with rho = 0 the limiter and the environment together are a passive environment.
 
 BETA = 0.01  # of a limiter's lag under this-environment unless another is asked for
