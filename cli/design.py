@@ -28,7 +28,7 @@ from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import Design, Requirement, finite, listed
 from design.robustness import Nearby, ranges_around
 from design.transparency import BAND_HZ, Transparency, transparency
-from sim.judged import Judged
+from sim.couplings import Judged
 from sim.scenario import InputError, Scenario
 
 
@@ -37,7 +37,6 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
-    options.check_json(args)
     out = out_file(args.out, f"out/design-{options.place(args)}.json", "the file of the coupling")
     scenario = options.scenario_from(args)
     loop = _loop(args, scenario)

@@ -23,17 +23,16 @@ from design.robustness import Nearby
 from design.transparency import BAND_HZ
 from sim import accuracy
 from sim import passivity_layer as layer
+from sim.accuracy import MOST
 from sim.alternatives import Alternative, alternatives
 from sim.api import ScenarioRun, run_scenario
-from sim.couplings import NAMES, choose
+from sim.couplings import NAMES, Judged, choose
 from sim.engines import INTEGRATORS
-from sim.judged import Judged
 from sim.passivity_layer import BaselineFigures
 from sim.run import ENGINES, AnyEngine
 from sim.run_report import Ran, RunReport, run_report
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, ExactVerdict
-from sim.step_choice import MOST
 
 
 def main(argv: list[str]) -> int:

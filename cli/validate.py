@@ -19,15 +19,14 @@ from design.files import unseen
 from design.guarantees import ANY
 from design.result import Chosen
 from models.human import Human, Population
+from models.scene import MIXED
 from sim import verdicts
 from sim.adversary import Worst, search, search_population
-from sim.couplings import NAMES
-from sim.crowds import ENGINES, MIXED, Findings, Validation
-from sim.judged import Judged
+from sim.couplings import NAMES, Judged
+from sim.crowds import ENGINES, Findings, Table, Validation, validate, validate_on_cluster
 from sim.report import DelaySpan, UnevenTicks, VaryingDelays
 from sim.run import assemble, engine_name
 from sim.scenario import InputError, Scenario, require_linear, save_humans
-from sim.shards import Table, validate, validate_on_cluster
 from sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
 from sim.switching import DelaysCovered
 

@@ -20,8 +20,7 @@ from design.guarantees import guarantee_of
 from design.result import Chosen, Requirement, finite
 from design.transparency import decibels, transparency
 from sim.accuracy import credible, force_error
-from sim.couplings import choose, limits_of
-from sim.judged import Judged
+from sim.couplings import Judged, choose, limits_of
 from sim.run import assemble, run
 from sim.scenario import Scenario, load
 from sim.stability import exact_growth, unstable

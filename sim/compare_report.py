@@ -18,7 +18,7 @@ from design.program import Options
 from design.result import CONDITIONS, Chosen, Requirement
 from design.robustness import Nearby, robustness_nearby
 from design.transparency import Transparency, transparency
-from sim.report import CouplingFigures
+from sim.couplings import CouplingFigures
 from sim.scenario import Scenario
 
 

@@ -9,15 +9,19 @@ from typing import Any
 
 from controller.coupling import PUBLISHED, Coupling, NoCoupling
 from controller.loop import DelayRange, Loop
+from controller.older import CONDITIONS as OLDER
+from controller.older import with_older
 from design.api import COUPLING, bare, fitting
-from design.certificate import assess, verify
+from design.certificate import RangesCheck, assess, check_ranges, verify
 from design.conditions import Condition
 from design.coupling_file import Stored, load
-from design.coverage import Limits, covered_limits
+from design.coverage import Limits, RangesFigures, covered_limits
 from design.designs import KINDS, design_by_kind, name_and_own, own_coupling, usual_condition
 from design.environments import THIS_ENVIRONMENT
+from design.files import unseen
+from design.guarantees import guarantee_of
 from design.lmi import ANY_ENVIRONMENT
-from design.own import called
+from design.own import called, place_of
 from design.result import CONDITIONS, Chosen, Design, DesignFailed, Requirement, switching_guarantee
 from sim import design_cache
 from sim.scenario import InputError, Scenario
@@ -45,6 +49,8 @@ def choose(
     except (DesignFailed, InputError):
         raise
     except ValueError as error:
+        if place_of(error):  # in a class of the user's own
+            raise
         raise InputError(str(error)) from None
     return replace(found, own=own, notes=(*found.notes, own.claim)) if own else found
 
@@ -195,3 +201,81 @@ def check_stored(stored: Stored, loop: Loop, own: Condition | None = None) -> _F
             f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"
         )
     return _FileCheck(tuple(notes), switching)
+
+
+@dataclass(frozen=True)
+class CouplingFigures:
+    """Kind, gains (None where it has none) and order of V, Q or R."""
+
+    kind: str
+    order: int
+    K: list[float] | None = None  # (m,) [N/m]
+    B: list[float] | None = None  # (m,) [N s/m]
+    stiffness: list[float] | None = unseen("given", None)  # (m,) [N/m], static, of a moving average
+
+    @classmethod
+    def of(cls, kind: str, coupling: Coupling, T: float) -> CouplingFigures:
+        return cls(kind, **coupling.figures(T))
+
+
+# ----------------------------------------------------------------------------------------------------
+# A coupling in its loop before anything runs: what each condition asks, ranges, limits, and whom it is safe for.
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """The parts that every report of a coupling begins with."""
+
+    chosen: Chosen = unseen("no")
+    whole: RangesCheck | None = unseen("no")
+    coupling: CouplingFigures = unseen()
+    certificates: dict[str, Requirement] = unseen()  # by condition, also under the names that they had before
+    guarantee: str | None = unseen(older="promise")
+    ranges: RangesFigures | None = unseen(older="set")
+    limiter: Limits = unseen()
+
+    @classmethod
+    def of(
+        cls,
+        chosen: Chosen,
+        loop: Loop,
+        requirements: dict[str, Requirement],
+        whole: RangesCheck | None,
+        limits: Limits,
+    ) -> Judged:
+        """The verdicts on a coupling in a loop."""
+        return cls(
+            chosen,
+            whole,
+            CouplingFigures.of(chosen.kind, chosen.coupling, loop.T),
+            with_older(requirements, OLDER),
+            guarantee_of(requirements, loop, bool(whole and whole.proved)),
+            whole and RangesFigures.of(whole),
+            limits,
+        )
+
+    @property
+    def requirements(self) -> dict[str, Requirement]:
+        """The certificates under today's names alone."""
+        return {name: need for name, need in self.certificates.items() if name not in OLDER}
+
+    @property
+    def proved(self) -> bool:
+        """Whether the guarantee is proved for the ranges."""
+        return bool(self.whole and self.whole.proved)
+
+
+def judge(
+    scenario: Scenario,
+    case: str,
+    chosen: Chosen,
+    seed: int,
+    limiter: bool | None,
+    met: Scenario,
+    progress: Callable[[int, int], None],
+) -> Judged:
+    """The coupling in the scenario's loop; conditions are asked of `met`, one environment of its ranges."""
+    whole = check_ranges(scenario.loop(case), chosen.coupling, seed, progress=progress)
+    requirements = assess(met.loop(case), chosen.coupling, chosen.phi, chosen.certificate, own=chosen.own)
+    limits = limits_of(met, chosen, requirements, limiter)
+    return Judged.of(chosen, met.loop(case), requirements, whole, limits)

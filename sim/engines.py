@@ -3,7 +3,7 @@
     exact         s+ = A s + B [w; f], the matrix exponential of the plant under held inputs (no Coulomb friction)
     exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: accelerations by one mj_forward a step,
                   J from the compiled model's matrices; exact on a linear scene, whatever its stiffness and the step
-    RK4, ..       steps of MuJoCo's own integrators, whose number per period sim.step_choice decides
+    RK4, ..       steps of MuJoCo's own integrators, whose number per period sim.accuracy decides
 
 The exponential engine shares J with the exact one, so it checks forces and assembly, not the stepping in time: for that
 there is RK4.
@@ -177,6 +177,7 @@ INTEGRATORS = {
 
 LEAST = 4  # steps per period of MuJoCo's own integrators
 
+_RESOLVED, _FOLLOWED = 0.2, 1.0  # what a step may advance the fastest mode [rad] and the strongest damping
 _WHOLE = 1e-9  # of a step: rounding, where a number of steps is counted
 
 
@@ -563,3 +564,32 @@ def _profiler_clock() -> ctypes.c_void_p | None:
         except (OSError, ValueError):
             continue
     return None
+
+
+@dataclass(frozen=True)
+class _PlantSpeed:
+    """How fast a plant moves."""
+
+    mode: float  # [rad/s] its fastest weakly damped mode, 0 where there is none
+    rate: float  # [1/s] its strongest damping
+
+    def within(self, h: float) -> bool:
+        """Whether a step of h seconds follows it."""
+        return self.mode * h <= _RESOLVED and self.rate * h < _FOLLOWED
+
+    def substeps(self, T: float) -> int:
+        """The least number of steps in T seconds that follows it, LEAST at least."""
+        return max(LEAST, math.ceil(self.mode * T / _RESOLVED), math.floor(self.rate * T / _FOLLOWED) + 1)
+
+    def hardest(self, h: float) -> str:
+        """What a step of h seconds has most trouble with, in words."""
+        if self.mode / _RESOLVED >= self.rate / _FOLLOWED:
+            return f"the mode at {self.mode / (2 * math.pi):.4g} Hz advances {self.mode * h:.3g} rad in a step"
+        return f"the damping of {self.rate:.4g} 1/s times the step is {self.rate * h:.3g}"
+
+
+def pace(A: Array) -> _PlantSpeed:
+    """The pace of x' = A x, or the fastest of many. Weakly damped is what turns faster than it decays."""
+    values = np.linalg.eigvals(A)
+    weak = np.abs(values.imag) > np.abs(values.real)
+    return _PlantSpeed(float(np.abs(values[weak]).max(initial=0.0)), float(-values.real.min(initial=0.0)))

@@ -20,12 +20,10 @@ from controller.tick import Process, StepBuffer
 from models.device import Device
 from models.hold import HeldPlant, hold
 from models.human import Population
-from models.scene import Crowd, Scene, variants
-from sim.crowds import crowds
-from sim.engines import MujocoBatchEngine, profiler_off, quiet_warnings
+from models.scene import Crowd, Scene, crowds, variants
+from sim.engines import MujocoBatchEngine, pace, profiler_off, quiet_warnings
 from sim.run import run_block
 from sim.stability import close
-from sim.step_choice import pace
 from sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen
 
 Cells = NDArray[np.intp]

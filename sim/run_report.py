@@ -15,7 +15,7 @@ from design.transparency import Transparency, transparency
 from sim import accuracy
 from sim.alternatives import Alternative
 from sim.api import ScenarioRun
-from sim.judged import Judged
+from sim.couplings import Judged
 from sim.passivity_layer import BaselineFigures, idle
 from sim.report import (
     PaperRow,

@@ -16,9 +16,8 @@ from design.coverage import Limits, RangesFigures
 from design.files import unseen, write
 from design.guarantees import CAVEATS
 from design.result import Requirement
-from sim.judged import Judged
+from sim.couplings import CouplingFigures, Judged
 from sim.limit_cycles import UNDECIDED, Plan
-from sim.report import CouplingFigures
 from sim.scenario import Scenario
 from sim.stability import MARGINAL
 from sim.trace import slowest_seen

@@ -12,8 +12,7 @@ from asked import this_environment
 from controller.coupling import PUBLISHED, NoCoupling
 from controller.tick import StepBuffer
 from models.hold import hold
-from models.scene import Variants, variants
-from sim.crowds import crowds
+from models.scene import Variants, crowds, variants
 from sim.engines import ExactEngine, MujocoBatchEngine, profiler_off
 from sim.run import assemble, run_block
 from sim.scenario import load

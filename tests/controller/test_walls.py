@@ -25,8 +25,7 @@ from design.guarantees import MAKING
 from models.device import CompliantDevice
 from models.hold import hold
 from models.human import Population
-from models.scene import variants
-from sim.crowds import crowds
+from models.scene import crowds, variants
 from sim.engines import ExactEngine, MujocoBatchEngine
 from sim.run import assemble, run, run_blocks
 from sim.scenario import SCENARIOS, InputError, load, parse

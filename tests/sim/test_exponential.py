@@ -17,7 +17,17 @@ from models.hold import expm_each, exponential_step, hold
 from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
 from sim import engines
-from sim.accuracy import _missed, compare_engines, cross_check, pick
+from sim.accuracy import (
+    _missed,
+    check_substeps,
+    compare_engines,
+    cross_check,
+    default_substeps,
+    measured_hold,
+    pace,
+    pick,
+    simulated_growth,
+)
 from sim.api import run_scenario
 from sim.engines import (
     EXPONENTIAL,
@@ -32,7 +42,6 @@ from sim.passivity_layer import EnergyNet
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, VaryingDelay, load
 from sim.stability import exact_growth
-from sim.step_choice import check_substeps, default_substeps, measured_hold, pace, simulated_growth
 
 SCENARIO = load()
 RUBBING = SCENARIO.replace(device=(CompliantDevice(friction=0.5),) * 2)

@@ -10,7 +10,8 @@ import pytest
 from worlds import force_map, loop_of
 
 from cli import zwidth
-from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
+from cli.main import execute
+from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall, environment
 from controller.law import Law
@@ -19,9 +20,8 @@ from controller.tick import Process, StepBuffer
 from design.frequency import on_circle, suprema
 from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Link
-from models.scene import build, variants
+from models.scene import build, crowds, variants
 from sim import zwidth as zwidth_map
-from sim.crowds import crowds
 from sim.engines import _discretised
 from sim.limit_cycles import Effects, HeldDevices, Plan
 from sim.scenario import InputError, load
