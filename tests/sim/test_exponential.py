@@ -18,12 +18,12 @@ from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
 from sim import engines
 from sim.accuracy import (
+    _check_substeps,
+    _measured_hold,
     _missed,
-    check_substeps,
     compare_engines,
     cross_check,
     default_substeps,
-    measured_hold,
     pace,
     pick,
     simulated_growth,
@@ -97,7 +97,7 @@ def test_one_step_is_exact_whatever_the_stiffness(stiffness, T):
     generator = np.zeros((states + inputs, states + inputs))
     generator[:states, :states], generator[:states, states:] = continuous.A, continuous.B
     unit = np.r_[np.ones(states // 2), np.full(states // 2, fastest), np.ones(inputs)]
-    step = measured_hold(loop, "mujoco", EXPONENTIAL, 1, T)
+    step = _measured_hold(loop, "mujoco", EXPONENTIAL, 1, T)
     own = np.hstack([step.A, step.B]) * unit / unit[:states, None]
     allowed = 1e-14 * (1 + fastest * T)
     exact, scipys = longer(generator * T * unit / unit[:, None]), expm(generator * T) * unit / unit[:, None]
@@ -247,8 +247,8 @@ def test_the_default_follows_from_the_scene(simulation):
     # no rule asks for more on a stiff linear scene, where Runge-Kutta takes 32
     assert default_substeps(stiff(1.45e6), EXPONENTIAL) == 1
     assert default_substeps(stiff(1.45e6), "RK4") == 32
-    assert check_substeps(stiff(1.45e6), EXPONENTIAL, 1) == []
-    assert check_substeps(rubbing, EXPONENTIAL, 8) == [
+    assert _check_substeps(stiff(1.45e6), EXPONENTIAL, 1) == []
+    assert _check_substeps(rubbing, EXPONENTIAL, 8) == [
         "exponential x 8: of first order where devices rub, RK4 is nearer at equal cost (--cross-check: by how much)."
     ]
     assert default_substeps(rubbing, EXPONENTIAL) == 4
