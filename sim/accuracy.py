@@ -20,7 +20,7 @@ from design.files import unseen
 from models.device import credible_force
 from models.hold import HeldPlant
 from sim.engines import EXPONENTIAL, default_integrator, pace, quiet_warnings
-from sim.run import AnyEngine, Progress, Simulation, engine_name, make_engine, run
+from sim.run import AnyEngine, EngineSettings, Progress, Simulation, engine_name, make_engine, run
 from sim.scenario import InputError
 from sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode
 from sim.trace import Trace
@@ -414,23 +414,20 @@ class CrossCheck:
     agrees: bool
 
 
-def cross_check(
-    simulation: Simulation, trace: Trace, engine: AnyEngine, integrator: str | None, own_substeps: int | None
-) -> CrossCheck:
+def cross_check(simulation: Simulation, trace: Trace, settings: EngineSettings) -> CrossCheck:
     """The run again by RK4, which shares no matrix with the exponential and the exact engine; by it, if RK4 ran.
 
-    `simulation` is what ran, with its net; integrator and substeps are MuJoCo's, else None. Positions are
-    compared as far as neither ended before its time.
+    `simulation` is what ran, with its net. Positions are compared as far as neither ended before its time.
     """
-    other = EXPONENTIAL if integrator == "RK4" else "RK4"
+    other = EXPONENTIAL if settings.integrator == "RK4" else "RK4"
     linear = simulation.smooth.even
     substeps = default_substeps(linear, other)
     beside = run(simulation, make_engine(simulation, "mujoco", other, substeps), ticks=trace.t.size)
     ticks, m = min(trace.t.size, beside.t.size), simulation.process.channels
     growth = simulated_growth(linear, other, substeps)
     own = exact_growth(linear)
-    if engine != "exact":
-        own = simulated_growth(linear, integrator, own_substeps, engine)
+    if settings.engine != "exact":
+        own = simulated_growth(linear, settings.integrator, settings.substeps, settings.engine)
     apart = _apart(trace.s[:ticks, :m], beside.s[:ticks, :m])
     agrees = not disagree(own, growth) and trace.diverged == beside.diverged
     return CrossCheck(other, substeps, apart, growth, growth - own, agrees)
