@@ -55,7 +55,7 @@ def main(argv: list[str]) -> int:
     with render.progress("measuring") as move:
         measured = measure_all(coupled, uncoupled, default, move)
     report = _Report(args.case, scenario.name, chosen.kind, args.seed, default, *measured)
-    drawn = {"accuracy.png": lambda plots: plots.plot_accuracy} if report.rows else {}
+    drawn = {"accuracy.png": "plot_accuracy"} if report.rows else {}
     files = render.pictures(args, report.rows, out, drawn)
     table = render.columns(f"speed against error · {scenario.title(args.case)}, {chosen.kind}", _CELLS, report.rows)
     lines = [*(f"not measured: {reason}" for reason in report.skipped), *_LEGEND]

@@ -56,7 +56,6 @@ class _Checked:
 def main(argv: list[str]) -> int:
     """Prove a stored coupling again. 0: proved, 1: not."""
     args = _parser().parse_args(argv)
-    options.check_json(args)
     begin = time.perf_counter()
     stored = read_coupling(args.coupling)
     with options.refused(f"{args.coupling}: "):

@@ -114,9 +114,9 @@ def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 _PICTURES = {
-    "singular-values.png": lambda plots: plots.plot_singular_values,
-    "required-damping.png": lambda plots: plots.plot_required_damping,
-    "perceived.png": lambda plots: plots.plot_perceived,
+    "singular-values.png": "plot_singular_values",
+    "required-damping.png": "plot_required_damping",
+    "perceived.png": "plot_perceived",
 }
 
 
@@ -286,7 +286,7 @@ def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
         out, begin = options.out_folder(args, "compare"), time.perf_counter()
         rows, interrupted = options.until_interrupted(all_of_them)
     report = baselines.Baselines(scenario.name, args.case, args.seed, rows, time.perf_counter() - begin, interrupted)
-    files = render.pictures(args, report, out, {"baselines.png": lambda plots: plots.plot_baselines} if rows else {})
+    files = render.pictures(args, report, out, {"baselines.png": "plot_baselines"} if rows else {})
     shown = [render.columns(f"on the same runs · {scenario.title(args.case)}", _RIVALS, rows, left=(0, 7))]
     lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
     began = f"{baselines.SLOW:g} m/s they began with"
@@ -327,7 +327,7 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     wall, gains = time.perf_counter() - begin, compare.gains(plan, sweeps, loop, asked)
     report = LimitCurves(*about, sweeps, gains, wall, interrupted)
     points = [(name, row) for name, sweep in sweeps.items() for row in sweep.curves["optimal"]]
-    files = render.pictures(args, report, out, {"limits.png": lambda plots: plots.plot_limits} if points else {})
+    files = render.pictures(args, report, out, {"limits.png": "plot_limits"} if points else {})
     names = " and by ".join(args.beside)
     lines = [f"beside the optimum: the designed spring-damper by {names}"] if names else []
     lines += [f"{name} {row.value:.4g}: {row.reason}" for name, row in points if row.reason]

@@ -37,7 +37,6 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
-    options.check_json(args)
     out = out_file(args.out, f"out/design-{options.place(args)}.json", "the file of the coupling")
     scenario = options.scenario_from(args)
     loop = _loop(args, scenario)

@@ -63,7 +63,6 @@ class _Exported:
 def main(argv: list[str]) -> int:
     """Export a stored coupling. 0: written, 1: written, but the certificate in its file does not hold."""
     args = _parser().parse_args(argv)
-    options.check_json(args)
     stored = read_coupling(args.coupling)
     try:
         verdict = verify(stored, args.condition and named(args.condition))

@@ -6,16 +6,10 @@ What depends on the scenario, such as one number per channel, is checked by `per
 
 from __future__ import annotations
 
-import _thread
 import argparse
-import io
 import math
-import os
 import re
-import signal
 import sys
-import threading
-import traceback
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -23,14 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import msgspec
-from threadpoolctl import threadpool_limits
 
 from controller import older
-from controller.arithmetic import SingularLoop
 from controller.delay import LOST, Periods, VaryingDelay
 from controller.loop import DelayRange, Loop
-from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
-from design.own import called, is_refusal, named, place_of
+from design.files import check_file, folder, read_text
+from design.own import called, named, place_of
 from design.result import CONDITIONS, DesignFailed
 from models.device import MOST_DAMPING
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
@@ -64,7 +56,7 @@ class Parser(argparse.ArgumentParser):
         self._only.append((where, acts, names))
 
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
-        """As argparse's; an empty word is refused for every option."""
+        """As argparse's; an empty word is refused for every option, and a --json file that cannot be written."""
         found, rest = super().parse_known_args(*args, **how)
         if gone := getattr(found, "gone", None):
             has = "has" if len(gone) == 1 else "have"
@@ -80,6 +72,8 @@ class Parser(argparse.ArgumentParser):
                 if getattr(found, name) != self.get_default(name):
                     option = next(a.option_strings[-1] for a in self._actions if a.dest == name and a.option_strings)
                     raise InputError(f"{option} is only {where}")
+        if getattr(found, "json", None) not in (None, "-"):
+            check_file("--json", Path(found.json), "a file or -")
         return found, rest
 
     def error(self, message: str) -> NoReturn:
@@ -316,6 +310,8 @@ def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[
     except (InputError, DesignFailed):
         raise
     except (ValueError, ArithmeticError) as error:
+        if place_of(error):  # in a class of the user's own
+            raise
         text = str(error)
         argument = text.partition(" ")[0]
         if given(getattr(args, argument, None)):
@@ -389,15 +385,8 @@ def with_humans(args: argparse.Namespace, scenario: Scenario) -> Scenario:
     return scenario if args.human is None else held_by(scenario, args.human)
 
 
-def check_json(args: argparse.Namespace) -> None:
-    """Whether the file of --json can be written, before any work is done. Raises InputError."""
-    if args.json is not None and args.json != "-":
-        check_file("--json", Path(args.json), "a file or -")
-
-
 def out_folder(args: argparse.Namespace, command: str) -> Path:
     """The folder for the files of a command, made before any work is done. Raises InputError."""
-    check_json(args)
     return folder(Path(args.out or f"out/{command}{f'-{place(args)}' if 'case' in args else ''}"))
 
 
@@ -497,82 +486,3 @@ def until_interrupted(rows: Iterable[_Given]) -> tuple[list[_Given], bool]:
 def exit_code(holds: bool, interrupted: bool = False) -> int:
     """The exit code of a command that has printed its report."""
     return INTERRUPTED if interrupted else DONE if holds else DOES_NOT_HOLD
-
-
-def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> NoReturn:
-    """Run a command and leave with its exit code; bad input is one line on standard error.
-
-    Whoever reads standard output may stop at any line (`| head -1`): the command's own exit code stays what it is,
-    also under `set -o pipefail`. SIGTERM ends a command as Ctrl-C does: temporary files are removed.
-    """
-    code: str | int | None
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of processes that this one starts
-    os.environ["MPLBACKEND"] = "Agg"  # pictures are files; a name that matplotlib does not know would stop its import
-    _streams()
-    sys.unraisablehook = _not_lost
-    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, _terminated)
-    try:
-        # the matrices here are small: more BLAS threads only wait for each other, and the last digits depend on them
-        with threadpool_limits(1, user_api="blas"), one_command():
-            code = main(sys.argv[1:] if argv is None else argv)
-    except (InputError, SingularLoop) as error:
-        code = _say(f"error: {error}", BAD_INPUT)
-    except DesignFailed as error:
-        code = _say(f"not possible: {error}", DOES_NOT_HOLD)
-    except KeyboardInterrupt:
-        code = _say("interrupted", INTERRUPTED)
-    except SystemExit as end:  # argparse, after --help, and SIGTERM
-        code = end.code
-    except MemoryError:
-        code = _say("error: there is not enough memory for this", UNFINISHED)
-    except OSError as error:  # a full disk behind standard output, mostly
-        code = _cannot(error)
-    except Exception as error:  # not 1, which says that what was asked does not hold
-        place, code = place_of(error), UNFINISHED  # a mistake of ours, or one in a class that the user named
-        if place and is_refusal(error):
-            code = _say(f"error: {place}: {error}", BAD_INPUT)
-        else:
-            traceback.print_exc()
-            if place:
-                code = _say(f"error: {place}, which is your own: {type(error).__name__}: {error}", BAD_INPUT)
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        nobody_reads()
-    except OSError as error:
-        code = _cannot(error)
-    sys.exit(code)
-
-
-def _say(message: str, code: int) -> int:
-    print(one_line(message), file=sys.stderr)
-    return code
-
-
-def _cannot(error: OSError) -> int:
-    """Say in one line what the operating system refused; later output is discarded."""
-    nobody_reads()
-    return _say(f"error: {error.filename or 'standard output'}: {error.strerror or error}", BAD_INPUT)
-
-
-def _streams() -> None:
-    """Replace closed standard streams, and characters that a terminal cannot show."""
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        stream = getattr(sys, name)
-        if stream is None:
-            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - for as long as the command runs
-        elif mode == "w" and isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-
-
-def _terminated(number: int, frame: Any) -> NoReturn:
-    raise SystemExit(_say("terminated", 128 + number))
-
-
-def _not_lost(unraisable: Any) -> None:
-    """Repeat a Ctrl-C that came during Python's clean-up, where it would be lost."""
-    if issubclass(unraisable.exc_type, KeyboardInterrupt):
-        _thread.interrupt_main()
-    else:
-        sys.__unraisablehook__(unraisable)

@@ -222,7 +222,6 @@ def _measured(check: Check, place: Path, seed: int) -> int:
 def main(argv: list[str]) -> int:
     """Run the checks. 0: all hold, 1: one does not, 130: interrupted; what was done is in the report."""
     args = _parser().parse_args(argv)
-    options.check_json(args)
     checks = _checks(args.only or _names())
     out, screen = folder(Path(args.out or "out/validate")), render.console(args)
     answers: list[_Answer] = []

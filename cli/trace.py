@@ -28,7 +28,6 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     if args.plot is not None:
         check_file("--plot", Path(args.plot))
-    options.check_json(args)
     result = Trace.load_npz(Path(args.trace))
     found = growths(result)
     if not result.t.size:

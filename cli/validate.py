@@ -208,6 +208,12 @@ class _Own:
         yield f"hands of {self.from_}", f"{growth}: {self.exact.exact_verdict}"
 
 
+def _judged_rows(judged: Judged) -> render.Rows:
+    if own := judged.chosen.own:
+        yield from render.certificate_rows({own.name: judged.requirements[own.name]}, 5)
+    yield "force limits", judged.limiter.words
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Report:
     """What a validation found; a part that does not exist is null or left out."""
@@ -227,7 +233,7 @@ class _Report:
     own_humans: _Own = render.several(_Own.rows)
     largest_difference_per_s: float | None = render.figure("growth rates apart", "{:.1e} 1/s at most")
     traces: verdicts.Traces | None = render.several(verdicts.Traces.rows)
-    judged: Judged = render.figure("force limits", "{.limiter.words}", json="beside")
+    judged: Judged = render.several(_judged_rows, "beside")
     settled: str | None = render.figure("handles come to rest", json="table")
     energy_audit: verdicts.EnergyAudit | None = render.figure("energy audit W >= 0", json="given")
     switching: verdicts.Growing[VaryingDelays] | None = render.several(

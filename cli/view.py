@@ -40,7 +40,6 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
     require_even_ticks(scenario, "sim.view")
-    options.check_json(args)
     if args.video:
         check_film(Path(args.video))
         if args.video.endswith(".gif") and 100 % args.fps:  # GIF counts in hundredths of a second

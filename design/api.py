@@ -75,6 +75,7 @@ def design_coupling(
     """
     of_kind("loop", loop, Loop, _LOOP)
     one_of("kind", kind, KINDS)
+    named(condition or usual_condition(loop, kind))  # refuses a taken name
     known(options, KINDS[kind].options, f"kind {kind!r}")
     return design_by_kind(loop, kind, condition, **options)
 

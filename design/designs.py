@@ -12,17 +12,18 @@ import msgspec
 import numpy as np
 
 from controller.loop import Loop
-from design.certificate import named as condition_named
 from design.conditions import Condition
+from design.environments import THIS_ENVIRONMENT
 from design.guarantees import ANY
+from design.lmi import ANY_ENVIRONMENT
 from design.own import called, named
-from design.result import CONDITIONS, Design, DesignFailed
+from design.result import Design, DesignFailed
 
 
 class Kind(NamedTuple):
     """One design: what it promises, where it is made, and what can be asked of it."""
 
-    conditions: tuple[str, ...]  # that it can be made for, its own first
+    conditions: tuple[Condition, ...]  # that it can be made for, its own first
     module: str  # loaded when it is asked for
     function: str  # from a loop to a Design
     takes: tuple[str, ...] = ()  # besides the loop and its options: condition, progress
@@ -34,7 +35,7 @@ class Kind(NamedTuple):
 
 KINDS = {
     "spring-damper": Kind(
-        ("this-environment", "any-environment"),
+        (THIS_ENVIRONMENT, ANY_ENVIRONMENT),
         "design.spring_damper",
         "design_with",
         ("condition",),
@@ -42,10 +43,10 @@ KINDS = {
         limited=True,
         softened=True,
     ),
-    "moving-average": Kind(("any-environment",), "design.spring_damper", "moving_average", softened=True),
-    "ccl": Kind(("any-environment",), "design.fixed_order", "design", options=("order", "method", "diagonal")),
+    "moving-average": Kind((ANY_ENVIRONMENT,), "design.spring_damper", "moving_average", softened=True),
+    "ccl": Kind((ANY_ENVIRONMENT,), "design.fixed_order", "design", options=("order", "method", "diagonal")),
     "optimal": Kind(
-        ("this-environment",),
+        (THIS_ENVIRONMENT,),
         "design.optimal",
         "design_with",
         ("progress",),
@@ -55,7 +56,7 @@ KINDS = {
 }
 
 
-_OWN = Kind(("this-environment", "any-environment"), "", "")  # a function of a user's own, which takes a loop alone
+_OWN = Kind((THIS_ENVIRONMENT, ANY_ENVIRONMENT), "", "")  # a function of a user's own, which takes a loop alone
 
 
 def kind_of(name: str) -> Kind:
@@ -71,16 +72,14 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """
     less = loop.environment.walls or loop.ranges or loop.varying_delay
     conditions = kind_of(kind).conditions
-    usual = conditions[-1] if less and not loop.latency else conditions[0]  # the last one is for the most environments
-    return usual
+    return (conditions[-1] if less and not loop.latency else conditions[0]).name  # the last is for more environments
 
 
 def name_and_own(condition: str | Condition | None) -> tuple[str | None, Condition | None]:
-    """The condition's name, and itself where it is one of the user's own. Raises ValueError for no condition."""
-    if condition is None:
-        return None, None
-    asked = condition_named(condition)
-    return asked.name, None if asked.name in CONDITIONS else asked
+    """The condition's name, and itself where it is one of the user's own."""
+    if condition is None or isinstance(condition, str):
+        return condition, None
+    return condition.name, None if condition in _OWN.conditions else condition
 
 
 def design_by_kind(
@@ -117,9 +116,10 @@ def design_by_kind(
         able = ", ".join(other for other in KINDS if KINDS[other].softened)
         why = f"for which {able} and functions of your own can be designed, not {kind}; a FILE.json is judged by it"
         raise ValueError(f"condition is {own.name}, {why}")
-    made_for = condition_named(usual_condition(loop, kind) if own or not name else name)
-    if made_for.name not in chosen.conditions:
-        raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(chosen.conditions)}")
+    asked, able = usual_condition(loop, kind) if own or not name else name, {c.name: c for c in chosen.conditions}
+    if asked not in able:
+        raise ValueError(f"condition is {asked!r}, for {kind} allowed are {', '.join(able)}")
+    made_for = able[asked]
     if chosen.model and loop.environment.walls:
         raise ValueError(f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls")
     further = {"condition": made_for.name, "progress": progress}

@@ -21,7 +21,7 @@ from design.environments import THIS_ENVIRONMENT
 from design.files import unseen
 from design.guarantees import guarantee_of, switching_guarantee
 from design.lmi import ANY_ENVIRONMENT
-from design.own import called
+from design.own import called, place_of
 from design.result import CONDITIONS, Chosen, Design, DesignFailed, Requirement
 from sim import design_cache
 from sim.scenario import InputError, Scenario
@@ -49,6 +49,8 @@ def choose(
     except (DesignFailed, InputError):
         raise
     except ValueError as error:
+        if place_of(error):  # in a class of the user's own
+            raise
         raise InputError(str(error)) from None
     return replace(found, own=own, notes=(*found.notes, own.claim)) if own else found
 

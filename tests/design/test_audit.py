@@ -10,7 +10,7 @@ import pytest
 from worlds import FIGURE_4, PAIR, SOFT
 
 from cli.audit import main
-from cli.options import execute
+from cli.main import execute
 from controller.coupling import PUBLISHED, Compliance, Coupling, NoCoupling, SpringDamper
 from controller.environment import GROUND, RIGID_WALL, Network, Spring
 from controller.loop import Loop

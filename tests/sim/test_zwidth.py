@@ -10,7 +10,8 @@ import pytest
 from worlds import force_map, loop_of
 
 from cli import zwidth
-from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
+from cli.main import execute
+from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall, environment
 from controller.law import Law
