@@ -14,6 +14,7 @@ Two transfer matrices of the paper can never satisfy the strict inequalities pri
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -285,7 +286,7 @@ class _AnyEnvironment(Condition):
     name, source, separable = "any-environment", "the paper's Theorem 4", True
     covers = tuple(name for name in conditions.BEYOND if name != "latency")
 
-    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
+    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         V = coupling.compliance(loop.period(exact))
         assert V is not None  # where it is None, `required` refuses
         if exact:
@@ -341,7 +342,10 @@ class _AnyEnvironment(Condition):
             multiplier, reason = self.least_multiplier(loop)
         if multiplier is None:
             return refusal(self.name, loop.delta, str(reason))
-        return conditions.any_environment(V, loop, np.array([float(p) for p in multiplier]))
+        if len(multiplier) != loop.channels:
+            raise NotProved("any-environment with psi >= 1 needs a multiplier Phi, one entry per channel")
+        found = conditions.any_environment(V, loop, np.array([float(p) for p in multiplier]))
+        return replace(found, multiplier=tuple(multiplier))
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         if not any(loop.psi):
@@ -355,13 +359,6 @@ class _AnyEnvironment(Condition):
             "P": conditions.any_environment_demand(V, loop, multiplier),
             "P_E": conditions.delayed_environment_demand(delayed, multiplier),
         }
-
-    def multiplier(self, loop: Loop, coupling: Coupling, given: Sequence[float] | None) -> Sequence[float] | None:
-        if not any(loop.psi) or self.beyond(loop) or coupling.compliance(loop.T) is None:
-            return None
-        if given is None or len(given) != loop.channels:
-            raise NotProved("any-environment with psi >= 1 needs a multiplier Phi, one entry per channel")
-        return given
 
     def multiplier_name(self, loop: Loop) -> str | None:
         return "Phi" if any(loop.psi) else None
