@@ -34,6 +34,7 @@ _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over
 _FIRST = 3  # of the environments: those that the nominal design misses most are imposed first
 _SETTLED_DB = 0.05  # a rung that gains less ends the climb
 _FEWEST_RUNGS = 3
+_MOST_REFUSED = 2  # rungs without a proof, one after the other, after which a larger one has none either
 _KEPT_STIFFNESS = 0.5  # of the most static stiffness of a rung that was best: one that renders less is not taken
 _LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # (beta, c) of a limiter to begin with: without psi the first alone
 _HOPELESS = 0.9  # relative mismatch from which on the climb is compared with other couplings
@@ -135,7 +136,12 @@ def design(
             better.append(found)
         settled = gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS
         hurried = not settled and climb.elapsed > options.seconds
-        if settled or hurried:
+        if (
+            settled
+            or hurried
+            or not any(each.proved for each in rungs[-_MOST_REFUSED:])
+            and len(rungs) >= _MOST_REFUSED
+        ):
             break
     if loop.ranges:
         for found in better[: -_TRIED - 1 : -1]:
@@ -271,7 +277,7 @@ class _Search:
         coupling, needs = self.kept_in_all(problem, [0])
         if slip:
             needs.append(min(limiter_requirement(self.loop, coupling, slip.beta).requirement.ratio, 1 + _TOLERATED))
-        for share in (0.95, 1.5, 2.5, 15.0, 50.0):  # of the margin, which stays unused until the rung is proved
+        for share in (0.95, 2.5, 50.0):  # of the margin, which stays unused until the rung is proved
             limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
