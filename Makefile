@@ -23,10 +23,10 @@ test: .venv/ready
 	$(PY) -m pytest $(PARALLEL)
 
 check: .venv/ready
-	$(PY) -m ruff check .
-	$(PY) -m ruff format --check .
-	$(PY) -m pyright $$($(PY) tests/touched.py sources)
-	CHECK_SECONDS=30 $(PY) -m pytest -rs $(PARALLEL) $$($(PY) tests/touched.py)
+	@export CHECK_UNTIL=$$(($$(date +%s) + 50)); set -ex; \
+	$(PY) -m ruff check .; $(PY) -m ruff format --check .; \
+	$(PY) -m pyright $$($(PY) tests/touched.py sources); \
+	$(PY) -m pytest -rs $(PARALLEL) $$($(PY) tests/touched.py)
 
 validate: .venv/ready
 	$(PY) -m sim.suite --out out/validate

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from cli import options, render
 from cli.judged import chosen_by
 from controller.coupling import NoCoupling
-from sim.accuracy import Row, measure_all
+from sim.accuracy import Row, default_substeps, measure_all
 from sim.couplings import NAMES, limits_of
-from sim.mujoco_engines import EXPONENTIAL
+from sim.engines import EXPONENTIAL
 from sim.run import assemble
 from sim.scenario import InputError, require_even_ticks, require_linear
-from sim.step_choice import default_substeps
 
 _MOST_STEPS = 3_000_000  # of a row: a minute or two
 _LEGEND = (
@@ -56,7 +55,7 @@ def main(argv: list[str]) -> int:
     with render.progress("measuring") as move:
         measured = measure_all(coupled, uncoupled, default, move)
     report = _Report(args.case, scenario.name, chosen.kind, args.seed, default, *measured)
-    drawn = {"accuracy.png": lambda plots: plots.plot_accuracy} if report.rows else {}
+    drawn = {"accuracy.png": "plot_accuracy"} if report.rows else {}
     files = render.pictures(args, report.rows, out, drawn)
     table = render.columns(f"speed against error · {scenario.title(args.case)}, {chosen.kind}", _CELLS, report.rows)
     lines = [*(f"not measured: {reason}" for reason in report.skipped), *_LEGEND]
@@ -69,12 +68,12 @@ def main(argv: list[str]) -> int:
 def _parser() -> options.Parser:
     example = "python -m sim.accuracy --duration 5"
     parser = options.Parser("sim.accuracy", "Speed against error, engine by engine.", example)
-    options.add_loop_options(parser)
-    options.add_coupling_options(parser, ", ".join(NAMES))
-    options.add_limiter_option(parser)
+    parser.add_loop()
+    parser.add_coupling(", ".join(NAMES))
+    parser.add_limiter()
     duration = "of each run (default: the scenario's)"
     parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help=duration)
-    options.add_output_options(parser, picture=True)
+    parser.add_output(picture=True)
     return parser
 
 

@@ -18,10 +18,10 @@ from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY, Audit, ConditionAudit, Help, audit
 from design.certificate import check_ranges
 from design.coverage import Switching
-from design.designs import KINDS
+from design.designs import KINDS, name_and_own
 from design.files import unseen
 from design.guarantees import EncoderSteps
-from design.result import CONDITIONS, listed
+from design.result import listed
 from models.device import CATALOGUE, listed_device
 from sim.couplings import check_stored, fitted, own_of, read_coupling
 from sim.report import encoder_steps
@@ -60,17 +60,18 @@ def main(argv: list[str]) -> int:
     scenario = options.scenario_from(args)
     loop = options.rigid_loop(args, scenario) if args.rigid else scenario.loop(args.case)
     coupling = _coupling(args, loop, scenario)
-    switching = _switching(args, loop)
+    switching, (_, own) = _switching(args, loop), name_and_own(args.condition)
     out = options.out_folder(args, "audit")
 
     begin = time.perf_counter()
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
         whole = check_ranges(loop, coupling, args.seed, progress=move)
     with options.refused():
-        found = audit(loop, coupling, switching, whole)
+        found = audit(loop, coupling, switching, whole, own)
     notes = ()
     if args.coupling and not _is_own(args):  # what its file is worth in the loop that is audited
-        notes = check_stored(read_coupling(args.coupling), scenario.loop(args.case).switching(switching)).notes
+        notes = check_stored(read_coupling(args.coupling), scenario.loop(args.case).switching(switching), own).notes
+    notes = (*notes, own.claim) if own else notes
     report = _Report(
         args.case,
         None if args.rigid else scenario.name,
@@ -95,14 +96,15 @@ def _parser() -> options.Parser:
     coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m]; one is for all")
     stored = "a stored coupling, or a function of your own, in place of --K and --B"
     coupling.add_argument("--coupling", metavar="FILE.json|MODULE:NAME", help=stored)
+    parser.add_condition("a further condition that must hold, beside the two that are always asked", to=coupling)
     device = "its damping and, where no gains are given, the largest that CHAI3D allows it, on a rigid wall at 1 kHz"
     coupling.add_argument("--device", metavar="NAME", help=f"of the catalogue: {device}; other options go first")
     coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")
-    options.add_loop_options(parser)
-    options.add_rigid_option(parser)
+    parser.add_loop()
+    parser.add_rigid()
     switching = "also any switching of the forces' delays in this range [samples]; or LO-HI,LO-HI,.. per channel"
-    options.add_varying_delay_option(parser, switching)
-    options.add_output_options(parser)
+    parser.add_varying_delay(switching)
+    parser.add_output()
     return parser
 
 
@@ -200,10 +202,10 @@ def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
 
 
 def _tables(found: Audit) -> list[Table]:
-    parts = [found.conditions[condition] for condition in CONDITIONS]
-    table = Table("", *CONDITIONS, title=_verdict(found), title_justify="left")
+    parts = found.parts
+    table = Table("", *parts, title=_verdict(found), title_justify="left")
     for name, cell in _ROWS.items():
-        table.add_row(name, *map(cell, parts))
+        table.add_row(name, *map(cell, parts.values()))
     if not found.ranges:
         return [table]
     return [table, render.facts("the ranges around the environment", found.ranges.rows(), left=True)]
@@ -246,8 +248,7 @@ _ROWS: dict[str, Callable[[ConditionAudit], str]] = {
 def _remarks(report: _Report) -> Iterator[str]:
     found = report.audit
     yield from (f"{note}." for note in report.notes)
-    for condition in CONDITIONS:
-        part = found.conditions[condition]
+    for condition, part in found.parts.items():
         sensitivity = part.sensitivity.reason if part.requirement.certified else None
         reasons = {
             "": part.requirement.reason,

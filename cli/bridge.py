@@ -12,13 +12,14 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from rich.console import Console
 
 from cli import options, render, session_cli
+from design.certificate import named
 from design.files import plain, write_json
 from design.guarantees import CAVEATS
-from design.lmi import LATE
 from design.result import listed
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
@@ -40,8 +41,10 @@ def main(argv: list[str]) -> int:
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
     at_once = args.latch == "arrival" or session_cli.host_clocked(args)  # a host that is the clock sends at once
-    if at_once and args.condition == "any-environment":
-        raise InputError(f"--latch arrival with --condition {args.condition}: {LATE}")
+    if at_once and args.condition:
+        asked, late = named(args.condition), ((0.0, scenario.T / 2),) * scenario.channels
+        if reason := asked.beyond(msgspec.structs.replace(scenario.loop(args.case), latency=late)):
+            raise InputError(f"--latch arrival with --condition {asked.name}: {reason}")
     if args.energy_budget and at_once:
         raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
     if args.energy_budget and not args.energy_budget[0]:
@@ -80,19 +83,19 @@ def _parser() -> argparse.ArgumentParser:
         "Drive a device over a serial port with a coupling that is certified for the delay measured.",
         "python -m hw.bridge --rehearse --case I --duration 2",
     )
-    options.add_loop_options(parser)
+    parser.add_loop()
     session_cli.add_link_options(parser)
     session_cli.add_safety_options(parser)
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
-    options.add_condition_option(parser)
+    parser.add_condition()
     latch = "when forces act: at whole ticks (default), or as soon as they arrive, certified for the latency measured"
     parser.add_argument("--latch", choices=("tick", "arrival"), default="tick", help=latch)
-    options.add_energy_budget_option(parser)
-    options.add_limiter_option(parser)
+    parser.add_energy_budget()
+    parser.add_limiter()
     seconds, most = "of forces at full gain (default: the scenario's)", options.number(0.1, _LONGEST)
     parser.add_argument("--duration", type=most, metavar="SECONDS", help=seconds)
-    options.add_output_options(parser, picture=True)
+    parser.add_output(picture=True)
     return parser
 
 

@@ -11,15 +11,13 @@ from rich.table import Table
 
 from cli import options, render
 from controller.ranges import regions
-from design.certificate import NotProved, Verdict, lag, prove, required_damping, verify, violated_between
+from design.certificate import NotProved, Verdict, lag, named, prove, required_damping, verify, violated_between
 from design.conditions import Condition
 from design.coupling_file import Stored, SwitchingProof
 from design.coverage import SearchFigures
 from design.environments import Searched, search, search_ranges
-from design.files import InputError
 from design.guarantees import HERE, RANGES, switching_guarantee
-from design.own import called, named
-from design.result import listed
+from design.result import CONDITIONS, listed
 from sim.couplings import read_coupling
 
 
@@ -58,18 +56,17 @@ class _Checked:
 def main(argv: list[str]) -> int:
     """Prove a stored coupling again. 0: proved, 1: not."""
     args = _parser().parse_args(argv)
-    options.check_json(args)
     begin = time.perf_counter()
     stored = read_coupling(args.coupling)
     with options.refused(f"{args.coupling}: "):
-        own = _own_condition(args.condition) if args.condition else None
+        own = named(args.condition) if args.condition else None
         stored, verdict = _by_own(stored, own) if own else (stored, verify(stored))
     searched = _searched(stored, own) if verdict.proved else None
     if searched and not searched.worst[0].ratio < 1:
         verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
     checked = _checked(stored, verdict, searched, time.perf_counter() - begin)
-    if own and verdict.proved:
-        checked = replace(checked, claim=f"that the block of {own.name} keeps this loop safe is yours, and not proved")
+    if own and verdict.proved and own.name not in CONDITIONS:
+        checked = replace(checked, claim=own.claim)
     render.publish(args, checked, [_table(checked)])
     return options.exit_code(verdict.proved)
 
@@ -78,17 +75,9 @@ def _parser() -> options.Parser:
     example = "python -m design.check coupling.json"
     parser = options.Parser("design.check", "Prove a stored coupling again, in exact arithmetic.", example)
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling")
-    own = "prove the coupling by a condition of your own (design.conditions.Condition), in place of the file's"
-    parser.add_argument("--condition", metavar="MODULE:CLASS", help=own)
-    options.add_json_option(parser)
+    parser.add_condition("prove the coupling by this condition, in place of the file's")
+    parser.add_json()
     return parser
-
-
-def _own_condition(name: str) -> Condition:
-    condition = called(f"--condition {name}", named("--condition", name))
-    if not isinstance(condition, Condition):
-        raise InputError(f"--condition {name} makes {condition!r}, expected a design.conditions.Condition")
-    return condition
 
 
 def _by_own(stored: Stored, condition: Condition) -> tuple[Stored, Verdict]:

@@ -21,6 +21,7 @@ from controller.loop import Loop
 from controller.lti import Array
 from design import compare
 from design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
+from design.conditions import Condition
 from design.program import Options
 from design.result import CONDITIONS, Chosen, DesignFailed, finite
 from design.robustness import Nearby, Robustness
@@ -52,16 +53,16 @@ def _parser() -> options.Parser:
   python -m design.compare --over damping=0.7:10,delay --points 5"""
     what = "Compare couplings over frequency, all designs as a ladder, or the best coupling along an axis of the loop."
     parser = options.Parser("design.compare", what, example)
-    options.add_loop_options(parser)
+    parser.add_loop()
     given = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION asks for a condition"
     parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"{given} (default none,spring-damper)")
-    options.add_condition_option(parser, "of designs that name none")
+    parser.add_condition("of designs that name none")
     short = "every design side by side, cases I and II (full: minutes)"
     parser.add_argument("--ladder", nargs="?", const="short", choices=tuple(LADDERS), help=short)
     classics = "on the same runs: no coupling, the classics (PO/PC, energy bounding), the energy budget, our designs"
     parser.add_argument("--baselines", action="store_true", help=classics)
     axes, names = ",".join(AXES), "damping, delay, period, order"
-    options.add_limiter_option(parser, "with --baselines clip the forces of our designs")
+    parser.add_limiter("with --baselines clip the forces of our designs")
     over = f"the best coupling along these axes: {names} (default: all of them)"
     parser.add_argument("--over", nargs="?", const=axes, metavar="NAME[=LOW:HIGH],..", help=over)
     curve = parser.add_argument_group("with --over")
@@ -71,9 +72,8 @@ def _parser() -> options.Parser:
     curve.add_argument("--keep", choices=("samples", "seconds"), default="samples", help="delays, as the period varies")
     beside = "spring-dampers drawn: none, any-environment, this-environment or both (default both)"
     curve.add_argument("--beside", type=_beside, default=tuple(CONDITIONS), metavar="NAME", help=beside)
-    optimal = parser.add_argument_group("the optimal coupling of --over")
-    add_optimal_options(optimal)
-    options.add_output_options(parser, picture=True)
+    add_optimal_options(parser, "the optimal coupling of --over")
+    parser.add_output(picture=True)
     plain = "without --over, --ladder and --baselines"
     parser.only(plain, lambda args: not (args.over or args.ladder or args.baselines), "coupling", "condition")
     parser.only("without --ladder, which has no picture", lambda args: not args.ladder, "no_plot")
@@ -114,9 +114,9 @@ def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 _PICTURES = {
-    "singular-values.png": lambda plots: plots.plot_singular_values,
-    "required-damping.png": lambda plots: plots.plot_required_damping,
-    "perceived.png": lambda plots: plots.plot_perceived,
+    "singular-values.png": "plot_singular_values",
+    "required-damping.png": "plot_required_damping",
+    "perceived.png": "plot_perceived",
 }
 
 
@@ -147,11 +147,14 @@ def _chosen(scenario: Scenario, args: argparse.Namespace, names: Sequence[str]) 
     return chosen, [f"{name}: not possible: {' '.join(str(error).split())}" for name, error in failures.items()]
 
 
-def _named(name: str) -> tuple[str, str | None]:
+def _named(name: str) -> tuple[str, str | Condition | None]:
     """NAME:CONDITION as both, the condition None where none is named. Raises InputError."""
-    plain, _, words = name.rpartition(":")
+    kind, _, words = name.partition(":")
+    plain, words = (kind, words) if kind in NAMES else name.rpartition(":")[::2]
     try:
-        return (plain, options.condition(words)) if plain else (name, None)
+        if not plain or plain == name:
+            return name, None
+        return plain, options.own_condition(words) if ":" in words else options.condition(words)
     except argparse.ArgumentTypeError as error:
         if plain in NAMES:
             raise InputError(f"--coupling {name}: the condition {error}") from None
@@ -165,13 +168,15 @@ def _guarantees(report: Comparison) -> Table:
     damping = "required damping" if alike else "required share of the damping"
     title = f"{damping} of {_list(available)} N s/m · {report.scenario}, case {report.case}"
     scale = available[0] if alike else 1.0
-    cells: dict[str, Callable[[ComparedCoupling], str]] = {
-        "coupling": lambda c: c.name,
-        "this-env.": lambda c: _needs(c.conditions["this-environment"], scale),
-        "at Hz": lambda c: _binds(c.conditions["this-environment"]),
-        "at 10 %": lambda c: _robust(c.nearby.robustness, scale),
-        "any-env.": lambda c: _needs(c.conditions["any-environment"], scale),
-        "at Hz ": lambda c: _binds(c.conditions["any-environment"]),
+    cells: dict[str, Callable[[ComparedCoupling], str]] = {"coupling": lambda c: c.name}
+    for i, condition in enumerate(report.conditions):
+        cells |= {
+            render.short(condition): lambda c, of=condition: _needs(c.conditions[of], scale),
+            "at Hz" + " " * i: lambda c, of=condition: _binds(c.conditions[of]),
+        }
+        if i == 0:
+            cells["at 10 %"] = lambda c: _robust(c.nearby.robustness, scale)
+    cells |= {
         "sup dB": lambda c: render.optional(finite(c.transparency.mismatch_db), "{:.2f}", "-inf"),
         "rms dB": lambda c: render.optional(finite(c.transparency.rms_mismatch_db), "{:.2f}", "-inf"),
     }
@@ -281,7 +286,7 @@ def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
         out, begin = options.out_folder(args, "compare"), time.perf_counter()
         rows, interrupted = options.until_interrupted(all_of_them)
     report = baselines.Baselines(scenario.name, args.case, args.seed, rows, time.perf_counter() - begin, interrupted)
-    files = render.pictures(args, report, out, {"baselines.png": lambda plots: plots.plot_baselines} if rows else {})
+    files = render.pictures(args, report, out, {"baselines.png": "plot_baselines"} if rows else {})
     shown = [render.columns(f"on the same runs · {scenario.title(args.case)}", _RIVALS, rows, left=(0, 7))]
     lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
     began = f"{baselines.SLOW:g} m/s they began with"
@@ -322,7 +327,7 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     wall, gains = time.perf_counter() - begin, compare.gains(plan, sweeps, loop, asked)
     report = LimitCurves(*about, sweeps, gains, wall, interrupted)
     points = [(name, row) for name, sweep in sweeps.items() for row in sweep.curves["optimal"]]
-    files = render.pictures(args, report, out, {"limits.png": lambda plots: plots.plot_limits} if points else {})
+    files = render.pictures(args, report, out, {"limits.png": "plot_limits"} if points else {})
     names = " and by ".join(args.beside)
     lines = [f"beside the optimum: the designed spring-damper by {names}"] if names else []
     lines += [f"{name} {row.value:.4g}: {row.reason}" for name, row in points if row.reason]

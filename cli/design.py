@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -16,7 +17,7 @@ from design import coverage
 from design.api import Filed, proved, store
 from design.audit import LONGEST_DELAY
 from design.bound import BoundBeside
-from design.certificate import SAMPLES, assess, check_ranges
+from design.certificate import SAMPLES, assess, check_ranges, named
 from design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
@@ -27,7 +28,7 @@ from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import Design, Requirement, finite, listed
 from design.robustness import Nearby, ranges_around
 from design.transparency import BAND_HZ, Transparency, transparency
-from sim.judged import Judged
+from sim.couplings import Judged
 from sim.scenario import InputError, Scenario
 
 
@@ -36,7 +37,6 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
-    options.check_json(args)
     out = out_file(args.out, f"out/design-{options.place(args)}.json", "the file of the coupling")
     scenario = options.scenario_from(args)
     loop = _loop(args, scenario)
@@ -55,7 +55,7 @@ def main(argv: list[str]) -> int:
 def _parser() -> options.Parser:
     example = "python -m design --case I --coupling spring-damper --out coupling.json"
     parser = options.Parser("design", "Design a coupling, prove its certificate and store both.", example)
-    options.add_loop_options(parser)
+    parser.add_loop()
     kind = parser.add_mutually_exclusive_group()
     kinds = f"{', '.join(KINDS)}, or package.module:function of your own (default spring-damper)"
     kind.add_argument("--coupling", metavar="NAME", default="spring-damper", help=kinds)
@@ -63,34 +63,34 @@ def _parser() -> options.Parser:
     kind.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
     around = "certify for every stiffness and mass this much more or less, as [ranges] of a scenario does"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
-    options.add_condition_option(parser, "what to certify")
+    parser.add_condition("what to certify")
     varying = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
-    options.add_varying_delay_option(parser, varying)
+    parser.add_varying_delay(varying)
     limiter = "for this-environment: proved also while forces are limited, or not made (spring-damper: if it can)"
     one_of = parser.add_mutually_exclusive_group()
     one_of.add_argument("--limiter", action="store_const", const=True, help=limiter)
-    options.add_limiter_option(one_of, "design and prove as if forces were never at their limits")
+    parser.add_limiter("design and prove as if forces were never at their limits", to=one_of)
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
     ways = "complementarity (as printed), inner or fixed-poles (default inner)"
     ccl.add_argument("--method", metavar="NAME", help=ways)
-    optimal = parser.add_argument_group("optimal: the best filter of the environment's forces")
-    add_optimal_options(optimal)
+    add_optimal_options(parser, "optimal: the best filter of the environment's forces")
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
     parser.add_argument("--samples", type=options.whole(0, 10_000), metavar="N", help=samples)
-    options.add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case or scenario>.json)")
+    parser.add_output("FILE.json", "the stored coupling (default out/design-<case or scenario>.json)")
     return parser
 
 
-def add_optimal_options(group: argparse._ActionsContainer) -> None:
-    """The options of an optimal coupling; None where not given."""
+def add_optimal_options(parser: options.Parser, title: str) -> None:
+    """The options of an optimal coupling, as a group of this title; None where not given."""
+    group = parser.add_argument_group(title)
     group.add_argument("--objective", choices=OBJECTIVES, help="which transparency error is minimised (default rms)")
-    options.add_band_option(group)
+    parser.add_band(to=group)
     gain = "limit of |F|/|E| above 100 Hz (default none: the force there is kept low, not limited)"
     group.add_argument("--high-gain", type=options.number(), metavar="G", help=gain)
     limit = "begin no larger basis after this time [s] (default 60)"
     group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
-    options.add_older_optimal_options(group)
+    parser.add_older_optimal(to=group)
 
 
 def _percent(text: str) -> float:
@@ -126,7 +126,7 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 def _for_switching(args: argparse.Namespace) -> bool:
     """Whether this design can be made for delays that vary; any other is only judged under them."""
     kind = kind_of(args.coupling)
-    return "switching" in kind.options and (args.condition or kind.conditions[0]) == "this-environment"
+    return "switching" in kind.options and named(args.condition or kind.conditions[0]).extensible
 
 
 def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
@@ -159,7 +159,7 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
 def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Judged:
     """What each condition asks of the coupling, by a sweep and an exact proof, and the limiter that it may have."""
     held, searched = design.certificate, design.searched if isinstance(design, Optimal) else None
-    requirements = assess(loop, design.coupling, design.phi, held)
+    requirements = assess(loop, design.coupling, design.phi, held, own=design.own)
     samples = SAMPLES if args.samples is None else args.samples
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
         whole = check_ranges(loop, design.coupling, args.seed, samples, move, searched, held)
@@ -171,13 +171,15 @@ def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: De
 
 
 def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judged, stored: Filed) -> _Report:
-    band, best, nearby = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None, Nearby()
+    band, best = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None
     switching = coverage.Switching.of(loop, design.coupling) if loop.varying_delay else None
     asked = Options(**asked_of(args, "optimal")) if best else DEFAULT
     with render.progress("working out robustness and its price, and the bound"):
-        if design.condition == "this-environment":
-            nearby = nearby_of(loop, design.coupling, asked)
+        nearby = nearby_of(loop, design.coupling, asked, named(design.asked))
         limit = best and BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, asked)
+    nominal = None
+    if kind_of(args.coupling).model:
+        nominal = partial(design_by_kind, kind=args.coupling, **asked_of(args, args.coupling))
     return _Report(
         case=args.case,
         seed=args.seed,
@@ -185,7 +187,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         objective_name=design.figure,
         wall_s=design.wall_s,
         certificate=judged.certificates[design.condition],
-        price=coverage.price(loop, design, args.coupling, asked_of(args, args.coupling)) if judged.whole else None,
+        price=coverage.price(loop, design, args.coupling, nominal) if judged.whole else None,
         judged=judged,
         switching=switching,
         delays=stored.switching.guarantee if stored.switching and stored.switching.proof else None,
@@ -194,6 +196,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         best=best and _Best(limit, best.g, best.ladder),
         sdps=design.sdps,
         stored=stored,
+        claim=design.own and design.own.claim,
     )
 
 
@@ -272,6 +275,7 @@ class _Report:
     best: _Best | None = render.several(_Best.rows, "beside")
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
     stored: Filed = render.several(_stored_rows)
+    claim: str | None = render.figure("claim", default=None, json="given")  # of a condition of the user's own
 
     @property
     def aim(self) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 from cli import options
 from cli.session_cli import add_pace_option, steady_scenario
-from hw.emulator import AXIS, DEVICE, LINE, Emulator, FaultInjection, Line, RealTimeEmulator, Terminal, nobody
+from hw.emulator import KINDS, Emulator, FaultInjection, Line, RealTimeEmulator, Terminal, nobody
 from sim.scenario import InputError
 
 
@@ -59,9 +59,9 @@ def _parser() -> argparse.ArgumentParser:
         "python -m hw.emulator --fault up:drop=0.05 --fault unplug@3",
     )
     add, number = parser.add_argument, options.number
-    options.add_loop_options(parser)
+    parser.add_loop()
     what = "KIND[=VALUE][@START[+DURATION]], times in seconds after arming; in front up: or down: for one direction, "
-    what += f"axis2: for an axis; KIND is {', '.join((*LINE, *DEVICE, *AXIS))}"
+    what += f"axis2: for an axis; KIND is {', '.join(KINDS)}"
     add("--fault", action="append", default=[], metavar="FAULT", help=what)
     end = "length of the emulation (default: until interrupted)"
     add("--duration", type=number(0, 1e6, "s"), default=1e6, metavar="SECONDS", help=end)

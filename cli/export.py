@@ -14,7 +14,7 @@ import numpy as np
 
 from cli import options, render
 from controller.lti import Array
-from design.certificate import Verdict, verify
+from design.certificate import Verdict, named, verify
 from design.coupling_file import Stored
 from design.export import (
     SUFFIXES,
@@ -63,10 +63,9 @@ class _Exported:
 def main(argv: list[str]) -> int:
     """Export a stored coupling. 0: written, 1: written, but the certificate in its file does not hold."""
     args = _parser().parse_args(argv)
-    options.check_json(args)
     stored = read_coupling(args.coupling)
     try:
-        verdict = verify(stored)
+        verdict = verify(stored, args.condition and named(args.condition))
     except (ValueError, ArithmeticError) as error:
         verdict = Verdict(False, str(error))
     block = _block(args, stored, verdict)
@@ -108,7 +107,8 @@ def _parser() -> options.Parser:
     parser.add_argument("--without-theta", action="store_true", help=link)
     limit = "with the limiter that the certificate covers, for forces of up to so much [N]; one is for all channels"
     parser.add_argument("--force-limit", type=options.several(float, 1e-3, 1e6, "N"), metavar="N,N,..", help=limit)
-    options.add_output_options(parser, "FILE", "the file (default out/export/<coupling>-<what>.<suffix>)")
+    parser.add_condition("the condition of the file's certificate, where that is one of your own")
+    parser.add_output("FILE", "the file (default out/export/<coupling>-<what>.<suffix>)")
     parser.only("with --process: a coupling alone has no delay", lambda args: args.process, "without_theta")
     parser.only("with --process: a coupling alone sends no forces", lambda args: args.process, "force_limit")
     parser.only("without --format control: that is linear", lambda args: args.format != "control", "force_limit")

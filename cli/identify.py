@@ -99,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
         "Estimate mass, friction and transmission of a device that nobody holds, and a lower bound of its damping.",
         "python -m hw.identify --rehearse",
     )
-    options.add_loop_options(parser)
+    parser.add_loop()
     add_link_options(parser)
     parser.set_defaults(deadman=None, no_preflight=True)
     add, number = parser.add_argument, options.number
@@ -115,7 +115,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--same-place", action="store_true", help=stay)
     rests = "with --rehearse, the damping of a hand at every handle in the first sitting (default 0)"
     add("--hand", type=number(0.0, 10.0), default=0.0, metavar="N_S/M", help=rests)
-    options.add_output_options(parser)
+    parser.add_output()
     parser.only("with --rehearse", lambda args: args.rehearse, "hand")
     parser.only("with --rehearse or --emulate", lambda args: not args.port, "coulomb")
     parser.only("with --port", lambda args: args.port, "same_place")

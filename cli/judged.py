@@ -6,9 +6,8 @@ import argparse
 
 from cli import render
 from design.result import Chosen
-from sim import judged
-from sim.couplings import choose
-from sim.judged import Judged
+from sim import couplings
+from sim.couplings import Judged, choose
 from sim.scenario import Scenario
 
 
@@ -22,7 +21,7 @@ def judge(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, met: Sce
     """The coupling in the scenario's loop; conditions are asked of `met`, one environment of its ranges."""
     ranges = scenario.loop(args.case).ranges
     with render.progress("searching the ranges" if ranges else "judging the coupling") as move:
-        return judged.judge(scenario, args.case, chosen, args.seed, args.limiter, met or scenario, move)
+        return couplings.judge(scenario, args.case, chosen, args.seed, args.limiter, met or scenario, move)
 
 
 def rows(part: Judged) -> render.Rows:

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+import _thread
+import io
+import os
+import signal
 import sys
+import threading
+import traceback
+from collections.abc import Callable
 from importlib import import_module
 from types import ModuleType
-from typing import NoReturn
+from typing import Any, NoReturn
 
-from cli.options import execute
+from threadpoolctl import threadpool_limits
+
+from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, UNFINISHED
+from controller.arithmetic import SingularLoop
+from design.files import nobody_reads, one_command, one_line
+from design.own import is_refusal, place_of
+from design.result import DesignFailed
 from sim.scenario import InputError
 
 #: command -> what python -m calls it, and what it is for; it lives in the file of its name in this folder
@@ -51,3 +64,86 @@ def _command(name: str) -> ModuleType:
     if name not in COMMANDS:
         raise InputError(f"unknown command {name!r}, allowed are {', '.join(COMMANDS)}")
     return import_module(f"cli.{name}")
+
+
+# ----------------------------------------------------------------------------------------------------
+# From the words of a command line to an exit code.
+
+
+def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> NoReturn:
+    """Run a command and leave with its exit code; bad input is one line on standard error.
+
+    Whoever reads standard output may stop at any line (`| head -1`): the command's own exit code stays what it is,
+    also under `set -o pipefail`. SIGTERM ends a command as Ctrl-C does: temporary files are removed.
+    """
+    code: str | int | None
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of processes that this one starts
+    os.environ["MPLBACKEND"] = "Agg"  # pictures are files; a name that matplotlib does not know would stop its import
+    _streams()
+    sys.unraisablehook = _not_lost
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _terminated)
+    try:
+        # the matrices here are small: more BLAS threads only wait for each other, and the last digits depend on them
+        with threadpool_limits(1, user_api="blas"), one_command():
+            code = main(sys.argv[1:] if argv is None else argv)
+    except (InputError, SingularLoop) as error:
+        code = _say(f"error: {error}", BAD_INPUT)
+    except DesignFailed as error:
+        code = _say(f"not possible: {error}", DOES_NOT_HOLD)
+    except KeyboardInterrupt:
+        code = _say("interrupted", INTERRUPTED)
+    except SystemExit as end:  # argparse, after --help, and SIGTERM
+        code = end.code
+    except MemoryError:
+        code = _say("error: there is not enough memory for this", UNFINISHED)
+    except OSError as error:  # a full disk behind standard output, mostly
+        code = _cannot(error)
+    except Exception as error:  # not 1, which says that what was asked does not hold
+        place, code = place_of(error), UNFINISHED  # a mistake of ours, or one in a class that the user named
+        if place and is_refusal(error):
+            code = _say(f"error: {place}: {error}", BAD_INPUT)
+        else:
+            traceback.print_exc()
+            if place:
+                code = _say(f"error: {place}, which is your own: {type(error).__name__}: {error}", BAD_INPUT)
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        nobody_reads()
+    except OSError as error:
+        code = _cannot(error)
+    sys.exit(code)
+
+
+def _say(message: str, code: int) -> int:
+    print(one_line(message), file=sys.stderr)
+    return code
+
+
+def _cannot(error: OSError) -> int:
+    """Say in one line what the operating system refused; later output is discarded."""
+    nobody_reads()
+    return _say(f"error: {error.filename or 'standard output'}: {error.strerror or error}", BAD_INPUT)
+
+
+def _streams() -> None:
+    """Replace closed standard streams, and characters that a terminal cannot show."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - for as long as the command runs
+        elif mode == "w" and isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _terminated(number: int, frame: Any) -> NoReturn:
+    raise SystemExit(_say("terminated", 128 + number))
+
+
+def _not_lost(unraisable: Any) -> None:
+    """Repeat a Ctrl-C that came during Python's clean-up, where it would be lost."""
+    if issubclass(unraisable.exc_type, KeyboardInterrupt):
+        _thread.interrupt_main()
+    else:
+        sys.__unraisablehook__(unraisable)

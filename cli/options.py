@@ -6,40 +6,35 @@ What depends on the scenario, such as one number per channel, is checked by `per
 
 from __future__ import annotations
 
-import _thread
 import argparse
-import io
 import math
-import os
 import re
-import signal
 import sys
-import threading
-import traceback
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import msgspec
-from threadpoolctl import threadpool_limits
 
 from controller import older
-from controller.arithmetic import SingularLoop
-from controller.delay import LOST, VaryingDelay
+from controller.delay import LOST, Periods, VaryingDelay
 from controller.loop import DelayRange, Loop
-from controller.timing import Periods
-from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
-from design.own import is_refusal, named, place_of
+from design.files import check_file, folder, read_text
+from design.own import called, named, place_of
 from design.result import CONDITIONS, DesignFailed
 from models.device import MOST_DAMPING
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
+
+if TYPE_CHECKING:
+    from design.conditions import Condition
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
 _Number = TypeVar("_Number", int, float)
 _Given = TypeVar("_Given")
+_Group = argparse._ActionsContainer
 _OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # of the types below
 
 
@@ -61,12 +56,14 @@ class Parser(argparse.ArgumentParser):
         self._only.append((where, acts, names))
 
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
-        """As argparse's; an empty word is refused for every option."""
+        """As argparse's; an empty word is refused for every option, and a --json file that cannot be written."""
         found, rest = super().parse_known_args(*args, **how)
         if gone := getattr(found, "gone", None):
             has = "has" if len(gone) == 1 else "have"
             why = f"{has} no effect any more: the basis of an optimal coupling grows by itself"
             print(", ".join(gone), why, file=sys.stderr)
+        if ":" in (getattr(found, "condition", None) or ""):
+            found.condition = own_condition(found.condition)
         for action in self._actions:
             if getattr(found, action.dest, None) == "":
                 raise InputError(f"{action.option_strings[-1] if action.option_strings else action.dest} is empty")
@@ -75,11 +72,110 @@ class Parser(argparse.ArgumentParser):
                 if getattr(found, name) != self.get_default(name):
                     option = next(a.option_strings[-1] for a in self._actions if a.dest == name and a.option_strings)
                     raise InputError(f"{option} is only {where}")
+        if getattr(found, "json", None) not in (None, "-"):
+            check_file("--json", Path(found.json), "a file or -")
         return found, rest
 
     def error(self, message: str) -> NoReturn:
         own = _OWN_WORDS.fullmatch(message)
         raise InputError(f"{own[1]} {own[2]}" if own else f"{message} (--help lists the options)")
+
+    # what several commands take
+
+    def add_loop(self) -> None:
+        """The options that describe a loop, which every command takes."""
+        loop = self.add_argument_group("the loop")
+        loop.add_argument("--case", choices=CASES, default="I", help="none, I (Lambda = Theta Psi) or II (Lambda = I)")
+        names = ", ".join(built_in())
+        loop.add_argument("--scenario", default=DEFAULT, metavar="FILE.toml", help=f"or one of: {names}")
+        for name, what in (("theta", "transmission"), ("psi", "environment"), ("lam", "reference")):
+            what = f"{what} delay per channel [samples]; one is for all"
+            loop.add_argument(f"--{name}", type=several(int), metavar="N,N,..", help=what)
+        damping, what = several(float, 0, MOST_DAMPING, "N s/m"), "damping of each device [N s/m]; one is for all"
+        loop.add_argument("--delta", type=damping, metavar="D,D,..", help=what)
+        loop.add_argument("--T", type=number(), metavar="SECONDS", help="sampling period [s]")
+        longest = "longest period [s], where it varies from tick to tick: certificates then are for any up to it"
+        loop.add_argument("--T-max", type=number(), metavar="SECONDS", help=longest)
+        late = "how late after a tick forces latch [s], less than T: at most S, or LO:HI; one is for all"
+        loop.add_argument("--latency", type=_latency_ranges, metavar="S", help=late)
+
+    def add_coupling(self, names: str) -> None:
+        """Which coupling, and the condition that it is designed for or judged by."""
+        what = f"{names}, FILE.json or package.module:function (default spring-damper)"
+        self.add_argument("--coupling", metavar="NAME|FILE", help=what)
+        self.add_condition()
+
+    def add_condition(self, what: str = "the condition of the certificate", to: _Group | None = None) -> None:
+        """--condition."""
+        help_ = f"{what}: {', '.join(CONDITIONS)} or FILE.py:NAME of your own (default: the coupling's)"
+        (to or self).add_argument("--condition", type=condition, metavar="NAME|FILE.py:NAME", help=help_)
+
+    def add_limiter(self, what: str = "clip forces at the devices' limits", to: _Group | None = None) -> None:
+        """--no-limiter: `limiter` is None, what is usual, or False."""
+        help_ = f"{what}, in place of the limiter that a guarantee covers"
+        (to or self).add_argument("--no-limiter", dest="limiter", action="store_const", const=False, help=help_)
+
+    def add_rigid(self) -> None:
+        """A rigid wall in place of the environment."""
+        wall = "a rigid wall in place of the environment; one channel, the scenario's first"
+        self.add_argument("--rigid", action="store_true", help=wall)
+
+    def add_human(self, more: str = "") -> None:
+        """--human."""
+        who = f"other humans: [[human]] per channel in a .toml, or `humans`{more} in a .py"
+        self.add_argument("--human", metavar="FILE", help=who)
+
+    def add_energy_budget(self) -> None:
+        """--energy-budget."""
+        what = "scale forces so that no passive hand is given more than W0 [J]; save at most CAP of what users put in"
+        self.add_argument("--energy-budget", type=_energy_budget, metavar="W0[,CAP]", help=what)
+
+    def add_band(self, to: _Group | None = None) -> None:
+        """--band."""
+        band = "frequencies over which the transparency error counts [Hz] (default 0.5,80)"
+        (to or self).add_argument("--band", dest="band_hz", type=_band_of, metavar="LOW,HIGH", help=band)
+
+    def add_varying_delay(self, what: str, to: _Group | None = None) -> None:
+        """--varying-delay, and --jitter, as it was called."""
+        (to or self).add_argument("--varying-delay", type=_delay_ranges, metavar="LO,HI", help=what)
+        (to or self).add_argument("--jitter", dest="varying_delay", type=_delay_ranges, help=argparse.SUPPRESS)
+
+    def add_varying_delays(self) -> None:
+        """--period, --varying-delay, --pattern, --loss and --playout."""
+        group = self.add_argument_group("delays and periods that vary")
+        periods = "periods [s], drawn anew at every tick between two of them, or a file of recorded ones"
+        group.add_argument("--period", metavar="MIN,MAX|FILE", help=periods)
+        span = "range of the forces' delays [samples]; or LO-HI,LO-HI,.. per channel"
+        self.add_varying_delay(span, group)
+        pattern = f"{', '.join(_DRAWN)} (default random), or a file of recorded delays, a row per tick"
+        group.add_argument("--pattern", metavar="NAME|FILE", help=pattern)
+        loss = "probability that a force is lost and the last one held"
+        group.add_argument("--loss", type=number(), metavar="P", help=loss)
+        group.add_argument("--playout", action="store_true", help="a buffer that makes every delay the largest one")
+
+    def add_output(
+        self,
+        out: str = "DIR",
+        what: str = "folder for files, made if it is not there (default out/<command>-<case or scenario>)",
+        picture: bool = False,
+    ) -> None:
+        """Where results go, and the seed."""
+        output = self.add_argument_group("output", "the folder of a FILE that you name must exist")
+        if picture:
+            output.add_argument("--no-plot", action="store_true", help="write no picture")
+        self.add_json(output)
+        output.add_argument("--out", metavar=out, help=what)
+        seed = "for random draws; recorded (default 0)"
+        output.add_argument("--seed", type=whole(0), metavar="N", default=0, help=seed)
+
+    def add_json(self, to: _Group | None = None) -> None:
+        """--json."""
+        (to or self).add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
+
+    def add_older_optimal(self, to: _Group | None = None) -> None:
+        """What the optimal coupling of version 0.1 was asked with: noted as without effect, for one version."""
+        for name, takes in (("functions", 1), ("filter", 1), ("margin", 1), ("diagonal", 0), ("full", 0)):
+            (to or self).add_argument(f"--{name}", dest="gone", action=_Gone, nargs=takes, help=argparse.SUPPRESS)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -141,7 +237,7 @@ def _band_of(text: str) -> tuple[float, float]:
     return low, high
 
 
-def energy_budget(text: str) -> tuple[float, float]:
+def _energy_budget(text: str) -> tuple[float, float]:
     """'W0' or 'W0,CAP' [J]: what a budget starts with and the most that it saves (inf where no cap is given)."""
     values = several(float, 0, unit="J")(text)
     start, cap = (*values, math.inf)[:2]
@@ -169,11 +265,24 @@ def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 
 def condition(text: str) -> str:
-    """A condition by its name, or by the name that it had before."""
+    """A condition by its name, or by the name that it had before; one of the user's own as it is."""
     name = older.CONDITIONS.get(text, text)
-    if name not in CONDITIONS:
-        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)}")
+    if name not in CONDITIONS and ":" not in text:
+        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)} and FILE.py:NAME")
     return name
+
+
+def own_condition(text: str) -> Condition:
+    """The user's own condition that `package.module:Name` or `FILE.py:NAME` names. Raises InputError."""
+    from design.certificate import named as checked
+    from design.conditions import Condition
+
+    found = named("--condition", text)
+    made = called(f"--condition {text}", found) if isinstance(found, type) else found
+    if not isinstance(made, Condition):
+        raise InputError(f"--condition {text} is {made!r}, expected a design.conditions.Condition")
+    with refused(f"--condition {text}: "):
+        return checked(made)
 
 
 def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
@@ -201,6 +310,8 @@ def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[
     except (InputError, DesignFailed):
         raise
     except (ValueError, ArithmeticError) as error:
+        if place_of(error):  # in a class of the user's own
+            raise
         text = str(error)
         argument = text.partition(" ")[0]
         if given(getattr(args, argument, None)):
@@ -240,24 +351,6 @@ def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) 
 # Groups of options that several commands have, and what they mean.
 
 
-def add_loop_options(parser: argparse.ArgumentParser) -> None:
-    """The options that describe a loop, which every command takes."""
-    loop = parser.add_argument_group("the loop")
-    loop.add_argument("--case", choices=CASES, default="I", help="none, I (Lambda = Theta Psi) or II (Lambda = I)")
-    names = ", ".join(built_in())
-    loop.add_argument("--scenario", default=DEFAULT, metavar="FILE.toml", help=f"or one of: {names}")
-    for name, what in (("theta", "transmission"), ("psi", "environment"), ("lam", "reference")):
-        what = f"{what} delay per channel [samples]; one is for all"
-        loop.add_argument(f"--{name}", type=several(int), metavar="N,N,..", help=what)
-    damping, what = several(float, 0, MOST_DAMPING, "N s/m"), "damping of each device [N s/m]; one is for all"
-    loop.add_argument("--delta", type=damping, metavar="D,D,..", help=what)
-    loop.add_argument("--T", type=number(), metavar="SECONDS", help="sampling period [s]")
-    longest = "longest period [s], where it varies from tick to tick: certificates then are for any up to it"
-    loop.add_argument("--T-max", type=number(), metavar="SECONDS", help=longest)
-    late = "how late after a tick forces latch [s], less than T: at most S, or LO:HI; one is for all"
-    loop.add_argument("--latency", type=_latency_ranges, metavar="S", help=late)
-
-
 def scenario_from(args: argparse.Namespace) -> Scenario:
     """The scenario that the loop options describe. Raises InputError."""
     scenario = load(args.scenario)
@@ -270,18 +363,6 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
         for name, value in said.items()
     }
     return scenario.replace(**changes) if changes else scenario
-
-
-def add_band_option(parser: argparse._ActionsContainer) -> None:
-    """--band."""
-    band = "frequencies over which the transparency error counts [Hz] (default 0.5,80)"
-    parser.add_argument("--band", dest="band_hz", type=_band_of, metavar="LOW,HIGH", help=band)
-
-
-def add_older_optimal_options(parser: argparse._ActionsContainer) -> None:
-    """What the optimal coupling of version 0.1 was asked with: noted as without effect, for one version."""
-    for name, takes in (("functions", 1), ("filter", 1), ("margin", 1), ("diagonal", 0), ("full", 0)):
-        parser.add_argument(f"--{name}", dest="gone", action=_Gone, nargs=takes, help=argparse.SUPPRESS)
 
 
 class _Gone(argparse.Action):
@@ -299,74 +380,13 @@ def own_or(option: str, text: str, names: Collection[str]) -> Any:
     raise InputError(f"{option} is {text!r}, allowed are {', '.join(names)} and package.module:Name")
 
 
-def add_human_option(parser: argparse.ArgumentParser, more: str = "") -> None:
-    """--human."""
-    who = f"other humans: [[human]] per channel in a .toml, or `humans`{more} in a .py"
-    parser.add_argument("--human", metavar="FILE", help=who)
-
-
 def with_humans(args: argparse.Namespace, scenario: Scenario) -> Scenario:
     """The scenario with the humans of --human. Raises InputError."""
     return scenario if args.human is None else held_by(scenario, args.human)
 
 
-def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: str = "spring-damper") -> None:
-    """Which coupling, and the condition that it is designed for or judged by."""
-    parser.add_argument(
-        "--coupling", metavar="NAME|FILE", help=f"{names}, FILE.json or package.module:function (default {default})"
-    )
-    add_condition_option(parser)
-
-
-def add_condition_option(parser: argparse._ActionsContainer, what: str = "the condition of the certificate") -> None:
-    """--condition."""
-    names = ",".join(CONDITIONS)
-    help_ = f"{what}: {' or '.join(CONDITIONS)} (default: the coupling's own)"
-    parser.add_argument("--condition", type=condition, metavar=f"{{{names}}}", help=help_)
-
-
-def add_limiter_option(parser: argparse._ActionsContainer, what: str = "clip forces at the devices' limits") -> None:
-    """--no-limiter: `limiter` is None, what is usual, or False."""
-    help_ = f"{what}, in place of the limiter that a guarantee covers"
-    parser.add_argument("--no-limiter", dest="limiter", action="store_const", const=False, help=help_)
-
-
-def add_energy_budget_option(parser: argparse._ActionsContainer) -> None:
-    """--energy-budget."""
-    what = "scale forces so that no passive hand is given more than W0 [J]; save at most CAP of what users put in"
-    parser.add_argument("--energy-budget", type=energy_budget, metavar="W0[,CAP]", help=what)
-
-
-def add_output_options(
-    parser: argparse.ArgumentParser,
-    out: str = "DIR",
-    what: str = "folder for files, made if it is not there (default out/<command>-<case or scenario>)",
-    picture: bool = False,
-) -> None:
-    """Where results go, and the seed."""
-    output = parser.add_argument_group("output", "the folder of a FILE that you name must exist")
-    if picture:
-        output.add_argument("--no-plot", action="store_true", help="write no picture")
-    add_json_option(output)
-    output.add_argument("--out", metavar=out, help=what)
-    seed = "for random draws; recorded (default 0)"
-    output.add_argument("--seed", type=whole(0), metavar="N", default=0, help=seed)
-
-
-def add_json_option(parser: argparse._ActionsContainer) -> None:
-    """--json."""
-    parser.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
-
-
-def check_json(args: argparse.Namespace) -> None:
-    """Whether the file of --json can be written, before any work is done. Raises InputError."""
-    if args.json is not None and args.json != "-":
-        check_file("--json", Path(args.json), "a file or -")
-
-
 def out_folder(args: argparse.Namespace, command: str) -> Path:
     """The folder for the files of a command, made before any work is done. Raises InputError."""
-    check_json(args)
     return folder(Path(args.out or f"out/{command}{f'-{place(args)}' if 'case' in args else ''}"))
 
 
@@ -375,12 +395,6 @@ def place(args: argparse.Namespace) -> str:
     if args.scenario == DEFAULT:
         return args.case
     return Path(args.scenario).stem + ("" if args.case == "I" else f"-{args.case}")
-
-
-def add_rigid_option(parser: argparse.ArgumentParser) -> None:
-    """A rigid wall in place of the environment."""
-    wall = "a rigid wall in place of the environment; one channel, the scenario's first"
-    parser.add_argument("--rigid", action="store_true", help=wall)
 
 
 def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
@@ -396,26 +410,6 @@ def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 
 
 _DRAWN = ("constant", "random", "bursty", "adversarial")
-
-
-def add_varying_delay_option(parser: argparse._ActionsContainer, what: str) -> None:
-    """--varying-delay, and --jitter, as it was called."""
-    parser.add_argument("--varying-delay", type=_delay_ranges, metavar="LO,HI", help=what)
-    parser.add_argument("--jitter", dest="varying_delay", type=_delay_ranges, help=argparse.SUPPRESS)
-
-
-def add_varying_delay_options(parser: argparse.ArgumentParser) -> None:
-    """--period, --varying-delay, --pattern, --loss and --playout."""
-    group = parser.add_argument_group("delays and periods that vary")
-    periods = "periods [s], drawn anew at every tick between two of them, or a file of recorded ones"
-    group.add_argument("--period", metavar="MIN,MAX|FILE", help=periods)
-    span = "range of the forces' delays [samples]; or LO-HI,LO-HI,.. per channel"
-    add_varying_delay_option(group, span)
-    pattern = f"{', '.join(_DRAWN)} (default random), or a file of recorded delays, a row per tick"
-    group.add_argument("--pattern", metavar="NAME|FILE", help=pattern)
-    loss = "probability that a force is lost and the last one held"
-    group.add_argument("--loss", type=number(), metavar="P", help=loss)
-    group.add_argument("--playout", action="store_true", help="a buffer that makes every delay the largest one")
 
 
 def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenario:
@@ -492,82 +486,3 @@ def until_interrupted(rows: Iterable[_Given]) -> tuple[list[_Given], bool]:
 def exit_code(holds: bool, interrupted: bool = False) -> int:
     """The exit code of a command that has printed its report."""
     return INTERRUPTED if interrupted else DONE if holds else DOES_NOT_HOLD
-
-
-def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> NoReturn:
-    """Run a command and leave with its exit code; bad input is one line on standard error.
-
-    Whoever reads standard output may stop at any line (`| head -1`): the command's own exit code stays what it is,
-    also under `set -o pipefail`. SIGTERM ends a command as Ctrl-C does: temporary files are removed.
-    """
-    code: str | int | None
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of processes that this one starts
-    os.environ["MPLBACKEND"] = "Agg"  # pictures are files; a name that matplotlib does not know would stop its import
-    _streams()
-    sys.unraisablehook = _not_lost
-    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, _terminated)
-    try:
-        # the matrices here are small: more BLAS threads only wait for each other, and the last digits depend on them
-        with threadpool_limits(1, user_api="blas"), one_command():
-            code = main(sys.argv[1:] if argv is None else argv)
-    except (InputError, SingularLoop) as error:
-        code = _say(f"error: {error}", BAD_INPUT)
-    except DesignFailed as error:
-        code = _say(f"not possible: {error}", DOES_NOT_HOLD)
-    except KeyboardInterrupt:
-        code = _say("interrupted", INTERRUPTED)
-    except SystemExit as end:  # argparse, after --help, and SIGTERM
-        code = end.code
-    except MemoryError:
-        code = _say("error: there is not enough memory for this", UNFINISHED)
-    except OSError as error:  # a full disk behind standard output, mostly
-        code = _cannot(error)
-    except Exception as error:  # not 1, which says that what was asked does not hold
-        place, code = place_of(error), UNFINISHED  # a mistake of ours, or one in a class that the user named
-        if place and is_refusal(error):
-            code = _say(f"error: {place}: {error}", BAD_INPUT)
-        else:
-            traceback.print_exc()
-            if place:
-                code = _say(f"error: {place}, which is your own: {type(error).__name__}: {error}", BAD_INPUT)
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        nobody_reads()
-    except OSError as error:
-        code = _cannot(error)
-    sys.exit(code)
-
-
-def _say(message: str, code: int) -> int:
-    print(one_line(message), file=sys.stderr)
-    return code
-
-
-def _cannot(error: OSError) -> int:
-    """Say in one line what the operating system refused; later output is discarded."""
-    nobody_reads()
-    return _say(f"error: {error.filename or 'standard output'}: {error.strerror or error}", BAD_INPUT)
-
-
-def _streams() -> None:
-    """Replace closed standard streams, and characters that a terminal cannot show."""
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        stream = getattr(sys, name)
-        if stream is None:
-            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - for as long as the command runs
-        elif mode == "w" and isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-
-
-def _terminated(number: int, frame: Any) -> NoReturn:
-    raise SystemExit(_say("terminated", 128 + number))
-
-
-def _not_lost(unraisable: Any) -> None:
-    """Repeat a Ctrl-C that came during Python's clean-up, where it would be lost."""
-    if issubclass(unraisable.exc_type, KeyboardInterrupt):
-        _thread.interrupt_main()
-    else:
-        sys.__unraisablehook__(unraisable)

@@ -127,9 +127,6 @@ def designing(loop: Loop | None = None, kind: str | None = None, condition: str 
 # A whole report: files, tables, lines below them, JSON.
 
 
-_Drawing = Callable[[Any], Callable[[Any, Path], Path]]  # from sim.plots the function that draws
-
-
 def publish(
     args: argparse.Namespace,
     report: Any,
@@ -158,13 +155,13 @@ def publish(
         write_json(args.json, outcome)
 
 
-def pictures(args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, _Drawing]) -> list[Path]:
-    """Pictures of a report, by file what draws it; with --no-plot none, and matplotlib is not loaded."""
+def pictures(args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, str]) -> list[Path]:
+    """Pictures of a report, by file what of sim.plots draws it; with --no-plot none, and matplotlib is not loaded."""
     if args.no_plot:
         return []
     from sim import plots
 
-    return [drawing(plots)(report, folder / file) for file, drawing in drawn.items()]
+    return [getattr(plots, name)(report, folder / file) for file, name in drawn.items()]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -252,6 +249,11 @@ def certified(need: Requirement, proof: bool = True) -> str:
     if not need.certified:
         return "[red]not certified[/]"
     return "[green]certified[/]" + (", proved exactly" if proof and need.proof == "rational" else "")
+
+
+def short(condition: str) -> str:
+    """Its name as the head of a narrow column: this-env., any-env."""
+    return condition.replace("environment", "env.")
 
 
 def needs(need: Requirement, digits: int = 6) -> str:

@@ -33,9 +33,8 @@ def main(argv: list[str]) -> int:
         "python -m hw.replay out/bridge-I/trace.npz",
     )
     parser.add_argument("trace", metavar="TRACE.npz", help="written by hw.bridge")
-    options.add_json_option(parser)
+    parser.add_json()
     args = parser.parse_args(argv)
-    options.check_json(args)
     result, link = load(Path(args.trace))
     compared = replay(result, link)
     different = compared.asked | compared.sent

@@ -14,6 +14,7 @@ from cli.judged import rows as judged_rows
 from controller.budget import BudgetFigures
 from controller.environment import GROUND
 from controller.loop import Loop
+from design.certificate import named
 from design.files import write
 from design.guarantees import ANY
 from design.optimal import nearby
@@ -22,17 +23,16 @@ from design.robustness import Nearby
 from design.transparency import BAND_HZ
 from sim import accuracy
 from sim import passivity_layer as layer
+from sim.accuracy import MOST
 from sim.alternatives import Alternative, alternatives
 from sim.api import ScenarioRun, run_scenario
-from sim.couplings import NAMES, choose
-from sim.judged import Judged
-from sim.mujoco_engines import INTEGRATORS
+from sim.couplings import NAMES, Judged, choose
+from sim.engines import INTEGRATORS
 from sim.passivity_layer import BaselineFigures
 from sim.run import ENGINES, AnyEngine
 from sim.run_report import Ran, RunReport, run_report
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, ExactVerdict
-from sim.step_choice import MOST
 
 
 def main(argv: list[str]) -> int:
@@ -61,10 +61,10 @@ def _parser() -> options.Parser:
         "sim.run", "Close the loop once and report stability, transparency and error.", "python -m sim.run --case none"
     )
     add = parser.add_argument
-    options.add_loop_options(parser)
-    options.add_varying_delay_options(parser)
-    options.add_coupling_options(parser, f"{', '.join(NAMES)}, as baselines {', '.join(layer.BASELINES)}")
-    options.add_energy_budget_option(parser)
+    parser.add_loop()
+    parser.add_varying_delays()
+    parser.add_coupling(f"{', '.join(NAMES)}, as baselines {', '.join(layer.BASELINES)}")
+    parser.add_energy_budget()
     engines = "mujoco (default), exact, or package.module:Class of your own"
     add("--engine", default="mujoco", metavar="NAME|MODULE:CLASS", help=engines)
     steppers = "integrator of MuJoCo (default exponential, RK4 where devices rub)"
@@ -76,12 +76,12 @@ def _parser() -> options.Parser:
     add("--error", type=options.number(1e-18, 1.0), metavar="E", help=asked)
     check = "run RK4 beside the exponential engine, with which it shares no matrix"
     add("--cross-check", action="store_true", help=check)
-    options.add_human_option(parser)
-    options.add_band_option(parser)
-    options.add_limiter_option(parser)
+    parser.add_human()
+    parser.add_band()
+    parser.add_limiter()
     vertex = "simulate at this vertex of the scenario's ranges (default 0: nominal)"
     add("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
-    options.add_output_options(parser, picture=True)
+    parser.add_output(picture=True)
     beside = parser.add_argument_group("the same devices and hands with other couplings")
     beside.add_argument("--no-alternatives", action="store_true", help="no table of them, which takes a second or two")
     beside.add_argument("--side-by-side", action="store_true", help="draw their forces, too, as couplings.png")
@@ -137,7 +137,9 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun
     skipped = args.no_alternatives or run.trace.interrupted or args.vertex > 0
     same = args.limiter is None and not scenario.ranges and args.case != "none"
     with render.progress("other couplings") as move:
-        made = [] if skipped else alternatives(scenario, args.case, move, judged if same else None)
+        made = []
+        if not skipped:
+            made = alternatives(scenario, args.case, move, judged if same else None, judged.chosen.own)
     if args.side_by_side and not any(other.trace is not None for other in made):
         raise InputError("--side-by-side is for runs without walls, friction, varying delays and --no-alternatives")
     return made
@@ -166,11 +168,10 @@ def _panel_title(other: Alternative) -> str:
 def _nearby(loop: Loop, judged: Judged) -> Nearby:
     """The damping needed where the environment is not as modelled; empty where no guarantee depends on that."""
     chosen = judged.chosen
-    alone = chosen.condition == "this-environment" and judged.certificates[chosen.condition].certified
-    if not alone or judged.guarantee == ANY:
+    if not judged.certificates[chosen.condition].certified or judged.guarantee == ANY:
         return Nearby()
     with render.progress("working out robustness and its price"):
-        return nearby(loop, chosen.coupling)
+        return nearby(loop, chosen.coupling, condition=named(chosen.asked))
 
 
 def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
@@ -300,21 +301,23 @@ def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> 
 def _beside(report: RunReport) -> Any:
     """A table of other couplings; the one of this run is marked."""
     own = report.judged.coupling.kind, report.certificate.condition
+    names = [*CONDITIONS, *([own[1]] if own[1] not in CONDITIONS else [])]
     cells = []
     for other in report.alternatives:
         if other.reason:
-            cells.append((other.name, "", "", f"not possible: {other.reason}", "", ""))
+            cells.append((other.name, *[""] * len(names), f"not possible: {other.reason}", "", ""))
             continue
         same = own == (other.coupling, other.condition) or own[0] == other.coupling != "spring-damper"
-        needs = (_share(other.needs(condition), "never") for condition in CONDITIONS)
+        needs = (_share(other.needs(condition), "never") for condition in names)
         grows = other.growth_rate_per_s is None or other.growth_rate_per_s > MARGINAL
         error = "grows" if grows else render.optional(other.force_error_percent, "{:.3g} %")
         felt = _share(other.dc_ratio, "-")
         cells.append((other.name + "*" * same, *needs, other.guarantee or "none", felt, error))
-    heads = ("coupling", "this-env.", "any-env.", "guarantee", "stiffness", "error")
+    heads = ("coupling", *map(render.short, names), "guarantee", "stiffness", "error")
     marked = " (*: this run)" if any(cell[0].endswith("*") for cell in cells) else ""
     title = f"the same devices with other couplings{marked}: required damping\nin % of theirs"
-    return render.grid(f"{title}, guarantee, rendered stiffness and force error", heads, cells, left=(0, 3))
+    what = f"{title}, guarantee, rendered stiffness and force error"
+    return render.grid(what, heads, cells, left=(0, heads.index("guarantee")))
 
 
 def _share(value: float | None, absent: str) -> str:

@@ -222,7 +222,6 @@ def _measured(check: Check, place: Path, seed: int) -> int:
 def main(argv: list[str]) -> int:
     """Run the checks. 0: all hold, 1: one does not, 130: interrupted; what was done is in the report."""
     args = _parser().parse_args(argv)
-    options.check_json(args)
     checks = _checks(args.only or _names())
     out, screen = folder(Path(args.out or "out/validate")), render.console(args)
     answers: list[_Answer] = []
@@ -264,7 +263,7 @@ def _parser() -> options.Parser:
     parser.add_argument("--only", type=_picked, metavar="NAME,..", help=f"of {','.join(_names())} (default all)")
     humans, count = "random humans per loop (default 300)", options.whole(1, 1_000_000)
     parser.add_argument("--humans", type=count, default=300, metavar="N", help=humans)
-    options.add_output_options(parser, what="folder for the report (default out/validate)")
+    parser.add_output(what="folder for the report (default out/validate)")
     return parser
 
 

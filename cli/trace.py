@@ -28,7 +28,6 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     if args.plot is not None:
         check_file("--plot", Path(args.plot))
-    options.check_json(args)
     result = Trace.load_npz(Path(args.trace))
     found = growths(result)
     if not result.t.size:
@@ -53,5 +52,5 @@ def _parser() -> options.Parser:
     )
     parser.add_argument("trace", metavar="TRACE.npz", help="written by sim.run or hw.bridge")
     parser.add_argument("--plot", metavar="FILE.png", help="draw the trace")
-    options.add_json_option(parser)
+    parser.add_json()
     return parser

@@ -19,15 +19,14 @@ from design.files import unseen
 from design.guarantees import ANY
 from design.result import Chosen
 from models.human import Human, Population
+from models.scene import MIXED
 from sim import verdicts
 from sim.adversary import Worst, search, search_population
-from sim.couplings import NAMES
-from sim.crowds import ENGINES, MIXED, Findings, Validation
-from sim.judged import Judged
+from sim.couplings import NAMES, Judged
+from sim.crowds import ENGINES, Findings, Table, Validation, validate, validate_on_cluster
 from sim.report import DelaySpan, UnevenTicks, VaryingDelays
 from sim.run import assemble, engine_name
 from sim.scenario import InputError, Scenario, require_linear, save_humans
-from sim.shards import Table, validate, validate_on_cluster
 from sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
 from sim.switching import DelaysCovered
 
@@ -66,11 +65,11 @@ def _parser() -> options.Parser:
         "python -m sim.validate --case I --humans 200 --adversary",
     )
     add, whole = parser.add_argument, options.whole
-    options.add_loop_options(parser)
-    options.add_varying_delay_options(parser)
-    options.add_coupling_options(parser, ", ".join(NAMES))
-    options.add_human_option(parser, " and `population`, whose draw(rng, n) gives n hands,")
-    options.add_limiter_option(parser)
+    parser.add_loop()
+    parser.add_varying_delays()
+    parser.add_coupling(", ".join(NAMES))
+    parser.add_human(" and `population`, whose draw(rng, n) gives n hands,")
+    parser.add_limiter()
     add("--humans", type=whole(1, 1_000_000), default=1000, metavar="N", help="random humans per device (default 1000)")
     add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
     who = f"who decides: {', '.join(ENGINES)} (default both), or package.module:Class, beside the exact one"
@@ -84,7 +83,7 @@ def _parser() -> options.Parser:
     add("--generations", type=whole(1, 10_000), metavar="N", help="length of that search (default 150)")
     met = "nominal (default), or ranges: in turn all vertices of the scenario's ranges and as many others inside"
     add("--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
-    options.add_output_options(parser, picture=True)
+    parser.add_output(picture=True)
     parser.only("with --adversary", lambda args: args.adversary, "generations")
     return parser
 
@@ -209,6 +208,12 @@ class _Own:
         yield f"hands of {self.from_}", f"{growth}: {self.exact.exact_verdict}"
 
 
+def _judged_rows(judged: Judged) -> render.Rows:
+    if own := judged.chosen.own:
+        yield from render.certificate_rows({own.name: judged.requirements[own.name]}, 5)
+    yield "force limits", judged.limiter.words
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Report:
     """What a validation found; a part that does not exist is null or left out."""
@@ -228,7 +233,7 @@ class _Report:
     own_humans: _Own = render.several(_Own.rows)
     largest_difference_per_s: float | None = render.figure("growth rates apart", "{:.1e} 1/s at most")
     traces: verdicts.Traces | None = render.several(verdicts.Traces.rows)
-    judged: Judged = render.figure("force limits", "{.limiter.words}", json="beside")
+    judged: Judged = render.several(_judged_rows, "beside")
     settled: str | None = render.figure("handles come to rest", json="table")
     energy_audit: verdicts.EnergyAudit | None = render.figure("energy audit W >= 0", json="given")
     switching: verdicts.Growing[VaryingDelays] | None = render.several(

@@ -12,7 +12,7 @@ from pathlib import Path
 from cli import options, render
 from design.coverage import Limits
 from design.files import unseen, write_json
-from design.result import CONDITIONS, Requirement
+from design.result import Requirement
 from sim.scenario import InputError, require_even_ticks
 from sim.view.session import (
     COUPLINGS,
@@ -40,7 +40,6 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
     require_even_ticks(scenario, "sim.view")
-    options.check_json(args)
     if args.video:
         check_film(Path(args.video))
         if args.video.endswith(".gif") and 100 % args.fps:  # GIF counts in hundredths of a second
@@ -87,7 +86,7 @@ class _Event:
         return cls(t, what, *loop, prepared.requirements, prepared.guarantee, prepared.limits)
 
     def line(self) -> str:
-        held = [name for name in CONDITIONS if self.certificates[name].certified]
+        held = [name for name, need in self.certificates.items() if need.certified]
         growth = f"{self.exact_growth_rate_per_s:+.3g} 1/s at {self.exact_frequency_hz:.1f} Hz"
         grows = growth if isfinite(self.exact_growth_rate_per_s) else "no growth"
         proved = f"certified ({', '.join(held)})" if held else "NOT certified"
@@ -146,15 +145,15 @@ def _parser() -> options.Parser:
     keys = ", ".join(f"{name} {word}" for name, word in keys_help(given=True))
     parser = options.Parser("sim.view", f"Feel the loop in a window, or film it.\n\nKeys: {keys}.", _EXAMPLE)
     add = parser.add_argument
-    options.add_loop_options(parser)
+    parser.add_loop()
     what = f"to begin with: {', '.join(_names())} or FILE.json; designed is spring-damper"
     add("--coupling", metavar="NAME|FILE", help=what)
-    options.add_condition_option(parser, "the condition of designs")
-    options.add_limiter_option(parser)
+    parser.add_condition("the condition of designs")
+    parser.add_limiter()
     add("--script", metavar="EVENTS", help=f"what happens when [s] (default of a video: '{_SCRIPT}')")
     until = "default: a window until it is closed, a video until after its script"
     add("--duration", type=options.number(1e-3, _LONGEST, "s"), metavar="SECONDS", help=until)
-    options.add_json_option(parser)
+    parser.add_json()
     add = parser.add_argument_group("without a display").add_argument
     add("--video", metavar="FILE", help="a film: .gif, or .mp4 where ffmpeg is installed")
     rate = "pictures per second (default 10); for a .gif what divides 100"

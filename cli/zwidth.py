@@ -14,7 +14,9 @@ import msgspec
 from cli import options, render
 from cli.judged import chosen_by, judge
 from controller.lti import Array
-from design.result import CONDITIONS, Chosen, Requirement
+from controller.older import CONDITIONS as OLDER
+from design.designs import name_and_own
+from design.result import Chosen, Requirement
 from sim import zwidth
 from sim.couplings import NAMES
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
@@ -71,13 +73,13 @@ def main(argv: list[str]) -> int:
 def _parser() -> options.Parser:
     what = "Draw the Z-width map: which spring-dampers are safe, for whom, by which test."
     parser = options.Parser("sim.zwidth", what, _EXAMPLE)
-    options.add_loop_options(parser)
-    options.add_rigid_option(parser)
+    parser.add_loop()
+    parser.add_rigid()
     of_map = parser.add_argument_group("the map (K and B are the same on all channels)")
     fixed = "this coupling, fixed, and K and B of the environment's contact springs on the axes"
     names = f"{', '.join(NAMES)} or FILE.json (default: K and B of the coupling)"
     of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed}: {names}")
-    options.add_condition_option(of_map, "that such a coupling is designed for")
+    parser.add_condition("that such a coupling is designed for; one of your own is drawn in every map", to=of_map)
     rows = "rows and columns (default 60; 24 with --coupling)"
     of_map.add_argument("--grid", type=options.whole(4, 400), metavar="N", help=rows)
     K, B = "[N/m]; default from delta, theta and T", "[N s/m]; default from delta"
@@ -87,19 +89,22 @@ def _parser() -> options.Parser:
     of_map.add_argument("--mark", type=_mark, action="append", default=[], metavar="K,B", help=mark)
     humans = "random humans per device (default 200)"
     of_map.add_argument("--humans", type=options.whole(1, 100_000), default=200, metavar="N", help=humans)
-    _add_points(parser.add_argument_group("the points simulated in MuJoCo, and what they have beside the linear loop"))
-    options.add_output_options(parser, picture=True)
+    _add_points(parser)
+    parser.add_output(picture=True)
     simulated = ("trials", "duration", "start", "press", "threshold", "quantisation", "saturation", "friction")
     parser.only("about simulated points: --points 0 has none", lambda args: args.points, *simulated)
     parser.only("about simulated points with --rigid: --points 0 has none", lambda a: a.points or not a.rigid, "wall")
     parser.only("with --saturation: motors without limits clip nothing", lambda args: args.saturation, "limiter")
-    parser.only("with --coupling: nothing else is designed", lambda args: args.coupling, "condition")
+    designed = "with --coupling, or of your own: nothing else is designed"
+    parser.only(designed, lambda args: args.coupling or name_and_own(args.condition)[1], "condition")
     gains = "for a map of spring-dampers: with --coupling the axes are the environment's"
     parser.only(gains, lambda args: args.coupling is None, "rigid", "wall", "velocity_filter")
     return parser
 
 
-def _add_points(points: argparse._ActionsContainer) -> None:
+def _add_points(parser: options.Parser) -> None:
+    points = parser.add_argument_group("the points simulated in MuJoCo, and what they have beside the linear loop")
+
     def add(name: str, kind: Callable[[str], float], metavar: str, what: str, default: float | None = None) -> None:
         points.add_argument(f"--{name}", type=kind, metavar=metavar, default=default, help=what)
 
@@ -113,7 +118,7 @@ def _add_points(points: argparse._ActionsContainer) -> None:
     add("threshold", options.number(1e-9, 1, "m"), "METRES", swing)
     add("quantisation", options.number(0, 1e-2, "m"), "METRES", "encoder step of every device")
     points.add_argument("--saturation", action="store_true", help="motors have their force limits")
-    options.add_limiter_option(points, "with --saturation clip forces at these limits")
+    parser.add_limiter("with --saturation clip forces at these limits", to=points)
     add("friction", options.number(0, 1e3, "N"), "NEWTONS", "Coulomb friction of every device")
     points.add_argument("--wall", action="store_true", help="contacts push and never pull")
     cutoff = "first-order cut-off of the damped velocity; in all maps"
@@ -135,11 +140,12 @@ def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) 
     loop = msgspec.structs.replace(loop, ranges=None, varying_delay=None)
     with options.refused():
         if chosen:
-            return zwidth.EnvironmentSweep(devices, scenario.population, loop, chosen.coupling)
+            return zwidth.EnvironmentSweep(devices, scenario.population, loop, chosen.coupling, own=chosen.own)
         if args.wall and not args.rigid:
             loop = loop.at(zwidth.one_sided(scenario.environment))
         wall, clip = args.rigid and args.wall, args.limiter is False
-        return zwidth.CouplingSweep(devices, scenario.population, loop, args.velocity_filter, wall, clip)
+        own = name_and_own(args.condition)[1]
+        return zwidth.CouplingSweep(devices, scenario.population, loop, args.velocity_filter, wall, clip, own=own)
 
 
 def _plan(args: argparse.Namespace, sweep: zwidth.Sweep) -> Plan:
@@ -180,7 +186,7 @@ def _share(count: int, report: MapReport) -> str:
 def _designed_rows(fixed: FixedCoupling, limited: bool) -> render.Rows:
     """The fixed coupling in the environment that it was designed for."""
     there = fixed.designed_for
-    asked = [(name, there.certificates[name]) for name in CONDITIONS]
+    asked = [(name, need) for name, need in there.certificates.items() if name not in OLDER]
     needs = "; ".join(
         f"{name} needs {100 / need.margin:.4g} % of the damping ({need.proof})" for name, need in asked if need.margin
     )

@@ -59,6 +59,12 @@ class Coupling:
         """V_i(z) of each channel, where V is diagonal by construction."""
         return None
 
+    def sampled(self, z: Complex, T: float) -> Sampled:
+        """V at z (n, k) or (1, k), of a coupling that has one."""
+        V = self.compliance(T)
+        assert V is not None
+        return Sampled.of(V, z)
+
     def with_model(self, model: Lti) -> Compliance | None:
         """The V that results where its model of the environment stays `model`; None for a coupling without a model."""
         return None

@@ -20,8 +20,7 @@ from controller.arithmetic import Number, rational
 from controller.coupling import Coupling, Strict
 from controller.delay import delay
 from controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_environment
-from controller.law import Law
-from controller.limiter import Limiter
+from controller.law import Law, Limiter
 from controller.lti import Block, Complex, Lti, Sampled, as_like
 from controller.ranges import Member, Ranges, members
 

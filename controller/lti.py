@@ -100,6 +100,16 @@ class Lti(ReadOnly):
         return cls(np.zeros((*lead, 0, 0)), np.zeros((*lead, 0, m)), np.zeros((*lead, p, 0)), gain, T)
 
     @classmethod
+    def with_rest(cls, A: Array, B: Array, R: Array, static: Array, T: Number) -> Self:
+        """G = static + (R - R z)(z I - A)^-1 B, whose G(1) and R = C (I - A)^-1 are known, not solved for.
+
+        With R held its matrices are affine in A, B and G(1).
+        """
+        whole = cls(A, B, R - R @ A, static - R @ B, T)
+        whole.__dict__["_rest"] = static, R
+        return whole
+
+    @classmethod
     def diag(cls, *blocks: Lti) -> Self:
         """The blocks side by side, each with its own inputs and outputs."""
         A, B, C, D = (_block_diagonal([getattr(g, name) for g in blocks]) for name in "ABCD")

@@ -10,7 +10,7 @@
 With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
 Steps 2, 3 and 5 are linear: they are ONE state-space block, and a tick is one matrix product
 [f; z+] = [C D; A B] [z; x] for any number of simulations at once. Walls that touch (controller.law) and forces that
-are limited (controller.limiter) ask for a small complementarity problem more; a force that is clipped is what the
+are limited (controller.law) ask for a small complementarity problem more; a force that is clipped is what the
 actuators make of it.
 Where delays vary, Theta is not in the block: its forces pass through a line that holds (controller.delay).
 """

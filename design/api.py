@@ -13,11 +13,21 @@ from controller.coupling import Coupling
 from controller.loop import Loop
 from controller.lti import Lti
 from design.arguments import known, of_kind, one_of, shown
-from design.certificate import RangesCheck, assess, check_ranges, lag, prove, prove_limiter, switching_requirement
+from design.certificate import (
+    RangesCheck,
+    assess,
+    check_ranges,
+    lag,
+    named,
+    prove,
+    prove_limiter,
+    switching_requirement,
+)
+from design.conditions import Condition
 from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save, sealed
-from design.designs import KINDS, design_by_kind, usual_condition
+from design.designs import KINDS, design_by_kind, name_and_own, usual_condition
 from design.files import unseen
-from design.guarantees import HERE, guarantee_of, switching_guarantee
+from design.guarantees import ANY, HERE, RANGES, guarantee_of, switching_guarantee
 from design.result import ConditionName, Design, NotProved, Requirement
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
@@ -44,14 +54,18 @@ class DesignOptions(TypedDict, total=False):
 
 
 def design_coupling(
-    loop: Loop, kind: _Kind = "spring-damper", condition: ConditionName | None = None, **options: Unpack[DesignOptions]
+    loop: Loop,
+    kind: _Kind = "spring-damper",
+    condition: ConditionName | Condition | None = None,
+    **options: Unpack[DesignOptions],
 ) -> Design:
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
     `kind` is "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal"; `condition` is
     "any-environment" or "this-environment", None for what the commands design: a spring-damper for this environment,
-    also while forces are limited; for any environment before walls, ranges or delays that vary. `options` are those of
-    the kind, see DesignOptions; switching is not taken from loop.varying_delay.
+    also while forces are limited; for any environment before walls, ranges or delays that vary. A Condition of your own
+    (design.conditions) must hold beside the kind's usual one. `options` are those of the kind, see DesignOptions;
+    switching is not taken from loop.varying_delay.
 
     Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
     that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).
@@ -61,6 +75,7 @@ def design_coupling(
     """
     of_kind("loop", loop, Loop, _LOOP)
     one_of("kind", kind, KINDS)
+    named(condition or usual_condition(loop, kind))  # refuses a taken name
     known(options, KINDS[kind].options, f"kind {kind!r}")
     return design_by_kind(loop, kind, condition, **options)
 
@@ -74,7 +89,7 @@ _QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
 )
 
 
-def instead(loop: Loop, kind: str, condition: str | None = None) -> str:
+def instead(loop: Loop, kind: str, condition: str | Condition | None = None) -> str:
     """What can be had in the place of a design that failed, in words, least rms mismatch first; "" where nothing is.
 
     Every other kind and condition is designed here and certified. Nothing is tried for delays that vary.
@@ -94,8 +109,10 @@ def instead(loop: Loop, kind: str, condition: str | None = None) -> str:
     return "certified instead: " + ", ".join(words for _, words in sorted(found)) if found else ""
 
 
-def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[str]]:
+def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None = None) -> dict[str, Requirement[str]]:
     """What both conditions, "any-environment" and "this-environment", ask of a coupling in its loop.
+
+    Beside them that of the design, or a `condition` of your own, under its name.
 
     With ranges around the loop's environment this-environment is about the environment and every vertex: the figure is
     that of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
@@ -110,12 +127,15 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[st
     SingularLoop where their algebraic loop has no solution.
     """
     of_kind("loop", loop, Loop, _LOOP)
-    phi = coupling.phi if isinstance(coupling, Design) else None
+    phi, own = (coupling.phi, coupling.own) if isinstance(coupling, Design) else (None, None)
     alone = fitting(loop, coupling)
-    requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi))
+    _, asked = name_and_own(condition)
+    requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi, own=asked or own))
     if whole := check_ranges(loop, alone, samples=0):
         _, worst = whole.worst if whole.proved else whole.worst_found
-        requirements["this-environment"] = replace(worst, proof="rational" if whole.proved else "sampled")
+        here = requirements[worst.condition].guarantee
+        proof, held = ("rational", RANGES) if whole.proved else ("sampled", here)
+        requirements[worst.condition] = replace(worst, proof=proof, guarantee=held)
     if loop.varying_delay:
         requirements["switching"] = switching_requirement(loop, alone).requirement
     return requirements
@@ -129,11 +149,9 @@ def guarantee(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str |
     """
     of_kind("loop", loop, Loop, _LOOP)
     of_kind("requirements", requirements, Mapping, "what certify returned")
-    if "this-environment" not in requirements:
+    if not any(isinstance(each, Requirement) and each.guarantee for each in requirements.values()):
         raise ValueError(f"requirements has {', '.join(requirements) or 'nothing'}, expected what certify returned")
-    held = requirements["this-environment"]
-    whole_ranges = loop.ranges is not None and held.certified and held.proof == "rational"
-    return guarantee_of(requirements, loop, whole_ranges)
+    return guarantee_of(requirements, loop)
 
 
 def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
@@ -175,7 +193,7 @@ def proved(loop: Loop, design: Design) -> Design:
         return design
     try:
         limiter = prove_limiter(loop, design.coupling, c=design.c) if design.c else None
-        return replace(design, certificate=prove(loop, design.coupling, design.condition, _multiplier(design), limiter))
+        return replace(design, certificate=prove(loop, design.coupling, design.asked, _multiplier(design), limiter))
     except NotProved:
         return design
 
@@ -192,10 +210,10 @@ def store(
     What is not proved for whole ranges, or for switching delays, is kept as what it is: a coupling for the nominal
     environment, or for constant delays. Raises InputError where the file cannot be written.
     """
-    if whole and whole.proved and design.condition == "this-environment":
+    if whole and whole.proved and whole.certificate and whole.certificate.condition == design.condition:
         certificate, reason = whole.certificate, None
     else:
-        loop = loop if design.condition == "any-environment" else loop.at(loop.environment)
+        loop = loop if named(design.asked).guarantee(loop) == ANY else loop.at(loop.environment)
         certificate, reason = _proved(loop, design, limiter)
     switching = None
     if loop.varying_delay:
@@ -214,10 +232,10 @@ def _proved(loop: Loop, design: Design, limiter: LimiterCertificate | None) -> t
     """The certificate of all that the loop claims, or why there is none."""
     held = design.certificate
     if held and held.scenario == digest(loop, design.coupling.form()):
-        limited = limiter if design.condition == "this-environment" else None
+        limited = limiter if named(design.asked).extensible else None
         return (sealed(msgspec.structs.replace(held, limiter=limited)) if limited else held), None
     try:
-        return prove(loop, design.coupling, design.condition, _multiplier(design), limiter), None
+        return prove(loop, design.coupling, design.asked, _multiplier(design), limiter), None
     except NotProved as error:
         return None, str(error)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
-from typing import Any, TypeVar, cast, get_args
+from typing import Any, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -19,15 +19,16 @@ from controller.coupling import (
 )
 from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
-from controller.older import CONDITIONS, with_older
+from controller.older import CONDITIONS as OLDER
+from controller.older import with_older
 from design.certificate import RangesCheck, named
-from design.conditions import any_environment
+from design.conditions import Condition
 from design.coverage import RangesFigures, Switching
+from design.environments import THIS_ENVIRONMENT
 from design.files import unseen
 from design.frequency import sweeping, too_long
 from design.guarantees import ANY, CAVEATS, guarantee_of
-from design.lmi import LATE
-from design.result import ConditionName, Requirement, listed, refusal
+from design.result import CONDITIONS, ConditionName, Requirement, listed, refusal
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling in its loop, judged by either condition.
@@ -37,27 +38,31 @@ from design.result import ConditionName, Requirement, listed, refusal
 LONGEST_DELAY = 100
 
 
-def requirement(loop: Loop, coupling: Coupling, condition: ConditionName) -> Requirement:
+_Asked = ConditionName | Condition
+
+
+def requirement(loop: Loop, coupling: Coupling, condition: _Asked) -> Requirement:
     """The damping that the condition asks of the devices."""
+    asked = named(condition)
     try:
-        return named(condition).judge(loop, coupling)
+        return asked.judge(loop, coupling)
     except TooLong:
         raise
     except ValueError as error:  # no solution of the algebraic loop
-        return refusal(condition, loop.delta, str(error))
+        return refusal(asked.name, loop.delta, str(error))
 
 
-def _varied(loop: Loop, coupling: Coupling, condition: ConditionName, **changes: Any) -> Requirement:
+def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any) -> Requirement:
     """The same with some of the loop's fields changed; a loop that cannot be is refused."""
     try:
         return requirement(msgspec.structs.replace(loop, **changes), coupling, condition)
     except TooLong:
         raise
     except ValueError as error:  # a latency that is longer than the period
-        return refusal(condition, loop.delta, str(error))
+        return refusal(condition.name, loop.delta, str(error))
 
 
-def _at_period(loop: Loop, coupling: Coupling, condition: ConditionName, T: float) -> Requirement:
+def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -> Requirement:
     """The same with the gains, or coefficients, and the delays in samples at another T [s]."""
     longest = loop.T_max and loop.T_max * (T / loop.T)  # periods vary in proportion
     return _varied(loop, coupling.at_period(T), condition, T=T, T_max=longest)
@@ -113,19 +118,20 @@ class _Sensitivity:
     reason: str | None = unseen("given", None)
 
 
-def stiffest(loop: Loop, coupling: Coupling, condition: ConditionName) -> _Stiffest:
-    """any-environment: channel by channel; this-environment: the largest common scale of all K."""
-    unknown = (None,) * loop.channels
+def stiffest(loop: Loop, coupling: Coupling, condition: _Asked) -> _Stiffest:
+    """The largest common scale of all K; channel by channel where the condition judges each of them alone."""
+    unknown, asked = (None,) * loop.channels, named(condition)
     gains = coupling.figures(loop.T)
     if "K" not in gains:
         return _Stiffest(unknown, "only a spring-damper has a K")
-    if condition == "any-environment":
-        return _stiffest_for_any_environment(loop, gains["B"])
+    if asked.separable:
+        reason = asked.not_varied(loop) or asked.beyond(loop)
+        return _Stiffest(unknown, reason) if reason else _stiffest_of_each(loop, gains["B"], asked)
     K = np.array(gains["K"])
 
     @cache
     def ratio(scale: float) -> float:
-        return requirement(loop, coupling.scaled(stiffness=scale), condition).ratio
+        return requirement(loop, coupling.scaled(stiffness=scale), asked).ratio
 
     scale = _STIFFEST / K.max()
     if ratio(scale) < 1:
@@ -138,12 +144,8 @@ def stiffest(loop: Loop, coupling: Coupling, condition: ConditionName) -> _Stiff
     return _Stiffest(unknown, "no scale of K is certified beside this B")
 
 
-def _stiffest_for_any_environment(loop: Loop, dampers: Sequence[float]) -> _Stiffest:
+def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition) -> _Stiffest:
     """Between 0 and 2 (delta - B)/T, the bound where z^-n = -1; the set of gains is convex and contains K -> 0."""
-    if any(loop.psi):
-        return _Stiffest((None,) * loop.channels, "with psi >= 1 each K needs a multiplier of its own: not searched")
-    if loop.latency:
-        return _Stiffest((None,) * loop.channels, LATE)
     stiffest, reasons = [], []
     for i, (B, delta) in enumerate(zip(dampers, loop.delta, strict=True)):
         if delta <= B:
@@ -154,23 +156,23 @@ def _stiffest_for_any_environment(loop: Loop, dampers: Sequence[float]) -> _Stif
 
         @cache
         def ratio(K: float, B: float = B, alone: Loop = one) -> float:
-            V = SpringDamper([K], [B]).compliance(loop.T)
-            return any_environment(V, alone).ratio
+            return condition.judge(alone, SpringDamper([K], [B])).ratio
 
         bound = 2 * (delta - B) / loop.T
         stiffest.append(edge(ratio, 1e-9 * bound, bound))
     return _Stiffest(tuple(stiffest), "; ".join(reasons) or None)
 
 
-def sensitivity(loop: Loop, coupling: Coupling, needs: Requirement) -> _Sensitivity:
-    """How much error in delta, T and delay the certificate by `needs.condition` tolerates."""
+def sensitivity(loop: Loop, coupling: Coupling, condition: _Asked) -> _Sensitivity:
+    """How much error in delta, T and delay the certificate by this condition tolerates."""
+    asked, needs = named(condition), requirement(loop, coupling, condition)
     if not needs.certified:
         return _Sensitivity(reason=_NOT_CERTIFIED)
-    if needs.condition == "any-environment" and any(loop.psi):
-        return _of_delta(needs, "with psi >= 1 every T and delay needs a multiplier of its own: not searched")
+    if reason := asked.not_varied(loop):
+        return _of_delta(needs, reason)
     fixed = loop.environment.one_period
-    largest = None if fixed else _largest_period(loop, coupling, needs.condition)
-    extra = _extra_samples(loop, coupling, needs.condition)
+    largest = None if fixed else _largest_period(loop, coupling, asked)
+    extra = _extra_samples(loop, coupling, asked)
     tried = "environment.block is of one T" if fixed else f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s"
     reasons = [
         tried if largest is None else "",
@@ -188,7 +190,7 @@ def _of_delta(needs: Requirement, reason: str | None) -> _Sensitivity:
     return _Sensitivity(needs.required, 1 - needs.ratio, reason=reason)
 
 
-def _largest_period(loop: Loop, coupling: Coupling, condition: ConditionName) -> float | None:
+def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> float | None:
     @cache
     def ratio(T: float) -> float:
         return _at_period(loop, coupling, condition, T).ratio
@@ -202,7 +204,7 @@ def _largest_period(loop: Loop, coupling: Coupling, condition: ConditionName) ->
     return None
 
 
-def _extra_samples(loop: Loop, coupling: Coupling, condition: ConditionName) -> int | None:
+def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int | None:
     for extra in range(1, MOST_EXTRA_SAMPLES + 1):
         later = tuple(n + extra for n in loop.theta)
         if not _varied(loop, coupling, condition, theta=later).certified:
@@ -243,22 +245,22 @@ class _Remedy:
     requirement: Requirement
 
 
-def remedies(loop: Loop, coupling: Coupling, needs: Requirement) -> list[_Remedy]:
+def remedies(loop: Loop, coupling: Coupling, condition: _Asked) -> list[_Remedy]:
     """What certifies, or lowers the required damping by 10 % or more, each change alone; [] where it is certified."""
-    condition = needs.condition
-    if needs.certified or (condition == "any-environment" and any(loop.psi)):
+    asked, needs = named(condition), requirement(loop, coupling, condition)
+    if needs.certified or asked.not_varied(loop):
         return []
-    found = [_fewer_samples(loop, coupling, condition, name) for name in ("theta", "psi")]
+    found = [_fewer_samples(loop, coupling, asked, name) for name in ("theta", "psi")]
     if any(B := coupling.figures(loop.T).get("B", ())):
         found.append(
             _smaller(
-                lambda x: requirement(loop, coupling.scaled(damping=x), condition),
+                lambda x: requirement(loop, coupling.scaled(damping=x), asked),
                 lambda x: f"smaller B: {listed([x * b for b in B], 5)} N s/m",
             )
         )
     found.append(
         _smaller(
-            lambda x: _at_period(loop, coupling, condition, x * loop.T),
+            lambda x: _at_period(loop, coupling, asked, x * loop.T),
             lambda x: f"faster: T = {1e3 * x * loop.T:.5g} ms",
         )
     )
@@ -266,7 +268,7 @@ def remedies(loop: Loop, coupling: Coupling, needs: Requirement) -> list[_Remedy
     return [r for r in found if r and (r.requirement.certified or r.requirement.ratio < least)]
 
 
-def _fewer_samples(loop: Loop, coupling: Coupling, condition: ConditionName, name: str) -> _Remedy | None:
+def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
     """One sample less at a time, on every channel that has one; the reference is none later than the loop."""
     steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):
@@ -347,31 +349,43 @@ class Audit:
     helps: list[Help] = unseen()
     not_covered: str = CAVEATS
 
+    @property
+    def parts(self) -> dict[str, ConditionAudit]:
+        """By today's names, in the order of a table: those with names, then the user's own."""
+        return {name: self.conditions[name] for name in {**CONDITIONS, **self.conditions} if name not in OLDER}
+
 
 def audit(
-    loop: Loop, coupling: Coupling, switching: DelayRange | None = None, whole: RangesCheck | None = None
+    loop: Loop,
+    coupling: Coupling,
+    switching: DelayRange | None = None,
+    whole: RangesCheck | None = None,
+    own: Condition | None = None,
 ) -> Audit:
-    """What both conditions say of the loop's own environment and constant delays.
+    """What both conditions say of the loop's own environment and constant delays, and one of the user's `own`.
 
     With a range of delays also the damping that any switching within it asks; `whole` is the same coupling over the
     ranges around the environment, if there is one. Raises ValueError naming the field of the loop that is wrong.
     """
     loop = loop.at(loop.environment).switching(None)
     check_loop(loop)
-    requirements = {name: requirement(loop, coupling, name) for name in reversed(get_args(ConditionName))}
-    here = requirements["this-environment"].certified
+    conditions = {each.name: each for each in (*map(named, reversed(CONDITIONS)), *([own] if own else []))}
+    requirements = {name: requirement(loop, coupling, each) for name, each in conditions.items()}
+    asked = own or THIS_ENVIRONMENT
+    here = requirements[asked.name].certified
+    fails = next((each for name, each in conditions.items() if here and not requirements[name].certified), asked)
     proved = bool(whole and whole.proved)
     guaranteed = guarantee_of(requirements, loop, proved)
     figures, rigid = coupling.figures(loop.T), loop.environment is RIGID_WALL
     return Audit(
         _Coupling(coupling.kind, figures.get("K"), figures.get("B")),
         _Loop(loop.T, loop.T_max, loop.latency, loop.theta, loop.psi, loop.delta, rigid),
-        with_older({name: _judged(loop, coupling, needs) for name, needs in requirements.items()}, CONDITIONS),
+        with_older({name: _judged(loop, coupling, conditions[name], r) for name, r in requirements.items()}, OLDER),
         _switching(loop, coupling, switching) if switching else None,
         whole and RangesFigures.of(whole),
         here and (whole is None or proved or guaranteed == ANY),
         guaranteed,
-        _helps(loop, coupling, requirements["any-environment" if here else "this-environment"]),
+        _helps(loop, coupling, fails),
     )
 
 
@@ -393,14 +407,12 @@ def _in_time(loop: Loop, coupling: Coupling, search: Callable[[], _Found], witho
         return search()
 
 
-def _judged(loop: Loop, coupling: Coupling, needs: Requirement) -> ConditionAudit:
+def _judged(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> ConditionAudit:
     unknown = (None,) * loop.channels
     return ConditionAudit(
         needs,
-        _in_time(
-            loop, coupling, lambda: stiffest(loop, coupling, needs.condition), lambda why: _Stiffest(unknown, why)
-        ),
-        _in_time(loop, coupling, lambda: sensitivity(loop, coupling, needs), lambda why: _of_delta(needs, why)),
+        _in_time(loop, coupling, lambda: stiffest(loop, coupling, condition), lambda why: _Stiffest(unknown, why)),
+        _in_time(loop, coupling, lambda: sensitivity(loop, coupling, condition), lambda why: _of_delta(needs, why)),
     )
 
 
@@ -410,11 +422,11 @@ def _switching(loop: Loop, coupling: Coupling, span: DelayRange) -> Switching:
     return Switching.of(touching, coupling)
 
 
-def _helps(loop: Loop, coupling: Coupling, needs: Requirement) -> list[Help]:
-    """Changes that help the condition that fails first: this-environment, else any_environment."""
-    found = _in_time(loop, coupling, lambda: remedies(loop, coupling, needs), lambda why: [])
+def _helps(loop: Loop, coupling: Coupling, condition: Condition) -> list[Help]:
+    """Changes that help a condition that does not hold."""
+    found = _in_time(loop, coupling, lambda: remedies(loop, coupling, condition), lambda why: [])
     asked = ((remedy.change, remedy.requirement) for remedy in found)
-    return [Help(change, needs.condition, after.required, after.certified) for change, after in asked]
+    return [Help(change, condition.name, after.required, after.certified) for change, after in asked]
 
 
 if __name__ == "__main__":

@@ -406,7 +406,9 @@ def named(condition: str | Condition) -> Condition:
             raise ValueError(f"{own}, expected one of its own, not {', '.join(sorted(taken))}")
         return condition
     if condition not in _NAMED:
-        raise ValueError(f"condition is {condition!r}, allowed are {', '.join(_NAMED)}, or a Condition of your own")
+        raise ValueError(
+            f"condition is {condition!r}, allowed are {', '.join(_NAMED)}, or one of your own (FILE.py:NAME)"
+        )
     return _NAMED[condition]
 
 

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, Literal
 
 import msgspec
@@ -19,14 +18,14 @@ from controller.loop import Loop
 from controller.lti import Array, Lti
 from design import conditions
 from design.bound import MOST, NO_BOUND, bound
-from design.certificate import prove
+from design.certificate import named, prove
+from design.conditions import Condition
 from design.coupling_file import digest
 from design.designs import design_by_kind
 from design.files import unseen
 from design.frequency import Response, frequencies, on_circle
-from design.lmi import ANY_ENVIRONMENT
 from design.program import LADDER, Options
-from design.result import ConditionName, Design, DesignFailed, NotProved, Requirement, finite
+from design.result import CONDITIONS, ConditionName, Design, DesignFailed, NotProved, Requirement, finite
 from design.robustness import Nearby
 from design.transparency import decibels, transparency
 
@@ -68,21 +67,18 @@ class Curves:
     demands: dict[str, Array | None] = field(metadata={"json": "table"})  # (k,) required over available damping
 
 
-def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Demands:
-    """Both conditions of a coupling, as figures and over frequency. Raises SingularLoop."""
-    F = loop.F(coupling)
-    phi = _multiplier(loop, coupling) if phi is None and any(loop.psi) else phi
-    requirements = {
-        "this-environment": conditions.this_environment(F, loop),
-        "any-environment": ANY_ENVIRONMENT.required(loop, coupling, phi),
-    }
-    demands: dict[str, Response | None] = dict.fromkeys(requirements)
-    if np.isfinite(requirements["this-environment"].ratio):
-        demands["this-environment"] = partial(conditions.least_scale, conditions.this_environment_demand(F, loop))
-    V = coupling.compliance(loop.T)
-    if V is not None and np.isfinite(requirements["any-environment"].ratio):
-        demand = conditions.any_environment_demand(V, loop, phi)
-        demands["any-environment"] = partial(conditions.least_scale, demand)
+def judge(loop: Loop, coupling: Coupling, phi: Array | None = None, own: Sequence[Condition] = ()) -> Demands:
+    """Every condition of a coupling, as figures and over frequency, before walls while all touch. Raises SingularLoop.
+
+    `phi` is Theorem 4's multiplier that the coupling was designed with, if any; `own` are conditions of the user's.
+    """
+    F, loop = loop.F(coupling), loop.at(loop.environment.frozen()[-1])
+    requirements: dict[str, Requirement] = {}
+    demands: dict[str, Response | None] = {}
+    for each in (*map(named, CONDITIONS), *own):
+        found, _ = each.least_multiplier(loop) if phi is None else (phi, None)
+        needs = requirements[each.name] = each.judge(loop, coupling, found)
+        demands[each.name] = each.over_frequency(loop, coupling, found) if np.isfinite(needs.ratio) else None
     return Demands(F, requirements, demands)
 
 
@@ -122,18 +118,6 @@ def perceived(G: NDArray[np.complex128], hz: Array) -> Perceived:
     """The diagonal of displacement-to-force responses (k, m, m) at `hz` (k,) > 0 as stiffness and damping."""
     own = np.diagonal(G, axis1=1, axis2=2)
     return Perceived(own.real, own.imag / (2 * np.pi * hz)[:, None])
-
-
-def _multiplier(loop: Loop, coupling: Coupling) -> Array | None:
-    """The least multiplier of Theorem 4 for an environment with delay inside, None where there is none."""
-    if coupling.compliance(loop.T) is None:
-        return None
-    from design.lmi import least_phi  # takes the solver
-
-    try:
-        return least_phi(loop)
-    except ValueError:
-        return None  # the condition says why
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ any-environment    Lemma 4 of the paper for any passive environment under backwa
 
 design/environments.py and lmi.py have the two as a `Condition` of a loop and a coupling: which form applies.
 design/multipliers.py has those of this-environment that weigh an error with a multiplier: walls that make and break
-contact, delays that switch, forces that leave through the limiter of controller.limiter.
+contact, delays that switch, forces that leave through the limiter of controller.law.
 
 The period may vary from tick to tick, up to T_max, in all of them: `even_damping` is where it enters.
 """
@@ -119,8 +119,7 @@ def v_hat(H: Block) -> tuple[Array, Block]:
 
     V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) carries the compliance V and what the delays add. It vanishes at
     z = 1, where nothing can be strict, so it is divided by |1 - 1/z|^2: (1 - 1/z) becomes 1/(1 - z), whose pole has
-    the Hermitian part 1/2. It is linear in H, so V and Theta-hat may come one by one. design.lmi.v_hat_ports states it
-    in the paper's ports, for realisations whose quotient is known, as a test compares.
+    the Hermitian part 1/2. It is linear in H, so V and Theta-hat may come one by one.
     """
     H1, R = H.split_at_one()
     return H1, H1 / 2 - R
@@ -247,7 +246,7 @@ class Condition(ABC):
     covers: tuple[str, ...] = ()  # of `BEYOND`, what the block is about; a subclass states its own
     source: str | None = None  # where it is from, for a report
     separable: bool = False  # whether it judges the channels of a coupling without cross terms one by one
-    limitable: bool = False  # whether forces that are limited have a block of their own, which a file may prove
+    extensible: bool = False  # whether limited forces and delays that switch have blocks beside it, in the same file
 
     @abstractmethod
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
@@ -267,6 +266,10 @@ class Condition(ABC):
         except SingularLoop as error:
             found = refusal(self.name, loop.delta, str(error))
         return replace(found, guarantee=self.words(loop), lag=self.lag(loop))
+
+    def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
+        """Required over available damping; with `thin` it may be by every thin-th frequency alone."""
+        return self.judge(loop, coupling).ratio
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         """w (k,) [rad/sample] -> required over available damping there; None for a coupling without such a curve."""
@@ -321,6 +324,11 @@ class Condition(ABC):
         """For which environments it holds."""
         # proved at every vertex; whether it is kept between them is searched by check_ranges and design.check
         return "these ranges" if loop.ranges else "this environment"
+
+    @property
+    def claim(self) -> str:
+        """What is said of one of the user's own."""
+        return f"the block of {self.name} is what is proved; that it keeps this loop safe is yours to show"
 
     def words(self, loop: Loop) -> str:
         """The same in the words of a report."""

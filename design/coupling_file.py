@@ -45,7 +45,7 @@ class SwitchingProof(Strict, frozen=True):
 
 
 class LimiterCertificate(Strict, frozen=True):
-    """What proves this-environment also while forces are limited, by the limiter of controller.limiter."""
+    """What proves this-environment also while forces are limited, by the limiter of controller.law."""
 
     beta: float  # rho = beta delta/T, to six digits
     rho: tuple[float, ...]  # (m,) lag of the limiter [N/m]; the tick must use these

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +14,6 @@ from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
 from design.conditions import this_environment
 from design.coupling_file import Certificate, LimiterCertificate
-from design.designs import KINDS, design_by_kind
 from design.environments import SEARCH, THIS_ENVIRONMENT, Searched, worst
 from design.files import unseen
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
@@ -185,16 +185,13 @@ class OverRanges:
         )
 
 
-def price(loop: Loop, design: Design, kind: str, asked: Mapping[str, Any]) -> list[OverRanges]:
-    """A design over the ranges; one made for all of them beside that for the nominal environment, `asked` the same."""
+def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
+    """A design over the ranges; one made for all of them beside what `nominal` makes for one environment alone."""
     couplings = {kind: design.coupling}
-    if KINDS[kind].model:
+    if nominal:
         couplings = {"whole ranges": design.coupling}
-        try:
-            alone = design_by_kind(loop.at(loop.environment), kind, None, **asked)
-            couplings = {"nominal only": alone.coupling, **couplings}
-        except DesignFailed:  # ranges are given another basis by default
-            pass
+        with suppress(DesignFailed):  # ranges are given another basis by default
+            couplings = {"nominal only": nominal(loop.at(loop.environment)).coupling, **couplings}
     members = loop.members()
     return [OverRanges.of(name, loop, coupling, members) for name, coupling in couplings.items()]
 

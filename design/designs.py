@@ -9,10 +9,13 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from controller.loop import Loop
+from design.conditions import Condition
 from design.environments import THIS_ENVIRONMENT
-from design.lmi import LATE
+from design.guarantees import ANY
+from design.lmi import ANY_ENVIRONMENT
 from design.own import called, named
 from design.result import Design, DesignFailed
 
@@ -20,28 +23,30 @@ from design.result import Design, DesignFailed
 class Kind(NamedTuple):
     """One design: what it promises, where it is made, and what can be asked of it."""
 
-    conditions: tuple[str, ...]  # that it can be made for, its own first
+    conditions: tuple[Condition, ...]  # that it can be made for, its own first
     module: str  # loaded when it is asked for
     function: str  # from a loop to a Design
     takes: tuple[str, ...] = ()  # besides the loop and its options: condition, progress
     options: tuple[str, ...] = ()  # in words of design.api.DesignOptions
     model: bool = False  # of the environment, in the coupling: made for late forces and whole ranges, not for walls
     limited: bool = False  # made for limited forces, too, unless it is asked not to be
+    softened: bool = False  # quick enough to be made for less and less damping, until another condition holds as well
 
 
 KINDS = {
     "spring-damper": Kind(
-        ("this-environment", "any-environment"),
+        (THIS_ENVIRONMENT, ANY_ENVIRONMENT),
         "design.spring_damper",
         "design_with",
         ("condition",),
         ("switching", "limiter", "band_hz"),
         limited=True,
+        softened=True,
     ),
-    "moving-average": Kind(("any-environment",), "design.spring_damper", "moving_average"),
-    "ccl": Kind(("any-environment",), "design.fixed_order", "design", options=("order", "method", "diagonal")),
+    "moving-average": Kind((ANY_ENVIRONMENT,), "design.spring_damper", "moving_average", softened=True),
+    "ccl": Kind((ANY_ENVIRONMENT,), "design.fixed_order", "design", options=("order", "method", "diagonal")),
     "optimal": Kind(
-        ("this-environment",),
+        (THIS_ENVIRONMENT,),
         "design.optimal",
         "design_with",
         ("progress",),
@@ -51,7 +56,7 @@ KINDS = {
 }
 
 
-_OWN = Kind(("this-environment", "any-environment"), "", "")  # a function of a user's own, which takes a loop alone
+_OWN = Kind((THIS_ENVIRONMENT, ANY_ENVIRONMENT), "", "")  # a function of a user's own, which takes a loop alone
 
 
 def kind_of(name: str) -> Kind:
@@ -67,48 +72,67 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """
     less = loop.environment.walls or loop.ranges or loop.varying_delay
     conditions = kind_of(kind).conditions
-    return "any-environment" if less and "any-environment" in conditions else conditions[0]
+    return (conditions[-1] if less and not loop.latency else conditions[0]).name  # the last is for more environments
+
+
+def name_and_own(condition: str | Condition | None) -> tuple[str | None, Condition | None]:
+    """The condition's name, and itself where it is one of the user's own."""
+    if condition is None or isinstance(condition, str):
+        return condition, None
+    return condition.name, None if condition in _OWN.conditions else condition
 
 
 def design_by_kind(
     loop: Loop,
     kind: str = "spring-damper",
-    condition: str | None = None,
+    condition: str | Condition | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
     **options: Any,
 ) -> Design:
     """Design and verify a coupling; `options` are those of the design's own function: order, method, diagonal for ccl,
     those of design.program.Options for optimal. `progress` hears what takes long: (what, steps done, of how many).
     Without a condition it is the usual one. A spring-damper for this environment is covered also while forces are
-    limited, unless `limiter` is False or no such one is found; with `limiter` True it is that or none.
+    limited, unless `limiter` is False or no such one is found; with `limiter` True it is that or none. For a condition
+    of the user's own a coupling is made for the kind's usual one, with as much of the damping as lets both hold.
 
     Raises ValueError for a kind or condition that does not exist, Infeasible or DesignFailed (design.result) where
     there is nothing to return.
     """
+    name, own = name_and_own(condition)
     if kind not in KINDS and ":" in kind:
         found = own_coupling(kind, loop)
         if not isinstance(found, Design):
             raise ValueError(f"coupling {kind} is {found!r} for this loop, expected a design.result.Design")
-        if condition not in (None, found.condition):
+        if own:
+            needs = own.judge(loop.at(loop.environment), found.coupling)
+            return replace(found, condition=own.name, own=own, requirement=needs)
+        if name not in (None, found.condition):
             raise ValueError(f"condition is {condition!r}, but {kind} is designed for {found.condition}")
         return found
     if kind not in KINDS:
         raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)} and package.module:function")
-    condition = condition or usual_condition(loop, kind)
     chosen = KINDS[kind]
-    if condition not in chosen.conditions:
-        raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(chosen.conditions)}")
+    if own and not chosen.softened:
+        able = ", ".join(other for other in KINDS if KINDS[other].softened)
+        why = f"for which {able} and functions of your own can be designed, not {kind}; a FILE.json is judged by it"
+        raise ValueError(f"condition is {own.name}, {why}")
+    asked, able = usual_condition(loop, kind) if own or not name else name, {c.name: c for c in chosen.conditions}
+    if asked not in able:
+        raise ValueError(f"condition is {asked!r}, for {kind} allowed are {', '.join(able)}")
+    made_for = able[asked]
     if chosen.model and loop.environment.walls:
         raise ValueError(f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls")
-    own = (("condition", condition), ("progress", progress))
-    further = {name: value for name, value in own if name in chosen.takes}
+    further = {"condition": made_for.name, "progress": progress}
+    further = {name: value for name, value in further.items() if name in chosen.takes}
     made = partial(getattr(import_module(chosen.module), chosen.function), **further, **options)
 
-    if condition == "any-environment" and loop.latency:
-        raise ValueError(f"latency: {LATE}, or design for this-environment")
-    if chosen.model or condition == "any-environment" or not (loop.latency or loop.environment.walls):
+    if loop.latency and "latency" not in made_for.covers:
+        raise ValueError(f"latency: {made_for.beyond(loop)}, or design for this-environment")
+    if own:
+        return replace(_with_less_damping(loop, made, own), condition=own.name, own=own, phi=None)
+    if chosen.model or made_for.guarantee(loop) == ANY or not (loop.latency or loop.environment.walls):
         return made(loop)
-    return _with_less_damping(loop, made)
+    return _with_less_damping(loop, made, made_for)
 
 
 def own_coupling(name: str, loop: Loop) -> Any:
@@ -116,28 +140,30 @@ def own_coupling(name: str, loop: Loop) -> Any:
     return called(f"--coupling {name}", named("--coupling", name), loop)
 
 
-#: A design for forces that latch late, or for walls, leaves at most this share of the damping, and is sought so often.
+#: A design for late forces, walls or another condition leaves at most this share of the damping; is sought so often.
 _UNUSED, _MOST_ROUNDS = 0.005, 6
 
 
-def _with_less_damping(loop: Loop, made: Callable[[Loop], Design]) -> Design:
-    """The design for less damping, so that late forces, or walls that make and break, need no more than is available.
+def _with_less_damping(loop: Loop, made: Callable[[Loop], Design], condition: Condition) -> Design:
+    """The design for less damping, so that the condition asks for no more than is available.
 
-    It is made for forces that latch at the tick, and walls that all touch.
+    It is made for forces that latch at the tick, and walls that all touch; the condition is about the loop as it is.
     """
-    share, best = 1.0, None
+    share, best, shortfall = 1.0, None, ""
     for _ in range(_MOST_ROUNDS):
         part = msgspec.structs.replace(loop, latency=None, delta=tuple(share * d for d in loop.delta))
         found = made(part)
-        needs = THIS_ENVIRONMENT.required(loop.at(loop.environment), found.coupling)
+        needs = condition.judge(loop.at(loop.environment), found.coupling)
+        shortfall = needs.shortfall
         if needs.certified:
             best = replace(found, requirement=needs)
             if needs.ratio > 1 - _UNUSED:
                 return best
+        if np.isinf(needs.ratio):
+            break
         share = min(1.0, share * (1 - _UNUSED / 2) / needs.ratio)
         if best and share == 1.0:
             return best
     if best is None:
-        what = f"a latency of {loop.latency} s" if loop.latency else "walls that make and break contact"
-        raise DesignFailed(None, (), f"no coupling was found for {what}")
+        raise DesignFailed(None, (), f"no coupling was found for {condition.name}: {shortfall}")
     return best

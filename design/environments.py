@@ -30,6 +30,7 @@ from design.conditions import (
     least_scale,
     this_environment,
     this_environment_demand,
+    this_environment_ratios,
 )
 from design.exact import require_size
 from design.frequency import MOST_SECONDS, frequencies, hermitian, on_circle, supremum, sweeping, too_long
@@ -39,7 +40,7 @@ from design.result import MAKING, NotProved, Requirement, from_ratio, refusal
 class ThisEnvironment(Condition):
     """Safe in the environment of the loop: around its walls, whether they touch or not, and at all of its members."""
 
-    name, covers, limitable = "this-environment", BEYOND, True
+    name, covers, extensible = "this-environment", BEYOND, True
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
         F = loop.F(coupling, exact)
@@ -74,6 +75,13 @@ class ThisEnvironment(Condition):
 
     def multiplier_name(self, loop: Loop) -> str | None:
         return _WALL_MULTIPLIER if loop.environment.walls else None
+
+    def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
+        return ratio_in(loop, coupling, thin)
+
+    def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
+        poles = loop.F(coupling).poles()
+        return this_environment_ratios(lambda z: loop.late(loop.sent_at(coupling, z)), poles, loop)
 
     def words(self, loop: Loop) -> str:
         return MAKING if loop.environment.walls else super().words(loop)

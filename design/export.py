@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from controller.complementarity import GROUNDED, PIVOT_ROUNDING
-from controller.limiter import Limiter
+from controller.law import Limiter
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.certificate import Verdict, lag

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -19,77 +20,90 @@ from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
 from controller.coupling import Compliance, SpringDamper
+from controller.environment import GROUND, Network, Spring
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design import lmi, spring_damper
 from design.arguments import of_kind, one_of, whole
+from design.conditions import any_environment, any_environment_demand
 from design.cone import ConeProgram, Inequality
 from design.frequency import on_circle
 from design.result import Design, DesignFailed, Requirement
 
+#: How such a coupling may be sought.
+_METHODS = ("complementarity", "inner", "fixed-poles")
+#: States per channel: each adds a row and a column to every cone; poles of those that a spring-damper does not have.
+_MOST_STATES, _SPARE_POLE = 10, 0.5
+
+
+class _Units:
+    """A loop in units T = 1 and usable damping = I, where matrix inequalities are well scaled."""
+
+    def __init__(self, shaping: lmi.Shaping, phi: Array | None) -> None:
+        loop, self.usable, self.T = shaping.loop, shaping.usable, shaping.loop.T
+        names, none = loop.environment.contacts, (0,) * loop.channels
+        anything = Network(names, tuple(Spring((name, GROUND), 1.0) for name in names))  # the condition holds for any
+        self.loop = Loop(1.0, loop.theta, none, none, (1.0,) * loop.channels, anything)
+        self.phi = None if phi is None else phi / self.usable
+
+    def si(self, V: Lti) -> Lti:
+        """V in SI units [m/N]."""
+        root = 1 / np.sqrt(self.usable)
+        return Lti(V.A, V.B * root, self.T * root[:, None] * V.C, self.T * root[:, None] * V.D * root, self.T)
+
+    def block(self, V: Lti) -> Lti:
+        """What Theorem 4 asks to be positive real, linear in what V puts out; rows of a multiplier have unit size."""
+        demand = any_environment_demand(V, self.loop, self.phi)
+        block, one = demand.gain + demand.free, np.ones(V.inputs)
+        scale = np.diag(np.append(one, 1 / np.sqrt(np.diag(block.D)[V.inputs :])))
+        return scale @ block @ scale
+
+
 # ----------------------------------------------------------------------------------------------------
 # State-space couplings of fixed order, in a realisation where both conditions are affine.
 #
-# V = V1 + (F - F z)(zI - A)^-1 B: the output is V1 u + F x - F x+. Its static compliance is V1, and what
-# the remedied (2) needs, v_hat(V), is F x + V1/2 u (design.conditions). With F held fixed, V, y2 and the loop (22)
-# are all affine in (A, B, V1). That loses nothing where F has full row rank: any such F is reached by a change of
-# state.
-
-
-#: How such a coupling may be sought.
-_METHODS = ("complementarity", "inner", "fixed-poles")
-
-#: Poles given to states beyond the first of a channel, which a spring-damper does not have.
-_MOST_STATES = 10  # per channel: each adds a row and a column to every cone
-_SPARE_POLE = 0.5
+# V = V1 + (F - F z)(zI - A)^-1 B (`Lti.with_rest`): its static compliance is V1, and its quotient, which Theorem 4
+# asks for, is -F (zI - A)^-1 B. With F held fixed, V, this quotient and the loop (22) are all affine in (A, B, V1).
+# That loses nothing where F has full row rank: any such F is reached by a change of state.
 
 
 class FixedOrder:
     """The couplings with `order` states per channel; unknowns are the free entries p of A, B and V1.
 
-    Everything is in units T = 1 and usable damping = I. `sigma` (N,) is Delta_V^-1 there, inf where psi = 0.
+    phi (N,) [N s/m] is the multiplier that psi >= 1 needs.
     """
 
-    def __init__(self, shaping: lmi.Shaping, sigma: Array, order: int = 1, diagonal: bool = True) -> None:
+    def __init__(self, shaping: lmi.Shaping, phi: Array | None = None, order: int = 1, diagonal: bool = True) -> None:
         if order < 1:
             raise ValueError(f"order is {order}, expected one state per channel or more")
-        self.loop, self.usable, self.sigma, self.order = shaping.loop, shaping.usable, sigma, order
-        N = self.loop.channels
-        self.states = N * order
-        one, row = np.eye(N), np.eye(order)[:1]
+        self.shaping, self.order, self.units = shaping, order, _Units(shaping, phi)
+        one, row = np.eye(shaping.loop.channels), np.eye(order)[:1]
         self.F = np.kron(one, row)  # reads the first state of every channel
         masks = [np.kron(one, np.ones((order, order))), np.kron(one, np.ones((order, 1))), one]
         masks = masks if diagonal else [np.ones_like(mask) for mask in masks]
+        self._shapes = [mask.shape for mask in masks]
         self._free = [np.nonzero(mask) for mask in (*masks[:2], np.triu(masks[2]))]
-        self.plant = _plant(shaping)
 
     @property
     def unknowns(self) -> int:
         return sum(rows.size for rows, _ in self._free)
 
-    def matrices(self, p: Array) -> tuple[Array, Array, Array]:
-        """A, B and V1 from their free entries."""
-        N = self.loop.channels
-        found = [np.zeros(shape) for shape in ((self.states, self.states), (self.states, N), (N, N))]
+    def unit_coupling(self, p: Array) -> Lti:
+        """V in units T = 1 and usable damping = I."""
+        found = [np.zeros(shape) for shape in self._shapes]
         ends = np.cumsum([rows.size for rows, _ in self._free])[:-1]
         for matrix, free, values in zip(found, self._free, np.split(p, ends), strict=True):
             matrix[free] = values
         A, B, V1 = found
-        return A, B, V1 + np.triu(V1, 1).T
-
-    def unit_coupling(self, p: Array) -> Lti:
-        """V in the units of this class."""
-        A, B, V1 = self.matrices(p)
-        return Lti(A, B, self.F - self.F @ A, V1 - self.F @ B, 1.0)
+        return Lti.with_rest(A, B, self.F, V1 + np.triu(V1, 1).T, 1.0)
 
     def coupling(self, p: Array) -> Lti:
         """V in SI units [m/N]."""
-        V, root, T = self.unit_coupling(p), 1 / np.sqrt(self.usable), self.loop.T
-        return Lti(V.A, V.B * root, T * root[:, None] * V.C, T * root[:, None] * V.D * root, T)
+        return self.units.si(self.unit_coupling(p))
 
     def start(self, gains: SpringDamper) -> Array:
         """p of a spring-damper; further states are driven by nothing yet, but are seen."""
-        k, b = gains.K * self.loop.T / self.usable, gains.B / self.usable
+        k, b = gains.K * self.units.T / self.units.usable, gains.B / self.units.usable
         pole = b / (k + b)
         A = np.kron(np.diag(pole), np.diag(np.eye(self.order)[0]))
         spare = np.diag(np.r_[0.0, _SPARE_POLE ** np.arange(1, self.order)]) + np.eye(self.order, k=1)
@@ -99,39 +113,14 @@ class FixedOrder:
         parts = (A, B, np.diag(1 / k))
         return np.concatenate([M[free] for M, free in zip(parts, self._free, strict=True)])
 
-    def ports(self, p: Array) -> lmi.Ports:
-        """The remedied V-hat: supply y2'u - y1'y1, y1 = Sigma^-1/2 H u, with no y1 rows where Sigma is infinite."""
-        A, B, V1 = self.matrices(p)
-        G = lmi.v_hat_ports(self.unit_coupling(p), self.loop.theta, Lti(A, B, self.F, V1 / 2, 1.0))
-        paid = np.isfinite(self.sigma)
-        weight = 1 / np.sqrt(self.sigma[paid])[:, None]
-        return G._replace(C1=G.C1[paid] * weight, D1=G.D1[paid] * weight)
+    def block(self, p: Array) -> Lti:
+        """What must be positive real, affine in p."""
+        return self.units.block(self.unit_coupling(p))
 
-    def weighted_loop(self, p: Array) -> tuple[Array, Array, Array, Array]:
-        """A, B, C, D of W1 L W2: the plant with V closed between its output u and its input v."""
-        V, (G, r) = self.unit_coupling(p), (self.plant, self.loop.channels)
-        Br, Bv = G.B[:, :r], G.B[:, r:]
-        y = G.outputs - V.inputs
-        Cy, Cu = G.C[:y], G.C[y:]
-        Dyr, Dyv, Dur = G.D[:y, :r], G.D[:y, r:], G.D[y:, :r]
-        A = np.block([[G.A + Bv @ V.D @ Cu, Bv @ V.C], [V.B @ Cu, V.A]])
-        B = np.vstack([Br + Bv @ V.D @ Dur, V.B @ Dur])
-        return A, B, np.hstack([Cy + Dyv @ V.D @ Cu, Dyv @ V.C]), Dyr + Dyv @ V.D @ Dur
-
-
-def _plant(shaping: lmi.Shaping) -> Lti:
-    """[y; u] from [r; v]: y = W1 ((I - Psi Lambda^-1 Theta) W2 r + Psi E v), u = W2 r, with v and u in unit scale."""
-    N, T = shaping.loop.channels, shaping.loop.T
-    root, one, zero = 1 / np.sqrt(shaping.usable), np.eye(N), np.zeros((N, N))
-
-    def constant(D: Array) -> Lti:
-        return Lti.constant(D, T)
-
-    weighted = Lti.diag(shaping.W2, constant(one))  # [W2 r; v]
-    copy = constant(np.block([[one, zero], [zero, one], [one, zero]]))
-    blocks = Lti.diag(shaping.late, shaping.environment @ constant(np.diag(T * root)), constant(np.diag(root)))
-    add = constant(np.block([[one, one, zero], [zero, zero, one]]))
-    return Lti.diag(shaping.W1, constant(one)) @ add @ blocks @ copy @ weighted
+    def weighted_loop(self, p: Array) -> Lti:
+        """W1 L W2, affine in p."""
+        shaping = self.shaping
+        return shaping.W1 @ (shaping.late + shaping.environment @ self.coupling(p)) @ shaping.W2
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -140,44 +129,80 @@ def _plant(shaping: lmi.Shaping) -> Lti:
 
 def _passivity_storage(family: FixedOrder, p: Array) -> Array:
     """P > 0 of the remedied (2) for the coupling p, with the most room; the coupling must satisfy it strictly."""
-    G = family.ports(p)
-    m, paid = G.D2.shape[0], G.D1.shape[0]
-    return _roomiest(lambda P: lmi.lemma1(G, P, np.eye(paid), np.zeros((m, m))), G.A.shape[0], "the storage of V-hat")
+    G = family.block(p)
+    zero = np.zeros_like(G.D)
+    return _roomiest(lambda P: lmi.lemma1(lmi.Ports.same(G), P, zero, zero), G.order, "the storage of V-hat")
 
 
 def _gain_storage(family: FixedOrder, p: Array, mu: float) -> Array:
     """U = X^-1 > 0 of Lemma 3, ||W1 L W2||_inf < mu, with the most room in coordinates of unit reachability."""
-    A, B, C, D = family.weighted_loop(p)
-    S = lmi.reachability_scaled(Lti(A, B, C, D, 1.0))
-    A, B, C, D = np.linalg.solve(S, A @ S), np.linalg.solve(S, B), C @ S / mu, D / mu
-    m = B.shape[1]
-    bounded = lmi.Ports(A, B, np.zeros((m, A.shape[0])), np.eye(m), C, D)
-    zero = np.zeros((m, m))
-    X = _roomiest(lambda X: lmi.lemma1(bounded, X, np.eye(C.shape[0]), zero), A.shape[0], "the storage of L")
+    G = family.weighted_loop(p) * (1 / mu)
+    S = lmi.reachability_scaled(G)
+    n, m = S.shape[0], G.inputs
+    bounded = lmi.Ports(np.linalg.solve(S, G.A @ S), np.linalg.solve(S, G.B), np.zeros((m, n)), np.eye(m), G.C @ S, G.D)
+    one, zero = np.eye(G.outputs), np.zeros((m, m))
+    X = _roomiest(lambda X: lmi.lemma1(bounded, X, one, zero), n, "the storage of L")
     return S @ np.linalg.inv(X) @ S.T
 
 
 def _roomiest(inequality: Callable[[Array], Array], n: int, what: str) -> Array:
     """The P that maximises s <= 1 with inequality(P) >= s I and P >= s I."""
-    size = inequality(np.zeros((n, n))).shape[0]
     every = range(lmi.packed(n) + 1)  # P and s
 
-    def storage(x: Array) -> Array:
-        return lmi.symmetric_from(x[:-1], n)
+    def roomy(of: Callable[[Array], Array]) -> Inequality:
+        def room(x: Array) -> Array:
+            matrix = of(lmi.symmetric_from(x[:-1], n))
+            return matrix - x[-1] * np.eye(len(matrix))
 
-    def most(x: Array) -> Array:
-        return 1 - x[-1:, None]
+        return Inequality.of(room, every)
 
-    def roomy(x: Array) -> Array:
-        return inequality(storage(x)) - x[-1] * np.eye(size)
+    cost = -np.eye(len(every))[-1]
+    blocks = [roomy(inequality), roomy(lambda P: P), Inequality.most(every[-1:], 1.0)]
+    return lmi.symmetric_from(ConeProgram(cost, blocks).solve(what)[:-1], n)
 
-    def positive(x: Array) -> Array:
-        return storage(x) - x[-1] * np.eye(n)
 
-    cost = np.append(np.zeros(lmi.packed(n)), -1.0)
-    return storage(
-        ConeProgram(cost, [Inequality.of(function, every) for function in (roomy, positive, most)]).solve(what)
-    )
+class _Lemmas:
+    """Lemmas 2 and 3 of a family around the coupling `at`, in coordinates where its Q and U are I and its norm is 1."""
+
+    def __init__(self, family: FixedOrder, at: Array, Q: Array, U: Array, norm: float) -> None:
+        self.at, self.LQ, self.LU, self.norm = at, np.linalg.cholesky(Q), np.linalg.cholesky(U), norm
+        self._block = _affine(family.block, at, self.LQ)
+        self._loop = _affine(lambda p: family.weighted_loop(p) * (1 / norm), at, self.LU)
+
+    def inequalities(self, parts: Callable[[Array], Sequence[Any]], every: range) -> list[Inequality]:
+        """Of unknowns with `parts` p - at, Q, Q^-1, U, U^-1 and mu^2."""
+
+        def passivity(v: Array) -> Array:
+            p, Q, Y, *_ = parts(v)
+            A, B, C, D = self._block(p)
+            return lmi.lemma2(lmi.Ports(A, B, C, D, C, D), Q, Y, None, np.zeros_like(D))
+
+        def gain(v: Array) -> Array:
+            p, _, _, U, X, mu2 = parts(v)
+            return lmi.lemma3(*self._loop(p), X, U, mu2)
+
+        return [Inequality.of(passivity, every), Inequality.of(gain, every)]
+
+
+_System = tuple[Array, Array, Array, Array]  # A, B, C, D
+
+
+def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Array], _System]:
+    """p - at -> A, B, C, D of a system that is affine in p, with the states L^-1 x."""
+    n = L.shape[0]
+
+    def whole(p: Array) -> Array:
+        G = system(at + p)
+        return np.block([[np.linalg.solve(L, G.A @ L), np.linalg.solve(L, G.B)], [G.C @ L, G.D]])
+
+    constant, *values = (whole(p) for p in np.eye(at.size + 1, at.size, k=-1))
+    slopes = np.stack(values) - constant
+
+    def matrices(p: Array) -> _System:
+        M = constant + np.tensordot(p, slopes, axes=1)
+        return M[:n, :n], M[:n, n:], M[n:, :n], M[n:, n:]
+
+    return matrices
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -203,48 +228,31 @@ def descend(family: FixedOrder, p: Array, norm: float) -> Iterator[Array]:
     Q = np.linalg.inv(_passivity_storage(family, p))
     U = _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
     while min(np.linalg.eigvalsh(Q)[0], np.linalg.eigvalsh(U)[0]) > 0:
-        p, Q, U = _step(family, p, Q, U, norm)
+        p, Q, U = _step(_Lemmas(family, p, Q, U, norm))
         yield p
 
 
-def _step(family: FixedOrder, at: Array, Q0: Array, U0: Array, norm: float) -> tuple[Array, Array, Array]:
-    """One SDP in x = (p - at, Q, U, mu^2/norm^2), Q and U in coordinates where Q0 = U0 = I."""
-    LQ, LU = np.linalg.cholesky(Q0), np.linalg.cholesky(U0)
-    nq, nu = Q0.shape[0], U0.shape[0]
-    ends = np.cumsum([family.unknowns, lmi.packed(nq), lmi.packed(nu)])
+def _step(lemmas: _Lemmas) -> tuple[Array, Array, Array]:
+    """p, Q and U after one SDP in (p - at, Q, U, mu^2/norm^2)."""
+    nq, nu = lemmas.LQ.shape[0], lemmas.LU.shape[0]
+    ends = np.cumsum([lemmas.at.size, lmi.packed(nq), lmi.packed(nu)])
     every = range(ends[-1] + 1)
 
-    def split(v: Array) -> tuple[Array, Array, Array, float]:
+    def parts(v: Array) -> Sequence[Any]:
         p, q, u, t = np.split(v, ends)
-        return at + p, lmi.symmetric_from(q, nq), lmi.symmetric_from(u, nu), t[0]
+        Q, U = lmi.symmetric_from(q, nq), lmi.symmetric_from(u, nu)
+        return p, Q, 2 * np.eye(nq) - Q, U, 2 * np.eye(nu) - U, t[0]
 
-    def passivity(v: Array) -> Array:
-        p, Q, _, _ = split(v)
-        G = _in_coordinates(family.ports(p), LQ)
-        sigma = np.eye(G.C1.shape[0]) if G.C1.size else None
-        return lmi.lemma2(G, Q, 2 * np.eye(nq) - Q, sigma, np.zeros_like(G.D2))
-
-    def gain(v: Array) -> Array:
-        p, _, U, t = split(v)
-        A, B, C, D = family.weighted_loop(p)
-        A, B, C = np.linalg.solve(LU, A @ LU), np.linalg.solve(LU, B), C @ LU / norm
-        return lmi.lemma3(A, B, C, D / norm, 2 * np.eye(nu) - U, U, t)
-
-    storages: list[Callable[[Array], Array]] = [
-        lambda v: split(v)[1] - _LEAST * np.eye(nq),
-        lambda v: split(v)[2] - _LEAST * np.eye(nu),
-        lambda v: _MOST * np.eye(nq) - split(v)[1],
-        lambda v: _MOST * np.eye(nu) - split(v)[2],
+    bounds: list[Callable[[Array], Array]] = [
+        lambda v: parts(v)[1] - _LEAST * np.eye(nq),
+        lambda v: parts(v)[3] - _LEAST * np.eye(nu),
+        lambda v: _MOST * np.eye(nq) - parts(v)[1],
+        lambda v: _MOST * np.eye(nu) - parts(v)[3],
     ]
-    blocks = [Inequality.of(function, every) for function in (passivity, gain, *storages)]
+    blocks = [*lemmas.inequalities(parts, every), *(Inequality.of(bound, every) for bound in bounds)]
     problem = ConeProgram(np.append(np.zeros(ends[-1]), 1.0), blocks)
-    p, Q, U, _ = split(problem.solve("a step of the inner convex approximation"))
-    return p, LQ @ Q @ LQ.T, LU @ U @ LU.T
-
-
-def _in_coordinates(G: lmi.Ports, L: Array) -> lmi.Ports:
-    """G with the states L^-1 x."""
-    return lmi.Ports(np.linalg.solve(L, G.A @ L), np.linalg.solve(L, G.B), G.C2 @ L, G.D2, G.C1 @ L, G.D1)
+    p, Q, _, U, *_ = parts(problem.solve("a step of the inner convex approximation"))
+    return lemmas.at + p, lemmas.LQ @ Q @ lemmas.LQ.T, lemmas.LU @ U @ lemmas.LU.T
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -252,7 +260,7 @@ def _in_coordinates(G: lmi.Ports, L: Array) -> lmi.Ports:
 #
 # For a given mu the inversions Y = Q^-1 and X = U^-1 are relaxed to [[Y, I], [I, Q]] >= 0 and [[X, I], [I, U]] >= 0,
 # and tr(QY) + tr(UX), which reaches its least value only where they hold, is linearised and minimised again and
-# again; mu is found by bisection. The sequence stalls far from the optimum, which is why `inner_convex` exists.
+# again; mu is found by bisection. The sequence stalls far from the optimum, which is why `descend` exists.
 
 
 #: Linearised problems per value of mu, and the relative width at which bisection ends.
@@ -264,11 +272,12 @@ def _bisect(
     family: FixedOrder, p: Array, norm: float, holds: Callable[[Array, float], bool], budget: int
 ) -> tuple[Array, int]:
     """(the best coupling, SDPs spent). `holds(p, mu)` judges a coupling from itself alone; p holds for its norm."""
-    relaxed = _Relaxed(family, p, norm)
+    Q, U = np.linalg.inv(_passivity_storage(family, p)), _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
+    lemmas = _Lemmas(family, p, Q, U, norm)
     low, high, best, sdps = 0.5 * norm, norm, p, 0
     while high - low > _WIDTH * high and sdps < budget:
         mu = (low + high) / 2
-        found, spent = relaxed.search(mu, holds, min(_PATIENCE, budget - sdps))
+        found, spent = _complementary(lemmas, mu, holds, min(_PATIENCE, budget - sdps))
         sdps += spent
         if found is None:
             low = mu
@@ -277,67 +286,44 @@ def _bisect(
     return best, sdps
 
 
-class _Relaxed:
-    """The relaxed problem in coordinates where the start's Q and U are the identity."""
+def _complementary(
+    lemmas: _Lemmas, mu: float, holds: Callable[[Array, float], bool], patience: int
+) -> tuple[Array | None, int]:
+    """(a coupling that holds for mu or None, SDPs spent)."""
+    sizes = (lemmas.LQ.shape[0],) * 2 + (lemmas.LU.shape[0],) * 2  # of Q, Y, U and X
+    ends = np.cumsum([lemmas.at.size, *map(lmi.packed, sizes)])
 
-    def __init__(self, family: FixedOrder, p: Array, norm: float) -> None:
-        self.family, self.at, self.norm = family, p, norm
-        self.LQ = np.linalg.cholesky(np.linalg.inv(_passivity_storage(family, p)))
-        self.LU = np.linalg.cholesky(_gain_storage(family, p, norm * (1 + _FIRST_ROOM)))
-        self.sizes = (self.LQ.shape[0],) * 2 + (self.LU.shape[0],) * 2
-        self.ends = np.cumsum([family.unknowns, *map(lmi.packed, self.sizes)])[:-1]
+    def parts(v: Array) -> Sequence[Any]:
+        p, *vectors = np.split(v, ends[:-1])
+        return p, *map(lmi.symmetric_from, vectors, sizes), (mu / lemmas.norm) ** 2
 
-    def split(self, v: Array) -> tuple[Array, list[Array]]:
-        """p and [Q, Y, U, X] from the vector of unknowns."""
-        p, *vectors = np.split(v, self.ends)
-        return self.at + p, [lmi.symmetric_from(u, n) for u, n in zip(vectors, self.sizes, strict=True)]
+    def pair(first: int) -> Callable[[Array], Array]:
+        one = np.eye(sizes[first])
+        return lambda v: lmi.symmetric([[parts(v)[first + 2], one], [one, parts(v)[first + 1]]])
 
-    def search(self, mu: float, holds: Callable[[Array, float], bool], patience: int) -> tuple[Array | None, int]:
-        """(a coupling that holds for mu or None, SDPs spent)."""
-        blocks = self._blocks(mu)
-        matrices = [np.eye(n) for n in self.sizes]
-        for spent in range(1, patience + 1):
-            try:
-                x = ConeProgram(self._inner(matrices), blocks).solve("a step of cone complementarity")
-            except DesignFailed:
-                return None, spent
-            p, matrices = self.split(x)
-            if holds(p, mu):
-                return p, spent
-        return None, patience
-
-    def _inner(self, at: Sequence[Array]) -> Array:
-        """The slopes of tr(Y0 Q) + tr(Q0 Y) + tr(X0 U) + tr(U0 X)."""
-        Q0, Y0, U0, X0 = at
-        both = [2 * M - np.diag(np.diag(M)) for M in (Y0, Q0, X0, U0)]
-        return np.concatenate([np.zeros(self.family.unknowns), *(M[np.triu_indices(len(M))] for M in both)])
-
-    def _blocks(self, mu: float) -> list[Inequality]:
-        def passivity(v: Array) -> Array:
-            p, (Q, Y, _, _) = self.split(v)
-            G = _in_coordinates(self.family.ports(p), self.LQ)
-            sigma = np.eye(G.C1.shape[0]) if G.C1.size else None
-            return lmi.lemma2(G, Q, Y, sigma, np.zeros_like(G.D2))
-
-        def gain(v: Array) -> Array:
-            p, (_, _, U, X) = self.split(v)
-            A, B, C, D = self.family.weighted_loop(p)
-            A, B, C = np.linalg.solve(self.LU, A @ self.LU), np.linalg.solve(self.LU, B), C @ self.LU / self.norm
-            return lmi.lemma3(A, B, C, D / self.norm, X, U, (mu / self.norm) ** 2)
-
-        def pair(first: int) -> Callable[[Array], Array]:
-            one = np.eye(self.sizes[first])
-            return lambda v: lmi.symmetric([[self.split(v)[1][first + 1], one], [one, self.split(v)[1][first]]])
-
-        every = range(self.family.unknowns + sum(map(lmi.packed, self.sizes)))
-        return [Inequality.of(f, every) for f in (passivity, gain, pair(0), pair(2))]
+    every = range(ends[-1])
+    blocks = [*lemmas.inequalities(parts, every), *(Inequality.of(pair(i), every) for i in (0, 2))]
+    Q, Y, U, X = map(np.eye, sizes)
+    for spent in range(1, patience + 1):
+        # the slopes of tr(Y0 Q) + tr(Q0 Y) + tr(X0 U) + tr(U0 X)
+        both = [(2 * M - np.diag(np.diag(M)))[np.triu_indices(len(M))] for M in (Y, Q, X, U)]
+        try:
+            x = ConeProgram(np.concatenate([np.zeros(lemmas.at.size), *both]), blocks).solve(
+                "a step of complementarity"
+            )
+        except DesignFailed:
+            return None, spent
+        p, Q, Y, U, X, _ = parts(x)
+        if holds(lemmas.at + p, mu):
+            return lemmas.at + p, spent
+    return None, patience
 
 
 # ----------------------------------------------------------------------------------------------------
 # Diagonal couplings with given poles: one convex problem, globally optimal for those poles.
 #
-# V_i = v_i + sum_j f_ij (1 - z)/(z - a_ij). With the poles fixed, the remedied (2) is linear in the storage P and in
-# (v, f), and W1 L W2 is affine in (v, f): its norm is bounded at sampled frequencies, with cutting planes.
+# V_i = v_i + sum_j f_ij (1 - z)/(z - a_ij). With the poles fixed, Lemma 1 is linear in the storage P and in (v, f),
+# and W1 L W2 is affine in (v, f): its norm is bounded at sampled frequencies, with cutting planes.
 
 
 #: Relative gap between the norm on a refined sweep and the bound at the sampled frequencies.
@@ -348,8 +334,8 @@ _MOST_CUTS = 20
 class FixedPoles:
     """The problem for one loop; frequencies that were binding are kept from one set of poles to the next."""
 
-    def __init__(self, shaping: lmi.Shaping, sigma: Array) -> None:
-        self.loop, self.sigma, self.shaping = shaping.loop, sigma, shaping
+    def __init__(self, shaping: lmi.Shaping, phi: Array | None = None) -> None:
+        self.shaping, self.phi, self.units = shaping, phi, _Units(shaping, phi)
         self.frequencies = [0.0]
         self.sdps = 0
 
@@ -358,78 +344,59 @@ class FixedPoles:
         cuts = 0
         while True:
             V, bound = self._solve(poles)
-            norm, peak = self.shaping.norm(V)
-            if norm <= bound * (1 + _GAP):
+            (norm, peak), cuts = self.shaping.norm(V), cuts + 1
+            if norm <= bound * (1 + _GAP) or cuts == _MOST_CUTS:
                 return V, norm
             self.frequencies.append(peak)
-            cuts += 1
-            if cuts == _MOST_CUTS:
-                return V, norm
 
-    def search(self, start: Sequence[float], holds: Callable[[Lti], bool], evaluations: int = 60) -> tuple[Lti, float]:
-        """`best` over one pole per channel, by a simplex search from `start`; only poles whose V `holds` count.
-
-        The search would otherwise be drawn to poles at which a solver's tolerance passes for passivity.
-        """
+    def search(self, start: Sequence[float], evaluations: int = 60) -> tuple[Lti, float]:
+        """`best` over one pole per channel, by a simplex search from `start`."""
 
         def norm(x: Array) -> float:
             try:
-                V, value = self.best([[a] for a in np.tanh(x)])
+                return self.best([[a] for a in np.tanh(x)])[1]
             except DesignFailed:
                 return np.inf
-            return value if holds(V) else np.inf
 
         options = {"maxfev": evaluations, "xatol": 1e-3, "fatol": 1e-4}
         found = minimize(norm, np.arctanh(start), method="Nelder-Mead", options=options)
         return self.best([[a] for a in np.tanh(found.x)])
 
     def _solve(self, poles: Sequence[Sequence[float]]) -> tuple[Lti, float]:
-        N = self.loop.channels
-        states = sum(map(len, poles)) + sum(self.loop.theta)
-        gains, entries = N + sum(map(len, poles)), lmi.packed(states)
+        N, ends = len(poles), np.cumsum([len(a) for a in poles])
+        A = np.diag(np.concatenate(poles))
+        B = np.asarray(block_diag(*(np.sqrt(1 - np.square(a))[:, None] for a in poles)))
+
+        def unit(x: Array) -> Lti:
+            F = np.asarray(block_diag(*(row[None] for row in np.split(x[N : N + ends[-1]], ends[:-1]))))
+            return Lti.with_rest(A, B, F, np.diag(x[:N]), 1.0)
+
+        gains = N + ends[-1]
+        states = self.units.block(unit(np.zeros(gains))).order
 
         def storage(x: Array) -> Array:
             return lmi.symmetric_from(x[gains:], states)
 
-        every = range(gains + entries)
-        passive = Inequality.of(lambda x: self._passivity(poles, x[:gains], storage(x)), every)
-        cost = np.append(np.zeros(len(every)), 1.0)  # t is the last
-        cuts = self._cuts(poles, [*range(gains), len(every)])
-        x = ConeProgram(cost, [passive, Inequality.of(storage, every), cuts]).solve("the coupling with fixed poles")
-        self.sdps += 1
-        return self._coupling(poles, x[:gains]), float(np.sqrt(x[-1]))
+        def passive(x: Array) -> Array:
+            block = self.units.block(unit(x))
+            zero = np.zeros_like(block.D)
+            return lmi.lemma1(lmi.Ports.same(block), storage(x), zero, zero)
 
-    def _unit(self, poles: Sequence[Sequence[float]], gains: Array) -> Lti:
-        """V in units T = 1 and usable damping = I."""
-        N = len(poles)
-        V1, f = np.diag(gains[:N]), np.split(gains[N:], np.cumsum([len(a) for a in poles])[:-1])
-        A = np.diag(np.concatenate(poles))
-        B = np.asarray(block_diag(*(np.sqrt(1 - np.square(a))[:, None] for a in poles)))
-        F = np.asarray(block_diag(*(row[None, :] for row in f)))
-        return Lti(A, B, F - F @ A, V1 - F @ B, 1.0)
-
-    def _coupling(self, poles: Sequence[Sequence[float]], gains: Array) -> Lti:
-        V, root, T = self._unit(poles, gains), 1 / np.sqrt(self.shaping.usable), self.loop.T
-        return Lti(V.A, V.B * root, T * root[:, None] * V.C, T * root[:, None] * V.D * root, T)
-
-    def _passivity(self, poles: Sequence[Sequence[float]], gains: Array, P: Array) -> Array:
-        """The remedied (2) with the excess term by a Schur complement, so that it is linear in (gains, P)."""
-        G = lmi.v_hat_ports(self._unit(poles, gains), self.loop.theta)
-        zero = np.zeros_like(G.D1)
-        plain = lmi.lemma1(G, P, zero, zero)
-        paid = np.isfinite(self.sigma)
-        excess = np.hstack([G.C1, G.D1])[paid] / np.sqrt(self.sigma[paid])[:, None]
-        return lmi.symmetric([[plain, excess.T], [excess, np.eye(excess.shape[0])]])
-
-    def _cuts(self, poles: Sequence[Sequence[float]], unknowns: Sequence[int]) -> Inequality:
-        """[[I, L*], [L, t I]] >= 0 for W1 L W2 at the binding frequencies."""
+        every = range(gains + lmi.packed(states))
         w = np.array(self.frequencies)
         left, right, late = self.shaping.parts(w)
-        units = np.eye(len(unknowns) - 1)
-        slopes = np.stack([left @ self._coupling(poles, e).at(on_circle(w)) @ right for e in units])
-        m = right.shape[-1]
-        base = np.broadcast_to(np.eye(m), (w.size, m, m)).astype(np.complex128)
-        return lmi.gain_block(unknowns, late @ right, slopes, base, np.zeros((len(units), w.size, m, m)))
+        slopes = np.stack([left @ self.units.si(unit(e)).at(on_circle(w)) @ right for e in np.eye(gains)])
+        # [[I, L*], [L, t I]] >= 0 for W1 L W2 at the binding frequencies; t is the last unknown
+        base = np.eye(N, dtype=np.complex128) * np.ones((w.size, 1, 1))
+        cuts = lmi.gain_block([*range(gains), len(every)], late @ right, slopes, base, 0 * slopes[:, :, :N])
+        blocks = [Inequality.of(passive, every), Inequality.of(storage, every), cuts]
+
+        def certified(x: Array) -> bool:  # or poles are chosen at which a solver's tolerance passes for passivity
+            return any_environment(self.units.si(unit(x)), self.shaping.loop, self.phi).certified
+
+        x = ConeProgram(np.append(np.zeros(len(every)), 1.0), blocks).solve("the coupling with fixed poles", certified)
+        self.sdps += 1
+        return self.units.si(unit(x)), float(np.sqrt(x[-1]))
 
 
 #: The start is designed for this much less damping, so that it is strictly feasible.
@@ -476,8 +443,7 @@ class _Search:
     def __init__(self, loop: Loop, order: int, diagonal: bool, start: SpringDamper | None) -> None:
         self.loop, self.shaping, self.sdps = loop, lmi.Shaping(loop), 0
         self.phi = lmi.least_phi(loop)
-        self.sigma = spring_damper.excess_limits(loop, self.phi)
-        self.family = FixedOrder(self.shaping, self.sigma, order, diagonal)
+        self.family = FixedOrder(self.shaping, self.phi, order, diagonal)
         self.gains = start or self._structured()
 
     def requirement(self, V: Lti) -> Requirement:
@@ -489,7 +455,11 @@ class _Search:
             V = self._fixed_poles(most_sdps)
         else:
             p = self.family.start(self.gains)
-            p = self._inner(p, most_sdps) if method == "inner" else self._complementarity(p, most_sdps)
+            if method == "inner":
+                p = self._inner(p, most_sdps)
+            else:
+                p, spent = _bisect(self.family, p, self._norm(p), self._holds, most_sdps)
+                self.sdps += spent
             V = self.family.coupling(p)
         if not self.requirement(V).certified:
             raise DesignFailed(None, (), f"{method} gave no coupling that Theorem 4 certifies")
@@ -503,7 +473,7 @@ class _Search:
         return found.coupling
 
     def _inner(self, p: Array, most_sdps: int) -> Array:
-        norm = self.shaping.norm(self.family.coupling(p))[0]
+        norm = self._norm(p)
         steps = descend(self.family, p, norm)
         for _ in range(most_sdps):
             try:
@@ -513,21 +483,18 @@ class _Search:
             if trial is None or not self._holds(trial, norm):
                 break
             self.sdps += 1
-            before, norm, p = norm, self.shaping.norm(self.family.coupling(trial))[0], trial
+            before, norm, p = norm, self._norm(trial), trial
             if before - norm < _SETTLED * norm:
                 break
         return p
 
-    def _complementarity(self, p: Array, most_sdps: int) -> Array:
-        norm = self.shaping.norm(self.family.coupling(p))[0]
-        p, spent = _bisect(self.family, p, norm, self._holds, most_sdps)
-        self.sdps += spent
-        return p
+    def _norm(self, p: Array) -> float:
+        return self.shaping.norm(self.family.coupling(p))[0]
 
     def _fixed_poles(self, most_sdps: int) -> Lti:
-        problem = FixedPoles(self.shaping, self.sigma)
+        problem = FixedPoles(self.shaping, self.phi)
         rate = self.gains.B / (self.gains.B + self.gains.K * self.loop.T)
-        V, _ = problem.search(rate.tolist(), lambda V: self.requirement(V).certified, evaluations=most_sdps)
+        V, _ = problem.search(rate.tolist(), most_sdps)
         self.sdps += problem.sdps
         return V
 

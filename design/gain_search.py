@@ -3,26 +3,33 @@
 The set is not convex in (K, B), so nothing here is proved best. The rms mismatch is minimised by sequential quadratic
 programming with the condition at sampled frequencies; where the refined sweep of the condition finds it violated in
 between, that frequency is added and the search resumed. What is returned passes that sweep.
+
+A condition is asked for its block at G = 0 and G = I, and with its multiplier 0 and 1, once for the frequencies: it is
+affine in both, channel by channel, so these responses have all its values and slopes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.loop import DelayRange, Loop
-from controller.lti import Array, Sampled
+from controller.lti import Array, Complex, Sampled
 from design.conditions import even_damping, this_environment, this_environment_demand
 from design.frequency import frequencies, hermitian, on_circle
-from design.lmi import RESERVE, Complex
+from design.lmi import RESERVE
 from design.multipliers import (
     BETA,
     Lags,
     half_widths,
+    limiter_demand,
     limiter_lag,
     switching_block,
     switching_sweep,
@@ -38,15 +45,11 @@ if TYPE_CHECKING:  # slow to load
 _SAMPLED_RESERVE = 1.5 * RESERVE
 _SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
 _CLOSEST_POLE = 1e-5  # from the unit circle
-_FIRST_WEIGHT, _MOST_WEIGHT = 0.5, 5.0  # of the limiter's multiplier
 _STUCK = 1e-3  # a search that leaves the sampled condition violated by this has no feasible point nearby
 _MOST_ROUNDS = 8
 #: Devices up to which steps are cheap; steps from every start beyond, from the likeliest one, and from each of these.
 FEW, _MOST_STEPS = 12, (15, 60, 100)
 _ROUGH = 0.01  # a violation that further steps will mend
-
-
-_Responses = tuple[Complex, Complex, Complex]  # (z-1)/(Tz), Psi E and Theta at some frequencies
 _DIFFERENCE = 1e-7
 
 
@@ -55,36 +58,41 @@ def damper_rate(z: Complex, T: float) -> Complex:
     return SpringDamper([1.0], [1.0]).sampled(z, T).inverse().G[..., 0, 0] - 1
 
 
-def polynomials(theta: int, w: Array) -> tuple[Array, Array]:
-    """1 + ... + z^-theta and 1 - z^-n at exp(jw), complex, (w,) each."""
-    n = theta + 1
-    turned = np.exp(-1j * w * n)
-    still = np.abs(np.exp(-1j * w) - 1) < 1e-12
-    window = np.where(still, n, (1 - turned) / np.where(still, 1, 1 - np.exp(-1j * w)))
-    return window, 1 - turned
+@dataclass(frozen=True, eq=False)
+class _Around:
+    """The loop around sampled responses, for gains at x: G = (I + Psi E V)^-1 Psi E and how gains move it."""
+
+    x: Array
+    G: Complex  # (k, m, m)
+    by: Array | Complex  # (2, k, m) an unknown of channel i, log K or B/delta, moves G by G[:, i] by[., i] G[i, :]
 
 
 class SampledLoop:
     """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta, ..).
 
-    The gains are the first 2N entries; behind them are the unknowns of a condition's multiplier, where it has some.
+    The gains are the first 2m entries; behind them are the unknowns of a condition's multiplier, where it has some.
     """
+
+    #: the channels that have a second row in the block, with an unknown multiplier, and its bounds in x
+    active: NDArray[np.intp] = np.zeros(0, dtype=int)
+    bounds = (0.0, 0.0)
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.loop, self.E = loop, loop.E()
         per_hz = 2 * np.pi * loop.T
         low, high = (per_hz * f for f in band_hz)
-        self.band = frequencies(self.E, low=low, high=min(high, np.pi), points=80)
-        self.conditions = frequencies(self.E, low=1e-3, points=80)
-        self.loop_in_band = self._responses(self.band)
-        self.loop_at_conditions, self.of_one = self._responses(self.conditions), self._of_one()
-        E = self.E.at(on_circle(self.band))
-        self.size2 = (np.abs(E) ** 2).sum(axis=(1, 2))
-        self.target = delay(loop.lam, loop.T).at(on_circle(self.band)) @ E
         self.delta = even_damping(loop)
         self.root = np.sqrt(loop.T / self.delta)
-        self._last: tuple[_Responses, Array, Array, Complex] | None = None
-        self._known: dict[int, tuple[_Responses, Array, tuple[Complex, Array, Complex, Complex]]] = {}
+        self.reserved = msgspec.structs.replace(loop, delta=tuple((1 - _SAMPLED_RESERVE) * d for d in loop.delta))
+        self.band = frequencies(self.E, low=low, high=min(high, np.pi), points=80)
+        E = Sampled.of(self.E, on_circle(self.band)[None])
+        one = Sampled(E.z, np.broadcast_to(np.eye(loop.channels, dtype=complex), E.G.shape), E.T)
+        self.late = loop.late(one).G[0]  # Theta
+        self.size2 = (np.abs(E.G[0]) ** 2).sum(axis=(1, 2))
+        self.target = delay(loop.lam, loop.T).at(E.z[0]) @ E.G[0]
+        self._known: dict[str, _Around] = {}
+        self._delayed = {"band": self._responses(self.band)}
+        self._impose(frequencies(self.E, low=1e-3, points=80))
 
     def coupling(self, x: Array) -> SpringDamper:
         log_k, b = np.split(self._gains(x), 2)
@@ -100,105 +108,137 @@ class SampledLoop:
         """What the refined sweep of its condition says of the gains at x."""
         return this_environment(self.loop.F(self.coupling(x)), self.loop)
 
-    def add(self, w: float) -> None:
-        """Impose the condition at the frequency w [rad/sample] too."""
-        self.conditions = np.append(self.conditions, w)
-        self.loop_at_conditions, self.of_one = self._responses(self.conditions), self._of_one()
+    def block(self, G: Sampled, mu: Array) -> Sampled:
+        """What must be positive real at the damping that is spent, affine in G and the multiplier mu (active,)."""
+        demand = this_environment_demand(self.loop.late(G), self.reserved)
+        return demand.free + demand.gain
+
+    def mu(self, x: Array) -> tuple[Array, Array]:
+        """The multiplier in x and its derivative by what is in x, (active,) each."""
+        return np.zeros(0), np.zeros(0)
 
     def multiplier(self, x: Array) -> Lags | None:
         """The limiter's multiplier c in x, where the condition has one."""
         return None
 
-    def _of_one(self) -> Complex:
-        """The block of this-environment without its damping where F is 1, (k,): it is proportional to F."""
-        F = Sampled(
-            on_circle(self.conditions)[None], np.ones((1, self.conditions.size, 1, 1), dtype=np.complex128), self.loop.T
-        )
-        return this_environment_demand(F, self.loop.channel(0)).free.G[0, :, 0, 0]
+    def add(self, w: float) -> None:
+        """Impose the condition at the frequency w [rad/sample] too."""
+        self._impose(np.append(self.conditions, w))
 
-    def _responses(self, w: Array) -> _Responses:
-        """(z-1)/(Tz), Psi E and Theta at exp(jw)."""
-        loop, z = self.loop, on_circle(w)
-        delayed = delay(loop.psi, loop.T).at(z) @ self.E.at(z)
-        return (z - 1) / (loop.T * z), delayed, delay(loop.theta, loop.T).at(z)
+    def _impose(self, w: Array) -> None:
+        """Sample loop and condition at w (k,): the entries of the block for G and mu of 0 and 1, and their slopes."""
+        self.conditions, m = w, self.loop.channels
+        self._delayed["conditions"] = self._responses(w)
+        self._known.clear()
+        self._last: tuple[Array, Array, Complex] | None = None
+        z, shape = on_circle(w)[None], (1, w.size, m, m)
 
-    def force(self, x: Array, responses: _Responses) -> Complex:
-        """F = Theta G (G + Psi E)^-1 Psi E with G = V^-1, (k, N, N)."""
-        by, b, _, right = self._solved(self._gains(x), responses)
-        g = by[0] + by[1] * b
-        return np.diagonal(responses[2], axis1=1, axis2=2)[:, :, None] * g[:, :, None] * right
+        def entries(G: float, mu: float) -> Complex:
+            response = Sampled(z, np.broadcast_to(np.asarray(G * np.eye(m), np.complex128), shape), self.loop.T)
+            H = self.block(response, np.full(self.active.size, mu)).G[0]
+            first, second = np.arange(m), np.arange(m, m + self.active.size)
+            rows = np.concatenate([first, second, self.active, second])
+            return H[:, rows, np.concatenate([first, self.active, second, second])]
 
-    def _solved(self, x: Array, responses: _Responses) -> tuple[Complex, Array, Complex, Complex]:
-        """(dG by log K and by B/delta, (2, k, N); B/delta; S = (G + Psi E)^-1; S Psi E) at x; the last is remembered.
+        none, of_G, of_mu = entries(0, 0), entries(1, 0), entries(0, 1)
+        self._affine = none, of_G - none, of_mu - none, entries(1, 1) - of_G - of_mu + none
 
-        An unknown of channel i moves F by (Theta Psi E S)[:, i] (S Psi E)[i, :] times dG.
-        """
-        (D, E, _), N = responses, self.loop.channels
-        known = self._known.get(D.size)
-        if known is None or known[0] is not responses or not np.array_equal(known[1], x):
-            log_k, b = np.split(x, 2)
-            by = np.stack([np.broadcast_to(np.exp(log_k), (D.size, N)), D[:, None] * self.delta])
-            S = np.linalg.inv((by[0] + by[1] * b)[:, :, None] * np.eye(N) + E)
-            known = self._known[D.size] = (responses, x.copy(), (by, b, S, S @ E))
-        return known[2]
+    def _responses(self, w: Array) -> Sampled:
+        """Psi E at exp(jw)."""
+        return Sampled.of(delay(self.loop.psi, self.loop.T) @ self.E, on_circle(w)[None])
+
+    def _around(self, x: Array, where: str) -> _Around:
+        """The loop at the frequencies of the band or of the conditions; that of the last x is remembered."""
+        gains, known = self._gains(x), self._known.get(where)
+        if known is None or not np.array_equal(known.x, gains):
+            coupling, delayed = self.coupling(x), self._delayed[where]
+            V = np.diagonal(coupling.sampled(delayed.z, delayed.T).G[0], axis1=1, axis2=2)
+            of_b = damper_rate(delayed.z[0], delayed.T)[:, None] * self.delta
+            by = V**2 * np.stack([np.broadcast_to(coupling.K, of_b.shape), of_b])
+            known = self._known[where] = _Around(gains.copy(), coupling.around(delayed).G[0], by)
+        return known
 
     def square_mismatch(self, x: Array) -> float:
         """Logarithm of the mean over log frequency of ||M||_F^2 / ||E||_F^2."""
-        M = self.force(x, self.loop_in_band) - self.target
-        ratio = (np.abs(M) ** 2).sum(axis=(1, 2)) / self.size2
         log_w = np.log(self.band)
-        return float(np.log(np.trapezoid(ratio, log_w) / (log_w[-1] - log_w[0])))
+        return float(np.log(self._mean(x) / (log_w[-1] - log_w[0])))
+
+    def _mean(self, x: Array) -> float:
+        M = self.late @ self._around(x, "band").G - self.target
+        return float(np.trapezoid((np.abs(M) ** 2).sum(axis=(1, 2)) / self.size2, np.log(self.band)))
 
     def square_mismatch_slope(self, x: Array) -> Array:
         """Its gradient by x; the unknowns behind the gains do not move it."""
-        _, E, theta = self.loop_in_band
-        by, _, S, right = self._solved(self._gains(x), self.loop_in_band)
-        M, log_w = self.force(x, self.loop_in_band) - self.target, np.log(self.band)
-        back = right @ M.conj().swapaxes(1, 2) @ theta @ E
-        moved = 2 * (np.einsum("kij,kji->ki", back, S) * by).real
-        total = np.trapezoid((np.abs(M) ** 2).sum(axis=(1, 2)) / self.size2, log_w)
-        slope = np.trapezoid(moved / self.size2[:, None], log_w, axis=1).ravel() / total
+        around = self._around(x, "band")
+        F = self.late @ around.G
+        back = np.einsum("kij,kji->ki", around.G @ (F - self.target).conj().swapaxes(1, 2), F)
+        moved = 2 * (back * around.by).real / self.size2[:, None]
+        slope = np.trapezoid(moved, np.log(self.band), axis=1).ravel() / self._mean(x)
         return np.concatenate([slope, np.zeros(x.size - slope.size)])
 
     def room(self, x: Array) -> Array:
-        """1 - SAMPLED_RESERVE less the damping ratio that each sampled frequency asks for; (k,), or (k + 1,).
+        """The least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency; (k,), or (k + 1,).
 
         Delay in the environment can make the loop unstable where the sampled condition still holds, so there the
         distance of its poles from the circle is the last entry.
         """
-        room = 1 - _SAMPLED_RESERVE + self._least(x)[0]
+        room = self._least(x)[0]
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def room_slope(self, x: Array) -> Array:
-        """The gradient of `room`, (k, 2N) or (k + 1, 2N); poles are differenced."""
-        _, E, theta = self.loop_at_conditions
-        by, _, S, right = self._solved(x, self.loop_at_conditions)
-        v = self._least(x)[1][:, :, None]
-        into = (v.conj().swapaxes(1, 2) @ theta @ E @ S)[:, 0]
-        turned = into * (right @ v)[:, :, 0] * self.of_one[:, None]
-        slope = np.concatenate([*(turned * by).real], axis=1)
-        if not any(self.loop.psi):
-            return slope
-        return np.vstack([slope, self._stability_slope(x)])
+        """The gradient of `room`; poles are differenced."""
+        around, (_, v), (mu, moves) = self._around(x, "conditions"), self._least(x), self.mu(x)
+        m, active = self.loop.channels, self.active
+        Gv = np.einsum("kij,kj->ki", around.G, v[:, :m])
+        _, of_G, of_mu, of_both = self._affine
+        of_G = of_G + of_both * self._spread(mu)
+        left = v[:, :m].conj() * of_G[:, :m]
+        left[:, active] += v[:, m:].conj() * of_G[:, m : m + active.size]
+        turned = np.einsum("ki,kij->kj", left, around.G) * Gv
+        slope = [*(turned * around.by).real]
+        if active.size:
+            rows = np.concatenate([v[:, :m], v[:, m:], v[:, active], v[:, m:]], axis=1).conj()
+            here = np.concatenate([v[:, :m], v[:, active], v[:, m:], v[:, m:]], axis=1)
+            sent = np.concatenate([Gv, Gv[:, active], 0 * v[:, m:], 0 * v[:, m:]], axis=1)
+            each = (rows * (of_mu * here + of_both * sent)).real
+            slope.append((each[:, active] + sum(np.split(each[:, m:], 3, axis=1))) * moves)
+        slope = np.concatenate(slope, axis=1)
+        return np.vstack([slope, self._stability_slope(x)]) if any(self.loop.psi) else slope
+
+    def _spread(self, mu: Array) -> Array:
+        """mu of each entry of the block that is kept, (m + 3 active,)."""
+        first = np.zeros(self.loop.channels)
+        first[self.active] = mu
+        return np.concatenate([first, mu, mu, mu])
 
     def _stability_slope(self, x: Array) -> Array:
         at, steps = self.stability(x), _DIFFERENCE * np.eye(x.size)
         return np.array([(self.stability(x + step) - at) / _DIFFERENCE for step in steps])
 
+    def parts(self, x: Array) -> tuple[Complex, Complex, Array]:
+        """The Hermitian part of the block: its first corner (k, m, m), what is below it, the diagonal of its last."""
+        G, mu, m, p = self._around(x, "conditions").G, self._spread(self.mu(x)[0]), self.loop.channels, self.active.size
+        none, of_G, of_mu, of_both = self._affine
+        fixed, of_G = none + of_mu * mu, of_G + of_both * mu
+        first = hermitian(of_G[:, :m, None] * G + fixed[:, :m, None] * np.eye(m))
+        beside = (fixed[:, m : m + p] + fixed[:, m + p : m + 2 * p].conj()) / 2
+        below = of_G[:, m : m + p, None] * G[:, self.active] / 2 + beside[:, :, None] * np.eye(m)[self.active]
+        return first, below, fixed[:, m + 2 * p :].real
+
     def _least(self, x: Array) -> tuple[Array, Complex]:
-        """Least eigenvalue (k,) of `_block` in units of Delta_D/T, and v whose v* block v it is; of the last x."""
-        at = self.loop_at_conditions
-        if self._last is None or self._last[0] is not at or not np.array_equal(self._last[1], x):
-            self._last = (at, x.copy(), *self._least_of(self._block(x)))
-        return self._last[2], self._last[3]
+        """Least eigenvalue (k,) of the block, and v (k, m + active) whose v* block v it is; of the last x.
 
-    def _least_of(self, block: Complex) -> tuple[Array, Complex]:
-        values, vectors = np.linalg.eigh(self.root[:, None] * block * self.root)
-        return values[:, 0].astype(float), vectors[:, :, 0] * self.root
-
-    def _block(self, x: Array) -> Complex:
-        """What must be positive definite with the damping, at each sampled frequency, Hermitian."""
-        return hermitian(self.force(x, self.loop_at_conditions) * self.of_one[:, None, None])
+        By the Schur complement of its last corner, which is diagonal and positive.
+        """
+        if self._last is None or not np.array_equal(self._last[0], x):
+            first, below, corner = self.parts(x)
+            follows = -below / corner[:, :, None]
+            schur = first + np.conj(np.swapaxes(below, 1, 2)) @ follows
+            values, vectors = np.linalg.eigh(self.root[:, None] * schur * self.root)
+            v = vectors[:, :, 0] * self.root
+            whole = np.concatenate([v, np.einsum("kij,kj->ki", follows, v)], axis=1)
+            self._last = x.copy(), values[:, 0].astype(float), whole
+        return self._last[1], self._last[2]
 
     def stability(self, x: Array) -> float:
         """By how much more than CLOSEST_POLE the poles keep away from the circle."""
@@ -207,153 +247,76 @@ class SampledLoop:
 
     def search(self, x: Array, most: int) -> OptimizeResult:
         """The local optimum from x, by so many steps."""
-        return self.minimised(x, most, [], self.room_slope)
-
-    def minimised(
-        self, x: Array, most: int, more: list[tuple[float, float]], slope: Callable[[Array], Array] | None = None
-    ) -> OptimizeResult:
-        """The local optimum from x; `more` bounds what is behind the gains; without `slope` room is differenced."""
-        N = self.loop.channels
         from scipy.optimize import minimize  # slow to load
 
-        bounds = [(np.log(_SOFTEST), np.log(STIFFEST))] * N + [(0.0, 20.0)] * N + more
-        condition = {"type": "ineq", "fun": self.room, "jac": slope}
+        m = self.loop.channels
+        bounds = [(np.log(_SOFTEST), np.log(STIFFEST))] * m + [(0.0, 20.0)] * m + [self.bounds] * self.active.size
+        condition = {"type": "ineq", "fun": self.room, "jac": self.room_slope}
         options = {"maxiter": most, "ftol": 1e-7}
         problem = {"bounds": bounds, "constraints": condition, "options": options}
         return minimize(self.square_mismatch, x, jac=self.square_mismatch_slope, method="SLSQP", **problem)
 
 
-# ----------------------------------------------------------------------------------------------------
-# Spring-damper gains that are safe under any switching of their delays: a local search like the one above.
-#
-# Its sampled condition is `switching_block`: the multiplier is searched together with the gains. What is returned
-# passes the sweep of `switching_sweep`, which knows nothing of the multiplier found here.
-
-
-_FIRST = 0.5  # the multiplier alpha T/delta that a search begins with where the start has none
-_MULTIPLIERS = (1e-4, 10.0)  # ... and its bounds
-
-
 class SwitchingLoop(SampledLoop):
-    """As SampledLoop, with x = (log K, B/delta, log alpha T/delta of the channels whose delay varies)."""
+    """Safe under any switching of the delays: x = (log K, B/delta, log alpha T/delta of the channels whose varies).
+
+    What is returned passes the sweep of `switching_sweep`, which knows nothing of the multiplier found here.
+    """
+
+    bounds = (np.log(1e-4), np.log(10.0))
+    _first = 0.5  # alpha T/delta that a search begins with where the start has none
 
     def __init__(self, loop: Loop, lo: Sequence[int], hi: Sequence[int]) -> None:
-        self.h, loop = half_widths(lo, hi), loop.switching(DelayRange(tuple(lo), tuple(hi)))
-        self.active = np.flatnonzero(self.h)
-        super().__init__(loop)
+        self.active = np.flatnonzero(half_widths(lo, hi))
+        super().__init__(loop.switching(DelayRange(tuple(lo), tuple(hi))))
 
     def point(self, coupling: SpringDamper) -> Array:
         """The gains with their best multiplier."""
-        loop = self.loop
-        found = switching_sweep(loop.sent(coupling), loop)
-        a = np.array(found.alpha)[self.active] * loop.T / self.delta[self.active]
-        a = np.clip(np.where(np.isfinite(a), a, _FIRST), *_MULTIPLIERS)
-        return np.concatenate([super().point(coupling), np.log(a)])
+        found = switching_sweep(self.loop.sent(coupling), self.loop)
+        a = np.array(found.alpha)[self.active] * (self.loop.T / self.delta)[self.active]
+        a = np.where(np.isfinite(a), a, self._first)
+        return np.concatenate([super().point(coupling), np.clip(np.log(np.maximum(a, 1e-300)), *self.bounds)])
 
     def judged(self, x: Array) -> Requirement:
-        sent = self.loop.sent(self.coupling(x))
-        return switching_sweep(sent, self.loop).requirement
+        return switching_sweep(self.loop.sent(self.coupling(x)), self.loop).requirement
 
-    def room(self, x: Array) -> Array:
-        """1 - SAMPLED_RESERVE less the damping ratio at each sampled frequency, with the multiplier in x."""
-        loop, m, alpha = self.loop, self.loop.channels, np.zeros(self.loop.channels)
-        alpha[self.active] = np.exp(x[2 * m :]) * (self.delta / loop.T)[self.active]
-        D, E, _ = self.loop_at_conditions
-        now = np.broadcast_to(np.eye(m, dtype=complex), E.shape)
-        G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], loop.T)
-        block = hermitian(switching_block(G, loop, alpha)[0].G[0])
-        error = block[:, m:, :m]
-        schur = block[:, :m, :m] - np.conj(np.swapaxes(error, 1, 2)) @ (error / (2 * alpha[self.active])[:, None])
-        room = (np.linalg.eigvalsh(self.root[:, None] * schur * self.root)[:, 0] - _SAMPLED_RESERVE).astype(float)
-        return np.append(room, self.stability(x)) if any(self.loop.psi) else room
+    def block(self, G: Sampled, mu: Array) -> Sampled:
+        alpha = np.zeros(self.loop.channels)
+        alpha[self.active] = mu
+        return switching_block(G, self.reserved, alpha)[0]
 
-    def search(self, x: Array, most: int) -> OptimizeResult:
-        return self.minimised(x, most, [(np.log(_MULTIPLIERS[0]), np.log(_MULTIPLIERS[1]))] * self.active.size)
-
-
-# ----------------------------------------------------------------------------------------------------
-# Spring-damper gains that are safe also while forces are limited: the same search with the limiter's block
-# (design.multipliers.limiter_demand) in the place of the linear one, and its multiplier among the unknowns.
+    def mu(self, x: Array) -> tuple[Array, Array]:
+        alpha = np.exp(x[2 * self.loop.channels :]) * (self.delta / self.loop.T)[self.active]
+        return alpha, alpha
 
 
 class LimiterLoop(SampledLoop):
-    """As Sampled, with x = (log K, B/delta, c) and one weight c per channel, of the lag 1."""
+    """Safe also while forces are limited: x = (log K, B/delta, c) and one weight c per channel, of the lag 1."""
+
+    bounds = (0.0, 5.0)
+    _first = 0.5  # the weight that a search begins with
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
-        self.rho = limiter_lag(loop.delta, loop.T, BETA)
-        self._undelayed: tuple[_Responses, _Responses] | None = None
+        self.rho, self.active = limiter_lag(loop.delta, loop.T, BETA), np.arange(loop.channels)
         super().__init__(loop, band_hz)
 
     def point(self, coupling: SpringDamper) -> Array:
         """The gains with a usual multiplier."""
-        return np.append(super().point(coupling), np.full(self.loop.channels, _FIRST_WEIGHT))
+        return np.append(super().point(coupling), np.full(self.loop.channels, self._first))
 
     def judged(self, x: Array) -> Requirement:
-        loop, sent, c = self.loop, self.loop.sent(self.coupling(x)), self._weights(x).tolist()
-        return limiter_proof(sent, loop, self.rho, c).requirement
+        sent, c = self.loop.sent(self.coupling(x)), self.mu(x)[0][:, None].tolist()
+        return limiter_proof(sent, self.loop, self.rho, c).requirement
 
-    def room(self, x: Array) -> Array:
-        """The least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency."""
-        room = self._least(x)[0]
-        return np.append(room, self.stability(x)) if any(self.loop.psi) else room
+    def block(self, G: Sampled, mu: Array) -> Sampled:
+        demand = limiter_demand(G, self.reserved, self.rho, mu[:, None].tolist())
+        return demand.free + demand.gain
 
-    def room_slope(self, x: Array) -> Array:
-        """Its gradient: the block's first columns hold G, and c_i takes itself from N_i."""
-        loop, (_, E, theta), v = self.loop, self.loop_at_conditions, self._least(x)[1]
-        (by, _, S, right), z = self._solved(self._gains(x), self._now()), on_circle(self.conditions)[:, None]
-        first, second = np.split(v, 2, axis=1)
-        N, late = self._lines(x), np.diagonal(theta, axis1=1, axis2=2) * self.of_one[:, None]
-        into = np.einsum("ki,kij->kj", first.conj() * late + second.conj() * N, E @ S)
-        turned = into * np.einsum("kij,kj->ki", right, first)
-        steps = np.einsum("kij,kj->ki", self.force(x, self._now()), first) - (1 - 1 / z) * np.array(self.rho) * second
-        slope = np.concatenate([*(turned * by).real, -(second.conj() * steps).real], axis=1)
-        return np.vstack([slope, self._stability_slope(x)]) if any(loop.psi) else slope
-
-    def _now(self) -> _Responses:
-        """Of the forces as they leave, before Theta."""
-        D, E, _ = at = self.loop_at_conditions
-        if self._undelayed is None or self._undelayed[0] is not at:
-            now = np.broadcast_to(np.eye(self.loop.channels, dtype=complex), E.shape)
-            self._undelayed = (at, (D, E, now))
-        return self._undelayed[1]
-
-    def _lines(self, x: Array) -> Array:
-        """N of `limiter_demand`, (k, m)."""
-        windows = [polynomials(n, self.conditions)[0] for n in self.loop.theta]
-        return -np.stack(windows, axis=1) - self._weights(x).T
-
-    def _least(self, x: Array) -> tuple[Array, Complex]:
-        """Of the Schur complement of the slip's own corner, which is diagonal and positive for any c >= 0."""
-        at = self.loop_at_conditions
-        if self._last is None or self._last[0] is not at or not np.array_equal(self._last[1], x):
-            first, cross, corner = self.parts(x)
-            follows = -cross / corner[:, :, None]
-            least, v = self._least_of(first + np.conj(np.swapaxes(cross, 1, 2)) @ follows)
-            self._last = (at, x.copy(), least, np.concatenate([v, (follows @ v[:, :, None])[:, :, 0]], axis=1))
-        return self._last[2], self._last[3]
-
-    def parts(self, x: Array) -> tuple[Complex, Complex, Array]:
-        """The Hermitian part of `limiter_demand` with what the reserve leaves of the damping.
-
-        Its first block (k, m, m), the one below that, and the diagonal (k, m) of its last one, which is diagonal: to
-        make it whole, as that function does of any G, takes four times as long.
-        """
-        z, theta = on_circle(self.conditions)[:, None], np.diagonal(self.loop_at_conditions[2], axis1=1, axis2=2)
-        G, N, one = self.force(x, self._now()), self._lines(x), np.eye(self.loop.channels)
-        damping, rho = (1 - _SAMPLED_RESERVE) * self.delta / self.loop.T, np.array(self.rho)
-        first = hermitian((theta * self.of_one[:, None])[:, :, None] * G) + damping * one
-        across = damping - np.conj(rho * theta / z) / 2
-        return first, N[:, :, None] * G / 2 + across[:, :, None] * one, damping - (N * (1 - 1 / z)).real * rho
-
-    def search(self, x: Array, most: int) -> OptimizeResult:
-        return self.minimised(x, most, [(0.0, _MOST_WEIGHT)] * self.loop.channels, self.room_slope)
+    def mu(self, x: Array) -> tuple[Array, Array]:
+        return np.maximum(x[2 * self.loop.channels :], 0.0), np.ones(self.loop.channels)
 
     def multiplier(self, x: Array) -> Lags:
-        return np.round(self._weights(x), 6).tolist()
-
-    def _weights(self, x: Array) -> Array:
-        """c, a row of one lag per channel."""
-        return np.maximum(x[2 * self.loop.channels :, None], 0.0)
+        return np.round(self.mu(x)[0][:, None], 6).tolist()
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_rang
     held = [requirement.guarantee for requirement in requirements.values() if requirement.certified]
     if ANY in held:
         return ANY
-    if whole_ranges:
+    if whole_ranges or RANGES in held:
         return RANGES
     found = next((words for words in held if words), None)
     return _FROZEN if found == MAKING and not making_covered(loop) else found

@@ -8,7 +8,7 @@ Two transfer matrices of the paper can never satisfy the strict inequalities pri
       Remedy: the Hermitian part of E(1) z/(z-1) on |z| = 1 is the constant E(1)/2, so what is left, E-hat less
       its pole plus E(1)/2, carries the same condition and is stable (`e_hat_regular`).
   V-hat = (1 - 1/z)(V - Theta-hat) vanishes at z = 1, where (2) asks 0 > 0.
-      Remedy: divide by |1 - 1/z|^2 (`v_hat_ports`).
+      Remedy: divide by |1 - 1/z|^2 (`design.conditions.v_hat`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from controller.loop import Loop
 from controller.lti import Array, Lti
 from controller.ranges import Member
 from design import conditions
-from design.conditions import Condition, Demand, even_damping, regular_part, uncovered, v_hat
+from design.conditions import Condition, Demand, even_damping, regular_part, uncovered
 from design.cone import ConeProgram, Inequality
 from design.exact import require_size
 from design.frequency import Response, frequencies, hermitian, on_circle, supremum
@@ -332,6 +332,10 @@ class _AnyEnvironment(Condition):
             return None
         return partial(conditions.least_scale, conditions.any_environment_demand(V, loop, phi))
 
+    def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
+        count = len(coupling.sampled(np.array([[1j]]), loop.T).G)
+        return conditions.any_environment_ratios(lambda z: coupling.sampled(z, loop.T), count, loop, multiplier)
+
     def _without(self, coupling: Coupling) -> str:
         """Why it says nothing of a coupling that has no V(z)."""
         if coupling.holds_model:
@@ -457,22 +461,6 @@ def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matri
 def e_hat_regular(E: Lti, psi: Sequence[int]) -> Lti:
     """E-hat less its pole at z = 1, plus E(1)/2; E(1) must be symmetric and >= 0."""
     return regular_part(delay(psi, E.T) @ E)
-
-
-def theta_hat(theta: Sequence[int]) -> Lti:
-    """(12) in these units."""
-    return conditions.theta_hat(theta, np.ones(len(theta)), 1.0)
-
-
-def v_hat_ports(V: Lti, theta: Sequence[int], regular: Lti | None = None) -> Ports:
-    """V-hat without its zero at z = 1: y1 = H u with H = V - Theta-hat, and y2 = v_hat(H) u of design.conditions.
-
-    V-hat is Delta-OSP iff He y2/u >= (y1/u)* Delta (y1/u); V(1) must be symmetric. One state per channel fewer than
-    (16). `regular` is v_hat(V) with the states of V, where a realisation has it without solving for it.
-    """
-    G = theta_hat(theta)
-    H, y2 = V - G, (regular or v_hat(V)[1]) - v_hat(G)[1]
-    return Ports(H.A, H.B, y2.C, (y2.D + y2.D.T) / 2, H.C, H.D)
 
 
 def symmetric(rows: list[list[_Matrix]]) -> _Matrix:

@@ -20,9 +20,11 @@ from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design import program
 from design.certificate import prove, prove_limiter
+from design.conditions import Condition
 from design.conditions import this_environment as requirement_of
 from design.coupling_file import Certificate, LimiterCertificate
-from design.environments import Searched, in_each, ratio_in, search_ranges, worst
+from design.environments import THIS_ENVIRONMENT, Searched, in_each, ratio_in, search_ranges, worst
+from design.guarantees import ANY
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.result import Design, DesignFailed, NotProved, from_ratio
 from design.robustness import Nearby, Spread, at, robustness_nearby, vertices
@@ -462,13 +464,22 @@ def spread(
     return Spread(db, db - before, found.g, max(needs[1:], default=needs[0]), found.states, len(needs), proved)
 
 
-def nearby(loop: Loop, coupling: Coupling, options: program.Options = program.DEFAULT) -> Nearby:
-    """What a coupling needs within ten percent, and what a design for that would cost.
+def nearby(
+    loop: Loop,
+    coupling: Coupling,
+    options: program.Options = program.DEFAULT,
+    condition: Condition = THIS_ENVIRONMENT,
+) -> Nearby:
+    """What the condition asks of a coupling within ten percent, and what a design for that would cost.
 
-    Without the design before walls, with ranges, for an environment that is no network of springs, and for a coupling
-    that is no optimal one.
+    Empty where it holds in any environment. Without the design for a condition of the user's own, before walls, with
+    ranges, for an environment that is no network of springs, and for a coupling that is no optimal one.
     """
-    known, there = robustness_nearby(loop, coupling), loop.environment
-    if known is None or loop.ranges or there.one_period or not isinstance(coupling, ForceFilter | NoCoupling):
+    if condition.guarantee(loop) == ANY or condition.not_varied(loop):
+        return Nearby()
+    known, there = robustness_nearby(loop, coupling, condition), loop.environment
+    if known is None or loop.ranges or there.one_period or not condition.extensible:
+        return Nearby(known)
+    if not isinstance(coupling, ForceFilter | NoCoupling):
         return Nearby(known)
     return Nearby(known, spread(loop, coupling, options))

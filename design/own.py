@@ -21,8 +21,10 @@ _OTHERS = ("<", f"{sys.prefix}{os.sep}", f"{sys.base_prefix}{os.sep}", *_OURS)
 def named(option: str, text: str) -> Any:
     """What `text` names, in a module of the working directory or an installed one. Raises InputError."""
     module, _, name = text.partition(":")
+    if module.endswith(".py"):  # a file of the working directory, or below it
+        module = module.removeprefix("./").removesuffix(".py").replace("/", ".")
     if not all(part.isidentifier() for part in (*module.split("."), name)):
-        raise InputError(f"{option} is {text!r}, expected package.module:Name")
+        raise InputError(f"{option} is {text!r}, expected package.module:Name or FILE.py:Name")
     place = reach_working_directory()
     try:
         found = import_module(module)

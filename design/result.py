@@ -18,7 +18,7 @@ ConditionName = Literal["this-environment", "any-environment"]
 Guarantee = Literal["any passive environment", "these ranges", "this environment"]
 
 #: the conditions in the order of tables, each with the environments for which it holds
-CONDITIONS: dict[ConditionName, str] = {
+CONDITIONS: dict[str, str] = {
     "this-environment": "this environment",
     "any-environment": "any passive environment",
 }
@@ -146,6 +146,11 @@ class Chosen:
     own: Any = field(kw_only=True, default=None)  # the design.conditions.Condition, where that is one of the user's own
     switching: DelayRange | None = field(kw_only=True, default=None)  # its file proves any switching within it
     notes: tuple[str, ...] = field(kw_only=True, default=())  # what a reader should know of its origin
+
+    @property
+    def asked(self) -> Any:
+        """The condition as design.certificate takes it: the user's own, or a name."""
+        return self.own or self.condition
 
 
 @dataclass(frozen=True, eq=False)

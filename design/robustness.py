@@ -12,7 +12,8 @@ from controller.coupling import Coupling
 from controller.environment import Network
 from controller.loop import Loop
 from controller.ranges import Ranges, UncertainSpring
-from design.environments import ratio_in
+from design.conditions import Condition
+from design.environments import THIS_ENVIRONMENT
 
 #: Of more environments than _FEW every _THIN-th frequency is looked at; only those that ask for the most there, or for
 #: next to it, are swept whole.
@@ -79,8 +80,10 @@ def vertices(network: Network, percent: float = 10.0) -> dict[str, Network]:
     return found
 
 
-def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> Robustness:
-    """The worst need of a coupling over `vertices`, by the refined sweep.
+def robustness(
+    loop: Loop, coupling: Coupling, percent: float = 10.0, condition: Condition = THIS_ENVIRONMENT
+) -> Robustness:
+    """The worst need of a coupling over `vertices`, by the refined sweep of the condition.
 
     Of many a thinned sweep comes first, and only those that come near the worst are refined.
     """
@@ -88,23 +91,23 @@ def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> Robustn
     loops = {name: at(loop, one) for name, one in networks.items()}
     order, rough = list(loops), dict.fromkeys(loops, np.inf)
     if len(loops) > _FEW:
-        rough = {name: ratio_in(each, coupling, _THIN) for name, each in loops.items()}
+        rough = {name: condition.ratio(each, coupling, _THIN) for name, each in loops.items()}
         order.sort(key=lambda name: -rough[name])
     worst, where = 0.0, "nominal"
     for name in order:
         if rough[name] < (1 - _NEAR) * worst:
             break
-        ratio = ratio_in(loops[name], coupling)
+        ratio = condition.ratio(loops[name], coupling)
         if ratio > worst:
             worst, where = ratio, name
     return Robustness(percent, worst, where, worst < 1)
 
 
-def robustness_nearby(loop: Loop, coupling: Coupling) -> Robustness | None:
+def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
     """The worst need within ten percent; None with walls, and for what is not all springs and masses."""
     if loop.environment.walls or not isinstance(loop.environment, Network) or loop.environment.block:
         return None
-    return robustness(loop, coupling)
+    return robustness(loop, coupling, condition=condition)
 
 
 def ranges_around(network: Network, percent: float) -> Ranges:

@@ -18,6 +18,7 @@ import numpy as np
 from controller.coupling import MovingAverage, SpringDamper
 from controller.loop import Loop
 from controller.lti import Array, Lti, hstack, taps, vstack
+from design.certificate import named
 from design.conditions import even_damping, theta_hat, this_environment
 from design.cone import ConeProgram, Inequality
 from design.frequency import on_circle, peaks, too_long
@@ -206,15 +207,13 @@ def design(
 
     Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for this-environment.
     """
-    if condition == "any-environment" and switching is None:
-        return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
-    if condition == "this-environment":
+    if named(condition).extensible:
         if switching and limiter:
             raise ValueError("limiter and switching: limited forces are proved for constant delays, ask for one")
         return _for_this_environment(loop, starts, switching, limiter, band_hz)
     if switching:
         raise ValueError("delays that vary are designed for by the this-environment condition only")
-    raise ValueError(f"condition is {condition!r}, expected 'any-environment' or 'this-environment'")
+    return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
 
 
 #: Digits that gains keep in a loop of many devices, finer than RESERVE: with all of them exact proofs take minutes.
@@ -234,7 +233,7 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
 
     Raises DesignFailed at once for so many devices that the search would take minutes.
     """
-    if condition == "any-environment":  # with rho = 0 it covers limited forces anyway
+    if not named(condition).extensible:  # with rho = 0 it covers limited forces anyway
         _require_few(
             loop, _MOST_ANY, "any-environment: use a moving average, which needs no search, or this-environment"
         )
@@ -384,14 +383,6 @@ def _verified(loop: Loop, coupling: SpringDamper | MovingAverage, phi: Array | N
         why = requirement.reason or f"it requires {max(requirement.required):.6g} N s/m"
         raise DesignFailed(None, (), f"the designed coupling is not certified by any_environment: {why}")
     return requirement
-
-
-def excess_limits(loop: Loop, phi: Array | None) -> Array:
-    """(N,) Sigma = Delta_V^-1 = Phi^-1 - Delta_D^-1 in units of the usable damping; inf without a multiplier."""
-    if phi is None:
-        return np.full(loop.channels, np.inf)
-    with np.errstate(divide="ignore"):
-        return usable(loop) / phi - 1
 
 
 def _coupling(loop: Loop, gains: Array) -> SpringDamper:

@@ -24,6 +24,7 @@ from controller.law import Law
 from controller.loop import Loop
 from controller.lti import Array
 from design.certificate import assess
+from design.conditions import Condition
 from design.coverage import Limits
 from design.files import unseen
 from design.guarantees import guarantee_of
@@ -391,7 +392,7 @@ def certified_coupling(
     scenario: Scenario,
     case: str,
     name: str | None,
-    condition: str | None,
+    condition: str | Condition | None,
     link: int,
     own: Coupling | Design | None = None,
     limiter: bool | None = None,
@@ -407,12 +408,10 @@ def certified_coupling(
     delays = tuple(max(n, link) for n in scenario.theta)
     slower = scenario.replace(theta=delays, latency=None if link else scenario.latency)
     try:
-        # a latency is derived for this environment only
-        wanted = condition or ("this-environment" if slower.latency else None)
-        chosen = choose(slower, case, name, wanted, limiter) if own is None else given(own)
+        chosen = choose(slower, case, name, condition, limiter) if own is None else given(own)
     except DesignFailed as error:
         raise SafetyStop(f"no coupling for a link of {link} tick{'s' if link > 1 else ''}: {error}") from None
-    requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
+    requirements = assess(slower.loop(case), chosen.coupling, chosen.phi, own=chosen.own)
     limits = limits_of(slower, chosen, requirements, limiter)
     waits = min(MAX_THETA, *slower.theta) if link else 0  # what is longer, the host waits for
     made = CertifiedCoupling(waits, slower, case, chosen, requirements, limits)
@@ -426,7 +425,7 @@ def certified_couplings(
     scenario: Scenario,
     case: str,
     name: str | None,
-    condition: str | None,
+    condition: str | Condition | None,
     link: int,
     spare: int = 2,
     limiter: bool | None = None,
@@ -438,7 +437,7 @@ def certified_couplings(
     SafetyStop where the first coupling is not certified.
     """
     found = [certified_coupling(scenario, case, name, condition, link, limiter=limiter)]
-    wanted = [(name, condition), _FALLBACK]
+    wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), _FALLBACK]
     while len(found) <= spare and wanted:
         kind, by = wanted[0]
         try:

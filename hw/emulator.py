@@ -56,7 +56,7 @@ _PATIENCE = 60.0  # [s] for the emulator to load MuJoCo and print its path
 
 
 #: kind -> (what VALUE is, least, most, default), for the line
-LINE = {
+_LINE = {
     "flip": ("probability per frame that one bit is wrong", 0.0, 1.0, 0.01),
     "drop": ("probability per frame that it is lost", 0.0, 1.0, 0.1),
     "truncate": ("probability per frame that its end is lost", 0.0, 1.0, 0.1),
@@ -67,7 +67,7 @@ LINE = {
     "jitter": ("mean of an exponential extra delay in seconds", 0.0, 10.0, 1e-4),
 }
 #: kind -> the same, for the device
-DEVICE = {
+_DEVICE = {
     "stall": ("seconds for which the device freezes", 0.0, 10.0, 0.01),
     "unplug": ("no value", 0.0, 0.0, 0.0),
     "reset": ("no value", 0.0, 0.0, 0.0),
@@ -79,7 +79,7 @@ DEVICE = {
     "letgo": ("no value: nobody holds the deadman at the device any more", 0.0, 0.0, 0.0),
 }
 #: kind -> the same, for one axis of it
-AXIS = {
+_AXIS = {
     "jump": ("millimetres by which its encoder jumps", -1000.0, 1000.0, 5.0),
     "freeze": ("no value: its encoder shows the same count for ever", 0.0, 0.0, 0.0),
     "toggle": ("no value: one channel of its encoder is dead, so that it toggles between two counts", 0.0, 0.0, 0.0),
@@ -88,7 +88,7 @@ AXIS = {
     "drift": ("metres per second that its encoder shows beside its motion", -10.0, 10.0, 2.0),
     "own": ("newtons that its motor has while armed, whatever it is told", -12.0, 12.0, 2.0),
 }
-_KINDS = LINE | DEVICE | AXIS
+KINDS = _LINE | _DEVICE | _AXIS
 _FORM = re.compile(r"(?:(up|down|axis[1-8]):)?([a-z]+)(?:=([^@+]+))?(?:@([^+]+)(?:\+(.+))?)?")
 
 
@@ -106,15 +106,15 @@ class FaultInjection:
     def parse(cls, text: str) -> Self:
         """The fault that `text` describes. Raises InputError naming what is wrong with it."""
         match = _FORM.fullmatch(text)
-        if not match or match[2] not in _KINDS:
-            names = ", ".join(_KINDS)
+        if not match or match[2] not in KINDS:
+            names = ", ".join(KINDS)
             raise InputError(f"--fault is {text!r}, expected KIND[=VALUE][@START[+DURATION]], KIND one of {names}")
         where, kind, value, start, duration = match.groups()
-        if where in ("up", "down") and kind not in LINE:
+        if where in ("up", "down") and kind not in _LINE:
             raise InputError(f"--fault {text}: {kind} happens to the device, not to one direction of the line")
-        if where and where.startswith("axis") and kind not in AXIS:
-            raise InputError(f"--fault {text}: {kind} does not happen to one axis; {', '.join(AXIS)} do")
-        what, low, high, default = _KINDS[kind]
+        if where and where.startswith("axis") and kind not in _AXIS:
+            raise InputError(f"--fault {text}: {kind} does not happen to one axis; {', '.join(_AXIS)} do")
+        what, low, high, default = KINDS[kind]
         try:
             given = default if value is None else float(value)
             begins = None if start is None else float(start)
@@ -126,7 +126,7 @@ class FaultInjection:
                 raise ValueError(f"VALUE is {given:g}, expected a whole number of ticks")
         except ValueError as error:
             raise InputError(f"--fault {text}: {str(error).strip()}") from None
-        return cls(kind, given, where or ("axis1" if kind in AXIS else "both"), begins, lasts)
+        return cls(kind, given, where or ("axis1" if kind in _AXIS else "both"), begins, lasts)
 
     @property
     def axis(self) -> int:
@@ -144,7 +144,7 @@ class Line:
     """One direction of the link: frames go in, bytes come out later, some of them wrong."""
 
     def __init__(self, direction: str, faults: tuple[FaultInjection, ...], seed: int, latency_us: float = 0.0) -> None:
-        self._faults = [u for u in faults if u.kind in LINE and u.where in (direction, "both")]
+        self._faults = [u for u in faults if u.kind in _LINE and u.where in (direction, "both")]
         self._rng = np.random.default_rng([seed, direction == "up"])
         self._latency = latency_us
         self._held: bytes | None = None  # a frame that lets the next one pass
@@ -287,7 +287,7 @@ class Emulator:
         self._offset = [0] * scenario.channels  # [counts] of an encoder that jumped
         self._encoder: dict[int, Callable[[int], int]] = {}  # by axis: what a broken encoder makes of its count
         for fault in faults:
-            if fault.kind in AXIS and fault.axis >= scenario.channels:
+            if fault.kind in _AXIS and fault.axis >= scenario.channels:
                 raise ValueError(
                     f"--fault {fault.kind} is for {fault.where}, the scenario has {scenario.channels} channels"
                 )

@@ -283,7 +283,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A hand as a transfer function, `mass` s + C (s I - A)^-1 B + D from velocity to force; see `state_space`.
 
-    It has no bodies: MuJoCo's engines move its state beside those of the scene (sim.mujoco_engines).
+    It has no bodies: MuJoCo's engines move its state beside those of the scene (sim.engines).
     """
 
     A: tuple[tuple[float, ...], ...]

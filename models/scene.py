@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -14,7 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.device import Device
-from models.human import Cross, Hand, Human, Impedance, Link, Person, Port, body_port, chain_port, check_holds
+from models.human import (
+    Cross,
+    Hand,
+    Human,
+    Impedance,
+    Link,
+    Person,
+    Population,
+    Port,
+    body_port,
+    chain_port,
+    check_holds,
+)
 
 if TYPE_CHECKING:  # a third of a second: loaded where it is used
     import mujoco
@@ -524,6 +536,50 @@ class Crowd:
         """The persons of set i who hold several devices."""
         pairs = zip(self.holds, self.bodies[i].tolist(), strict=True)
         return tuple(Person(holds, m, b, k, Cross(*cross)) for holds, (m, b, k, *cross) in pairs)
+
+
+MIXED = 0  # as a number of links: half the humans are simple, half are networks of two links
+
+
+def draw(population: Population, channels: int, seed: int, index: int, links: int) -> _Array:
+    """Links of the humans with this index, one per channel: (channels, links, 3) as in Crowd.
+
+    They depend on (seed, index) and the population only. `links` = MIXED tosses a coin between 1 and 2.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
+    count = int(rng.integers(1, 3)) if links == MIXED else links
+    low, high = np.log([population.mass, population.damping, population.stiffness]).T
+    return np.exp(rng.uniform(low, high, size=(channels, count, 3)))
+
+
+def crowds(
+    population: Population,
+    channels: int,
+    seed: int,
+    indices: Iterable[int],
+    links: int,
+    holds: tuple[tuple[int, ...], ...] = (),
+) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
+    """The humans of these indices, grouped by their number of links: (indices of the group, crowd).
+
+    `holds` says which channels one person holds, as in Crowd.
+    """
+    drawn = {i: draw(population, channels, seed, i, links) for i in indices}
+    for count in sorted({values.shape[1] for values in drawn.values()}):
+        group = [i for i, values in drawn.items() if values.shape[1] == count]
+        bodies = np.stack([_draw_bodies(population, len(holds), seed, i) for i in group])
+        yield np.array(group), Crowd(np.stack([drawn[i] for i in group]), holds, bodies)
+
+
+def _draw_bodies(population: Population, persons: int, seed: int, index: int) -> _Array:
+    """Bodies of the persons with this index who hold several devices: (persons, 5) as in Crowd, from the same ranges.
+
+    Drawn apart from the links, which are the same whether or not a person holds several devices.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
+    ranges = (population.mass, population.damping, population.stiffness, population.damping, population.stiffness)
+    low, high = np.log(ranges).T
+    return np.exp(rng.uniform(low, high, size=(persons, 5)))
 
 
 @dataclass(frozen=True, eq=False)

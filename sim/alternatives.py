@@ -13,28 +13,28 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from controller.lti import Array
-from design.certificate import assess
+from design.certificate import assess, named
+from design.conditions import Condition
 from design.files import unseen
 from design.guarantees import guarantee_of
 from design.result import Chosen, Requirement, finite
 from design.transparency import decibels, transparency
 from sim.accuracy import credible, force_error
-from sim.couplings import choose, limits_of
-from sim.judged import Judged
+from sim.couplings import Judged, choose, limits_of
 from sim.run import assemble, run
 from sim.scenario import Scenario, load
 from sim.stability import exact_growth, unstable
 from sim.trace import Trace
 
-#: (kind, condition) in the order of a table
-_ROWS = (
-    ("none", None),
-    ("published", None),
-    ("spring-damper", "any-environment"),
-    ("spring-damper", "this-environment"),
-    ("optimal", "this-environment"),
-)
-_QUICK, _SHORT = 2, 200  # channels of an optimal one, samples of delay in all for any environment: more take long
+#: (kind, condition) in the order of a table, and the samples of delay in all beyond which a design takes long
+_ROWS: dict[tuple[str, str | None], float] = {
+    ("none", None): math.inf,
+    ("published", None): math.inf,
+    ("spring-damper", "any-environment"): 200,
+    ("spring-damper", "this-environment"): math.inf,
+    ("optimal", "this-environment"): math.inf,
+}
+_QUICK = 2  # channels of an optimal one
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +76,11 @@ def alternatives(
     case: str,
     progress: Callable[[int, int], None] = lambda done, of: None,
     own: Judged | None = None,
+    also: Condition | None = None,
 ) -> list[Alternative]:
     """Every coupling that can stand in the place of the run's own; none where the delays switch.
 
-    `own` is the run's, with what was found of it in the same loop.
+    `own` is the run's, with what was found of it in the same loop; `also` a condition of the user's that judges all.
     Of ranges only couplings for any environment are shown, and the optimal one holds a linear model: none before walls.
     """
     if scenario.switches:
@@ -90,30 +91,36 @@ def alternatives(
     made = []
     for i, row in enumerate(rows):
         progress(i, len(rows))
-        made.append(_alternative(scenario, case, *row, own if row == present else None))
+        made.append(_alternative(scenario, case, *row, own if row == present else None, also))
     return made
 
 
 def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -> bool:
+    loop = scenario.loop(case)
     if kind == "published":
-        return scenario.loop(case) == load().loop(case)
-    if condition == "this-environment" and scenario.ranges:
+        return loop == load().loop(case)
+    if condition and loop.ranges and named(condition).members(loop):
         return False
-    if condition == "any-environment" and sum(scenario.theta) + sum(scenario.psi) > _SHORT:
+    if sum(loop.theta) + sum(loop.psi) > _ROWS[kind, condition]:
         return False
     return kind != "optimal" or (scenario.channels <= _QUICK and not scenario.environment.walls)
 
 
 def _alternative(
-    scenario: Scenario, case: str, kind: str, condition: str | None, own: Judged | None = None
+    scenario: Scenario,
+    case: str,
+    kind: str,
+    condition: str | None,
+    own: Judged | None = None,
+    also: Condition | None = None,
 ) -> Alternative:
     loop = scenario.loop(case)
     try:
         chosen = own.chosen if own else choose(scenario, case, kind, condition)
     except ValueError as error:
         return Alternative(kind, condition, reason=str(error))
-    certificate = chosen.certificate
-    requirements = own.requirements if own else assess(loop, chosen.coupling, chosen.phi, certificate, more=False)
+    known = chosen.certificate
+    requirements = own.requirements if own else assess(loop, chosen.coupling, chosen.phi, known, False, also)
     simulation = assemble(scenario, chosen.coupling, own.limiter.rho if own else _lag(scenario, chosen, requirements))
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
@@ -137,5 +144,6 @@ def _alternative(
 
 def _lag(scenario: Scenario, chosen: Chosen, requirements: dict[str, Requirement]) -> tuple[float, ...] | None:
     """rho (m,) [N/m] of the limiter; None: forces are clipped, as those of a coupling just proved without a limiter."""
-    without = chosen.certificate and chosen.certificate.condition == "this-environment" and not chosen.limiter
+    known = chosen.certificate
+    without = known and named(known.condition).extensible and not chosen.limiter
     return None if without else limits_of(scenario, chosen, requirements).rho

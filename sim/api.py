@@ -13,15 +13,13 @@ from controller.lti import Array
 from design.arguments import number, of_kind, one_of, whole
 from design.files import plain
 from design.result import Design
-from sim.accuracy import EngineChoice, compare_engines, pick
+from sim.accuracy import MOST, EngineChoice, compare_engines, pick, settle
 from sim.couplings import given, limits_of
-from sim.engines import Engine
-from sim.mujoco_engines import INTEGRATORS
+from sim.engines import INTEGRATORS, Engine
 from sim.passivity_layer import EnergyNet, Plugged, Wanted, netted
 from sim.run import ENGINES, AnyEngine, Progress, Simulation, assemble, engine_name, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
 from sim.stability import stability_of
-from sim.step_choice import MOST, settle
 from sim.switching import Period, switching
 from sim.trace import Trace
 
@@ -186,7 +184,7 @@ def validate(
     TypeError for an argument of another type.
     """
     from sim import crowds  # its workers are loaded where they are used
-    from sim.shards import validate as validate_all
+    from sim.crowds import validate as validate_all
 
     of_kind("scenario", scenario, Scenario, _SCENARIO)
     chosen = given(coupling)

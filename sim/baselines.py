@@ -16,7 +16,7 @@ import numpy as np
 from controller.coupling import NoCoupling
 from controller.lti import Array
 from controller.tick import StepBuffer
-from design.result import Chosen, DesignFailed
+from design.result import CONDITIONS, Chosen, DesignFailed
 from models.hold import hold
 from models.scene import Crowd, variants
 from sim.accuracy import force_error
@@ -35,7 +35,6 @@ _DESIGNS = (
     ("spring-damper", "this-environment"),
     ("optimal", "this-environment"),
 )
-_GUARANTEES = {"any-environment": "any passive environment", "this-environment": "this environment"}
 
 
 @dataclass(frozen=True)
@@ -127,7 +126,7 @@ def _judged(
     moving, fastest = _left_alone(with_net)
     name, guarantee, source = (net.name, net.guarantee, net.source) if net else ("none, clipped", None, None)
     if design:
-        guarantee = _GUARANTEES[design.condition]
+        guarantee = CONDITIONS[design.condition]
         name = f"{design.kind}, {guarantee}"
     return Rival(
         name,

@@ -18,7 +18,7 @@ from design.program import Options
 from design.result import CONDITIONS, Chosen, Requirement
 from design.robustness import Nearby, robustness_nearby
 from design.transparency import Transparency, transparency
-from sim.report import CouplingFigures
+from sim.couplings import CouplingFigures
 from sim.scenario import Scenario
 
 
@@ -114,18 +114,24 @@ class Comparison:
     couplings: list[ComparedCoupling]
     notes: list[str]
 
+    @property
+    def conditions(self) -> list[str]:
+        """By which every coupling is judged."""
+        return [name for name in self.couplings[0].conditions if name not in OLDER]
+
     @classmethod
     def of(
         cls, scenario: Scenario, case: str, chosen: Mapping[str, Chosen], failed: Sequence[str], seed: int
     ) -> Comparison:
         """Of the couplings chosen, by name; `failed` says what could not be designed."""
         loop = scenario.loop(case)
-        judged = {name: compare.judge(loop, c.coupling, c.phi) for name, c in chosen.items()}
+        own = {c.condition: c.own for c in chosen.values() if c.own}
+        judged = {name: compare.judge(loop, c.coupling, c.phi, [*own.values()]) for name, c in chosen.items()}
         hz = compare.grid(loop, list(judged.values()))
         couplings = [ComparedCoupling.of(loop, name, c, judged[name], hz) for name, c in chosen.items()]
         notes = [*(f"{name}: {note}" for name, c in chosen.items() for note in c.notes), *failed]
         for c in couplings:
-            reasons = {condition: c.conditions[condition].reason for condition in CONDITIONS}
+            reasons = {name: c.conditions[name].reason for name in (*CONDITIONS, *own)}
             notes += [f"{c.name}, {condition}: {reason}" for condition, reason in reasons.items() if reason]
         about = case, scenario.name, seed, loop.T, loop.theta, loop.psi, loop.lam, loop.delta
         return cls(*about, hz, *compare.ideal(loop, hz), couplings, notes)

@@ -9,14 +9,20 @@ from typing import Any
 
 from controller.coupling import PUBLISHED, Coupling, NoCoupling
 from controller.loop import DelayRange, Loop
+from controller.older import CONDITIONS as OLDER
+from controller.older import with_older
 from design.api import COUPLING, bare, fitting
-from design.certificate import assess, verify
+from design.certificate import RangesCheck, assess, check_ranges, verify
+from design.conditions import Condition
 from design.coupling_file import Stored, load
-from design.coverage import Limits, covered_limits
-from design.designs import KINDS, design_by_kind, own_coupling, usual_condition
-from design.guarantees import switching_guarantee
-from design.own import called
-from design.result import Chosen, Design, DesignFailed, Requirement
+from design.coverage import Limits, RangesFigures, covered_limits
+from design.designs import KINDS, design_by_kind, name_and_own, own_coupling, usual_condition
+from design.environments import THIS_ENVIRONMENT
+from design.files import unseen
+from design.guarantees import guarantee_of, switching_guarantee
+from design.lmi import ANY_ENVIRONMENT
+from design.own import called, place_of
+from design.result import CONDITIONS, Chosen, Design, DesignFailed, Requirement
 from sim import design_cache
 from sim.scenario import InputError, Scenario
 
@@ -27,46 +33,65 @@ def choose(
     scenario: Scenario,
     case: str,
     name: str | None = None,
-    condition: str | None = None,
+    condition: str | Condition | None = None,
     limiter: bool | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Chosen:
     """The coupling of a case; by default the designed spring-damper.
 
-    See design.designs.design_by_kind for `limiter` and `progress`.
+    See design.designs.design_by_kind for `condition`, `limiter` and `progress`.
 
     Raises InputError where the request contradicts itself, DesignFailed where there is no such coupling.
     """
+    try:
+        asked, own = name_and_own(condition)
+        found = _choose(scenario, case, name, asked, own, limiter, progress)
+    except (DesignFailed, InputError):
+        raise
+    except ValueError as error:
+        if place_of(error):  # in a class of the user's own
+            raise
+        raise InputError(str(error)) from None
+    return replace(found, own=own, notes=(*found.notes, own.claim)) if own else found
+
+
+def _choose(
+    scenario: Scenario,
+    case: str,
+    name: str | None,
+    condition: str | None,
+    own: Condition | None,
+    limiter: bool | None,
+    progress: Callable[[str, int, int], None],
+) -> Chosen:
+    """The same, by the name of the condition, and the user's own of that name."""
     if case == "none":
         if name not in (None, "none"):
             raise InputError(f"--coupling {name} with --case none: that case is the loop without coupling")
         name = "none"
     name = name or "spring-damper"
     if name == "none":
-        return Chosen(NoCoupling(), condition or "this-environment", kind=name)
+        return Chosen(NoCoupling(), condition or THIS_ENVIRONMENT.name, kind=name)
     if name == "published":
         if scenario.channels != 2:
             raise InputError(f"--coupling published: the paper prints gains for 2 channels, not {scenario.channels}")
-        return Chosen(PUBLISHED[case], condition or "any-environment", kind=name)
+        return Chosen(PUBLISHED[case], condition or ANY_ENVIRONMENT.name, kind=name)
     if name not in KINDS and ":" in name:
-        own = own_of(name, scenario.loop(case))
-        return replace(own, condition=condition or own.condition)
+        made = own_of(name, scenario.loop(case))
+        return replace(made, condition=condition or made.condition)
     if name in KINDS:
-        try:
-            loop = scenario.loop(case)
-            condition = condition or usual_condition(loop, name)
-            asked: dict[str, Any] = {"limiter": limiter} if limiter is not None and KINDS[name].limited else {}
-            question = (loop, name, condition, *asked.items())
-            if kept := design_cache.find(*question):
-                assert kept.certificate
-                proof = kept.certificate.limiter or None
-                return Chosen(kept.built(), condition, kind=name, limiter=proof, certificate=kept.certificate)
-            design = design_by_kind(loop, name, condition, progress, **asked)
-            known = design_cache.keep(design, *question)
-        except DesignFailed:
-            raise
-        except ValueError as error:
-            raise InputError(str(error)) from None
+        loop = scenario.loop(case)
+        condition = condition or usual_condition(loop, name)
+        asked: dict[str, Any] = {"limiter": limiter} if limiter is not None and KINDS[name].limited else {}
+        question = (loop, name, condition, *asked.items())
+        if own:  # a class has no digest, so nothing is kept of it
+            return replace(design_by_kind(loop, name, own, progress, **asked), kind=name)
+        if kept := design_cache.find(*question):
+            assert kept.certificate
+            proof = kept.certificate.limiter or None
+            return Chosen(kept.built(), condition, kind=name, limiter=proof, certificate=kept.certificate)
+        design = design_by_kind(loop, name, condition, progress, **asked)
+        known = design_cache.keep(design, *question)
         return replace(design, kind=name, certificate=known, limiter=(known and known.limiter) or None)
     if Path(name).suffix != ".json":
         raise InputError(
@@ -74,8 +99,10 @@ def choose(
         )
     stored = read_coupling(name)
     coupling = fitted(stored, name, scenario.channels, scenario.T)
-    made_for = stored.certificate.condition if stored.certificate else "this-environment"
-    checked = check_stored(stored, scenario.loop(case))
+    made_for = stored.certificate.condition if stored.certificate else THIS_ENVIRONMENT.name
+    checked = check_stored(stored, scenario.loop(case), own)
+    if made_for not in CONDITIONS:  # one of the user's own, which has to be named again
+        made_for = THIS_ENVIRONMENT.name
     proof = (stored.certificate and stored.certificate.limiter) or None
     how = {"notes": checked.notes, "switching": checked.switching, "limiter": proof}
     return Chosen(coupling, condition or made_for, kind=Path(name).name, **how)
@@ -94,7 +121,7 @@ def given(coupling: Coupling | Design | None, kind: str = "given") -> Chosen:
         proof = (coupling.certificate and coupling.certificate.limiter) or None
         return replace(coupling, kind=kind, certificate=None, limiter=proof)
     alone = NoCoupling() if coupling is None else bare(coupling, f"{COUPLING}, or None for the loop without one")
-    return Chosen(alone, "this-environment", kind=kind)
+    return Chosen(alone, THIS_ENVIRONMENT.name, kind=kind)
 
 
 def limits_of(
@@ -111,7 +138,7 @@ def limits_of(
         return Limits(None, "limited forces are proved for constant delays", force_limit=within)
     loop = scenario.loop("I")  # the reference does not matter
     coupling, proof = chosen.coupling, chosen.limiter
-    asked = requirements or assess(loop, coupling, chosen.phi, chosen.certificate)
+    asked = requirements or assess(loop, coupling, chosen.phi, chosen.certificate, own=chosen.own)
     return covered_limits(loop, coupling, asked, proof, chosen.certificate).within(within)
 
 
@@ -143,10 +170,15 @@ class _FileCheck:
     switching: DelayRange | None = None  # the file proves that any switching of the delays within it is safe here
 
 
-def check_stored(stored: Stored, loop: Loop) -> _FileCheck:
-    """Whether the certificate on file holds, and what it says of the coupling in this loop."""
+def check_stored(stored: Stored, loop: Loop, own: Condition | None = None) -> _FileCheck:
+    """Whether the certificate on file holds, and what it says of the coupling in this loop.
+
+    `own` is a condition of the user's, for a certificate of that name.
+    """
+    claim = stored.certificate
+    asked = own if claim and own and claim.condition == own.name else None
     try:
-        reason = verify(stored).reason if stored.certificate else None
+        reason = verify(stored, asked).reason if claim else None
     except (ValueError, ArithmeticError) as error:
         reason = str(error)
     notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []
@@ -169,3 +201,81 @@ def check_stored(stored: Stored, loop: Loop) -> _FileCheck:
             f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"
         )
     return _FileCheck(tuple(notes), switching)
+
+
+@dataclass(frozen=True)
+class CouplingFigures:
+    """Kind, gains (None where it has none) and order of V, Q or R."""
+
+    kind: str
+    order: int
+    K: list[float] | None = None  # (m,) [N/m]
+    B: list[float] | None = None  # (m,) [N s/m]
+    stiffness: list[float] | None = unseen("given", None)  # (m,) [N/m], static, of a moving average
+
+    @classmethod
+    def of(cls, kind: str, coupling: Coupling, T: float) -> CouplingFigures:
+        return cls(kind, **coupling.figures(T))
+
+
+# ----------------------------------------------------------------------------------------------------
+# A coupling in its loop before anything runs: what each condition asks, ranges, limits, and whom it is safe for.
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """The parts that every report of a coupling begins with."""
+
+    chosen: Chosen = unseen("no")
+    whole: RangesCheck | None = unseen("no")
+    coupling: CouplingFigures = unseen()
+    certificates: dict[str, Requirement] = unseen()  # by condition, also under the names that they had before
+    guarantee: str | None = unseen(older="promise")
+    ranges: RangesFigures | None = unseen(older="set")
+    limiter: Limits = unseen()
+
+    @classmethod
+    def of(
+        cls,
+        chosen: Chosen,
+        loop: Loop,
+        requirements: dict[str, Requirement],
+        whole: RangesCheck | None,
+        limits: Limits,
+    ) -> Judged:
+        """The verdicts on a coupling in a loop."""
+        return cls(
+            chosen,
+            whole,
+            CouplingFigures.of(chosen.kind, chosen.coupling, loop.T),
+            with_older(requirements, OLDER),
+            guarantee_of(requirements, loop, bool(whole and whole.proved)),
+            whole and RangesFigures.of(whole),
+            limits,
+        )
+
+    @property
+    def requirements(self) -> dict[str, Requirement]:
+        """The certificates under today's names alone."""
+        return {name: need for name, need in self.certificates.items() if name not in OLDER}
+
+    @property
+    def proved(self) -> bool:
+        """Whether the guarantee is proved for the ranges."""
+        return bool(self.whole and self.whole.proved)
+
+
+def judge(
+    scenario: Scenario,
+    case: str,
+    chosen: Chosen,
+    seed: int,
+    limiter: bool | None,
+    met: Scenario,
+    progress: Callable[[int, int], None],
+) -> Judged:
+    """The coupling in the scenario's loop; conditions are asked of `met`, one environment of its ranges."""
+    whole = check_ranges(scenario.loop(case), chosen.coupling, seed, progress=progress)
+    requirements = assess(met.loop(case), chosen.coupling, chosen.phi, chosen.certificate, own=chosen.own)
+    limits = limits_of(met, chosen, requirements, limiter)
+    return Judged.of(chosen, met.loop(case), requirements, whole, limits)

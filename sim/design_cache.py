@@ -20,7 +20,7 @@ import msgspec
 import controller
 import design
 from controller.loop import Loop
-from design.certificate import prove, prove_limiter, verify
+from design.certificate import named, prove, prove_limiter, verify
 from design.coupling_file import Certificate, Stored, digest, load, save, sealed
 from design.files import one_command
 from design.result import Design, NotProved
@@ -65,8 +65,8 @@ def keep(made: Design, loop: Loop, *question: Any) -> Certificate | None:
 
 def proved(made: Design, loop: Loop) -> Certificate:
     """The proof of a design, also while forces are limited where that can be had. Raises NotProved."""
-    certificate = prove(loop, made.coupling, made.condition)
-    if made.condition == "this-environment":
+    certificate = prove(loop, made.coupling, made.asked)
+    if named(made.asked).extensible:
         with suppress(NotProved):
             limiter = prove_limiter(loop, made.coupling, c=made.c)
             certificate = sealed(msgspec.structs.replace(certificate, limiter=limiter))

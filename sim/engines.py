@@ -1,26 +1,50 @@
 """Engines: what moves the plant between two samples, for one simulation or for many at once.
 
     exact         s+ = A s + B [w; f], the matrix exponential of the plant under held inputs (no Coulomb friction)
-    exponential   and MuJoCo's own integrators: sim.mujoco_engines
+    exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: accelerations by one mj_forward a step,
+                  J from the compiled model's matrices; exact on a linear scene, whatever its stiffness and the step
+    RK4, ..       steps of MuJoCo's own integrators, whose number per period sim.accuracy decides
+
+The exponential engine shares J with the exact one, so it checks forces and assembly, not the stepping in time: for that
+there is RK4.
+
+An impedance (A, B, C, D) that a hand has is no body. Its state and its force are part of the exponential step, which
+stays exact. Around each step of MuJoCo's own integrators lie two half steps, exact too, of what the impedance and the
+masses do to each other while positions rest (Strang's splitting): of second order in the step, and never active.
 
 All of them read their inputs from the rows of a step buffer and write the next row, with no copy in between. With a
-timing (controller.timing) every tick has a length of its own, and forces that latch late act from within it; then the
+timing (controller.delay) every tick has a length of its own, and forces that latch late act from within it; then the
 forces that the actuators hold are the last entries of the plant's state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import lru_cache, partial
-from typing import Protocol
+import ctypes
+import glob
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache, partial
+from itertools import pairwise
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
 
+from controller.delay import Timing
+from controller.lti import Array
 from controller.tick import FusedTicks, StepBuffer, Stretch
-from controller.timing import Timing
-from models.hold import HeldPlant, Product, hold, latched, product_of
-from models.scene import Plant
+from design.files import InputError
+from models.hold import HeldPlant, Product, expm_each, exponential_step, hold, latched, product_of
+from models.scene import Plant, Scene, Variants
+
+if TYPE_CHECKING:
+    import mujoco
+
 
 _MOST_MAPS = 256  # of ticks that differ, kept by an engine
 
@@ -133,3 +157,439 @@ class ExactTimedEngine(_Exact):
     def advance(self, k: int, /) -> None:
         buffer, which = self._buffer, self._which
         self._product(which[(buffer.first + k) % len(which)])(buffer.plant_row[k], buffer.plant_state[k + 1])
+
+
+# ----------------------------------------------------------------------------------------------------
+# MuJoCo's engines.
+
+#: the integrator of ours, which reads MuJoCo's accelerations
+EXPONENTIAL = "exponential"
+
+#: name -> what MuJoCo's model is set to, for the exponential one, where it decides nothing, to RK4
+INTEGRATORS = {
+    EXPONENTIAL: "mjINT_RK4",
+    "RK4": "mjINT_RK4",
+    "Euler": "mjINT_EULER",
+    "implicit": "mjINT_IMPLICIT",
+    "implicitfast": "mjINT_IMPLICITFAST",
+    "discrete": "mjINT_DISCRETE",
+}
+
+LEAST = 4  # steps per period of MuJoCo's own integrators
+
+_RESOLVED, _FOLLOWED = 0.2, 1.0  # what a step may advance the fastest mode [rad] and the strongest damping
+_WHOLE = 1e-9  # of a step: rounding, where a number of steps is counted
+
+
+def default_integrator(scene: Scene) -> str:
+    """exponential where the scene is smooth; RK4 where something rubs, which is nearer there at equal cost."""
+    rubs = scene.model.dof_frictionloss.any() or scene.model.tendon_frictionloss.any()
+    return "RK4" if rubs else EXPONENTIAL
+
+
+def _segments(late: tuple[float, ...] | None, T: float) -> list[tuple[float, NDArray[np.bool_]]]:
+    """(seconds, channels whose last force still acts) between the latch times of a tick, (m,) or (0,) each."""
+    taus = np.array(late or ())
+    ends = np.unique(np.concatenate([[0.0], taus, [T]]))
+    return [(float(b - a), taus > a) for a, b in pairwise(ends)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Access:
+    """What is written to MuJoCo and read from it: of one simulation arrays (n,), of many (n, nsim).
+
+    Its ticks are closures: looking things up would take longer than moving them, and a bound method would be a cycle
+    that keeps a batch's memory.
+    """
+
+    T: float  # [s]
+    substeps: int
+    ctrl: Array
+    state: Array  # [q; v], (2, n) of one simulation
+    size: int  # of a state of the plant: q, v and what the impedances of hands have
+    qacc: Array
+    forward: Callable[[], object]
+    step: Callable[[int], object]  # so many steps
+    pace: Callable[[float], object]  # sets their length [s]
+    move: Callable[[float], Product] | None  # seconds -> [state; qacc] to the state then, where steps are exponential
+    kick: Callable[[float], Product] | None  # seconds -> a state to that after impedances alone have acted
+
+    def put(self, buffer: StepBuffer, k: int) -> None:
+        """Put the plant into the state of row k."""
+        self.state[...] = buffer.s[k, : 2 * len(self.qacc)].reshape(self.state.shape)
+
+    def ticks(self, buffer: StepBuffer, timing: Timing | None) -> Callable[[int], None]:
+        """What moves tick k of the buffer, from where the plant is."""
+        one = (..., 0) if self.ctrl.ndim == 1 else ...
+        states = buffer.s[:, : self.size][one]
+        rows, inputs = list(states), list(buffer.rows[:, -len(self.ctrl) :][one])
+        if timing:
+            return self._timed(buffer, timing, rows, inputs)
+        if self.kick and not self.move:
+            return self._by_both(rows, inputs)
+        shaped = list(self._shaped(states))
+        return self._by_exponentials(rows, inputs, shaped) if self.move else self._by_steps(inputs, shaped)
+
+    def _shaped(self, states: Array) -> Array:
+        """A view of [q; v] of states (ticks, size, ..), as `state` is."""
+        return states[:, : 2 * len(self.qacc)].reshape(-1, *self.state.shape)
+
+    def _by_both(self, rows: list[Array], inputs: list[Array]) -> Callable[[int], None]:
+        ctrl, move_by, T = self.ctrl, self._move_by, self.T
+
+        def advance(k: int) -> None:
+            ctrl[...] = inputs[k]
+            rows[k + 1][...] = rows[k]
+            move_by(T, rows[k + 1])
+
+        return advance
+
+    def _by_steps(self, inputs: list[Array], written: list[Array]) -> Callable[[int], None]:
+        ctrl, state, step, count = self.ctrl, self.state, self.step, self.substeps
+
+        def advance(k: int) -> None:
+            ctrl[...] = inputs[k]
+            step(count)
+            written[k + 1][...] = state
+
+        return advance
+
+    def _by_exponentials(self, rows: list[Array], inputs: list[Array], shaped: list[Array]) -> Callable[[int], None]:
+        assert self.move
+        ctrl, state, qacc, forward, move = self.ctrl, self.state, self.qacc, self.forward, self.move
+        sight = np.concatenate([rows[0], np.zeros_like(qacc)])  # [q; v; qacc]
+        seen, qacc_seen = np.split(sight, [len(rows[0])])
+        product, each = move(self.T / self.substeps), range(self.substeps)
+
+        def advance(k: int) -> None:
+            ctrl[...] = inputs[k]
+            before, after = rows[k], rows[k + 1]
+            for _ in each:
+                forward()
+                seen[...] = before
+                qacc_seen[...] = qacc
+                product(sight, after)
+                state[...] = shaped[k + 1]
+                before = after
+
+        return advance
+
+    def _timed(
+        self, buffer: StepBuffer, timing: Timing, rows: list[Array], inputs: list[Array]
+    ) -> Callable[[int], None]:
+        """From latch to latch; of the next row also the forces that are held, behind the state."""
+        kinds, which = [_segments(late, T) for T, late in timing.kinds], timing.which
+        m, states = 0 if timing.late is None else timing.late.shape[1], len(rows[0])
+        forces = self.ctrl[len(self.ctrl) - m :]
+
+        def advance(k: int) -> None:
+            self.ctrl[...] = inputs[k]
+            asked, held = inputs[k][len(self.ctrl) - m :], buffer.plant_state[k][states:].reshape(forces.shape)
+            rows[k + 1][...] = rows[k]
+            for seconds, waiting in kinds[which[(buffer.first + k) % len(which)]]:
+                forces[...] = asked
+                forces[waiting] = held[waiting]
+                self._move_by(seconds, rows[k + 1])
+            if m:
+                buffer.plant_state[k + 1][states:] = asked.reshape(m, -1)
+
+        return advance
+
+    def _move_by(self, seconds: float, row: Array) -> None:
+        """Move MuJoCo and the state `row`, which is where it stands."""
+        (view,) = self._shaped(row[None])
+        if self.move:
+            for _ in range(self.substeps):
+                self.forward()
+                self.move(seconds / self.substeps)(np.concatenate([row, self.qacc]), row)
+                self.state[...] = view
+            return
+        count = max(1, math.ceil(self.substeps * seconds / self.T - _WHOLE))
+        self.pace(seconds / count)
+        if not self.kick:
+            self.step(count)
+            view[...] = self.state
+            return
+        half = self.kick(seconds / count / 2)
+        for _ in range(count):
+            half(row.copy(), row)
+            self.state[...] = view
+            self.step(1)
+            view[...] = self.state
+            half(row.copy(), row)
+        self.state[...] = view
+
+
+class MujocoEngine:
+    """One simulation in one MjData, which a viewer can show; inputs are held by MuJoCo's ctrl."""
+
+    def __init__(
+        self, scene: Scene, T: float, integrator: str = "RK4", substeps: int = 4, timing: Timing | None = None
+    ) -> None:
+        import mujoco
+
+        self.model = _discretised(scene, T, integrator, substeps)
+        self.data = mujoco.MjData(self.model)
+        self._warnings = self.data.warning.number
+        self.stretch: Stretch | None = None
+        stacked, moves = _stacked(scene.plant), partial(_step_of, scene.plant, scene.model.nv)
+        self._whole = moves if integrator == EXPONENTIAL and substeps == 1 else None
+        self._timing, both, q, v = timing, (self.model, self.data), self.data.qpos, self.data.qvel
+        self._access = _Access(
+            T,
+            substeps,
+            self.data.ctrl,
+            # one view of both, wherever MuJoCo has put them: one copy reads them
+            as_strided(q, (2, q.size), (v.ctypes.data - q.ctypes.data, q.itemsize)),
+            len(scene.plant.A),
+            self.data.qacc,
+            partial(mujoco.mj_forward, *both),
+            partial(mujoco.mj_step, *both),
+            partial(setattr, self.model.opt, "timestep"),
+            (lambda h: moves(h).dot) if integrator == EXPONENTIAL else None,
+            _kicks(stacked),
+        )
+        # what rubs is solved from the solution before, which nothing takes back
+        self._rubs = default_integrator(scene) != EXPONENTIAL
+
+    def start(self, buffer: StepBuffer) -> None:
+        self._buffer, self.stretch, access = buffer, None, self._access
+        access.put(buffer, 0)
+        self._warnings[:] = 0
+        self._advance: Callable[[int], None] | None = None
+        if buffer.calm and not self._timing and not (self._rubs and buffer.limited):
+            if self._whole:
+                self.stretch = self._fused(buffer, self._whole(access.T))
+            elif not (access.move or access.kick):
+                self.stretch = self._stepped(buffer)
+
+    @property
+    def advance(self) -> Callable[[int], None]:
+        """From `start` on; prepared when a tick is asked for alone."""
+        self._advance = self._advance or self._access.ticks(self._buffer, self._timing)
+        return self._advance
+
+    def _fused(self, buffer: StepBuffer, move: Array) -> Stretch:
+        access, states = self._access, len(move)
+        fused = FusedTicks(buffer, move[:, :states], G=move[:, states:])
+        ctrl, qacc, forward, (q, v) = access.ctrl.data, access.qacc.data, access.forward, access.state
+        q, v = q.data, v.data
+        rows, product = list(zip(*fused.copied(len(q)), fused.before, fused.next, strict=False)), fused.product
+
+        def stretch(ticks: int) -> None:
+            for count in fused.parts(ticks):
+                for inputs, rate, q_then, v_then, now, then in rows[:count]:
+                    ctrl[:] = inputs
+                    forward()
+                    rate[:] = qacc
+                    product(now, then)
+                    q[:] = q_then
+                    v[:] = v_then
+
+        return stretch
+
+    def _stepped(self, buffer: StepBuffer) -> Stretch:
+        access = self._access
+        ctrl, state, step, count = access.ctrl, access.state, access.step, access.substeps
+        rows, law, m = buffer.rows[:, :, 0], buffer.process.linear.dot, buffer.process.channels
+        states = list(buffer.s[1:, :, 0].reshape(-1, *state.shape))
+        before, after = list(rows[:, : buffer.z.shape[1] + m]), list(buffer.after[:, :, 0])
+        inputs = list(rows[:, -len(ctrl) :])
+
+        def stretch(ticks: int) -> None:
+            for now, then, held, moved in zip(before, after[:ticks], inputs, states, strict=False):
+                law(now, then)
+                ctrl[...] = held
+                step(count)
+                moved[...] = state
+
+        return stretch
+
+    def back(self, k: int) -> None:
+        """Put the plant into the state of row k; what was warned of since does not count."""
+        self._access.put(self._buffer, k)
+        self._warnings[:] = 0
+
+    def troubled(self) -> bool:
+        return bool(self._warnings.any())
+
+
+class MujocoBatchEngine:
+    """All simulations of a buffer in one mujoco.batch.Batch: one for every set of humans.
+
+    Steps are those of MujocoEngine for each one, bit for bit; the exponential integrator's products are summed in
+    another order, so they differ by rounding.
+    """
+
+    def __init__(
+        self,
+        held_by: Variants,
+        T: float,
+        integrator: str = "RK4",
+        substeps: int = 4,
+        nthread: int = 0,
+        timing: Timing | None = None,
+    ) -> None:
+        import mujoco
+        from mujoco.batch import Batch
+
+        model = _discretised(held_by.scene, T, integrator, substeps)
+        self.batch = batch = Batch(model, len(held_by), nthread)
+        for name, rows in held_by.fields.items():
+            batch.expand(name)[...] = rows
+        batch.set_const()
+        parts, before = mujoco.mjtState, int(mujoco.mjtState.mjSTATE_TIME)
+        moved = before | int(parts.mjSTATE_QPOS) | int(parts.mjSTATE_QVEL)
+        time, motion = (mujoco.mj_stateSize(model, part) for part in (before, moved))
+
+        # Runge-Kutta asks for no matrix of bodies alone
+        asked = integrator == EXPONENTIAL or held_by.impedances
+        plants = held_by.plants() if asked else _stacked(held_by.scene.plant)
+
+        def move(h: float) -> Product:
+            return _product_of_each(exponential_step(plants.A, h, model.nv, plants.felt))
+
+        self.advance: Callable[[int], None]  # from `start` on
+        self._timing = timing
+        self._access = _Access(
+            T,
+            substeps,
+            batch.bind("ctrl").T,
+            batch.state[:, time:motion].T,  # position and velocity lie side by side in a state row
+            plants.A.shape[-1],
+            batch.bind("qacc").T,
+            batch.forward,
+            lambda count: batch.step(nstep=count),
+            batch.expand("opt.timestep").fill if timing else float,
+            cache(move) if integrator == EXPONENTIAL else None,
+            _kicks(plants),
+        )
+
+    def start(self, buffer: StepBuffer) -> None:
+        self._access.put(buffer, 0)
+        self.advance = self._access.ticks(buffer, self._timing)
+
+    def troubled(self) -> bool:
+        return bool(np.any(self.batch.warning))
+
+
+@lru_cache(64)  # runs of the same plant follow each other
+def _step_of(plant: Plant, n: int, h: float) -> Array:
+    """[s; a] to s then, of one plant with n joints, in h seconds."""
+    stacked = _stacked(plant)
+    return exponential_step(stacked.A, h, n, stacked.felt)[0]
+
+
+def _stacked(plant: Plant) -> Plant:
+    """One plant, or many, as a stack."""
+    if plant.A.ndim > 2:
+        return plant
+    return Plant(plant.A[None], plant.B[None], plant.C, None if plant.felt is None else plant.felt[None])
+
+
+def _kicks(plants: Plant) -> Callable[[float], Product] | None:
+    """Seconds to what makes the states after the impedances alone have acted; None where there are none."""
+    felt = plants.felt
+    if felt is None:
+        return None
+
+    @cache
+    def kick(h: float) -> Product:
+        return _product_of_each(expm_each(h * felt))
+
+    return kick
+
+
+def _product_of_each(steps: Array) -> Product:
+    """Of a stack of matrices with as many states, one for all where it is the only one."""
+    return product_of(steps if len(steps) > 1 else steps[0])
+
+
+def _discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
+    """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T."""
+    import mujoco
+
+    if integrator not in INTEGRATORS:
+        raise ValueError(f"integrator is {integrator!r}, allowed are {', '.join(INTEGRATORS)}")
+    if substeps < 1:
+        raise ValueError(f"substeps is {substeps}, allowed are whole numbers from 1")
+    if integrator == EXPONENTIAL != default_integrator(scene) and scene.plant.felt is not None:
+        raise InputError("a human has an impedance (A, B, C, D) and a device rubs: use integrator RK4, not exponential")
+    model = copy(scene.model)
+    model.opt.timestep = T / substeps
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, INTEGRATORS[integrator])
+    return model
+
+
+@contextmanager
+def profiler_off() -> Iterator[bool]:
+    """Run without the clock that MuJoCo's Python binding reads several times per step.
+
+    The clock is the function pointer `mjcb_time` of the library; clearing it changes no result. Yields whether
+    the pointer was found; where it is not, everything just runs with the clock. It is put back at the end.
+    """
+    pointer = _profiler_clock()
+    if pointer is None:
+        yield False
+        return
+    saved = pointer.value
+    pointer.value = None
+    try:
+        yield True
+    finally:
+        pointer.value = saved
+
+
+@contextmanager
+def quiet_warnings() -> Iterator[None]:
+    """Keep MuJoCo from printing and logging its warnings: the engine counts and reports them."""
+    import mujoco
+
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(previous)
+
+
+@cache
+def _profiler_clock() -> ctypes.c_void_p | None:
+    import mujoco
+
+    folder = os.path.dirname(mujoco.__file__)
+    for library in glob.glob(os.path.join(folder, "libmujoco*")):
+        try:
+            return ctypes.c_void_p.in_dll(ctypes.CDLL(library), "mjcb_time")
+        except (OSError, ValueError):
+            continue
+    return None
+
+
+@dataclass(frozen=True)
+class _PlantSpeed:
+    """How fast a plant moves."""
+
+    mode: float  # [rad/s] its fastest weakly damped mode, 0 where there is none
+    rate: float  # [1/s] its strongest damping
+
+    def within(self, h: float) -> bool:
+        """Whether a step of h seconds follows it."""
+        return self.mode * h <= _RESOLVED and self.rate * h < _FOLLOWED
+
+    def substeps(self, T: float) -> int:
+        """The least number of steps in T seconds that follows it, LEAST at least."""
+        return max(LEAST, math.ceil(self.mode * T / _RESOLVED), math.floor(self.rate * T / _FOLLOWED) + 1)
+
+    def hardest(self, h: float) -> str:
+        """What a step of h seconds has most trouble with, in words."""
+        if self.mode / _RESOLVED >= self.rate / _FOLLOWED:
+            return f"the mode at {self.mode / (2 * math.pi):.4g} Hz advances {self.mode * h:.3g} rad in a step"
+        return f"the damping of {self.rate:.4g} 1/s times the step is {self.rate * h:.3g}"
+
+
+def pace(A: Array) -> _PlantSpeed:
+    """The pace of x' = A x, or the fastest of many. Weakly damped is what turns faster than it decays."""
+    values = np.linalg.eigvals(A)
+    weak = np.abs(values.imag) > np.abs(values.real)
+    return _PlantSpeed(float(np.abs(values[weak]).max(initial=0.0)), float(-values.real.min(initial=0.0)))

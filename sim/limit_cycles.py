@@ -14,18 +14,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.delay import Timing
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
-from controller.timing import Timing
 from models.device import Device
 from models.hold import HeldPlant, hold
 from models.human import Population
-from models.scene import Crowd, Scene, variants
-from sim.crowds import crowds
-from sim.mujoco_engines import MujocoBatchEngine, profiler_off, quiet_warnings
+from models.scene import Crowd, Scene, crowds, variants
+from sim.engines import MujocoBatchEngine, pace, profiler_off, quiet_warnings
 from sim.run import run_block
 from sim.stability import close
-from sim.step_choice import pace
 from sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen
 
 Cells = NDArray[np.intp]

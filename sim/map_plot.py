@@ -29,6 +29,7 @@ _LINES: dict[str, dict[str, Any]] = {
     "any-environment": plots.STYLES[0] | {"linestyle": "--", "linewidth": 1.8},
     MODEL_KEPT: plots.STYLES[3] | {"linewidth": 1.8},
 }
+_OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.2}  # of a condition of the user's
 
 
 def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:
@@ -72,10 +73,9 @@ def _cell_edges(axis: Array, scale: str) -> Array:
 def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
     entries = []
     environments: dict[str, str] = {**CONDITIONS}
-    for name, style in _LINES.items():
-        if name not in drawn.ratio:
-            continue
-        ratio = drawn.ratio[name]
+    order = [*_LINES, *drawn.ratio]
+    for name, ratio in sorted(drawn.ratio.items(), key=lambda item: order.index(item[0])):
+        style = _LINES.get(name, _OWN_LINE)
         # the edge is where required damping is what is available; far from it the figure is only kept finite
         height = np.ma.masked_invalid(np.clip(ratio, 0, 4).reshape(drawn.grid.shape))
         safe, unsafe = bool((ratio < 1).any()), bool((ratio >= 1).any())

@@ -9,7 +9,7 @@ forces that the actuators can apply; the passivity controller stands behind it, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -30,6 +30,7 @@ from controller.budget import (
 from controller.delay import LOST, Ticks, ages
 from controller.lti import Array
 from controller.tick import Net, Process
+from design.guarantees import ANY
 from design.result import Requirement
 from sim.run import Simulation
 from sim.scenario import InputError
@@ -146,7 +147,7 @@ def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> 
     return replace(simulation, process=replace(process, net=make))
 
 
-def idle(simulation: Simulation, any_environment: Requirement, budget: BudgetFigures) -> str | None:
+def idle(simulation: Simulation, requirements: Iterable[Requirement], budget: BudgetFigures) -> str | None:
     """Why the budget never acts in this run from rest; None where it may, or where no proof says so."""
     scenario = simulation.scenario
     if (
@@ -156,8 +157,11 @@ def idle(simulation: Simulation, any_environment: Requirement, budget: BudgetFig
         or (simulation.process.encoder_step > 0).any()
     ):
         return None
-    within = zip(any_environment.required, scenario.delta, strict=True)
-    if not any_environment.certified or not all(needed <= (1 - EPS) * delta for needed, delta in within):
+    anywhere = [r for r in requirements if r.certified and r.guarantee == ANY]
+    if not any(
+        all(needed <= (1 - EPS) * delta for needed, delta in zip(each.required, scenario.delta, strict=True))
+        for each in anywhere
+    ):
         return None
     return f"it never acts from rest: certified for any environment with {100 * EPS:g} % of the damping to spare"
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from controller.lti import Array
 from design.files import printable, write
+from design.guarantees import ANY
 from design.result import CONDITIONS
 from sim.trace import Trace
 
@@ -470,11 +471,12 @@ def plot_singular_values(report: Comparison, path: Path) -> Path:
 def plot_required_damping(report: Comparison, path: Path) -> Path:
     """What each condition asks of the devices at each frequency, what they have, and where it binds."""
     title = "required damping over frequency; o: where it binds, ^: above the picture"
-    figure, axes = _over_frequency(title, 1, 2, (5.5, 4.2))
+    names = report.conditions
+    figure, axes = _over_frequency(title, 1, len(names), (5.5, 4.2))
     hz, available = report.frequency_hz, report.available_damping
     alike = len(set(available)) == 1  # devices that are not are drawn as ratios
     scale, unit = (available[0], " [N s/m]") if alike else (1.0, " over available damping")
-    for axis, (condition, words) in zip(axes[0], CONDITIONS.items(), strict=True):
+    for axis, condition in zip(axes[0], names, strict=True):
         axis.axhline(scale, color="black", linewidth=1.2)
         axis.annotate("available", (hz[0], scale), (2, 3), textcoords="offset points", fontsize=8)
         parts = [coupling.conditions[condition] for coupling in report.couplings]
@@ -488,8 +490,8 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
             at = max(part.requirement.frequency_hz or 0.0, hz[0]), min(binds, top)
             axis.plot(*at, "o" if binds <= top else "^", color=style["color"])
         axis.axhspan(scale, 1.12 * top, color="black", alpha=0.06, linewidth=0)
-        delayed = condition == "any-environment" and any(report.psi)
-        words += " (with a multiplier of this one)" if delayed else ""
+        words, holds = CONDITIONS.get(condition, condition), parts[0].requirement.guarantee
+        words += " (with a multiplier of this one)" if words == ANY != holds else ""
         axis.set(xscale="log", title=words, xlabel="frequency [Hz]", ylim=(-0.5 * scale, 1.12 * top))
         axis.legend(fontsize=8)
     axes[0, 0].set_ylabel(f"required damping{unit}")

@@ -8,12 +8,12 @@ from typing import Self
 import numpy as np
 
 from controller.coupling import PUBLISHED, Coupling
-from controller.delay import LOST, VaryingDelay, ages
-from controller.timing import Timing
+from controller.delay import LOST, Timing, VaryingDelay, ages
 from design.certificate import assess
 from design.files import unseen
 from design.guarantees import EncoderSteps
 from design.result import Chosen, finite, listed
+from sim.couplings import CouplingFigures
 from sim.run import Simulation
 from sim.scenario import Scenario, load
 from sim.stability import Stability, close, dominant_mode, eigenvalues, linear_growth
@@ -22,21 +22,6 @@ from sim.trace import Trace
 
 # ----------------------------------------------------------------------------------------------------
 # Couplings and encoders.
-
-
-@dataclass(frozen=True)
-class CouplingFigures:
-    """Kind, gains (None where it has none) and order of V, Q or R."""
-
-    kind: str
-    order: int
-    K: list[float] | None = None  # (m,) [N/m]
-    B: list[float] | None = None  # (m,) [N s/m]
-    stiffness: list[float] | None = unseen("given", None)  # (m,) [N/m], static, of a moving average
-
-    @classmethod
-    def of(cls, kind: str, coupling: Coupling, T: float) -> CouplingFigures:
-        return cls(kind, **coupling.figures(T))
 
 
 def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> EncoderSteps | None:

@@ -21,16 +21,25 @@ import msgspec
 import numpy as np
 
 from controller.coupling import Coupling
+from controller.delay import Timing
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from controller.tick import Net, Process, StepBuffer
-from controller.timing import Timing
 from design.own import called
 from models.hold import HeldPlant, hold
 from models.human import Hand, Person
 from models.scene import Scene, build
-from sim.engines import Engine, ExactEngine, ExactTimedEngine
-from sim.mujoco_engines import EXPONENTIAL, LEAST, MujocoEngine, default_integrator, profiler_off, quiet_warnings
+from sim.engines import (
+    EXPONENTIAL,
+    LEAST,
+    Engine,
+    ExactEngine,
+    ExactTimedEngine,
+    MujocoEngine,
+    default_integrator,
+    profiler_off,
+    quiet_warnings,
+)
 from sim.scenario import InputError, Scenario
 from sim.trace import Trace
 

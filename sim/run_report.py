@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from controller.budget import BudgetFigures
 from controller.lti import Array
+from design.certificate import named
 from design.files import unseen
 from design.guarantees import ANY, CAVEATS, MAKING, EncoderSteps
 from design.result import Requirement, listed
@@ -14,7 +15,7 @@ from design.transparency import Transparency, transparency
 from sim import accuracy
 from sim.alternatives import Alternative
 from sim.api import ScenarioRun
-from sim.judged import Judged
+from sim.couplings import Judged
 from sim.passivity_layer import BaselineFigures, idle
 from sim.report import (
     PaperRow,
@@ -86,16 +87,16 @@ class RunReport:
     def notes(self) -> list[str]:
         """Remarks that explain the figures."""
         lines, guarantee = [], self.judged.guarantee
-        certificates = self.judged.requirements
-        name = "any-environment" if self.certificate.condition == "any-environment" else "this-environment"
-        part = certificates[name]
+        certificates, part = self.judged.requirements, self.certificate
         if not part.certified and not part.reason:
-            condition = f"the {name} condition" + (" (the paper's Theorem 4)" if name == "any-environment" else "")
+            source = named(self.judged.chosen.asked).source
+            condition = f"the {part.condition} condition" + (f" ({source})" if source else "")
             what = "The loop without" if self.judged.coupling.kind == "none" else "This"
             needs = f"it needs {part.ratio:.3g} times the damping that the devices guarantee"
             lines.append(f"{what} coupling fails {condition}: {needs}.")
         if contact := self.stability.contact:
-            covered = {ANY: "any-environment", MAKING: "this-environment"}.get(guarantee or "", "no certificate")
+            making = [r.condition for r in certificates.values() if r.certified and r.guarantee == guarantee]
+            covered = making[0] if making and guarantee in (ANY, MAKING) else "no certificate"
             softer = f", and any walls with K + 2 B/T up to {listed(contact.slopes_n_per_m)} N/m"
             softer = softer if guarantee == MAKING else ""
             lines.append(f"Contact that makes and breaks: {covered} covers it in this loop{softer}.")
@@ -150,7 +151,7 @@ def run_report(
         error=accuracy.position_error(trace, run.exact, simulation, grows),
         credible=accuracy.credible(simulation, trace),
         ideal_force=accuracy.force_error(run.ran, trace, loop.lam),
-        energy_budget=budget and replace(budget, idle=idle(simulation, judged.requirements["any-environment"], budget)),
+        energy_budget=budget and replace(budget, idle=idle(simulation, judged.requirements.values(), budget)),
         baseline=net if isinstance(net, BaselineFigures) else None,
         reproducibility=beside_the_paper(simulation.scenario, case, stability, judged.coupling),
         remarks=(*run.remarks, *chosen.notes),

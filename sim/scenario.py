@@ -20,14 +20,13 @@ from typing import Any, Self, get_args
 import msgspec
 import numpy as np
 
-from controller.delay import VaryingDelay
+from controller.delay import Periods, Timing, VaryingDelay, drawn
 from controller.environment import RIGID_WALL, Block, Environment, Network, Spring, Wall, environment, parts_of
 from controller.loop import MOST_SAMPLES, DelayRange, Loop
 from controller.lti import Lti
 from controller.older import SCENARIOS as OLDER_SCENARIOS
 from controller.older import named_first, named_today
 from controller.ranges import Ranges, UncertainSpring
-from controller.timing import Periods, Timing, drawn
 from design.files import InputError, counted, printable, read_text, toml, write
 from design.own import called, named, place_of, reach_working_directory
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
@@ -467,7 +466,7 @@ def _with_own(raw: dict[str, Any]) -> dict[str, Any]:
         what = f"environment.elements #{i}"
         for part in called(what, parts_of, _own(what, table)):
             name = "springs" if isinstance(part, Spring) else "walls"
-            parts[name] = [*parts[name], msgspec.to_builtins(part)]
+            parts[name] = [*parts[name], _plain(what, part)]
     rest = {name: value for name, value in found.items() if name != "elements"}
     return raw | {"environment": rest | {name: some for name, some in parts.items() if some}}
 

@@ -13,16 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from controller.delay import Timing
 from controller.law import State
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
-from controller.timing import Timing
 from design.files import unseen
 from models.hold import HeldPlant, at_the_latch, hold
 from models.scene import Scene, Variants
-from sim.engines import Engine
-from sim.mujoco_engines import MujocoBatchEngine, profiler_off, quiet_warnings
+from sim.engines import Engine, MujocoBatchEngine, profiler_off, quiet_warnings
 from sim.run import Simulation, beginnings, make_engine, run_blocks
 from sim.trace import Trace
 

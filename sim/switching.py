@@ -20,11 +20,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.delay import LOST, Ticks, VaryingDelay, realising
+from controller.delay import LOST, Ticks, Timing, VaryingDelay, realising
 from controller.loop import DelayRange
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
-from controller.timing import Timing
 from design.coverage import Switching
 from design.files import unseen
 from design.guarantees import switching_guarantee

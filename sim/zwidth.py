@@ -11,27 +11,29 @@ from __future__ import annotations
 
 import os
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from controller import environment
-from controller.arithmetic import SingularLoop
 from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
-from controller.law import Law
-from controller.limiter import Limiter
+from controller.law import Law, Limiter
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from controller.tick import Process
-from design import conditions
 from design.audit import check_loop, edge
+from design.certificate import named
+from design.conditions import Condition
 from design.coverage import covered_limits
-from design.lmi import ANY_ENVIRONMENT
+from design.environments import THIS_ENVIRONMENT
+from design.guarantees import ANY
 from design.result import CONDITIONS, Requirement, refusal
 from models.device import Device
 from models.human import Population
@@ -49,17 +51,35 @@ _HARD_WALL = environment.Network(("tip",), walls=(environment.Wall(("tip", envir
 
 
 @dataclass(frozen=True, eq=False)
-class _Sweep:
+class _Sweep(ABC):
     """What both kinds share: devices, delays and an environment; K and B are (n,) arrays of as many cells."""
 
     devices: tuple[Device, ...]  # (m,)
     population: Population
     loop: Loop  # without ranges and with constant delays
+    own: Condition | None = field(kw_only=True, default=None)  # a further condition, of the user's
 
-    def _ratios(self, loop: Loop, coupling: Coupling) -> Array:
-        """this-environment's ratios, (n,), of a loop and a coupling of which one is a stack."""
-        poles = loop.F(coupling).poles()
-        return conditions.this_environment_ratios(lambda z: loop.late(loop.sent_at(coupling, z)), poles, loop)
+    @abstractmethod
+    def requirement(self, condition: str, K: float, B: float) -> Requirement:
+        """The damping that the condition asks at one point, by a sweep of its own, which a map is checked against."""
+
+    @cached_property
+    def asked(self) -> dict[str, Condition]:
+        """The conditions by their names."""
+        return {each.name: each for each in (*map(named, CONDITIONS), *([self.own] if self.own else []))}
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """The conditions that every cell is judged by."""
+        return tuple(self.asked)
+
+    @property
+    def decisive(self) -> str:
+        """The condition by which a coupling that was asked about is judged."""
+        return (self.own or THIS_ENVIRONMENT).name
+
+    def _one_by_one(self, condition: str, K: Array, B: Array) -> Array:
+        return np.array([self.requirement(condition, k, b).ratio for k, b in zip(K.tolist(), B.tolist(), strict=True)])
 
     def _limits(self, devices: Sequence[Device]) -> tuple[Array, Array]:
         """Force limits [N] and encoder steps [m], (m,) each."""
@@ -93,20 +113,14 @@ class CouplingSweep(_Sweep):
         return max(2 * d / ((n + 1) * self.loop.T) for d, n in zip(self.loop.delta, self.loop.theta, strict=True))
 
     @property
-    def conditions(self) -> tuple[str, ...]:
-        """The conditions that every cell is judged by."""
-        return tuple(CONDITIONS)
-
-    @property
     def refusals(self) -> dict[str, str]:
         """Conditions that do not apply to this map, with the reason."""
-        reason = self.multiplier[1]
-        return {"any-environment": reason} if reason else {}
+        return {name: reason for name, (_, reason) in self._multipliers.items() if reason}
 
     @cached_property
-    def multiplier(self) -> tuple[Array | None, str | None]:
-        """Phi of Theorem 4 [N s/m], (m,), which only delay in the environment needs; or why there is none."""
-        return ANY_ENVIRONMENT.least_multiplier(self.loop)
+    def _multipliers(self) -> dict[str, tuple[Array | None, str | None]]:
+        """What a condition needs beside every coupling, (m,); or why it says nothing of this loop."""
+        return {name: each.least_multiplier(self.loop) for name, each in self.asked.items()}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """F of every coupling, a stack for each frozen contact state of the environment, all walls touching first.
@@ -129,38 +143,32 @@ class CouplingSweep(_Sweep):
     def _limiter(self, K: float, B: float, force_limit: Array) -> tuple[Array, Array]:
         """Limit and rho of the limiter of one coupling; one that is not covered never slips, and its motors clip."""
         coupling = self._coupling(K, B)
-        rho = covered_limits(self.loop, coupling, {name: self.requirement(name, K, B) for name in CONDITIONS}).rho
+        rho = covered_limits(self.loop, coupling, {name: self.requirement(name, K, B) for name in self.asked}).rho
         if rho is None or (self.one_sided and any(rho)):  # which is a proof of the wall that holds
             return np.full(self.loop.channels, np.inf), np.zeros(self.loop.channels)
         return force_limit, np.array(rho)
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough. Of walls, in the worst state."""
-        if condition == "this-environment":
-            couplings = self._couplings(K, B)
-            return np.max([self._ratios(state, couplings) for state in self._states], axis=0)
-        phi, reason = self.multiplier
+        asked, (given, reason) = self.asked[condition], self._multipliers[condition]
         if reason:
             return np.full(K.size, np.inf)
-        one, none = self._couplings(K, B, 1), [None] * self.loop.channels
-        alone = map(self.loop.channel, range(self.loop.channels))
-        channels = set(zip(alone, none if phi is None else phi.tolist(), strict=True))
-        each = [
-            conditions.any_environment_ratios(
-                lambda z: one.sampled(z, self.loop.T), K.size, loop, None if p is None else [p]
-            )
-            for loop, p in channels
-        ]
-        return np.max(each, axis=0)
+        couplings, loops = self._couplings(K, B), [(state, None) for state in self._states]
+        if asked.separable:
+            each = [None] * self.loop.channels if given is None else [(p,) for p in given.tolist()]
+            loops = [*set(zip(map(self.loop.channel, range(self.loop.channels)), each, strict=True))]
+            couplings = self._couplings(K, B, 1)
+        found = [asked.ratios(loop, couplings, multiplier) for loop, multiplier in loops]
+        known = [ratios for ratios in found if ratios is not None]
+        return np.max(known, axis=0) if known else self._one_by_one(condition, K, B)
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """The same of one coupling by a sweep of its own, which a map is checked against."""
-        loop = self.loop
-        coupling = self._coupling(K, B)
-        if condition == "this-environment":
-            states = [conditions.this_environment(s.F(coupling), loop) for s in self._states]
-            return max(states, key=lambda requirement: requirement.ratio)
-        return ANY_ENVIRONMENT.judge(loop, coupling, self.multiplier[0])
+        asked, (given, reason), coupling = self.asked[condition], self._multipliers[condition], self._coupling(K, B)
+        if reason:
+            return refusal(condition, self.loop.delta, reason)
+        states = (self.loop,) if asked.separable else self._states
+        return max((asked.judge(state, coupling, given) for state in states), key=lambda requirement: requirement.ratio)
 
     def _coupling(self, K: float, B: float) -> SpringDamper:
         return SpringDamper([K] * self.loop.channels, [B] * self.loop.channels, self.cutoff)
@@ -220,16 +228,12 @@ class EnvironmentSweep(_Sweep):
     @property
     def conditions(self) -> tuple[str, ...]:
         """The conditions that every cell is judged by."""
-        return (*CONDITIONS, MODEL_KEPT) if self._kept else tuple(CONDITIONS)
+        return (*self.asked, MODEL_KEPT) if self._kept else tuple(self.asked)
 
     @property
     def refusals(self) -> dict[str, str]:
         """Conditions that do not apply to this map, with the reason."""
-        if any(self.loop.psi):
-            why = "with delay in the environment it takes a multiplier for each: ask design.audit about single ones"
-            return {"any-environment": why}
-        reason = self._any_environment.reason
-        return {"any-environment": reason} if reason else {}
+        return {name: needs.reason for name, needs in self._everywhere.items() if needs.reason}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """F in every environment, the coupling's model following it; one stack, since there is no contact to freeze."""
@@ -249,26 +253,33 @@ class EnvironmentSweep(_Sweep):
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough."""
-        if condition == "any-environment":
-            return np.full(K.size, self._any_environment.ratio)
-        return self._ratios(self._at(K, B), self._facing(condition))
+        if condition in self._everywhere:
+            return np.full(K.size, self._everywhere[condition].ratio)
+        found = self._judge(condition).ratios(self._at(K, B), self._facing(condition))
+        return self._one_by_one(condition, K, B) if found is None else found
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """The damping that the condition asks of the devices in one environment, by a sweep of its own."""
-        if condition == "any-environment":
-            return self._any_environment
-        try:
-            F = self._at(np.array([K]), np.array([B])).F(self._facing(condition))[0]
-            return conditions.this_environment(F, self.loop)
-        except SingularLoop as error:
-            return refusal("this-environment", self.loop.delta, str(error))
+        if condition in self._everywhere:
+            return self._everywhere[condition]
+        network, varied = self.loop.network, contact_springs(self.loop.network)
+        springs = [msgspec.structs.replace(s, stiffness=K, damping=B) if s in varied else s for s in network.springs]
+        cell = self.loop.at(msgspec.structs.replace(network, springs=tuple(springs)))
+        return self._judge(condition).judge(cell, self._facing(condition))
 
     @cached_property
-    def _any_environment(self) -> Requirement:
-        """any-environment's requirement, which no spring of the environment changes."""
-        if any(self.loop.psi):
-            return refusal("any-environment", self.loop.delta, "not asked")
-        return ANY_ENVIRONMENT.required(self.loop, self.coupling)
+    def _everywhere(self) -> dict[str, Requirement]:
+        """The requirements that no spring of the environment changes, by condition; and those that do not apply."""
+        found: dict[str, Requirement] = {}
+        for name, each in self.asked.items():
+            reason = each.not_varied(self.loop) or each.beyond(self.loop)
+            if reason or each.guarantee(self.loop) == ANY:
+                loop = self.loop
+                found[name] = refusal(name, loop.delta, reason) if reason else each.judge(loop, self.coupling)
+        return found
+
+    def _judge(self, condition: str) -> Condition:
+        return THIS_ENVIRONMENT if condition == MODEL_KEPT else self.asked[condition]
 
     def _facing(self, condition: str) -> Coupling:
         """The coupling; for MODEL_KEPT as the V whose model stays that of the scenario's environment."""

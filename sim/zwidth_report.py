@@ -15,14 +15,13 @@ from controller.lti import Array
 from design.coverage import Limits, RangesFigures
 from design.files import unseen, write
 from design.guarantees import CAVEATS
-from design.result import CONDITIONS, Requirement
-from sim.judged import Judged
+from design.result import Requirement
+from sim.couplings import CouplingFigures, Judged
 from sim.limit_cycles import UNDECIDED, Plan
-from sim.report import CouplingFigures
 from sim.scenario import Scenario
 from sim.stability import MARGINAL
 from sim.trace import slowest_seen
-from sim.zwidth import Map, MapError, Mark, Sweep, contact_springs, map_error
+from sim.zwidth import MODEL_KEPT, Map, MapError, Mark, Sweep, contact_springs, map_error
 
 _NOT_REACHED = "not reached before the interruption"
 
@@ -230,8 +229,8 @@ class MapReport:
         loop, whole, rigid = sweep.loop, not drawn.interrupted, sweep.loop.environment is RIGID_WALL
         ratios = {name: _ratio(sweep, drawn, name) for name in drawn.ratio}
         simulation = _Simulated.of(sweep, drawn, plan)
-        certified = all(mark.requirement["this-environment"].certified for mark in marks)
-        contradicted = simulation.contradicts or any(ratios[name].contradicted_cells for name in CONDITIONS)
+        certified = all(mark.requirement[sweep.decisive].certified for mark in marks)
+        contradicted = simulation.contradicts or any(ratio.contradicted_cells for ratio in ratios.values())
         return cls(
             rigid,
             None if rigid else scenario.name,
@@ -264,7 +263,7 @@ class MapReport:
 
 def _ratio(sweep: Sweep, drawn: Map, name: str) -> _Ratio:
     ratio = drawn.ratio[name]
-    contradicted = int(((ratio < 1) & (drawn.growth > MARGINAL)).sum()) if name in CONDITIONS else None
+    contradicted = int(((ratio < 1) & (drawn.growth > MARGINAL)).sum()) if name != MODEL_KEPT else None
     return _Ratio(ratio.reshape(drawn.grid.shape), int((ratio < 1).sum()), contradicted, _nulls(sweep, drawn, name))
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cvxpy as cp
 import numpy as np
 
-from controller.lti import Array, Lti
+from controller.lti import Array, Lti, taps
 from design.conditions import dampings
 from design.lmi import (
     Ports,
@@ -20,8 +20,23 @@ from design.lmi import (
     symmetric,
     unit_coupling,
     unit_environment,
-    v_hat_ports,
 )
+
+
+def theta_hat(theta: Sequence[int]) -> Lti:
+    """(12) where T = 1 and Delta_D = I."""
+    return Lti.diag(*(taps([0.5] * (n + 1), 1.0) for n in theta))
+
+
+def v_hat_ports(V: Lti, theta: Sequence[int]) -> Ports:
+    """V-hat without its zero at z = 1, in the paper's ports: y1 = H u with H = V - Theta-hat, y2 = H(1)/2 - quotient.
+
+    V-hat is Delta-OSP iff He y2/u >= (y1/u)* Delta (y1/u); V(1) must be symmetric. One state per channel fewer than
+    (16).
+    """
+    H = V - theta_hat(theta)
+    R = H.C @ np.linalg.inv(np.eye(H.order) - H.A)  # (H(1) - H)/(z - 1) is R (z - A)^-1 B
+    return Ports(H.A, H.B, R, H.dc() / 2, H.C, H.D)
 
 
 def lemma4(Delta_V: cp.Variable, Phi: cp.Variable) -> cp.Expression:

@@ -36,7 +36,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
     from sim import alternatives, couplings
 
     for made, modules in (
-        (designs.design_by_kind, (cli.design, api, compare, coverage, couplings)),
+        (designs.design_by_kind, (cli.design, api, compare, couplings)),
         (bound.bound, (bound, compare)),
         (optimal.spread, (optimal,)),
         (coverage.limiter_requirement, (coverage,)),
@@ -72,6 +72,7 @@ def _remembering(folder: Path, make):
 
 def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
     """What a call asks of the loop, defaults by their values, in words that two equal calls share."""
+    from design.conditions import Condition
     from design.coupling_file import digest
     from design.designs import usual_condition
     from design.program import DEFAULT
@@ -79,6 +80,8 @@ def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
     call = inspect.signature(make).bind(loop, *asked, **options)
     call.apply_defaults()
     words = {name: x for name, x in call.arguments.items() if name != "loop" and not callable(x)}
+    if any(isinstance(x, Condition) for x in words.values()):
+        raise TypeError("a condition of a user's own")
     if make.__name__ == "design_by_kind":
         if ":" in words["kind"]:
             raise TypeError("a design of a user's own")

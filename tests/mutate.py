@@ -52,7 +52,6 @@ TABLE = {
     "sim/test_limited",
     "controller/complementarity.py": "controller/test_tick controller/test_walls controller/test_limiter",
     "controller/law.py": "controller/test_limiter controller/test_tick controller/test_walls",
-    "controller/limiter.py": "controller/test_tick controller/test_limiter",
     "hw/limits.py": "hw/test_limits",
     "hw/device_state.py": "hw/test_device hw/test_latch_on_arrival",
 }

@@ -26,8 +26,9 @@ from controller.coupling import Coupling
 from controller.lti import Array
 from controller.tick import StepBuffer
 from design.certificate import assess
+from design.conditions import Condition
 from design.coverage import Limits
-from design.designs import KINDS
+from design.designs import KINDS, name_and_own
 from design.guarantees import guarantee_of
 from design.result import Chosen, DesignFailed, Requirement
 from models.hold import HeldPlant, hold
@@ -157,7 +158,7 @@ class Menu:
     """What the keys choose from."""
 
     case: str
-    condition: str | None = None  # what a coupling is designed for, by default its own
+    condition: str | Condition | None = None  # what a coupling is designed for, by default its own
     given: str | None = None  # the file of --coupling
     limiter: bool | None = None  # False: forces are clipped
 
@@ -205,14 +206,15 @@ def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
     if label == GIVEN:
         if menu.given is None:
             raise InputError("there is no coupling from a file (start with --coupling FILE.json)")
-        return choose(scenario, menu.case, menu.given)
+        return choose(scenario, menu.case, menu.given, name_and_own(menu.condition)[1])
     name = COUPLINGS[label]
-    return choose(scenario, menu.case, name, menu.condition if name in KINDS else None, menu.limiter)
+    asked = menu.condition if name in KINDS else name_and_own(menu.condition)[1]
+    return choose(scenario, menu.case, name, asked, menu.limiter)
 
 
 def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> PreparedLoop:
     loop = scenario.loop(menu.case)
-    requirements = assess(loop, chosen.coupling, chosen.phi)
+    requirements = assess(loop, chosen.coupling, chosen.phi, own=chosen.own)
     limits = limits_of(scenario, chosen, requirements, menu.limiter)
     simulation, guarantee = assemble(scenario, chosen.coupling, limits.rho), guarantee_of(requirements, loop)
     return PreparedLoop(menu, label, chosen, simulation, worst_mode(simulation), requirements, guarantee, limits)

@@ -107,13 +107,12 @@ def _overlay(frame: Frame, live: bool) -> _Lines:
     """Labels and values; `live` adds the clock, which a video has none of."""
     prepared, scenario = frame.prepared, frame.prepared.scenario
     delays = f"theta {_list(scenario.theta)}, psi {_list(scenario.psi)} samples of {1e3 * scenario.T:g} ms"
-    mode, here = prepared.mode, prepared.requirements["this-environment"]
+    mode = prepared.mode
     lines = [
         ("coupling", prepared.label),
         ("delays", delays),
         ("growth", f"{mode.growth:+.3g} 1/s at {mode.frequency_hz:.1f} Hz: {mode.verdict}"),
-        ("this environment", _needs(here)),
-        ("any environment", _needs(prepared.requirements["any-environment"])),
+        *((name.replace("-", " "), _needs(need)) for name, need in prepared.requirements.items()),
         ("force limits", _limited(prepared)),
         ("largest force", f"{np.abs(frame.history).max():.2f} N in {HISTORY:g} s, {frame.clipped} ticks at the limit"),
     ]

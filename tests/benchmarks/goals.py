@@ -23,12 +23,11 @@ import matplotlib
 import numpy as np
 from test_engine_cost import SCENES, cpu_seconds, looped, raw
 
-from sim.accuracy import position_error
+from sim.accuracy import position_error, simulated_growth
 from sim.couplings import choose, limits_of
-from sim.mujoco_engines import EXPONENTIAL
+from sim.engines import EXPONENTIAL
 from sim.run import assemble
 from sim.stability import exact_growth
-from sim.step_choice import simulated_growth
 
 ROOT = Path(__file__).parents[2]
 PAGES = {"engines": "docs/accuracy-engine.md", "cold": "docs/accuracy.md"}

@@ -22,7 +22,7 @@ import numpy as np
 from controller.coupling import PUBLISHED
 from controller.lti import Array
 from models.scene import _actuation, _tendon_jacobian
-from sim.mujoco_engines import EXPONENTIAL
+from sim.engines import EXPONENTIAL
 from sim.run import Simulation, assemble, make_engine, outside_forces, run
 from sim.scenario import load
 from sim.stability import MARGINAL, _measured_growth, close, dominant_mode

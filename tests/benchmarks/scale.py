@@ -20,10 +20,10 @@ from controller.loop import Loop
 from design import certify, design_coupling
 from design.certificate import prove_limiter
 from design.result import Design, NotProved
-from sim.crowds import MIXED, Validation
+from models.scene import MIXED
+from sim.crowds import Validation, validate
 from sim.run import assemble, run
 from sim.scenario import load, parse
-from sim.shards import validate
 from sim.stability import exact_growth
 
 

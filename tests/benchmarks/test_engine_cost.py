@@ -18,14 +18,12 @@ from controller.coupling import PUBLISHED
 from controller.tick import StepBuffer
 from models.device import CompliantDevice
 from models.hold import hold
-from models.scene import plant, variants
-from sim.crowds import crowds
-from sim.engines import ExactEngine
-from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, _discretised, profiler_off
+from models.scene import crowds, plant, variants
+from sim.accuracy import default_substeps, measured_hold, pace, simulated_growth
+from sim.engines import EXPONENTIAL, ExactEngine, MujocoBatchEngine, _discretised, profiler_off
 from sim.run import assemble, make_engine, run, run_block
 from sim.scenario import load
 from sim.stability import exact_growth
-from sim.step_choice import default_substeps, measured_hold, pace, simulated_growth
 
 pytestmark = pytest.mark.benchmark(group="engines")
 ROUNDS = 9

@@ -12,10 +12,8 @@ from asked import this_environment
 from controller.coupling import PUBLISHED, NoCoupling
 from controller.tick import StepBuffer
 from models.hold import hold
-from models.scene import Variants, variants
-from sim.crowds import crowds
-from sim.engines import ExactEngine
-from sim.mujoco_engines import MujocoBatchEngine, profiler_off
+from models.scene import Variants, crowds, variants
+from sim.engines import ExactEngine, MujocoBatchEngine, profiler_off
 from sim.run import assemble, run_block
 from sim.scenario import load
 from sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable

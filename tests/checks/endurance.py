@@ -19,9 +19,8 @@ from hw.monitor import LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import session_for
 from sim.couplings import choose
-from sim.crowds import Validation
+from sim.crowds import Validation, as_worker, validate
 from sim.scenario import load
-from sim.shards import as_worker, validate
 from sim.stability import unstable
 from tests.checks.faults import person
 

@@ -11,11 +11,10 @@ import numpy as np
 from controller.coupling import PUBLISHED, Coupling, SpringDamper
 from models.device import CompliantDevice
 from models.human import Human, Link
-from sim.accuracy import position_error
+from sim.accuracy import check_substeps, default_substeps, position_error, simulated_growth
 from sim.run import Simulation, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, load
 from sim.stability import exact_growth
-from sim.step_choice import check_substeps, default_substeps, simulated_growth
 
 CLOSE = 1e-2  # [1/s] what the growth rate of the rule's own choice may be off
 #: a setting holds if it is stable, has the exact verdict, and errs by less than both of these

@@ -20,10 +20,10 @@ from design.certificate import prove, required_damping
 from design.result import NotProved
 from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Population, Voluntary
+from sim.accuracy import settle
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, Scenario
 from sim.stability import NOT_EXCITED, disagree, stability_of
-from sim.step_choice import settle
 
 _TOO_CLOSE = 1e-4  # of the damping: a proof needs some room
 _HANDS = Population()

@@ -33,7 +33,7 @@ import numpy as np
 from hostile_cases import BUT, Case, furnish, npz, put
 
 from cli import options
-from cli.main import COMMANDS
+from cli.main import COMMANDS, execute
 
 SECONDS = 20  # of processor time that a case may take
 
@@ -165,7 +165,7 @@ def run(case: Case, place: Path) -> int:
             after = {str(path.relative_to(files)): content(path) for path in files.rglob("*")}
             put(place / "changed", json.dumps({name: one for name, one in after.items() if before.get(name) != one}))
         command, *words = case.words
-        options.execute(lambda argv: put(place / "begun", "") or import_module(f"cli.{command}").main(argv), words)
+        execute(lambda argv: put(place / "begun", "") or import_module(f"cli.{command}").main(argv), words)
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 0
     except BaseException:

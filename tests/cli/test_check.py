@@ -8,7 +8,7 @@ import pytest
 from worlds import PAIR, SOFT
 
 from cli.check import main
-from cli.options import execute
+from cli.main import execute
 from design.certificate import prove
 from design.coupling_file import Stored, save
 

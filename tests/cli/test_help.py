@@ -90,7 +90,7 @@ def test_help_says_what_every_option_is(module, capsys, monkeypatch):
 def test_commands_compute_with_one_blas_thread():
     """The last digits of a result depend on how a sum is shared; an environment that asks for two changes nothing."""
     script = (
-        "import sys, scipy.linalg; from threadpoolctl import threadpool_info; from cli.options import execute\n"
+        "import sys, scipy.linalg; from threadpoolctl import threadpool_info; from cli.main import execute\n"
         "count = lambda: {lib['num_threads'] for lib in threadpool_info() if lib['user_api'] == 'blas'}\n"
         "print(count()); execute(lambda words: print(count()) or 0)"
     )

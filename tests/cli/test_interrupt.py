@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.options import execute
+from cli.main import execute
 from controller.coupling import SpringDamper
 from design.coupling_file import Stored, save
 from design.files import check_file, out_file

@@ -25,7 +25,7 @@ def parser():
     made.add_argument("--theta", type=options.several(int))
     made.add_argument("--mark", type=options.pair, action="append")
     made.add_argument("--varying-delay", type=options._delay_ranges)
-    options.add_condition_option(made)
+    made.add_condition()
     return made
 
 
@@ -41,7 +41,7 @@ def parser():
         ("--theta 1,x", "--theta is '1,x', expected whole numbers separated by commas"),
         ("--mark 1,2,3", "--mark is '1,2,3', expected two numbers separated by a comma"),
         ("--varying-delay 1", "--varying-delay is '1', expected LO,HI or LO-HI,LO-HI,.. in whole samples"),
-        ("--condition any", "--condition is 'any', allowed are this-environment, any-environment"),
+        ("--condition any", "--condition is 'any', allowed are this-environment, any-environment and FILE.py:NAME"),
         ("--nonsense", "unrecognized arguments: --nonsense (--help lists the options)"),
     ],
 )

@@ -9,7 +9,7 @@ from controller.arithmetic import SingularLoop
 from controller.complementarity import BoxProblem
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, Wall
-from controller.limiter import Limiter
+from controller.law import Limiter
 from controller.lti import Lti
 from controller.tick import Process, StepBuffer
 

@@ -25,10 +25,8 @@ from design.guarantees import MAKING
 from models.device import CompliantDevice
 from models.hold import hold
 from models.human import Population
-from models.scene import variants
-from sim.crowds import crowds
-from sim.engines import ExactEngine
-from sim.mujoco_engines import MujocoBatchEngine
+from models.scene import crowds, variants
+from sim.engines import ExactEngine, MujocoBatchEngine
 from sim.run import assemble, run, run_blocks
 from sim.scenario import SCENARIOS, InputError, load, parse
 

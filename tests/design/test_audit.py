@@ -10,7 +10,7 @@ import pytest
 from worlds import FIGURE_4, PAIR, SOFT
 
 from cli.audit import main
-from cli.options import execute
+from cli.main import execute
 from controller.coupling import PUBLISHED, Compliance, Coupling, NoCoupling, SpringDamper
 from controller.environment import GROUND, RIGID_WALL, Network, Spring
 from controller.loop import Loop
@@ -118,7 +118,7 @@ def test_the_stiffest_spring_before_a_wall_is_colgates(condition, theta, K):
 def test_the_largest_period_before_a_wall_is_colgates():
     subject = wall(1000, 0.37)
     for condition in CONDITIONS:
-        found = sensitivity(*subject, requirement(*subject, condition))
+        found = sensitivity(*subject, condition)
         assert found.largest_T_s == pytest.approx(2 * (1.37 - 0.37) / 1000, rel=1e-6)
 
 
@@ -148,7 +148,7 @@ def test_just_inside_is_certified_and_just_outside_is_not(subject, condition):
     loop, coupling = subject
     needs = requirement(loop, coupling, condition)
     assert needs.certified
-    found = sensitivity(loop, coupling, needs)
+    found = sensitivity(loop, coupling, condition)
     K = np.array(stiffest(loop, coupling, condition).K)
     least, T = np.array(found.least_delta), found.largest_T_s
     change, later = msgspec.structs.replace, [n + found.extra_samples for n in loop.theta]
@@ -170,26 +170,23 @@ def test_just_inside_is_certified_and_just_outside_is_not(subject, condition):
 
 def test_figures_that_do_not_exist_say_why():
     spring = wall(0.01, 0.0, delta=1.0)
-    found = sensitivity(*spring, requirement(*spring, "this-environment"))
+    found = sensitivity(*spring, "this-environment")
     assert (found.largest_T_s, found.extra_samples) == (None, None)
     assert f"{MOST_EXTRA_SAMPLES} samples more" in found.reason
     assert "largest T tried" in found.reason
     assert "no scale of K" in stiffest(*wall(5000, 30), "this-environment").reason
     assert "stiffest K tried" in stiffest(*pair(SAFE, delta=(3.0, 3.0)), "this-environment").reason
-    assert (
-        "nothing to lose"
-        in sensitivity(*pair(PUBLISHED["I"]), requirement(*pair(PUBLISHED["I"]), "this-environment")).reason
-    )
+    assert "nothing to lose" in sensitivity(*pair(PUBLISHED["I"]), "this-environment").reason
 
 
 def test_remedies_are_tried_and_mild():
     subject = wall(5000, 0.5, 1)
-    changes = {r.change.split(":")[0]: r for r in remedies(*subject, requirement(*subject, "this-environment"))}
+    changes = {r.change.split(":")[0]: r for r in remedies(*subject, "this-environment")}
     assert changes["less delay"].requirement.required[0] == pytest.approx(3.0)
     assert not changes["less delay"].requirement.certified
     assert changes["faster"].requirement.certified
     assert changes["faster"].requirement.required[0] > 0.98 * 1.37
-    assert remedies(*wall(500, 0), requirement(*wall(500, 0), "this-environment")) == []
+    assert remedies(*wall(500, 0), "this-environment") == []
     assert {helping["condition"] for helping in report(*wall(5000, 0))["helps"]} == {"this-environment"}
 
 

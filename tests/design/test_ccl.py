@@ -10,11 +10,11 @@ from controller.loop import Loop
 from controller.lti import Lti
 from design import fixed_order as ccl
 from design import spring_damper
+from design.conditions import any_environment_demand
 from design.fixed_order import FixedOrder, FixedPoles, descend
-from design.lmi import RESERVE, Shaping, v_hat_ports
+from design.lmi import RESERVE, Shaping
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
-NO_MULTIPLIER = np.full(2, np.inf)
 
 
 def asked(lam=(1, 2), network=FIGURE_4, psi=(0, 0), delta=DELTA) -> Loop:
@@ -35,7 +35,7 @@ def inner():
 def test_a_spring_damper_is_a_member_of_every_family(order, diagonal):
     gains = SpringDamper([500.0, 900.0], [0.4, 1.0])
     loop = asked(delta=(2.0, 0.8))
-    family = FixedOrder(Shaping(loop), NO_MULTIPLIER, order, diagonal)
+    family = FixedOrder(Shaping(loop), None, order, diagonal)
     p = family.start(gains)
     assert p.shape == (family.unknowns,)
     np.testing.assert_allclose(family.coupling(p).at(Z), gains.compliance(T).at(Z), atol=1e-15)
@@ -45,25 +45,28 @@ def test_a_spring_damper_is_a_member_of_every_family(order, diagonal):
 @pytest.mark.parametrize("case", [(1, 2), (0, 0)])
 def test_the_affine_realisations_are_the_transfer_matrices(order, diagonal, case):
     loop = asked(case, delta=(2.0, 0.8))
-    family = FixedOrder(Shaping(loop), NO_MULTIPLIER, order, diagonal)
+    family = FixedOrder(Shaping(loop), None, order, diagonal)
     p = family.start(SpringDamper([500.0, 900.0], [0.4, 1.0]))
     p = p + 0.05 * np.random.default_rng(0).normal(size=p.size)
     left, right, late = Shaping(loop).parts(np.angle(Z))
     expected = (left @ family.coupling(p).at(Z) + late) @ right
-    np.testing.assert_allclose(Lti(*family.weighted_loop(p), T).at(Z), expected, atol=1e-9 * np.abs(expected).max())
-    found, wanted = family.ports(p), v_hat_ports(family.unit_coupling(p), loop.theta)
-    y2 = Lti(found.A, found.B, found.C2, found.D2, 1.0).at(Z)
-    np.testing.assert_allclose(y2, Lti(wanted.A, wanted.B, wanted.C2, wanted.D2, 1.0).at(Z), atol=1e-9)
+    np.testing.assert_allclose(family.weighted_loop(p).at(Z), expected, atol=1e-9 * np.abs(expected).max())
+    V = family.coupling(p)
+    demand = any_environment_demand(Lti(V.A, V.B, V.C, V.D, T), loop)  # by the quotient that is solved for, in SI units
+    root = np.sqrt((1 - RESERVE) * np.array(loop.delta) / T)
+    wanted = demand.gain.at(Z) + demand.free.at(Z) / (1 - RESERVE)
+    np.testing.assert_allclose(family.block(p).at(Z), root[:, None] * wanted * root, atol=1e-9)
 
 
 @pytest.mark.parametrize("diagonal", [True, False])
 def test_the_inequalities_are_affine_in_the_unknowns(diagonal):
-    family = FixedOrder(Shaping(asked((0, 0))), np.array([2.0, 3.0]), 2, diagonal)
+    family = FixedOrder(Shaping(asked((0, 0))), np.array([0.4, 0.3]), 2, diagonal)
     rng = np.random.default_rng(1)
     one, two = rng.normal(size=(2, family.unknowns))
 
     def everything(p):
-        return np.concatenate([np.ravel(M) for M in (*family.weighted_loop(p), *family.ports(p))])
+        both = family.weighted_loop(p), family.block(p)
+        return np.concatenate([np.ravel(M) for G in both for M in (G.A, G.B, G.C, G.D)])
 
     middle = (everything(one) + everything(two)) / 2
     np.testing.assert_allclose(everything((one + two) / 2), middle, atol=1e-9 * np.abs(middle).max())
@@ -87,7 +90,7 @@ def test_what_is_returned_is_certified_from_the_coupling_alone(inner):
 
 def test_every_step_of_the_descent_is_feasible_and_better():
     loop = asked((0, 0))
-    family = FixedOrder(Shaping(loop), NO_MULTIPLIER)
+    family = FixedOrder(Shaping(loop))
     gains = spring_damper.design(asked((0, 0), delta=(1.36, 1.36))).coupling
     p = family.start(gains)
     norm = Shaping(loop).norm(gains.compliance(T))[0]
@@ -106,7 +109,7 @@ def test_the_fixed_pole_reference_agrees(inner):
 
 
 def test_more_poles_never_hurt_and_the_structured_poles_are_beaten(structured):
-    problem = FixedPoles(Shaping(asked()), NO_MULTIPLIER)
+    problem = FixedPoles(Shaping(asked()))
     gains = structured.coupling
     rate = gains.B / (gains.B + gains.K * T)
     _, one = problem.best([[rate[0]], [rate[1]]])

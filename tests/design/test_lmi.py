@@ -3,7 +3,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
-from analysis import analysis, solve
+from analysis import analysis, solve, theta_hat, v_hat_ports
 from asked import any_environment
 from worlds import DELTA, FIGURE_4, T
 
@@ -20,10 +20,8 @@ from design.lmi import (
     lemma1,
     lemma2,
     lemma3,
-    theta_hat,
     unit_coupling,
     unit_environment,
-    v_hat_ports,
 )
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))

@@ -18,7 +18,7 @@ from hw.rehearsal import Rehearsal
 from hw.session import Stage, session_for
 from models.scene import plant
 from sim import load
-from sim.report import CouplingFigures
+from sim.couplings import CouplingFigures
 from sim.run import outside_forces
 from sim.scenario import InputError
 

@@ -16,13 +16,13 @@ import pytest
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra `dask`)")
 
 from controller.coupling import PUBLISHED  # noqa: E402
-from sim import shards  # noqa: E402
-from sim.crowds import _BATCH, MIXED, Findings, Validation  # noqa: E402
+from models.scene import MIXED  # noqa: E402
+from sim import crowds as shards  # noqa: E402
+from sim.crowds import _BATCH, Findings, Table, Validation, validate, validate_on_cluster  # noqa: E402
 from sim.scenario import (  # noqa: E402
     InputError,
     load,
 )
-from sim.shards import Table, validate, validate_on_cluster  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
 QUESTION = Validation(

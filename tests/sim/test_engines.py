@@ -13,9 +13,9 @@ from driven import alike, driven
 
 from controller.coupling import PUBLISHED, NoCoupling
 from models.scene import plant
-from sim import mujoco_engines as mujoco_engine
+from sim import engines as mujoco_engine
 from sim import run as loop
-from sim.mujoco_engines import MujocoBatchEngine, MujocoEngine, profiler_off
+from sim.engines import MujocoBatchEngine, MujocoEngine, profiler_off
 from sim.run import assemble, make_engine, outside_forces, run
 from sim.scenario import InputError, load
 from sim.stability import close, dominant_mode

@@ -16,16 +16,32 @@ from models.device import CompliantDevice
 from models.hold import expm_each, exponential_step, hold
 from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
-from sim import mujoco_engines
-from sim.accuracy import _missed, compare_engines, cross_check, pick
+from sim import engines
+from sim.accuracy import (
+    _missed,
+    check_substeps,
+    compare_engines,
+    cross_check,
+    default_substeps,
+    measured_hold,
+    pace,
+    pick,
+    simulated_growth,
+)
 from sim.api import run_scenario
-from sim.engines import Engine, ExactEngine
-from sim.mujoco_engines import EXPONENTIAL, INTEGRATORS, MujocoBatchEngine, MujocoEngine, default_integrator
+from sim.engines import (
+    EXPONENTIAL,
+    INTEGRATORS,
+    Engine,
+    ExactEngine,
+    MujocoBatchEngine,
+    MujocoEngine,
+    default_integrator,
+)
 from sim.passivity_layer import EnergyNet
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, VaryingDelay, load
 from sim.stability import exact_growth
-from sim.step_choice import check_substeps, default_substeps, measured_hold, pace, simulated_growth
 
 SCENARIO = load()
 RUBBING = SCENARIO.replace(device=(CompliantDevice(friction=0.5),) * 2)
@@ -370,7 +386,7 @@ def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
     assert sound.position_relative_rms < 1e-6  # of RK4 x 4 here
     assert abs(sound.growth_rate_difference_per_s) < 1e-3
     wrong_step = exponential_step(1.001 * loop.scene.plant.A[None], SCENARIO.T, loop.scene.model.nv)[0]
-    monkeypatch.setattr(mujoco_engines, "_step_of", lambda *_: wrong_step)
+    monkeypatch.setattr(engines, "_step_of", lambda *_: wrong_step)
     wrong = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), "mujoco", EXPONENTIAL, 1)
     assert wrong.position_relative_rms > 30 * sound.position_relative_rms
     assert abs(wrong.growth_rate_difference_per_s) > 1e-3

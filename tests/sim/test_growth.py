@@ -8,10 +8,10 @@ import pytest
 from cli import run as command
 from cli import trace
 from controller.coupling import NoCoupling
+from sim.accuracy import settle
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, load
 from sim.stability import close, dominant_mode, stability_of
-from sim.step_choice import settle
 from sim.trace import Trace, growth, growths
 from tests.checks.random_loops import traces
 

@@ -12,12 +12,11 @@ from controller.coupling import PUBLISHED, NoCoupling
 from design.certificate import assess
 from models.device import CompliantDevice
 from models.human import Human, Link
-from sim.accuracy import _limit_cycle
-from sim.mujoco_engines import EXPONENTIAL
+from sim.accuracy import _limit_cycle, default_substeps, simulated_growth
+from sim.engines import EXPONENTIAL
 from sim.run import assemble, make_engine, outside_forces, run, run_blocks
 from sim.scenario import InputError, load
 from sim.stability import exact_growth
-from sim.step_choice import default_substeps, simulated_growth
 from tests.checks.hard import cases, devices, measure, nominal
 
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from controller.coupling import Coupling, NoCoupling
-from models.scene import Crowd, Variants, variants
+from models.scene import Crowd, Variants, draw, variants
 from sim.adversary import _DESTABILISED, search
 from sim.couplings import choose
-from sim.crowds import draw
 from sim.run import assemble
 from sim.scenario import load
 from sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable

@@ -10,7 +10,7 @@ import pytest
 from cli.run import main
 from cli.validate import main as validate_command
 from controller.coupling import PUBLISHED, NoCoupling
-from controller.timing import Periods
+from controller.delay import Periods
 from design import design_coupling
 from models.hold import hold
 from models.human import Human, Link, Person, Port, state_space

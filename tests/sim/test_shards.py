@@ -16,10 +16,10 @@ import pytest
 
 from cli.validate import main
 from controller.coupling import PUBLISHED
-from sim import shards
-from sim.crowds import _BATCH, MIXED, Findings, Validation
+from models.scene import MIXED
+from sim import crowds as shards
+from sim.crowds import _BATCH, Findings, Table, Validation, validate
 from sim.scenario import InputError, load
-from sim.shards import Table, validate
 
 ROOT = Path(__file__).parents[2]
 QUESTION = Validation(load(), PUBLISHED["I"], 0, 3 * _BATCH + 10, MIXED, "exact", 0.0)

@@ -10,12 +10,7 @@ from controller.coupling import PUBLISHED, NoCoupling
 from models.device import CompliantDevice
 from models.human import Human, Link, Person
 from models.scene import plant
-from sim.mujoco_engines import INTEGRATORS
-from sim.run import assemble, make_engine, run
-from sim.scenario import SCENARIOS, InputError, load
-from sim.stability import exact_growth
-from sim.step_choice import (
-    _PlantSpeed,
+from sim.accuracy import (
     check_substeps,
     default_substeps,
     measured_hold,
@@ -23,6 +18,10 @@ from sim.step_choice import (
     simulated_growth,
     step_radius,
 )
+from sim.engines import INTEGRATORS, _PlantSpeed
+from sim.run import assemble, make_engine, run
+from sim.scenario import SCENARIOS, InputError, load
+from sim.stability import exact_growth
 
 SCENARIO = load()
 STIFF = SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=1e6),) * 2)

@@ -16,9 +16,8 @@ from controller.tick import Process, StepBuffer
 from design.frequency import on_circle
 from design.optimal import design
 from design.program import Options
-from models.scene import variants
+from models.scene import crowds, variants
 from sim.couplings import choose
-from sim.crowds import crowds
 from sim.limit_cycles import HeldDevices
 from sim.scenario import load
 from sim.stability import dominant_mode, exact_loops

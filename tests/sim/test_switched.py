@@ -15,8 +15,8 @@ from controller.delay import VaryingDelay, ages, realising
 from controller.tick import StepBuffer
 from design import coupling_file
 from models.hold import HeldPlant
-from models.scene import Crowd, plant, variants
-from sim.crowds import _batch, draw
+from models.scene import Crowd, draw, plant, variants
+from sim.crowds import _batch
 from sim.engines import ExactEngine
 from sim.run import assemble
 from sim.run import run as close_loop

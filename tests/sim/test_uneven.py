@@ -12,14 +12,13 @@ from scipy.linalg import expm
 from cli.run import main
 from cli.validate import main as validate
 from controller.coupling import NoCoupling, SpringDamper
-from controller.delay import VaryingDelay
-from controller.timing import Periods, Timing
+from controller.delay import Periods, Timing, VaryingDelay
 from design.files import InputError
 from models.hold import at_the_latch, hold
 from models.scene import Plant, plant
 from sim import load
 from sim.crowds import Validation, examine
-from sim.mujoco_engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
+from sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
 from sim.run import assemble, make_engine, run
 from sim.stability import close, dominant_mode
 from tests.checks import uneven

@@ -19,15 +19,13 @@ from controller.delay import VaryingDelay
 from models.device import RigidDevice
 from models.hold import hold
 from models.human import Person
-from models.scene import Crowd, build, plant, variants
+from models.scene import MIXED, Crowd, build, crowds, draw, plant, variants
 from sim import crowds as examine_module
-from sim import shards
 from sim.couplings import choose
-from sim.crowds import _BATCH, MIXED, Findings, Validation, crowds, draw
+from sim.crowds import _BATCH, Findings, Validation, validate
 from sim.engines import ExactEngine
 from sim.run import assemble, run
 from sim.scenario import InputError, load
-from sim.shards import validate
 from sim.stability import close, disagree, dominant_mode, exact_loops, impulse_forces, mujoco_loops, unstable
 from sim.verdicts import Traces
 
@@ -264,7 +262,7 @@ def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return real(question, batch, ticked)
 
-    monkeypatch.setattr(shards, "examine", interrupted)
+    monkeypatch.setattr(examine_module, "examine", interrupted)
     options = ["--humans", "300", "--engine", "exact", "--duration", "0", "--no-plot"]
     assert main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 130
     report = json.loads((tmp_path / "r.json").read_text())

@@ -10,7 +10,8 @@ import pytest
 from worlds import force_map, loop_of
 
 from cli import zwidth
-from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
+from cli.main import execute
+from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall, environment
 from controller.law import Law
@@ -19,11 +20,10 @@ from controller.tick import Process, StepBuffer
 from design.frequency import on_circle, suprema
 from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Link
-from models.scene import build, variants
+from models.scene import build, crowds, variants
 from sim import zwidth as zwidth_map
-from sim.crowds import crowds
+from sim.engines import _discretised
 from sim.limit_cycles import Effects, HeldDevices, Plan
-from sim.mujoco_engines import _discretised
 from sim.scenario import InputError, load
 from sim.stability import dominant_mode, exact_loops
 from sim.trace import oscillation, slowest_seen
@@ -86,7 +86,7 @@ def test_the_map_is_that_of_design_margin(name):
         finite = np.isfinite(true)
         np.testing.assert_allclose(drawn[finite], true[finite], rtol=2e-9)
     if name == "pair, delay inside":
-        assert sweep.multiplier[1] is not None
+        assert sweep.refusals.keys() == {"any-environment"}
 
 
 @pytest.mark.parametrize("scenario", [PAIR, STAR], ids=lambda s: s.name)

@@ -1,0 +1,132 @@
+"""The condition that docs/architecture.md shows, in every command: designed for, proved, judged, drawn, driven."""
+
+import json
+import re
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design import certify, design_coupling
+from design.files import InputError
+from sim import load
+
+PAGE = (Path(__file__).parents[2] / "docs/architecture.md").read_text()
+NAME, OWN = "joined-devices", "joined_devices.py:JoinedDevices"
+JSON = ["--json", "report.json"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """With the page's condition in a file, and a spring-damper that the command has designed for it."""
+    place = tmp_path_factory.mktemp("own")
+    found = re.search(r"```python\n# joined.py\n(.*?)```", PAGE, re.DOTALL)
+    (place / "joined_devices.py").write_text(found[1])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        assert run("design", "--out", "joined.json", *JSON) == 0
+        (place / "design.json").write_text((place / "report.json").read_text())
+    return place
+
+
+def run(command: str, *words: str) -> int:
+    return import_module(f"cli.{command}").main([*words, "--condition", OWN])
+
+
+def test_a_design_for_it_is_proved_and_uses_nearly_all_that_it_allows(folder):
+    report = json.loads((folder / "design.json").read_text())
+    needs = report["certificates"][NAME]
+    assert report["certificate"] == needs
+    assert (needs["proof"], report["stored"]["proof"]) == ("rational", "rational")
+    assert 1.36 < max(needs["required_damping"]) < 1.37
+    # the devices' joint damping is a full matrix: its least eigenvalue is .2 less, its largest .2 more
+    here = max(report["certificates"]["this-environment"]["required_damping"])
+    assert 1.37 * here / 1.57 < max(needs["required_damping"]) < 1.37 * here / 1.17
+    assert "yours to show" in report["claim"]
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("check", ["joined.json"]),
+        ("audit", ["--coupling", "joined.json"]),
+        ("export", ["joined.json"]),
+        ("compare", ["--coupling", f"joined.json,moving-average:{OWN}", "--no-plot"]),
+        ("run", ["--coupling", "joined.json", "--duration", ".1", "--no-plot", "--no-alternatives"]),
+        ("validate", ["--coupling", "joined.json", "--humans", "3", "--duration", "0", "--no-plot"]),
+        ("zwidth", ["--grid", "4", "--points", "0", "--humans", "3", "--mark", "900,.4"]),
+        ("zwidth", ["--coupling", "joined.json", "--grid", "4", "--points", "0", "--humans", "3", "--no-plot"]),
+        ("bridge", ["--rehearse", "--coupling", "joined.json", "--duration", ".1", "--no-plot"]),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_every_command_judges_by_it(command, words, folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert run(command, *words, *JSON) == 0
+    shown, text = capsys.readouterr().out, Path("report.json").read_text()
+    if command == "export":
+        assert "certificate │ proved" in shown
+        return
+    assert f'"{NAME}"' in text
+    assert NAME in shown
+    if "joined.json" in words and command != "check":
+        assert "does not hold" not in text
+
+
+def test_a_file_says_so_where_its_condition_is_not_given(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    assert import_module("cli.check").main(["joined.json", *JSON]) == 1
+    assert "condition is 'joined-devices', allowed are" in Path("report.json").read_text()
+    words = ["--coupling", "joined.json", "--duration", ".1", "--no-plot", "--no-alternatives", *JSON]
+    assert import_module("cli.run").main(words) == 0
+    report = json.loads(Path("report.json").read_text())
+    assert report["certificate"]["condition"] == "this-environment"
+    assert any("condition is 'joined-devices'" in remark for remark in report["remarks"])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["--coupling", "optimal"],
+            "for which spring-damper, moving-average and functions of your own can be designed",
+        ),
+        (["--scenario", "one-wall"], "the loop has walls, which the condition joined-devices does not name in covers"),
+    ],
+)
+def test_what_cannot_be_designed_for_it_is_said_in_a_line(words, message, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    with pytest.raises(ValueError, match=message) as caught:
+        run("design", *words)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("named", "message"),
+    [
+        ("joined_devices:Nothing", "joined_devices has no Nothing, but JoinedDevices"),
+        ("joined_devices.py:np", "has no np"),
+        ("pathlib:Path", "expected a design.conditions.Condition"),
+        ("this-env", "allowed are this-environment, any-environment and FILE.py:NAME"),
+    ],
+)
+def test_a_condition_that_is_none_is_refused(named, message, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    with pytest.raises(InputError, match=message):
+        import_module("cli.design").main(["--condition", named])
+
+
+def test_in_python_it_is_the_class(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    own = import_module("joined_devices").JoinedDevices()
+    loop = load("omega-pair").loop("I")
+    made = design_coupling(loop, "moving-average", own)
+    assert (made.condition, made.own) == (NAME, own)
+    needs = certify(loop, made)
+    assert needs[NAME].proof == "rational"
+    assert certify(loop, made.coupling, own)[NAME].required == needs[NAME].required
+    assert NAME not in certify(loop, made.coupling)
+    # with Delta = 1.37 I in the place of the full matrix its block is that of this-environment, so s is between
+    assert 1 / 1.57 < needs[NAME].ratio / needs["this-environment"].ratio / 1.37 < 1 / 1.17
+    assert np.isfinite(needs["any-environment"].ratio)
