@@ -138,12 +138,8 @@ def design(
             better.append(found)
         settled = gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS
         hurried = not settled and climb.elapsed > options.seconds
-        if (
-            settled
-            or hurried
-            or not any(each.proved for each in rungs[-_MOST_REFUSED:])
-            and len(rungs) >= _MOST_REFUSED
-        ):
+        hopeless = len(rungs) >= _MOST_REFUSED and not any(each.proved for each in rungs[-_MOST_REFUSED:])
+        if settled or hurried or (hopeless and not loop.ranges):
             break
     if loop.ranges:
         for found in better[: -_TRIED - 1 : -1]:

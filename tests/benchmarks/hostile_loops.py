@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 
@@ -39,7 +40,7 @@ def hostile(rng: np.random.Generator) -> Loop:
         return Spring((one, other), stiffness, float(f"{damping:.3g}"))
 
     chain = [*names[:1], *inner, *names[1:]] if len(names) + len(inner) > 1 else [names, GROUND]
-    springs = [spring(one, other) for one, other in zip(chain, chain[1:], strict=False)]
+    springs = [spring(one, other) for one, other in pairwise(chain)]
     for _ in range(int(rng.integers(0, 3))):
         one, other = rng.choice(len(places), 2, replace=False)
         springs.append(spring(places[one], places[other]))
@@ -71,9 +72,10 @@ def main() -> None:
         least = 20 * np.log10(max(bound(loop).value, 1e-9)) if args.bound else np.nan
         missed += not found.proved
         delays = f"{','.join(map(str, loop.theta))}/{','.join(map(str, loop.psi))}"
+        kind, told = type(found.coupling).__name__, found.reason or "proved"
+        figures = f"{reached:8.2f} dB, bound {least:8.2f}, g {found.g:.3f}"
         print(
-            f"{number:5d} {delays:16s} {reached:8.2f} dB, bound {least:8.2f}, g {found.g:.3f} {type(found.coupling).__name__:13s}"
-            f" {found.states:4d} states {seconds:5.1f} s  {found.reason or 'proved'}",
+            f"{number:5d} {delays:16s} {figures} {kind:13s} {found.states:4d} states {seconds:5.1f} s  {told}",
             flush=True,
         )
     raise SystemExit(missed > 0)
