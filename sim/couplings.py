@@ -19,10 +19,10 @@ from design.coverage import Limits, RangesFigures, covered_limits
 from design.designs import KINDS, design_by_kind, name_and_own, own_coupling, usual_condition
 from design.environments import THIS_ENVIRONMENT
 from design.files import unseen
-from design.guarantees import guarantee_of, switching_guarantee
+from design.guarantees import guarantee_of
 from design.lmi import ANY_ENVIRONMENT
 from design.own import called, place_of
-from design.result import CONDITIONS, Chosen, Design, DesignFailed, Requirement
+from design.result import CONDITIONS, Chosen, Design, DesignFailed, Requirement, switching_guarantee
 from sim import design_cache
 from sim.scenario import InputError, Scenario
 
