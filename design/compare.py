@@ -72,13 +72,14 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None, own: Sequenc
 
     `phi` is Theorem 4's multiplier that the coupling was designed with, if any; `own` are conditions of the user's.
     """
-    F, loop = loop.F(coupling), loop.at(loop.environment.frozen()[-1])
+    F, touching = loop.F(coupling), loop.at(loop.environment.frozen()[-1])
     requirements: dict[str, Requirement] = {}
     demands: dict[str, Response | None] = {}
     for each in (*map(named, CONDITIONS), *own):
-        found, _ = each.least_multiplier(loop) if phi is None else (phi, None)
-        needs = requirements[each.name] = each.judge(loop, coupling, found)
-        demands[each.name] = each.over_frequency(loop, coupling, found) if np.isfinite(needs.ratio) else None
+        here = loop.at(loop.environment) if each.beyond(loop.at(loop.environment)) else touching  # refused, or judged
+        found, _ = each.least_multiplier(here) if phi is None else (phi, None)
+        needs = requirements[each.name] = each.judge(here, coupling, found)
+        demands[each.name] = each.over_frequency(here, coupling, found) if np.isfinite(needs.ratio) else None
     return Demands(F, requirements, demands)
 
 
