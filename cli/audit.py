@@ -22,7 +22,7 @@ from design.designs import KINDS, name_and_own
 from design.files import unseen
 from design.guarantees import EncoderSteps
 from design.result import listed
-from models.device import CATALOGUE, listed_device
+from models.device import CATALOGUE, Listed, listed_device
 from sim.couplings import check_stored, fitted, own_of, read_coupling
 from sim.report import encoder_steps
 from sim.scenario import InputError, Scenario
@@ -34,13 +34,21 @@ _EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
   python -m design.audit --devices"""
 
 
+@dataclass(frozen=True)
+class _CatalogueDevice:
+    """A device of the catalogue, by its name."""
+
+    name: str
+    listed: Listed = unseen("beside")
+
+
 @dataclass(frozen=True, eq=False)
 class _Report:
     """An audit and where its numbers come from; SI units, null with a "reason" where a figure does not exist."""
 
     case: str
     scenario: str | None
-    device: dict[str, Any] | None
+    device: _CatalogueDevice | None
     gains: str | None  # the source of a device's gains
     audit: Audit = unseen("beside")
     encoder: EncoderSteps | None = unseen()
@@ -75,7 +83,7 @@ def main(argv: list[str]) -> int:
     report = _Report(
         args.case,
         None if args.rigid else scenario.name,
-        {"name": args.device, **render.plain(CATALOGUE[args.device])} if args.device else None,
+        _CatalogueDevice(args.device, CATALOGUE[args.device]) if args.device else None,
         args.source if args.device else None,
         found,
         None if args.rigid else encoder_steps(scenario, args.case, coupling),

@@ -15,9 +15,9 @@ from design.certificate import NotProved, Verdict, lag, named, prove, required_d
 from design.conditions import Condition
 from design.coupling_file import Stored, SwitchingProof
 from design.coverage import SearchFigures
-from design.environments import Searched, search, search_ranges
-from design.guarantees import HERE, RANGES, switching_guarantee
-from design.result import CONDITIONS, listed
+from design.guarantees import HERE, RANGES
+from design.result import CONDITIONS, listed, switching_guarantee
+from design.worst_member import Searched, search, search_ranges
 from sim.couplings import read_coupling
 
 

@@ -29,7 +29,7 @@ from sim.api import ScenarioRun, run_scenario
 from sim.couplings import NAMES, Judged, choose
 from sim.engines import INTEGRATORS
 from sim.passivity_layer import BaselineFigures
-from sim.run import ENGINES, AnyEngine
+from sim.run import ENGINES, AnyEngine, EngineSettings
 from sim.run_report import Ran, RunReport, run_report
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, ExactVerdict
@@ -126,10 +126,10 @@ def _run(args: argparse.Namespace, scenario: Scenario, judged: Judged, engine: A
         net = layer.Classic(args.coupling)
     elif args.energy_budget:
         net = layer.EnergyNet(*args.energy_budget)
-    asked = {name: getattr(args, name) for name in ("integrator", "substeps", "error", "seed")}
+    settings = EngineSettings(engine, args.integrator, args.substeps, args.error)
     coupling, lag = judged.chosen.coupling, judged.limiter.rho
     with render.progress("simulating") as move:
-        return run_scenario(scenario, coupling, lag, engine=engine, **asked, net=net, progress=move)
+        return run_scenario(scenario, coupling, lag, settings, args.seed, net, move)
 
 
 def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun, judged: Judged) -> list[Alternative]:

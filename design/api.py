@@ -13,22 +13,14 @@ from controller.coupling import Coupling
 from controller.loop import Loop
 from controller.lti import Lti
 from design.arguments import known, of_kind, one_of, shown
-from design.certificate import (
-    RangesCheck,
-    assess,
-    check_ranges,
-    lag,
-    named,
-    prove,
-    prove_limiter,
-    switching_requirement,
-)
+from design.certificate import RangesCheck, assess, check_ranges, judged, lag, named, prove, prove_limiter
 from design.conditions import Condition
 from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save, sealed
 from design.designs import KINDS, design_by_kind, name_and_own, usual_condition
+from design.environments import SWITCHING
 from design.files import unseen
-from design.guarantees import ANY, HERE, RANGES, guarantee_of, switching_guarantee
-from design.result import ConditionName, Design, NotProved, Requirement
+from design.guarantees import ANY, HERE, RANGES, guarantee_of
+from design.result import ConditionName, Design, NotProved, Requirement, switching_guarantee
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 _Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
@@ -116,7 +108,7 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
 
     With ranges around the loop's environment this-environment is about the environment and every vertex: the figure is
     that of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
-    violation found there (design.environments) is the figure then, and not certified. With a range of delays,
+    violation found there (design.worst_member) is the figure then, and not certified. With a range of delays,
     loop.varying_delay, there is a third, "switching": what any switching within the range asks.
 
     Each Requirement has `required` and `available` (m,) [N s/m], `certified` (required < available), the frequency [Hz]
@@ -127,17 +119,17 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     SingularLoop where their algebraic loop has no solution.
     """
     of_kind("loop", loop, Loop, _LOOP)
-    phi, own = (coupling.phi, coupling.own) if isinstance(coupling, Design) else (None, None)
+    own = coupling.own if isinstance(coupling, Design) else None
     alone = fitting(loop, coupling)
     _, asked = name_and_own(condition)
-    requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi, own=asked or own))
+    requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, own=asked or own))
     if whole := check_ranges(loop, alone, samples=0):
         _, worst = whole.worst if whole.proved else whole.worst_found
         here = requirements[worst.condition].guarantee
         proof, held = ("rational", RANGES) if whole.proved else ("sampled", here)
         requirements[worst.condition] = replace(worst, proof=proof, guarantee=held)
     if loop.varying_delay:
-        requirements["switching"] = switching_requirement(loop, alone).requirement
+        requirements["switching"] = judged(loop, alone, SWITCHING)
     return requirements
 
 

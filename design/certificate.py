@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -15,18 +14,16 @@ import numpy as np
 import scipy
 
 from controller.arithmetic import SingularLoop, TooLong, rational, within
-from controller.coupling import (
-    Coupling,
-)
+from controller.coupling import Coupling
 from controller.loop import Loop
-from controller.lti import Array, Lti
+from controller.lti import Lti
 from controller.older import AUDITS as OLDER
 from controller.ranges import Member, inside, number_of_vertices
-from design import conditions, multipliers
-from design.conditions import Condition
+from design.conditions import Condition, Demand
 from design.coupling_file import (
     Certificate,
     LimiterCertificate,
+    Rows,
     Stored,
     SwitchingProof,
     digest,
@@ -34,33 +31,14 @@ from design.coupling_file import (
     own_fields,
     sealed,
 )
-from design.environments import (
-    THIS_ENVIRONMENT,
-    Progress,
-    Searched,
-    in_each,
-    search_ranges,
-    worst,
-)
-from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, require_size, rows_of, too_large
+from design.environments import BETA, SWITCHING, THIS_ENVIRONMENT, Limiter, Switching, in_each, worst
+from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, require_size, rows_of
 from design.frequency import frequencies, on_circle, rounding
-from design.guarantees import switching_guarantee
 from design.lmi import ANY_ENVIRONMENT
 from design.result import NotProved, Requirement
-
-# ----------------------------------------------------------------------------------------------------
-# An exact proof that no switching of the delays within a loop's range is dangerous: made, stored, proved again.
-#
-# With G the forces as they leave, F = Theta_nom G, F(z) = F(1) + (z - 1) R(z) and F(1) exactly symmetric and positive
-# semidefinite, the block
-#     [[R + Delta_D/T - diag(alpha)/2 - F(1)/2,  0], [2 h G,  2 diag(alpha)]]
-# is strictly positive real (design.exact).
-# Channels whose delay does not vary have no row and column of the second kind, and alpha = 0.
-
+from design.worst_member import Progress, Searched, search_ranges
 
 _CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
-
-
 _LONGEST = 60.0  # [s] of exact arithmetic for one coupling: what fits into the limits on states takes less
 
 
@@ -72,149 +50,6 @@ def _in_time() -> Iterator[None]:
             yield
     except TooLong as error:
         raise NotProved(str(error)) from None
-
-
-def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
-    """An exact proof of any switching within the loop's range, or why there is none."""
-    found = multipliers.swept(loop, coupling)
-    requirement = found.requirement
-    if not requirement.certified:
-        return requirement.shortfall
-    P = storage(loop, coupling, found.alpha)
-    if isinstance(P, str):
-        return P
-    return SwitchingProof(requirement.required, _margin(found.requirement), found.alpha, rows_of(P))
-
-
-def storage(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Matrix | str:
-    """The matrix that proves the condition for these alpha [N/m] at the loop's damping, or why there is none."""
-    try:
-        with within(_LONGEST):
-            P, reason = find_storage(condition_block(loop, coupling, alpha))
-    except (SingularLoop, ValueError) as error:
-        return str(error)
-    return str(reason) if P is None else P
-
-
-def refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof | msgspec.UnsetType) -> str | None:
-    """Why what is on file does not prove that the delays may switch within the loop's range, or None if it does."""
-    if loop.varying_delay is None:
-        return None if proof is msgspec.UNSET else "a proof for switching delays, but the loop's delays are constant"
-    reason = "no proof is on file" if proof is msgspec.UNSET else _refuted(loop, coupling, proof)
-    return reason and f"{switching_guarantee(loop.varying_delay)}: {reason}"
-
-
-def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof) -> str | None:
-    try:
-        condition = condition_block(loop, coupling, proof.alpha)
-    except (SingularLoop, ValueError) as error:
-        return str(error)
-    other = _other_figures(proof, multipliers.swept(loop, coupling, proof.alpha).requirement)
-    return other or refuted_rows("P", condition, proof.P)
-
-
-def _other_figures(claim: Certificate | SwitchingProof | LimiterCertificate, found: Requirement) -> str | None:
-    """Where the figures on file are not those of the sweep, or None."""
-    required = found.required
-    if len(claim.required) != len(required) or not np.allclose(claim.required, required, rtol=_CLAIM_TOLERANCE):
-        return f"required is {list(claim.required)}, the sweep finds {list(required)}"
-    if not np.isclose(claim.margin, _margin(found), rtol=_CLAIM_TOLERANCE):
-        return f"margin is {claim.margin:.9g}, the sweep finds {_margin(found):.9g}"
-    return None
-
-
-def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Lti:
-    """The exact block that must be strictly positive real.
-
-    Raises ValueError where alpha [N/m] is no multiplier of this range, the model has too many states, or F(1) is not
-    exactly as it must be; SingularLoop where the loop has a pole at z = 1.
-    """
-    span, m = loop.delays, loop.channels
-    widths = [hi - lo for lo, hi in zip(span.lo, span.hi, strict=True)]
-    if len(alpha) != m or any((a > 0) != (width > 0) or a < 0 for a, width in zip(alpha, widths, strict=True)):
-        raise ValueError(f"alpha is {list(alpha)}, expected a positive number where the delay varies and 0 elsewhere")
-    G = loop.sent(coupling, exact=True)
-    if reason := too_large(G.order + sum(span.hi)):  # splitting it takes long too
-        raise ValueError(reason)
-    block, F1 = multipliers.switching_block(G, loop, alpha)
-    static = Matrix.of(F1)
-    if not static.equals(static.T) or not definiteness(static).semidefinite:
-        raise ValueError("G(1) is not exactly symmetric and positive semidefinite")
-    return block
-
-
-def _margin(requirement: Requirement) -> float:
-    return 1 / max(requirement.ratio, 1e-12)
-
-
-def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None:
-    """rho (m,) [N/m] of the limiter that the certificate covers, or None where limited forces are not covered."""
-    if certificate is None:
-        return None
-    if certificate.limiter is not msgspec.UNSET:
-        return certificate.limiter.rho
-    known = _NAMED.get(certificate.condition)
-    return known.lag(loop) if known else None
-
-
-@_in_time()
-def prove_limiter(
-    loop: Loop, coupling: Coupling, beta: float = multipliers.BETA, c: multipliers.Lags | None = None
-) -> LimiterCertificate:
-    """An exact proof with the multiplier `c` or the best one. Raises NotProved with the reason."""
-    coupling = filed(loop, coupling)
-    _require_limits(loop, coupling, THIS_ENVIRONMENT)
-    found = multipliers.limiter_requirement(loop, coupling, beta, c)
-    requirement = found.requirement
-    if not requirement.certified:
-        raise NotProved(requirement.reason or f"limiter: {requirement.shortfall}", requirement)
-    P, refused = find_storage(_limiter_block(loop, coupling, found.rho, found.c))
-    if P is None:
-        raise NotProved(f"limiter: {refused}; the sweep asks {requirement.ratio:.9f} of the damping", requirement)
-    return LimiterCertificate(beta, found.rho, found.c, requirement.required, _margin(requirement), rows_of(P))
-
-
-def _limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: multipliers.Lags) -> Lti:
-    """The exact block that must be strictly positive real. Raises NotProved."""
-    try:
-        G = loop.sent(coupling, exact=True)
-        require_size(G.order + 2 * loop.channels + sum(max(n, len(row)) for n, row in zip(loop.theta, c, strict=True)))
-        demand = multipliers.limiter_demand(G, loop, rho, c)
-    except (SingularLoop, ValueError) as error:
-        raise NotProved(f"limiter: {error}") from None
-    return _block(demand)
-
-
-def check_limiter(
-    loop: Loop, coupling: Coupling, proof: LimiterCertificate, known: Certificate | None = None
-) -> Requirement:
-    """What the limiter on file asks of the devices, proved again. Raises NotProved where the file does not prove it.
-
-    What `known`, a certificate that was proved in this process, contains is swept, and not proved again.
-    """
-    if reason := multipliers.limiter_refusal(loop):
-        raise NotProved(reason)
-    if any(not (0 <= v < math.inf) for v in (*proof.rho, *(v for row in proof.c for v in row))):
-        raise NotProved("limiter: rho and c must be numbers >= 0")
-    if proof.rho != multipliers.limiter_lag(loop.delta, loop.T, proof.beta) or len(proof.c) != loop.channels:
-        expected = f"expected beta delta/T with beta = {proof.beta:g}, one row of c each"
-        raise NotProved(f"limiter: rho is {list(proof.rho)}, {expected}")
-    found = multipliers.limiter_requirement(loop, coupling, proof.beta, proof.c).requirement
-    reason = _other_figures(proof, found)
-    if not reason and known and known.limiter is proof and known.scenario == digest(loop, coupling.form()):
-        return replace(found, proof="rational")
-    if reason := reason or refuted_rows("P", _limiter_block(loop, coupling, proof.rho, proof.c), proof.P):
-        raise NotProved(f"limiter: {reason}")
-    return replace(found, proof="rational")
-
-
-def switching_requirement(loop: Loop, coupling: Coupling) -> multipliers.SwitchingSweep:
-    """The damping that switching in loop.varying_delay asks; `proof` is "rational" where it is proved exactly."""
-    coupling = filed(loop, coupling)
-    found = multipliers.swept(loop, coupling)
-    if not found.requirement.certified or not isinstance(storage(loop, coupling, found.alpha), Matrix):
-        return found
-    return replace(found, requirement=replace(found.requirement, proof="rational"))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -251,34 +86,21 @@ def prove(
 ) -> Certificate:
     """A certificate with an exact proof of the condition, one of your own or that of a name.
 
-    `phi` [N s/m] is Theorem 4's multiplier where psi >= 1.
+    `phi` is its multiplier, of Theorem 4 where psi >= 1 in N s/m; the best one, or the least, where it is not given.
+    Where the delays of the loop may switch, the certificate proves that, too.
 
     With `limiter`, which `prove_limiter` gives of this loop, also of forces that are limited, under this-environment;
     under any-environment without delay in the environment rho is 0 and the certificate is the same. `swept` is what
     `required_damping` gives, of a caller who has just asked. Raises NotProved with the reason.
     """
     asked, coupling = named(condition), filed(loop, coupling)
-    _require_limits(loop, coupling, asked)
-    given = asked.multiplier(loop, coupling, phi)
-    multiplier = None if given is None else [rational(float(p)) for p in given]
-    requirement = swept or required_damping(loop, coupling, asked, multiplier)
-    if not requirement.certified:
-        members = asked.members(loop)
-        each = [required_damping(loop.at(m.network), coupling, asked) for m in members if len(members) > 1]
-        place = f"P{worst(each) if each else ''}"
-        raise NotProved(f"{_place(loop, asked, place)}{requirement.shortfall}", requirement)
-    if reason := _another_system(loop, coupling):
-        raise NotProved(reason, requirement)
-    proof: dict[str, Matrix] = {}
-    for name, real in _blocks(loop, coupling, asked, multiplier).items():
-        require_size(real.order, requirement)
-        P, reason = find_storage(real)
-        if P is None:
-            share = f"the sweep asks {requirement.ratio:.9f} of the available damping"
-            raise NotProved(f"{_place(loop, asked, name)}{reason}; {share}", requirement)
-        proof[name] = P
-    if multiplier is not None:
-        proof[str(asked.multiplier_name(loop))] = Matrix.of([multiplier])
+    requirement, proof = _proof(asked, loop, coupling, phi, swept)
+    if name := asked.multiplier_name(loop):
+        proof[name] = rows_of(Matrix.of([[rational(float(p)) for p in requirement.multiplier or ()]]))
+    switching: SwitchingProof | msgspec.UnsetType = msgspec.UNSET
+    if loop.varying_delay:
+        found, P = _proof(SWITCHING, loop, coupling)
+        switching = SwitchingProof(found.required, _margin(found), found.multiplier or (), P["P"])
     return sealed(
         Certificate(
             condition=asked.name,
@@ -287,13 +109,82 @@ def prove(
             margin=_margin(requirement),
             guarantee=asked.guarantee(loop),
             proof="rational",
-            matrices={name: rows_of(M) for name, M in proof.items()},
+            matrices=proof,
             scenario=digest(loop, coupling.form()),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
-            switching=_switching(loop, coupling, requirement),
-            limiter=msgspec.UNSET if limiter is None or asked is not THIS_ENVIRONMENT else limiter,
+            switching=switching,
+            limiter=limiter if limiter and asked.extensible else msgspec.UNSET,
         )
     )
+
+
+@_in_time()
+def prove_limiter(
+    loop: Loop,
+    coupling: Coupling,
+    beta: float = BETA,
+    c: Sequence[Sequence[float]] | None = None,
+    swept: Requirement | None = None,
+) -> LimiterCertificate:
+    """An exact proof with the multiplier `c` or the best one; `swept` as in `prove`. Raises NotProved."""
+    limiter = Limiter(beta, len(c[0]) if c else 1)
+    found, proof = _proof(limiter, loop, filed(loop, coupling), c and [v for row in c for v in row], swept)
+    c = limiter.rows(loop, found.multiplier or ())
+    return LimiterCertificate(beta, limiter.rho(loop), c, found.required, _margin(found), proof["P"])
+
+
+def _proof(
+    condition: Condition,
+    loop: Loop,
+    coupling: Coupling,
+    multiplier: Sequence[Any] | None = None,
+    swept: Requirement | None = None,
+) -> tuple[Requirement, dict[str, Rows]]:
+    """What a condition asks, and the matrices that prove it. Raises NotProved."""
+    _require_limits(loop, coupling, condition)
+    requirement = swept or required_damping(loop, coupling, condition, multiplier)
+    if not requirement.certified:
+        members = condition.members(loop)
+        each = [required_damping(loop.at(m.network), coupling, condition) for m in members if len(members) > 1]
+        place = condition.place(loop, f"P{worst(each) if each else ''}")
+        raise NotProved(_placed(place, requirement.shortfall), requirement)
+    if reason := _another_system(loop, coupling):
+        raise NotProved(reason, requirement)
+    proof: dict[str, Rows] = {}
+    for name, real in _blocks(loop, coupling, condition, requirement.multiplier).items():
+        require_size(real.order, requirement)
+        P, reason = find_storage(real)
+        if P is None:
+            share = f"the sweep asks {requirement.ratio:.9f} of the available damping"
+            raise NotProved(f"{condition.place(loop, name)}{reason}; {share}", requirement)
+        proof[name] = rows_of(P)
+    return requirement, proof
+
+
+def _placed(place: str, reason: str) -> str:
+    """The reason with its place before it, once."""
+    return f"{place}{reason.removeprefix(place)}"
+
+
+def judged(
+    loop: Loop, coupling: Coupling, condition: str | Condition, multiplier: Sequence[Any] | None = None
+) -> Requirement:
+    """What a condition asks; `proof` is "rational" where it is proved exactly."""
+    asked, coupling = named(condition), filed(loop, coupling)
+    needs = required_damping(loop, coupling, asked, multiplier)
+    return _with_proof(loop, coupling, asked, needs)
+
+
+def _with_proof(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> Requirement:
+    """The requirement with `proof` = 'rational' where an exact proof was found, as it is where not."""
+    if not needs.certified:
+        return needs
+    try:
+        with _in_time():
+            _proof(condition, loop, coupling, swept=needs)
+    except NotProved:
+        return needs
+    return replace(needs, proof="rational")
 
 
 #: More delays, states or digits than these are not looked at: a proof would take minutes.
@@ -314,9 +205,9 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
         states = loop.sent(coupling).order
     except SingularLoop:
         return  # the sweep says where
-    states += 0 if condition is ANY_ENVIRONMENT else sum(loop.theta)
+    members = len(condition.members(loop))
+    states += sum(loop.theta) if members else 0  # what holds in any environment has V's states alone
     require_size(states)
-    members = len(condition.members(loop)) or 1
     if members * states**3 > _MOST_COST * LARGEST**3:
         raise NotProved(f"a proof in {members} environments over {states} states each takes long")
 
@@ -358,14 +249,14 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     )
 
 
-def _switching(loop: Loop, coupling: Coupling, requirement: Requirement) -> SwitchingProof | msgspec.UnsetType:
-    """The proof that the delays may switch, of a loop with a range of them. Raises NotProved."""
-    if loop.varying_delay is None:
-        return msgspec.UNSET
-    proof = prove_switching(loop, coupling)
-    if isinstance(proof, str):
-        raise NotProved(f"{switching_guarantee(loop.varying_delay)}: {proof}", requirement)
-    return proof
+def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None:
+    """rho (m,) [N/m] of the limiter that the certificate covers, or None where limited forces are not covered."""
+    if certificate is None:
+        return None
+    if certificate.limiter is not msgspec.UNSET:
+        return certificate.limiter.rho
+    known = _NAMED.get(certificate.condition)
+    return known.lag(loop) if known else None
 
 
 def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
@@ -387,21 +278,118 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
     try:
         asked = named(condition or certificate.condition)
         with _in_time():
-            reason = _refuted_claims(loop, coupling, asked, certificate)
-            reason = reason or _refuted_proof(loop, coupling, asked, certificate)
+            _check(loop, coupling, asked, certificate)
     except ValueError as refused:  # NotProved, or a user's own condition
-        reason = str(refused)
-    return Verdict(reason is None, reason)
+        return Verdict(False, str(refused))
+    return Verdict(True)
+
+
+def _check(loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate) -> None:
+    """Raises NotProved where the certificate does not prove all that it claims."""
+    if certificate.proof != "rational":
+        raise NotProved(f"the certificate is {certificate.proof}: it carries no exact proof")
+    if certificate.guarantee != condition.guarantee(loop):
+        raise NotProved(f"{certificate.condition} does not guarantee {certificate.guarantee!r}")
+    if certificate.available != loop.delta:
+        raise NotProved(f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}")
+    matrices, multiplier = dict(certificate.matrices), None
+    if name := condition.multiplier_name(loop):
+        multiplier = _fractions(name, matrices.pop(name, None))
+    _check_part(loop, coupling, condition, certificate, multiplier, matrices)
+    if certificate.limiter is not msgspec.UNSET:
+        if not condition.extensible:
+            raise NotProved(f"limiter: {condition.name} needs no proof of its own, and one is on file")
+        check_limiter(loop, coupling, certificate.limiter)
+    delays = certificate.switching
+    if (delays is msgspec.UNSET) != (loop.varying_delay is None):
+        there = "a proof for switching delays, but the loop's delays are constant"
+        raise NotProved(f"{SWITCHING.place(loop)}no proof is on file" if delays is msgspec.UNSET else there)
+    if delays is not msgspec.UNSET:
+        _check_part(loop, coupling, SWITCHING, delays, delays.alpha, {"P": delays.P})
+
+
+def check_limiter(
+    loop: Loop, coupling: Coupling, proof: LimiterCertificate, known: Certificate | None = None
+) -> Requirement:
+    """What the limiter on file asks of the devices, proved again. Raises NotProved where the file does not prove it.
+
+    What `known`, a certificate that was proved in this process, contains is swept, and not proved again.
+    """
+    limiter, lags = Limiter(proof.beta, len(proof.c[0]) if proof.c else 1), {len(row) for row in proof.c}
+    rho = limiter.rho(loop)
+    if proof.rho != rho or len(proof.c) != loop.channels or len(lags) > 1:
+        expected = f"expected beta delta/T with beta = {proof.beta:g}, one row of c each"
+        raise NotProved(f"limiter: rho is {list(proof.rho)}, {expected}")
+    shown = known and known.limiter is proof and known.scenario == digest(loop, coupling.form())
+    c = [v for row in proof.c for v in row]
+    return _check_part(loop, coupling, limiter, proof, c, None if shown else {"P": proof.P})
+
+
+def _check_part(
+    loop: Loop,
+    coupling: Coupling,
+    condition: Condition,
+    claim: Certificate | SwitchingProof | LimiterCertificate,
+    multiplier: Sequence[Any] | None,
+    matrices: Mapping[str, Rows] | None,
+) -> Requirement:
+    """What the condition asks at the multiplier on file: its figures swept, its matrices proved again if given.
+
+    Raises NotProved where they are not those on file, or prove nothing.
+    """
+    _require_limits(loop, coupling, condition)
+    found, place = required_damping(loop, coupling, condition, multiplier), condition.place(loop)
+    reason = found.reason or _other_figures(claim, found)
+    if not (reason or found.certified):
+        reason = f"the sweep asks {found.ratio:.6g} times the available damping, whatever the matrices prove"
+    if reason := reason or _another_system(loop, coupling):
+        raise NotProved(_placed(place, reason))
+    if matrices is None:
+        return replace(found, proof="rational")
+    blocks = _blocks(loop, coupling, condition, multiplier)
+    if set(matrices) != set(blocks):
+        raise NotProved(f"matrices are {', '.join(matrices) or 'none'}, expected {', '.join(sorted(blocks))}")
+    for name, real in blocks.items():
+        if reason := refuted_rows(name, real, matrices[name]):
+            raise NotProved(f"{condition.place(loop, name)}{reason}")
+    return replace(found, proof="rational")
+
+
+def _other_figures(claim: Certificate | SwitchingProof | LimiterCertificate, found: Requirement) -> str | None:
+    """Where the figures on file are not those of the sweep, or None."""
+    required = found.required
+    if len(claim.required) != len(required) or not np.allclose(claim.required, required, rtol=_CLAIM_TOLERANCE):
+        return f"required is {list(claim.required)}, the sweep finds {list(required)}"
+    if not np.isclose(claim.margin, _margin(found), rtol=_CLAIM_TOLERANCE):
+        return f"margin is {claim.margin:.9g}, the sweep finds {_margin(found):.9g}"
+    return None
+
+
+def _margin(requirement: Requirement) -> float:
+    return 1 / max(requirement.ratio, 1e-12)
+
+
+def _fractions(name: str, rows: Rows | None) -> Sequence[Fraction]:
+    """A stored multiplier. Raises NotProved where it is no row of rationals."""
+    if rows is None:
+        raise NotProved(f"no multiplier {name} is on file")
+    try:
+        return [Fraction(value) for value in rows[0]]
+    except (IndexError, ValueError, ZeroDivisionError):
+        raise NotProved(f"{name} is no row of rational numbers") from None
 
 
 _NAMED: dict[str, Condition] = {each.name: each for each in (ANY_ENVIRONMENT, THIS_ENVIRONMENT)}
+_PARTS = Switching, Limiter  # of a certificate, beside its condition
 
 
 def named(condition: str | Condition) -> Condition:
     """The condition of that name; one that comes itself is itself. Raises ValueError for an unknown or a taken name."""
     if not isinstance(condition, str):
-        name, taken = getattr(condition, "name", None), {*_NAMED, *OLDER, "switching", "limiter"}
-        if condition not in _NAMED.values() and (not isinstance(name, str) or not name.strip() or name in taken):
+        name, taken = getattr(condition, "name", None), {*_NAMED, *OLDER, *(each.name for each in _PARTS)}
+        if not (condition in _NAMED.values() or type(condition) in _PARTS) and (
+            not isinstance(name, str) or not name.strip() or name in taken
+        ):
             own = f"condition {type(condition).__name__}: its name is {name!r}"
             raise ValueError(f"{own}, expected one of its own, not {', '.join(sorted(taken))}")
         return condition
@@ -427,16 +415,15 @@ def _blocks(loop: Loop, coupling: Coupling, condition: Condition, multiplier: An
     """The exact blocks to be strictly positive real, by the name of the matrix that proves it. Raises NotProved."""
     try:
         demands = condition.exact_demands(loop, coupling, multiplier)
-    except NotProved:
-        raise
+        return {name: _block(demand) for name, demand in demands.items()}
     except SingularLoop as error:
-        raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
+        reason = f"a pole at z = 1 or an algebraic loop without solution: {error}"
     except ValueError as error:
-        raise NotProved(str(error)) from None
-    return {name: _block(demand) for name, demand in demands.items()}
+        reason = str(error)
+    raise NotProved(_placed(condition.place(loop), reason))
 
 
-def _block(demand: conditions.Demand[Lti]) -> Lti:
+def _block(demand: Demand[Lti]) -> Lti:
     """The block of a demand at the devices' damping, after the exact tests of what is static. Raises NotProved."""
     for name, value in demand.static.items():
         if not (value == value.T).all():
@@ -446,70 +433,14 @@ def _block(demand: conditions.Demand[Lti]) -> Lti:
     return demand.gain + demand.free
 
 
-def _place(loop: Loop, condition: Condition, matrix: str) -> str:
-    """Which member of the ranges the matrix P, P1, P2, .. is about, as the beginning of a message."""
-    members = condition.members(loop)
-    return f"{members[int(matrix[1:] or 0)].name}: " if len(members) > 1 else ""
-
-
-def _refuted_claims(loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate) -> str | None:
-    """Why the figures on file do not follow from the loop and the coupling, or None."""
-    if certificate.proof != "rational":
-        return f"the certificate is {certificate.proof}: it carries no exact proof"
-    if certificate.guarantee != condition.guarantee(loop):
-        return f"{certificate.condition} does not guarantee {certificate.guarantee!r}"
-    if certificate.available != loop.delta:
-        return f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}"
-    _require_limits(loop, coupling, condition)
-    requirement = required_damping(loop, coupling, condition, _multiplier(loop, condition, certificate))
-    if reason := _other_figures(certificate, requirement):
-        return reason
-    if not requirement.certified:
-        return f"the sweep asks {requirement.ratio:.6g} times the available damping, whatever the matrices prove"
-    return _another_system(loop, coupling)
-
-
-def _refuted_proof(loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate) -> str | None:
-    """Why the matrices prove nothing, or None if they prove the condition."""
-    blocks = _blocks(loop, coupling, condition, _multiplier(loop, condition, certificate))
-    expected = {*blocks, *filter(None, [condition.multiplier_name(loop)])}
-    if set(certificate.matrices) != expected:
-        found = ", ".join(certificate.matrices) or "none"
-        return f"matrices are {found}, expected {', '.join(sorted(expected))}"
-    for name, real in blocks.items():
-        if reason := refuted_rows(name, real, certificate.matrices[name]):
-            return f"{_place(loop, condition, name)}{reason}"
-    if certificate.limiter is not msgspec.UNSET:
-        if condition is not THIS_ENVIRONMENT:
-            return f"limiter: {condition.name} needs no proof of its own, and one is on file"
-        check_limiter(loop, coupling, certificate.limiter)
-    return refuted(loop, coupling, certificate.switching)
-
-
-def _multiplier(loop: Loop, condition: Condition, certificate: Certificate) -> Sequence[Fraction] | None:
-    """The stored multiplier, or None for a condition without. Raises NotProved where it is no row of rationals."""
-    name = condition.multiplier_name(loop)
-    if name is None:
-        return None
-    if name not in certificate.matrices:
-        raise NotProved(f"no multiplier {name} is on file")
-    try:
-        return [Fraction(value) for value in certificate.matrices[name][0]]
-    except (IndexError, ValueError, ZeroDivisionError):
-        raise NotProved(f"{name} is no row of rational numbers") from None
-
-
 def assess(
     loop: Loop,
     coupling: Coupling,
-    phi: Array | None = None,
     known: Certificate | None = None,
     more: bool = True,
     own: Condition | None = None,
 ) -> dict[str, Requirement]:
-    """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
-
-    Beside those with names that of the user's `own`, if there is one.
+    """Required damping by each condition that has a name, and by the user's `own`, if there is one.
 
     this-environment is about the nominal environment alone (design.coverage.RangesFigures asks for the rest of its
     ranges) and the constant theta (sim.switching.DelaysCovered asks for the rest of its range). What `known`, a
@@ -519,28 +450,15 @@ def assess(
     conditions = (*_NAMED.values(), *([named(own)] if own else []))
     proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
 
-    asked = [(each, each.judge(loop, coupling, phi if each is ANY_ENVIRONMENT else None)) for each in conditions]
+    asked = [(each, each.judge(loop, coupling)) for each in conditions]
 
     def judged(each: Condition, needs: Requirement) -> Requirement:
         if each.name == proved:
             return replace(needs, proof="rational")
-        return _proved(loop, coupling, each, needs, phi) if more or not proved else needs
+        return _with_proof(loop, filed(loop, coupling), each, needs) if more or not proved else needs
 
     with within(_LONGEST):  # all proofs together
         return {each.name: judged(each, needs) for each, needs in asked}
-
-
-def _proved(
-    loop: Loop, coupling: Coupling, condition: Condition, requirement: Requirement, phi: Array | None = None
-) -> Requirement:
-    """The requirement with `proof` = 'rational' where an exact proof was found, as it is where not."""
-    if not requirement.certified:
-        return requirement
-    try:
-        prove(loop, coupling, condition, None if phi is None else phi.tolist())
-    except NotProved:
-        return requirement
-    return replace(requirement, proof="rational")
 
 
 SAMPLES = 64  # environments drawn evenly from inside the ranges, beside what the search looks at

@@ -11,7 +11,7 @@ any-environment    Lemma 4 of the paper for any passive environment under backwa
                    `any_environment_demand`; of an environment that holds delay `delayed_environment_demand`
 
 design/environments.py and lmi.py have the two as a `Condition` of a loop and a coupling: which form applies.
-design/multipliers.py has those of this-environment that weigh an error with a multiplier: walls that make and break
+environments.py also has those of this-environment that weigh an error with a multiplier: walls that make and break
 contact, delays that switch, forces that leave through the limiter of controller.law.
 
 The period may vary from tick to tick, up to T_max, in all of them: `even_damping` is where it enters.
@@ -152,7 +152,7 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     return Demand(-taken, gain, {"V(1)": V1})
 
 
-def delayed_environment_demand(delayed: Lti, phi: Sequence[Any]) -> Demand[Lti]:
+def delayed_environment_demand(delayed: Lti, phi: Sequence[Any] | Array) -> Demand[Lti]:
     """E-hat + Phi without its pole must be positive real; `delayed` is Psi E.
 
     E-hat = T z/(z-1) Psi E = T E(1) z/(z-1) + T z R(z), and the Hermitian part of z/(z-1) on the circle is 1/2:
@@ -160,6 +160,17 @@ def delayed_environment_demand(delayed: Lti, phi: Sequence[Any]) -> Demand[Lti]:
     """
     T, E1 = delayed.T, delayed.dc()
     return Demand(T * regular_part(delayed), Lti.constant(np.diag(numbers(phi, T)), T), {"E(1)": E1}, ("E(1)",))
+
+
+def uncovered(environment: Lti, psi: Sequence[int], phi: Sequence[float] | Array) -> tuple[float, float]:
+    """The most that E-hat + Phi lacks of being passive [N s/m], > 0 where phi (m,) is too small, and at which w."""
+    demand = delayed_environment_demand(delay(psi, environment.T) @ environment, phi)
+    block = demand.free + demand.gain
+
+    def short(w: Array) -> Array:
+        return largest_eigenvalue(-hermitian(block.at(on_circle(w))))
+
+    return supremum(short, np.concatenate([[0.0], frequencies(block)]))
 
 
 #: 1 - |a| of a matrix [1, a; a*, 1] below which it is singular in floating point; a diagonal entry that is rounding.
@@ -186,7 +197,8 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
     known = own > _NOTHING * own.max(axis=-1, keepdims=True)
     weight = 1 / np.sqrt(np.where(known, own, 1.0))
     free, gain = (weight[..., :, None] * part * weight[..., None, :] for part in (free, gain))
-    if known.all() and not (gain * (1 - np.eye(gain.shape[-1]))).any():
+    diagonal = not (gain * (1 - np.eye(gain.shape[-1]))).any()
+    if known.all() and diagonal:
         return largest_eigenvalue(-free)
     if gain.shape[-1] == 2 and known.all() and (np.abs(np.abs(gain[..., 0, 1]) - 1) > _SINGULAR).all():
         return _of_pairs(free, gain[..., 0, 1])
@@ -194,15 +206,19 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
         gain = gain[..., :1, :, :]  # the same at every frequency: one decomposition
     eigenvalues, basis = np.linalg.eigh(gain)
     floor = np.maximum(1e-13 * np.abs(eigenvalues).max(axis=-1, keepdims=True), np.finfo(float).tiny)
-    scale = np.where(eigenvalues > floor, 1 / np.sqrt(np.maximum(eigenvalues, floor)), 1.0)
-    whitened = np.conj(np.swapaxes(basis, -1, -2)) * scale[..., :, None]
-    H = whitened @ (free @ np.conj(np.swapaxes(whitened, -1, -2)))
+    if diagonal and eigenvalues.size == gain.shape[-1]:
+        order = np.argsort(np.diagonal(gain, axis1=-2, axis2=-1).real.ravel())
+        H = free[..., order[:, None], order]
+    else:
+        scale = np.where(eigenvalues > floor, 1 / np.sqrt(np.maximum(eigenvalues, floor)), 1.0)
+        whitened = np.conj(np.swapaxes(basis, -1, -2)) * scale[..., :, None]
+        H = whitened @ (free @ np.conj(np.swapaxes(whitened, -1, -2)))
     flat, shape = H.reshape(-1, *H.shape[-2:]), H.shape[:-2]
     missing = np.broadcast_to((eigenvalues <= floor).sum(axis=-1), shape).ravel()
     needed = np.empty(missing.size)
     for r in np.unique(missing):  # eigenvalues ascend: the first r directions are those that the gain does not reach
         here = flat[missing == r]
-        needed[missing == r] = _beyond_the_null_space(here, r) if r else np.linalg.eigvalsh(-here)[:, -1]
+        needed[missing == r] = _beyond_the_null_space(here, r) if r else largest_eigenvalue(-here)
     needed[np.broadcast_to((eigenvalues < -floor).any(axis=-1), shape).ravel()] = np.inf
     return needed.reshape(shape)
 
@@ -221,13 +237,13 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
     """The least s with H + s diag(0, I) >= 0, where 0 has r rows; (n,)."""
     null, cross, rest = H[:, :r, :r], H[:, :r, r:], H[:, r:, r:]
     size = np.abs(np.diagonal(H, axis1=1, axis2=2)).max(axis=1, initial=0.0)
-    positive = np.linalg.eigvalsh(null)[:, 0] > 1e-13 * size
+    positive = largest_eigenvalue(-null) < -1e-13 * size
     needed = np.full(len(H), np.inf)
     left = rest - np.conj(np.swapaxes(cross, 1, 2)) @ np.linalg.solve(
         np.where(positive[:, None, None], null, np.eye(r)), cross
     )
     if r < H.shape[-1]:
-        needed[positive] = np.linalg.eigvalsh(-left)[positive, -1]
+        needed[positive] = largest_eigenvalue(-left)[positive]
     return needed
 
 
@@ -249,8 +265,11 @@ class Condition(ABC):
     extensible: bool = False  # whether limited forces and delays that switch have blocks beside it, in the same file
 
     @abstractmethod
-    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
-        """The block of this coupling in this loop, over Fractions where `exact`. Raises SingularLoop."""
+    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
+        """The block of this coupling in this loop, over Fractions where `exact`. Raises SingularLoop.
+
+        Only a condition that has a `multiplier_name` is given a multiplier.
+        """
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """The damping that it asks of the devices, from a refined sweep. Raises SingularLoop."""
@@ -273,7 +292,8 @@ class Condition(ABC):
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         """w (k,) [rad/sample] -> required over available damping there; None for a coupling without such a curve."""
-        return partial(least_scale, self.demand(loop, coupling))
+        more = {} if multiplier is None else {"multiplier": multiplier}
+        return partial(least_scale, self.demand(loop, coupling, **more))
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
         """Required over available damping, (n,), where loop or coupling is a stack; None: ask them one by one."""
@@ -281,7 +301,9 @@ class Condition(ABC):
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         """What is to be proved over the rationals, by the name of the matrix that proves it. Raises NotProved."""
-        return {f"P{i or ''}": self.demand(each, coupling, exact=True) for i, each in enumerate(self._loops(loop))}
+        more = {} if multiplier is None else {"multiplier": multiplier}
+        loops = enumerate(self._loops(loop))
+        return {f"P{i or ''}": self.demand(each, coupling, exact=True, **more) for i, each in loops}
 
     def _loops(self, loop: Loop) -> list[Loop]:
         return [loop.at(member.network) for member in self.members(loop)] or [loop]
@@ -300,12 +322,8 @@ class Condition(ABC):
         """rho (m,) [N/m] of a limiter that needs no further proof; None where limited forces are not covered."""
         return None
 
-    def multiplier(self, loop: Loop, coupling: Coupling, given: Sequence[float] | None) -> Sequence[float] | None:
-        """The numbers that the block needs beside the coupling: those given or the best found. Raises NotProved."""
-        return None
-
     def multiplier_name(self, loop: Loop) -> str | None:
-        """What a file calls them; None for a condition without any."""
+        """What a file calls the numbers that the block needs beside the coupling; None for a condition without any."""
         return None
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
@@ -325,6 +343,11 @@ class Condition(ABC):
         # proved at every vertex; whether it is kept between them is searched by check_ranges and design.check
         return "these ranges" if loop.ranges else "this environment"
 
+    def place(self, loop: Loop, matrix: str = "P") -> str:
+        """What a matrix is about, as the beginning of a message: which member of the ranges, where there are some."""
+        members = self.members(loop)
+        return f"{members[int(matrix[1:] or 0)].name}: " if len(members) > 1 else ""
+
     @property
     def claim(self) -> str:
         """What is said of one of the user's own."""
@@ -337,40 +360,45 @@ class Condition(ABC):
 
 
 def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], delta: Sequence[float]) -> Requirement:
-    """The damping that a demand asks of devices with `delta` [N s/m], by a refined sweep.
-
-    `system` is the block whose poles it has, and whose size says what is rounding.
-    """
+    """The damping that a demand asks of devices with `delta` [N s/m], by a refined sweep; `system` as in `unsound`."""
     available = tuple(delta)
-
-    def refused(reason: str) -> Requirement:
+    if reason := unsound(system, available):
         return refusal(name, available, reason)
-
-    if min(available) == 0:
-        return refused("a device guarantees no damping, so no coupling is safe for every passive human")
-    if reason := too_long(system):
-        return refused(reason)
-    radius = float(np.abs(system.poles()).max(initial=0.0))
-    if radius >= 1:
-        return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
     try:
         asked = demand()
     except SingularLoop as error:  # a radius that rounding has kept below one
-        return refused(f"the force map is singular in floating point: {error}")
+        return refusal(name, available, f"the force map is singular in floating point: {error}")
+    if reason := unsound_static(system, asked, available):
+        return refusal(name, available, reason)
+    ratio, w = supremum(lambda w: least_scale(asked, w), np.concatenate([[0.0], frequencies(system)]))
+    return from_ratio(name, max(ratio, 0.0), available, w / (2 * np.pi * system.T))
+
+
+def unsound(system: Lti, delta: Sequence[float]) -> str | None:
+    """Why no sweep says anything of a block that has the poles of this system, whose size says what is rounding."""
+    if min(delta) == 0:
+        return "a device guarantees no damping, so no coupling is safe for every passive human"
+    if reason := too_long(system):
+        return reason
+    radius = float(np.abs(system.poles()).max(initial=0.0))
+    return f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle" if radius >= 1 else None
+
+
+def unsound_static(system: Lti, asked: Demand[Lti], delta: Sequence[float]) -> str | None:
+    """Why what the demand says of z = 1 does not hold, beyond rounding."""
     end = system.at(-1.0)
     for matrix, value in asked.static.items():
         skew, least = _static_errors(value, system.D, end)
         slack = _STATIC
         if max(skew, -least) > slack:  # of a map that is nothing but rounding
             size = max(float(np.abs(part).max()) for part in (value, system.D, end))
-            allowed = min(rounding(system, on_circle(frequencies(system))), _STATIC * min(available) / system.T)
+            allowed = min(rounding(system, on_circle(frequencies(system))), _STATIC * min(delta) / system.T)
             slack = max(slack, allowed / max(size, 1e-12))
         if skew > slack:
-            return refused(f"the static stiffness {matrix} is not symmetric: a slow closed path could extract energy")
+            return f"the static stiffness {matrix} is not symmetric: a slow closed path could extract energy"
         if least < -slack and matrix in asked.semidefinite:
-            return refused(f"the static stiffness {matrix} has a negative direction: it pushes outwards")
-    ratio, w = supremum(lambda w: least_scale(asked, w), np.concatenate([[0.0], frequencies(system)]))
-    return from_ratio(name, max(ratio, 0.0), available, w / (2 * np.pi * system.T))
+            return f"the static stiffness {matrix} has a negative direction: it pushes outwards"
+    return None
 
 
 def this_environment(F: Lti, loop: Loop) -> Requirement:
@@ -379,6 +407,38 @@ def this_environment(F: Lti, loop: Loop) -> Requirement:
     return _least_damping("this-environment", F, lambda: this_environment_demand(F, loop), loop.delta)
 
 
+def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
+    """The damping that this-environment requires over the available damping, by a refined sweep of a stable coupling.
+
+    With `thin` by every `thin`-th frequency of its grid alone. Of one in series, a force filter, the responses of
+    environment and filter are multiplied: the poles of their series are defective and cost digits, and time.
+    """
+    if (chain := coupling.in_series(loop.T)) is None:
+        return _of_whole(loop, coupling, thin)
+    E = loop.E()
+    delayed = delay(loop.psi, loop.T) @ E
+
+    def needed(w: Array) -> Array:
+        F = loop.late(coupling.around(Sampled.of(delayed, on_circle(w)[None])))
+        demand = this_environment_demand(F, loop)
+        return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
+
+    grid = frequencies(E, chain, low=_LOWEST)
+    return float(needed(grid[::thin]).max()) if thin > 1 else supremum(needed, grid)[0]
+
+
+def _of_whole(loop: Loop, coupling: Coupling, thin: int) -> float:
+    try:
+        F = loop.F(coupling)
+        if thin == 1:
+            return this_environment(F, loop).ratio
+        demand = this_environment_demand(F, loop)
+    except SingularLoop:
+        return np.inf
+    return float(least_scale(demand, frequencies(F)[::thin]).max()) if F.is_stable() else np.inf
+
+
+_LOWEST = 1e-6  # [rad/sample]: below it nothing changes
 _W_ZERO = 1e-10  # [rad/sample] stands for F(1) of many, whose real part is even: sampled, a network may be 0/0 there
 #: rounding that F(1) may miss of symmetry and of positive semidefiniteness
 _STATIC = 1e-9
@@ -415,7 +475,7 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
     V1 = demand.static["V(1)"]
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
-    if phi is not None and uncovered(loop.E(), loop.psi, np.diag(phi)) > _ROUNDING * max(even_damping(loop)):
+    if phi is not None and uncovered(loop.E(), loop.psi, phi)[0] > _ROUNDING * max(even_damping(loop)):
         return refused("E-hat + Phi is not passive for this multiplier")
     least = partial(least_scale, demand) if phi is not None else partial(_scale_beside_zeros, V, demand)
     ratio, w = supremum(least, np.concatenate([[0.0], frequencies(V)]))
@@ -520,17 +580,6 @@ def encoder_friction(F: Lti, steps: Sequence[float]) -> Array:
     if q.shape != (F.inputs,) or not (q >= 0).all():
         raise ValueError(f"steps is {q.tolist()}, expected {F.inputs} encoder steps >= 0 in m")
     return l1_gain(F) @ (q / 2)
-
-
-def uncovered(environment: Lti, psi: Sequence[int], Phi: Array) -> float:
-    """sup over frequency of the largest eigenvalue of -He E-hat - Phi [N s/m]; > 0 where Phi is too small."""
-    delayed = delay(psi, environment.T) @ environment
-    regular = regular_part(delayed)
-
-    def short(w: Array) -> Array:
-        return -np.linalg.eigvalsh(environment.T * hermitian(regular.at(on_circle(w))) + Phi)[:, 0]
-
-    return supremum(short, np.concatenate([[0.0], frequencies(delayed)]))[0]
 
 
 # Many couplings or environments at once: a row for each, as a map asks for them.

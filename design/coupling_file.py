@@ -23,10 +23,8 @@ from design.files import InputError, counted, read, write
 from design.frequency import frequencies, on_circle, rounding
 from design.result import Guarantee
 
-_Rows = tuple[tuple[float, ...], ...]
-
-
 _Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
+Rows = tuple[tuple[_Rational, ...], ...]  # of a matrix, rationals "p/q"
 
 
 _OLDER = CONDITIONS | GUARANTEES
@@ -36,12 +34,12 @@ _Part = TypeVar("_Part", bound=msgspec.Struct)
 
 
 class SwitchingProof(Strict, frozen=True):
-    """What proves that the delays may switch within the loop's range (design.multipliers)."""
+    """What proves that the delays may switch within the loop's range (design.environments)."""
 
     required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
     margin: float  # available / required
     alpha: tuple[float, ...]  # (m,) multiplier [N/m], 0 where the delay does not vary
-    P: tuple[tuple[_Rational, ...], ...]  # rationals "p/q"
+    P: Rows
 
 
 class LimiterCertificate(Strict, frozen=True):
@@ -52,7 +50,7 @@ class LimiterCertificate(Strict, frozen=True):
     c: tuple[tuple[float, ...], ...]  # (m, lags) multiplier
     required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
     margin: float  # available / required
-    P: tuple[tuple[_Rational, ...], ...]  # rationals "p/q"
+    P: Rows
 
 
 class Certificate(Strict, frozen=True):
@@ -64,7 +62,7 @@ class Certificate(Strict, frozen=True):
     margin: float  # available / required
     guarantee: Guarantee = msgspec.field(name="promise")
     proof: Literal["sampled", "kyp", "rational"]
-    matrices: dict[str, tuple[tuple[_Rational, ...], ...]]  # rationals "p/q"
+    matrices: dict[str, Rows]
     scenario: str  # digest of the loop and the coupling
     versions: dict[str, str]
     seal: str = ""  # digest of all other fields

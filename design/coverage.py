@@ -11,14 +11,14 @@ from typing import Any
 from controller.coupling import Coupling
 from controller.loop import Loop
 from controller.ranges import Member
-from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
+from design.certificate import RangesCheck, check_limiter, judged, prove_limiter, required_damping
 from design.conditions import this_environment
 from design.coupling_file import Certificate, LimiterCertificate
-from design.environments import SEARCH, THIS_ENVIRONMENT, Searched, worst
+from design.environments import BETA, LIMITER, SWITCHING, THIS_ENVIRONMENT, Limiter, worst
 from design.files import unseen
-from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.result import Design, DesignFailed, NotProved, Requirement
 from design.transparency import decibels, transparency
+from design.worst_member import SEARCH, Searched
 
 _OWN_PROOF = "by a proof of its own, for this environment"
 
@@ -74,7 +74,7 @@ def covered_limits(
     one of the same beta. What `known` contains is not proved again (design.certificate.check_limiter).
     """
     if loop.varying_delay:
-        return Limits(None, str(limiter_refusal(loop)))
+        return Limits(None, str(LIMITER.beyond(loop)))
     for each in requirements.values():
         if each.certified and each.lag is not None:
             return Limits(each.lag, f"{each.condition} covers limited forces")
@@ -86,17 +86,17 @@ def covered_limits(
             return Limits(proof.rho, _OWN_PROOF, requirement, proof.c, proof)
         except NotProved:  # made for another loop
             pass
-    beta = proof.beta if proof and 0 < proof.beta <= 1 else BETA
-    found = limiter_requirement(loop, coupling, beta)
-    requirement = found.requirement
+    limiter = Limiter(proof.beta if proof and 0 < proof.beta <= 1 else BETA)
+    requirement = required_damping(loop, coupling, limiter)
+    c = limiter.rows(loop, requirement.multiplier or ())
     if not requirement.certified:
         needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
-        return Limits(None, requirement.reason or needs, requirement, found.c)
+        return Limits(None, requirement.reason or needs, requirement, c)
     try:
-        proved = prove_limiter(loop, coupling, beta, found.c)
+        proved = prove_limiter(loop, coupling, limiter.beta, swept=requirement)
     except NotProved as refused:
-        return Limits(found.rho, f"swept, not proved: {refused}", requirement, found.c)
-    return Limits(found.rho, _OWN_PROOF, replace(requirement, proof="rational"), found.c, proved)
+        return Limits(limiter.rho(loop), f"swept, not proved: {refused}", requirement, c)
+    return Limits(proved.rho, _OWN_PROOF, replace(requirement, proof="rational"), c, proved)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -131,13 +131,13 @@ class Switching:
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling) -> Switching:
-        found, span = switching_requirement(loop, coupling), loop.delays
-        if found.requirement.reason:
-            return cls(found.requirement, span.lo, span.hi)
+        found, span = judged(loop, coupling, SWITCHING), loop.delays
+        if found.reason:
+            return cls(found, span.lo, span.hi)
         latest = loop.delayed(span.hi)
         buffered = this_environment(latest.F(coupling), latest)
         playout = _Playout(span.hi, buffered.required, buffered.certified)
-        return cls(found.requirement, span.lo, span.hi, tuple(found.alpha), playout, _NOT_COVERED)
+        return cls(found, span.lo, span.hi, found.multiplier, playout, _NOT_COVERED)
 
 
 # ----------------------------------------------------------------------------------------------------

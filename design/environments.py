@@ -1,48 +1,242 @@
-"""What the conditions that have names ask of a coupling: in this environment, its walls and ranges, and in any other.
+"""What this-environment asks of a coupling: around walls, over ranges, under delays that switch, with limited forces.
 
-And the environment of ranges in which a coupling asks the most: a search, no proof.
+Each of the last three weighs an error with a multiplier, in which its block is affine: `Multiplied` finds the best one.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import product
 from typing import Any
 
 import numpy as np
 
-from controller.arithmetic import SingularLoop, TooLong, numbers
+from controller.arithmetic import Number, SingularLoop, numbers
 from controller.coupling import Coupling
-from controller.delay import delay
 from controller.loop import Loop
-from controller.lti import Array, Block, Lti, Sampled, constant_like, vstack
-from controller.ranges import Member, Region, regions
+from controller.lti import Array, Block, Lti, as_like, constant_like, hstack, taps, vstack
+from controller.ranges import Member
 from design.conditions import (
     BEYOND,
     Condition,
     Demand,
-    dampings,
     even_damping,
-    least_multiple,
     least_scale,
+    ratio_in,
     this_environment,
     this_environment_demand,
     this_environment_ratios,
+    unsound,
+    unsound_static,
 )
+from design.cone import ConeProgram, Inequality
 from design.exact import require_size
-from design.frequency import MOST_SECONDS, frequencies, hermitian, on_circle, supremum, sweeping, too_long
-from design.result import MAKING, NotProved, Requirement, from_ratio, refusal
+from design.frequency import frequencies, hermitian, on_circle, peaks, supremum, sweeping
+from design.result import MAKING, DesignFailed, Requirement, from_ratio, refusal, switching_guarantee
+
+# ----------------------------------------------------------------------------------------------------
+# The best multiplier. The block is affine in (s, multiplier), so the least s over all multipliers at some frequencies
+# is a matrix inequality (design.cone). It bounds s from below; where a sweep of the multiplier found needs more, these
+# frequencies join, until it attains the bound.
 
 
-class ThisEnvironment(Condition):
+@dataclass(frozen=True)
+class Unknowns:
+    """The numbers of a multiplier, and where a search looks for them: in [least, most] units each."""
+
+    name: str  # what a file calls them
+    units: tuple[float, ...]  # (n,); 0 for a number that is 0
+    expected: str  # what they must be, for messages; positive where `least` is
+    least: float
+    most: float
+    spare: tuple[float, ...] | float = 0.0  # (p,) that the block's diagonal keeps, however large the damping
+
+    def check(self, values: Sequence[Any]) -> None:
+        """Raises ValueError for what is no multiplier."""
+        right = len(values) == len(self.units) and all(
+            (v > 0 or v == self.least if unit else v == 0) and v < np.inf
+            for v, unit in zip(values, self.units, strict=True)
+        )
+        if not right:
+            raise ValueError(f"{self.name} is {[float(v) for v in values]}, expected {self.expected}")
+
+
+class Multiplied(Condition):
+    """A condition whose block is affine in a multiplier. One of your own has `unknowns`, `map` and `block`."""
+
+    @abstractmethod
+    def unknowns(self, loop: Loop) -> Unknowns | None:
+        """What the multiplier consists of; None where the block needs none."""
+
+    @abstractmethod
+    def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
+        """The map that the block is about. Raises SingularLoop, and NotProved for one too large to be proved."""
+
+    @abstractmethod
+    def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
+        """The block of such a map, in any arithmetic."""
+
+    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
+        return self.block(self.map(loop, coupling, exact), loop, multiplier)
+
+    def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
+        """The multiplier that a search begins with; the one of a block of many rows, whose search would take long."""
+        unknowns = self.unknowns(loop)
+        return unknowns.units if unknowns else ()
+
+    def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
+        """At this multiplier, or at the best one: `multiplier` and `bound` of the requirement say which."""
+        unknowns, reason = self.unknowns(loop), self.beyond(loop)
+        if reason:
+            return refusal(self.name, loop.delta, reason)
+        if unknowns is None:
+            return super().required(loop, coupling)
+        try:
+            with sweeping():
+                return self.required_of(self.map(loop, coupling), loop, multiplier)
+        except ValueError as error:  # SingularLoop, TooLong, or a multiplier that is none
+            return refusal(self.name, loop.delta, str(error))
+
+    def required_of(self, G: Lti, loop: Loop, multiplier: Any = None) -> Requirement:
+        """The same of a map."""
+        unknowns, delta = self.unknowns(loop), loop.delta
+        assert unknowns
+        values = tuple(float(v) for v in (self.usual(G, loop) if multiplier is None else multiplier))
+        unknowns.check(values)
+        asked = self.block(G, loop, values)
+        if reason := unsound(asked.free, delta) or self.unsound_static(G, loop, asked):
+            return replace(refusal(self.name, delta, reason), multiplier=values)
+        search = _Search(lambda x: self.block(G, loop, x), unknowns, asked.free)
+        bound, values = search.best(values) if multiplier is None and search.pays else (0.0, values)
+        ratio, w = search.swept(values)
+        if np.isinf(ratio):
+            reason = f"no multiplier {unknowns.name} was found with which any damping is enough"
+            return replace(refusal(self.name, delta, reason), multiplier=values)
+        found = from_ratio(self.name, max(ratio, 0.0), tuple(delta), w / (2 * np.pi * loop.T))
+        return replace(found, multiplier=values, bound=min(bound, ratio))
+
+    def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
+        """Why what the block says of z = 1 does not hold, beyond rounding."""
+        return unsound_static(asked.free, asked, loop.delta)
+
+    def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
+        if unknowns := self.unknowns(loop):
+            unknowns.check(multiplier)
+        return super().exact_demands(loop, coupling, multiplier)
+
+    def multiplier_name(self, loop: Loop) -> str | None:
+        unknowns = self.unknowns(loop)
+        return unknowns and unknowns.name
+
+
+_MOST_ROWS = 24  # of a block whose multiplier is searched: twelve devices with limited forces
+_MOST_STALLED = 3  # rounds in which the bound does not rise
+_MOST_PEAKS = 3  # frequencies that join at once
+_NEAR = 0.1  # of the highest peak, relatively: lower ones do not join
+_SETTLED = 5e-7  # relative gap between what the multiplier asks and the bound
+_DIGITS, _NOTHING = 8, 1e-6  # of a number of the multiplier; what counts as 0, in units
+
+
+class _Search:
+    """The multiplier at which a block asks least, by cutting planes."""
+
+    def __init__(self, block: Callable[[Sequence[float]], Demand[Lti]], unknowns: Unknowns, system: Lti) -> None:
+        self._block, self._unknowns, self._units = block, unknowns, np.array(unknowns.units)
+        self._searched, self._last = np.flatnonzero(self._units), ((), (0.0, 0.0))
+        self._grid = np.concatenate([[0.0], frequencies(system)])
+        self._spare = np.diag(np.broadcast_to(unknowns.spare, system.outputs))
+        self.pays = system.outputs <= _MOST_ROWS and self._searched.size > 0
+
+    def swept(self, values: Sequence[float]) -> tuple[float, float]:
+        """(the ratio that the block asks at these values, where [rad/sample]), by a refined sweep."""
+        if self._last[0] != values:
+            asked = self._block(values)
+            self._last = values, supremum(lambda w: least_scale(asked, w), self._grid)
+        return self._last[1]
+
+    def best(self, values: Sequence[float]) -> tuple[float, tuple[float, ...]]:
+        """(a ratio that no multiplier is below, the best one), beginning with these values."""
+        unknowns, count, bound = self._unknowns, self._searched.size, 0.0
+        units = np.eye(self._units.size)[self._searched] * self._units
+        self._plain = [self._block(tuple(x)) for x in (0 * self._units, *units)]
+        by = np.abs(np.diagonal(self._parts(self._grid[[0, -1]])[1], axis1=2, axis2=3)).max(axis=1)
+        self._root = 1 / np.sqrt(np.where(by[-1] > 0, by[-1], np.maximum(by.max(axis=0), 1e-300)))
+        low = Inequality.least(range(count), unknowns.least), Inequality.least([count], 0.0)
+        blocks = [*low, Inequality.most(range(count), unknowns.most)]
+        top, w = self._worst(values, bound)
+        best, least, stalled = values, top, 0
+        while stalled < _MOST_STALLED and w.size:
+            blocks.append(self._inequality(w))
+            try:
+                found = ConeProgram(np.eye(count + 1)[-1], blocks).solve(f"the multiplier {unknowns.name}")
+            except DesignFailed:  # none within the bounds makes the block positive, however large the damping
+                break
+            stalled = 0 if found[-1] > bound + _SETTLED * max(bound, 1.0) else stalled + 1
+            bound, values = max(bound, float(found[-1])), self._values(found[:-1])
+            top, w = self._worst(values, bound)
+            best, least = min((best, least), (values, top), key=lambda one: one[1])
+        return bound, tuple(best)
+
+    def _values(self, x: Array) -> tuple[float, ...]:
+        """The multiplier of x, in units, in few digits."""
+        values, least, most = np.zeros(self._units.size), self._unknowns.least, self._unknowns.most
+        x = np.where(x < _NOTHING, 0.0, np.minimum(x, most)) if least == 0 else np.clip(x, least, most)
+        values[self._searched] = [float(f"{v:.{_DIGITS}g}") for v in x * self._units[self._searched]]
+        return tuple(values.tolist())
+
+    def _worst(self, values: Sequence[float], bound: float) -> tuple[float, Array]:
+        """(the most that these values ask, with something to spare, the worst few frequencies): none at the bound."""
+        asked = self._block(values)
+        asked = replace(asked, free=asked.free - self._spare) if self._spare.any() else asked
+
+        def needed(w: Array) -> Array:
+            return least_scale(asked, w)
+
+        w = peaks(needed, self._grid, -np.inf, near=_NEAR)
+        at = needed(w)
+        if (top := float(at.max(initial=-np.inf))) <= bound + _SETTLED * max(bound, 1.0):
+            top, between = found = supremum(needed, self._grid)
+            if not self._spare.any():
+                self._last = tuple(values), found
+            w = np.array([between] if top > bound + 2 * _SETTLED * max(bound, 1.0) else [])
+            return top, w
+        return top, w[np.argsort(-at)[:_MOST_PEAKS]]
+
+    def _parts(self, w: Array) -> tuple[Any, Any]:
+        """The Hermitian parts of the constant, and of what each unknown and s multiply, at w (k,)."""
+        z = on_circle(w)
+        free = [hermitian(each.free.at(z)) for each in self._plain]
+        return free[0] - self._spare, np.array([*(f - free[0] for f in free[1:]), hermitian(self._plain[0].gain.at(z))])
+
+    def _inequality(self, w: Array) -> Inequality:
+        constant, by = (self._root[:, None] * part * self._root for part in self._parts(w))
+        return Inequality(constant, by, range(len(by)))
+
+
+# ----------------------------------------------------------------------------------------------------
+# In the environment of the loop, around walls that make and break contact, and at all members of ranges.
+
+
+class ThisEnvironment(Multiplied):
     """Safe in the environment of the loop: around its walls, whether they touch or not, and at all of its members."""
 
     name, covers, extensible = "this-environment", BEYOND, True
 
-    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Demand[Lti]:
+    def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
+        G = loop.walled(coupling, exact)
+        if exact:
+            require_size(G.order)
+        return G
+
+    def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
+        return walls_demand(G, loop, multiplier)
+
+    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
+        """With the multiplier of its walls; without one as if they all touched, where it has some."""
+        if multiplier is not None:
+            return super().demand(loop, coupling, exact, multiplier)
         F = loop.F(coupling, exact)
         if exact:
             require_size(F.order)
@@ -51,30 +245,31 @@ class ThisEnvironment(Condition):
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """The most that any member asks."""
         if loop.environment.walls:
-            try:
-                return walls_of(loop, coupling, multiplier).requirement
-            except NotProved as error:
-                return refusal(self.name, loop.delta, str(error))
+            return super().required(loop, coupling, multiplier)
         if loop.ranges is None:
             return this_environment(loop.F(coupling), loop)
         requirements = in_each(loop, coupling, loop.members())
         return requirements[worst(requirements)]
 
-    def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
-        if loop.environment.walls:
-            return {"P": self._walls(loop, coupling, multiplier)}
-        return super().exact_demands(loop, coupling)
+    def beyond(self, loop: Loop) -> str | None:
+        if loop.environment.walls and loop.ranges:
+            return "walls and ranges: walls are proved in one environment"
+        return super().beyond(loop)
 
-    def _walls(self, loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Demand[Lti]:
-        G = loop.walled(coupling, exact=True)
-        require_size(G.order)
-        return walls_demand(G, loop, g)
+    def unknowns(self, loop: Loop) -> Unknowns | None:
+        walls = len(loop.environment.walls)
+        return Unknowns("g", (1.0,) * walls, f"a number > 0 for each of {walls} walls", 1e-3, 1e3) if walls else None
 
-    def multiplier(self, loop: Loop, coupling: Coupling, given: Sequence[float] | None) -> Sequence[float] | None:
-        return walls_of(loop, coupling).g if loop.environment.walls else None
-
-    def multiplier_name(self, loop: Loop) -> str | None:
-        return _WALL_MULTIPLIER if loop.environment.walls else None
+    def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
+        """Rounding is relative to what each channel and wall is elsewhere: forces and ways have units of their own."""
+        m, S1 = loop.channels, G.dc()
+        own = np.abs([np.diag(part) for part in (S1, G.D, G.at(-1.0))]).max(axis=0)
+        if (np.abs(S1 - S1.T) > _ROUNDING * np.sqrt(np.outer(own, own))).any():
+            return "the static map of devices and walls is not symmetric: a slow closed path could extract energy"
+        for name, part, size in (("F(1)", S1[:m, :m], own[:m]), ("-Y(1)", -S1[m:, m:], own[m:])):
+            if np.linalg.eigvalsh((part + part.T) / 2).min() < -_ROUNDING * size.max():
+                return f"{name} has a negative direction: it pushes outwards"
+        return None
 
     def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
         return ratio_in(loop, coupling, thin)
@@ -88,28 +283,7 @@ class ThisEnvironment(Condition):
 
 
 THIS_ENVIRONMENT = ThisEnvironment()
-
-
-def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
-    """The this-environment condition of this coupling around each of the members, every one frozen."""
-    return [_required(loop, coupling, member) for member in members]
-
-
-def worst(requirements: Sequence[Requirement]) -> int:
-    """The member that requires the most damping."""
-    return max(range(len(requirements)), key=lambda i: requirements[i].ratio)
-
-
-def _required(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
-    try:
-        F = loop.at(member.network).F(coupling)
-    except SingularLoop as error:
-        return refusal("this-environment", loop.delta, str(error))
-    return this_environment(F, loop)
-
-
-# ----------------------------------------------------------------------------------------------------
-# Walls that make and break contact: this-environment with a multiplier for each.
+_ROUNDING = 1e-9  # that a static map may miss of symmetry and of its signs
 
 
 def walls_demand(G: Block, loop: Loop, g: Any, lam: Sequence[Any] | None = None) -> Demand[Block]:
@@ -136,299 +310,176 @@ def walls_demand(G: Block, loop: Loop, g: Any, lam: Sequence[Any] | None = None)
     return Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
 
 
-# this-environment with walls: the best multiplier. The least s is convex in g, because the block is affine in both.
+def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
+    """The this-environment condition of this coupling around each of the members, every one frozen."""
+    return [_in_one(loop, coupling, member) for member in members]
 
 
-#: Where the multiplier of a wall is looked for [samples], and the digits that are kept of it.
-_LEAST_G, _MOST_G, _G_DIGITS = 1e-3, 1e3, 4
-
-
-@dataclass(frozen=True)
-class _WallsProof:
-    """What walls that make and break contact ask of the devices."""
-
-    requirement: Requirement  # condition "this-environment"
-    g: tuple[float, ...]  # (w,) the multiplier that shows it
-
-
-def walls_proof(G: Lti, loop: Loop, g: Sequence[float] | None = None) -> _WallsProof:
-    """The damping that `walls_demand` asks with the best multiplier found, or with g (w,) where it is given.
-
-    G takes [x; p] to [f; y] while no wall touches.
-    """
-    m, w = loop.channels, len(loop.environment.walls)
-    available = dampings(loop.delta, m)
-
-    def refused(reason: str) -> _WallsProof:
-        return _WallsProof(refusal("this-environment", available, reason), tuple(g or (1.0,) * w))
-
-    if min(available) == 0:
-        return refused("a device guarantees no damping, so no coupling is safe for every passive human")
-    if reason := too_long(G):
-        return refused(reason)
-    radius = float(np.abs(G.poles()).max(initial=0.0))
-    if radius >= 1:
-        return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
-    S1 = G.dc()
-    # rounding, relative to what each channel and wall is elsewhere
-    own = np.abs([np.diag(S1), np.diag(G.D), np.diag(G.at(-1.0))]).max(axis=0)
-    if (np.abs(S1 - S1.T) > 1e-9 * np.sqrt(np.outer(own, own))).any():
-        return refused("the static map of devices and walls is not symmetric: a slow closed path could extract energy")
-    for name, part, size in (("F(1)", S1[:m, :m], own[:m]), ("-Y(1)", -S1[m:, m:], own[m:])):
-        if np.linalg.eigvalsh((part + part.T) / 2).min() < -1e-9 * size.max():
-            return refused(f"{name} has a negative direction: it pushes outwards")
-    grid = np.concatenate([[0.0], frequencies(G)])
-    z = on_circle(frequencies(G, points=100))
-    sampled = Sampled(z[None], G.at(z)[None], G.T)
-
-    def needed(values: Array) -> float:
-        demand = walls_demand(sampled, loop, values)
-        return float(least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G)).max())
-
-    found = _best_g(needed, w) if g is None else np.asarray(g, dtype=float)
-    demand = walls_demand(G, loop, found)
-    ratio, at = supremum(lambda w: least_scale(demand, w), grid)
-    if np.isinf(ratio):
-        return refused("no multiplier was found with which the walls are covered, whatever the damping")
-    return _WallsProof(
-        from_ratio("this-environment", max(ratio, 0.0), available, at / (2 * np.pi * G.T)), tuple(found.tolist())
-    )
-
-
-def _best_g(needed: Callable[[Array], float], walls: int) -> Array:
-    """g (walls,) with about the least `needed`: one for all of them, then one by one, each by a search in log g."""
-    from scipy.optimize import minimize_scalar  # slow to load, and seldom needed
-
-    g = np.ones(walls)
-    turns = [np.ones(walls, dtype=bool), *(np.eye(walls, dtype=bool) if walls > 1 else ())]
-
-    def moved(which: Array, value: float) -> Array:
-        return np.where(which, value, g)
-
-    for which in turns:
-        grid = np.geomspace(_LEAST_G, _MOST_G, 13)
-        values = [needed(moved(which, value)) for value in grid]
-        best = int(np.argmin(values))
-        ends = np.log(grid[max(best - 1, 0)]), np.log(grid[min(best + 1, grid.size - 1)])
-        finer = minimize_scalar(
-            lambda x, which=which: min(needed(moved(which, np.exp(x))), 1e300),
-            bounds=ends,
-            method="bounded",
-            options={"xatol": 1e-2},
-        )
-        g = moved(which, float(np.exp(finer.x)) if finer.fun < values[best] else float(grid[best]))
-    return np.array([float(f"{value:.{_G_DIGITS}g}") for value in g])
-
-
-#: What a certificate calls the multipliers of walls that make and break contact, one each.
-_WALL_MULTIPLIER = "g"
-
-
-def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None) -> _WallsProof:
-    """What this-environment asks where walls make and break contact, with the multipliers g (w,) or the best found.
-
-    Raises NotProved for walls that nothing is proved of.
-    """
-    walls = loop.environment.walls
-    if loop.ranges:
-        raise NotProved("walls and ranges: walls are proved in one environment")
+def _in_one(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
     try:
-        G = loop.walled(coupling)
-    except (SingularLoop, ValueError) as error:
-        raise NotProved(str(error)) from None
-    values = None if g is None else [float(value) for value in g]
-    if values is not None and (len(values) != len(walls) or min(values) < 0):
-        raise NotProved(f"{_WALL_MULTIPLIER} is {values}, expected a number >= 0 for each of {len(walls)} walls")
-    try:
-        with sweeping():
-            return walls_proof(G, loop, values)
-    except TooLong as error:
-        raise NotProved(str(error)) from None
+        F = loop.at(member.network).F(coupling)
+    except SingularLoop as error:
+        return refusal("this-environment", loop.delta, str(error))
+    return this_environment(F, loop)
+
+
+def worst(requirements: Sequence[Requirement]) -> int:
+    """The member that requires the most damping."""
+    return max(range(len(requirements)), key=lambda i: requirements[i].ratio)
 
 
 # ----------------------------------------------------------------------------------------------------
-# The environment within ranges in which a coupling needs the most damping: a search, the same every time, and no proof.
-#
-# Between the vertices the need is no convex function of stiffness and mass, and what asks the most often lies on an
-# edge or a face, where points drawn evenly from the ranges never fall: the resonance moves from one vertex to the next.
-# So every way in which the contacts may be there or absent is searched along all its edges, on its faces and inside,
-# and from the worst points that were found a compass search goes on within the ranges until its steps are small.
+# Delays that switch within [lo, hi] at every tick and on every channel.
 
 
-_Ratio = Callable[[Member], float]  # required over available damping
+class Switching(Multiplied):
+    """Safe in the environment of the loop whatever its delays do within loop.delays."""
+
+    name, covers = "switching", ("psi", "T_max", "varying_delay")
+
+    def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
+        G = loop.sent(coupling, exact)
+        if exact:
+            require_size(G.order + sum(loop.delays.hi))
+        return G
+
+    def unknowns(self, loop: Loop) -> Unknowns:
+        units = tuple((even_damping(loop) / loop.T * (half_widths(loop) > 0)).tolist())
+        return Unknowns("alpha", units, "a positive number where the delay varies and 0 elsewhere", 1e-8, 1e6)
+
+    def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
+        """[[this-environment - diag(alpha)/2, 0], [2 h G, 2 diag(alpha)]] for delays that switch within loop.delays.
+
+        F = Theta_nom G with Theta_nom = (z^-lo + z^-hi)/2 and 2 h = hi - lo; G are the forces as they leave,
+        alpha (m,) [N/m] is the multiplier, positive where the delay varies. Channels whose delay does not vary have no
+        row and column of the second kind.
+
+        A force that is late by n in [lo, hi] differs from the nominal one by at most h times the sum of the steps in
+        between; the multiplier weighs that error against the displacement (an S-procedure, channel by channel).
+        """
+        T, m, lo, hi = G.T, loop.channels, loop.delays.lo, loop.delays.hi
+        varying = [i for i in range(m) if lo[i] < hi[i]]
+        a, one = numbers(multiplier, T), np.eye(m, dtype=int)
+        half = Lti.diag(*(taps(_halves(p, q), T) for p, q in zip(lo, hi, strict=True)))
+        spread = Lti.constant(np.diag([q - p for p, q in zip(lo, hi, strict=True)])[varying], T)
+        both: Any = as_like(G, vstack(half, spread)) @ G
+        linear = this_environment_demand(both.rows(slice(None, m)), loop)
+        if not varying:
+            return linear
+        upper = vstack(linear.free - np.diag(a / 2), both.rows(slice(m, None)))
+        corner = np.vstack([0 * one[:, varying], np.diag(2 * a[varying])])
+        free = hstack(upper, constant_like(G, corner))
+        wide = np.eye(m, m + len(varying), dtype=int)
+        return replace(linear, free=free, gain=np.transpose(wide) @ linear.gain @ wide)
+
+    def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
+        """h times the largest own force of each device per displacement: the best for springs."""
+        own = np.abs(np.diagonal(G.at(on_circle(frequencies(G, points=60))), axis1=1, axis2=2)).max(axis=0)
+        least = 1e-8 * np.array(self.unknowns(loop).units)
+        return np.maximum(half_widths(loop) * own, least).tolist()
+
+    def place(self, loop: Loop, matrix: str = "P") -> str:
+        return f"{switching_guarantee(loop.delays)}: "
 
 
-Progress = Callable[[int, int], None]  # points tried, of about how many
+SWITCHING = Switching()
 
 
-_ON_EDGES, _ALONG = 240, (3, 9)  # points on the edges of a region, and on each of them: least, most
+def _halves(lo: int, hi: int) -> list[Number]:
+    return [Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)]
 
 
-_DRAWN, _SEED = 48, 0xFACE  # points on faces and inside of each region
+def half_widths(loop: Loop) -> Array:
+    """h = (hi - lo)/2, (m,)."""
+    return (np.array(loop.delays.hi) - np.array(loop.delays.lo)) / 2
 
 
-_MANY = 7  # parameters from which on vertices and edges are drawn, too
+# ----------------------------------------------------------------------------------------------------
+# Forces that leave through the limiter of controller.law. any-environment without delay in the environment needs no
+# proof of its own: with rho = 0 the limiter and the environment together are a passive environment.
 
-
-_STARTS, _APART, _SAME = 4, 0.2, 0.05  # of the compass search in a region; least distance of starts, and of tops
-
-
-_LOWEST = 1e-6  # [rad/sample]: below it nothing changes
-
-
-_FIRST, _LAST = 1 / 16, 1 / 128  # its steps, in widths of the ranges
-
-
-SEARCH = "along all edges, or many of them, on faces and inside, then uphill from the worst points"
+BETA = 0.01  # of a limiter's lag under this-environment unless another is asked for
+_SPARE = 0.02  # of rho: what the block keeps, however large the damping, so that c may be rounded and the proof exact
 
 
 @dataclass(frozen=True)
-class _Found:
-    """An environment of the ranges, and the share of the damping that is needed there."""
+class Limiter(Multiplied):
+    """this-environment also while forces are limited, by a limiter of lag rho = beta delta/T."""
 
-    member: Member
-    ratio: float
+    beta: float = BETA
+    lags: int = 1  # weights c_ij per channel
+    name, covers = "limiter", ("psi", "T_max")
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.beta < np.inf:
+            raise ValueError(f"limiter: beta is {self.beta}, expected a number >= 0")
 
-@dataclass(frozen=True)
-class Searched:
-    """The worst environments, each the top of its neighbourhood, the worst of all first; and how many were tried."""
+    def rho(self, loop: Loop) -> tuple[float, ...]:
+        """(m,) [N/m], to six digits, which the damping in a sweep does not scale."""
+        return tuple(float(f"{self.beta * d / loop.T:.6g}") for d in loop.delta)
 
-    worst: tuple[_Found, ...]
-    tried: int
-    ended: bool = False  # by its clock, before it was done
+    def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
+        G = loop.sent(coupling, exact)
+        if exact:
+            require_size(G.order + 2 * loop.channels + sum(max(n, self.lags) for n in loop.theta))
+        return G
 
+    def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
+        """The limiter's block on (dx - de, de), the steps of what the environment follows and of the slip.
 
-def search(
-    regions: Sequence[Region],
-    ratio: _Ratio,
-    progress: Progress = lambda done, total: None,
-    seconds: float = MOST_SECONDS,
-) -> Searched:
-    """Where the coupling behind `ratio` needs the most in the ranges that consist of these regions.
+        G are the forces as they leave without the limiter, rho its lag, which the damping does not scale, and c the
+        multiplier. With df_e = G (dx - de) - rho (1 - 1/z) de, the steps of the limited forces, the block is
+        [Theta/(z-1); N] df_e + s Delta_D/T [1, 0; 2, 1], where
+        N_i = -(1 + .. + z^-theta_i) - sum_j c_ij (j + (j-1)/z + .. + z^-(j-1)).
+        """
+        theta, c, m, T = loop.theta, self.rows(loop, multiplier), loop.channels, G.T
+        damping = np.diag(even_damping(loop, T) / T)
+        lines = Lti.diag(*(_delay_and_weights(n, row, T) for n, row in zip(theta, c, strict=True)))
+        lines = lines.rows([*range(0, 2 * m, 2), *range(1, 2 * m, 2)])
+        difference = Lti.diag(*(taps([1, -1], T) for _ in theta))
+        steps: Any = hstack(G, as_like(G, difference @ np.diag(-numbers(self.rho(loop), T))))
+        both = as_like(G, lines) @ steps
+        static, ramp = both.rows(slice(None, m)).split_at_one()  # [F(1), 0]: the slip's steps have no mean
+        zero = np.zeros((m, m), dtype=int)
+        free = vstack(ramp - static / 2, both.rows(slice(m, None)))
+        gain = np.block([[damping, zero], [2 * damping, damping]])
+        return Demand(free, constant_like(G, gain), {"F(1)": static[..., :m]}, ("F(1)",))
 
-    When its time is over it returns the worst of what it has tried.
-    """
-    until = time.perf_counter() + seconds
-    points = [list(_points(region)) for region in regions]
-    refinements = [min(_STARTS, len(some)) * 8 * region.low.size for region, some in zip(regions, points, strict=True)]
-    tried, total = 0, sum(map(len, points)) + sum(refinements)
-    tops: list[_Found] = []
+    def rows(self, loop: Loop, multiplier: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
+        """c as a row per channel, of one entry per lag."""
+        return tuple(tuple(multiplier[i * self.lags : (i + 1) * self.lags]) for i in range(loop.channels))
 
-    for region, some in zip(regions, points, strict=True):
-        known: dict[bytes, float] = {}
+    def unknowns(self, loop: Loop) -> Unknowns:
+        spare = tuple(_SPARE * r for r in self.rho(loop) * 2)
+        units = (1.0,) * loop.channels * self.lags
+        return Unknowns("c", units, "numbers >= 0, as many for each channel", 0.0, 10.0, spare)
 
-        def need(point: Array, region: Region = region, known: dict[bytes, float] = known) -> float:
-            nonlocal tried
-            if point.tobytes() not in known:
-                if tried and time.perf_counter() > until:
-                    return -np.inf
-                tried += 1
-                progress(min(tried, total), total)
-                known[point.tobytes()] = ratio(_member(region, point))
-            return known[point.tobytes()]
+    def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
+        return (0.0,) * loop.channels * self.lags
 
-        starts = _apart(some, [need(point) for point in some], _APART)[:_STARTS]
-        climbed = [_climbed(need, *start) for start in starts]
-        distinct = _apart([point for point, _ in climbed], [value for _, value in climbed], _SAME)
-        tops += [_Found(_member(region, point), value) for point, value in distinct if value > -np.inf]
-    progress(total, total)
-    return Searched(tuple(sorted(tops, key=lambda found: -found.ratio)), tried, time.perf_counter() > until)
+    def beyond(self, loop: Loop) -> str | None:
+        if loop.varying_delay:
+            return "limiter: forces that are limited are proved for constant delays, not for delays that switch"
+        if loop.environment.walls:
+            return "limiter: with walls only any-environment covers limited forces (no delay in the environment)"
+        if loop.ranges:
+            return "limiter: limited forces are proved for one environment, not for ranges"
+        if loop.latency:
+            return "limiter: limited forces are proved for forces that latch at ticks, not for a latency"
+        return None
 
-
-def _member(region: Region, point: Array) -> Member:
-    """The environment at a point of the unit cube that stands for the region."""
-    return region.at("point", region.low + point * (region.high - region.low))
-
-
-def _points(region: Region) -> Iterator[Array]:
-    """Of the unit cube: its vertices, points along every edge, and points on faces and inside."""
-    n = region.low.size
-    rng = np.random.default_rng(_SEED)
-    if n > _MANY:
-        yield from rng.integers(0, 2, (_ON_EDGES, n)).astype(float)
-        for corner in rng.integers(0, 2, (_ON_EDGES, n)).astype(float):
-            corner[rng.integers(n)] = rng.random()
-            yield corner
-        yield from rng.random((_DRAWN, n))
-        return
-    yield from (np.array(corner, dtype=float) for corner in product((0.0, 1.0), repeat=n))
-    if n == 0:
-        return
-    least, most = _ALONG
-    count = int(np.clip(_ON_EDGES // (n * 2 ** (n - 1)), least, most))
-    for i in range(n):
-        for others in product((0.0, 1.0), repeat=n - 1):
-            for x in np.arange(1, count + 1) / (count + 1):
-                yield np.insert(np.array(others), i, x)
-    if n == 1:
-        return
-    for _ in range(_DRAWN):  # every number in between, or at one of its ends, as often as not
-        between, end, coin = rng.random(n), rng.integers(0, 2, n), rng.random(n) < 0.5
-        yield np.where(coin, between, end)
+    def place(self, loop: Loop, matrix: str = "P") -> str:
+        return "limiter: "
 
 
-def _apart(points: Sequence[Array], values: Sequence[float], distance: float) -> list[tuple[Array, float]]:
-    """The points by falling value, without those that are close to a worse one."""
-    chosen: list[tuple[Array, float]] = []
-    for i in np.argsort(-np.array(values), kind="stable"):
-        if all(np.abs(points[i] - other).max(initial=0.0) >= distance for other, _ in chosen):
-            chosen.append((points[i], values[i]))
-    return chosen
+LIMITER = Limiter()
 
 
-def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tuple[Array, float]:
-    """Uphill along the axes of the unit cube, with steps that are halved where none leads up; the ends are exact."""
-    step = 1.0 if point.size > _MANY else _FIRST  # from end to end first, where not all ends were tried
-    while point.size and step >= _LAST and np.isfinite(value):
-        moves = [np.clip(point + sign * step * axis, 0, 1) for axis in np.eye(point.size) for sign in (1, -1)]
-        values = [need(move) if (move != point).any() else -np.inf for move in moves]
-        best = int(np.argmax(values))
-        if values[best] > value:
-            point, value = moves[best], values[best]
-        else:
-            step /= 2
-    return point, value
-
-
-def search_ranges(
-    loop: Loop,
-    coupling: Coupling,
-    progress: Progress = lambda done, total: None,
-    seconds: float = MOST_SECONDS,
-) -> Searched:
-    """The worst environments of the loop's ranges that the search of design.environments finds."""
-    assert loop.ranges
-    parts = regions(loop.network, loop.ranges)
-    return search(parts, lambda member: ratio_in(loop.at(member.network), coupling), progress, seconds)
-
-
-def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
-    """The damping that this-environment requires over the available damping, by a refined sweep of a stable coupling.
-
-    With `thin` by every `thin`-th frequency of its grid alone. Of one in series, a force filter, the responses of
-    environment and filter are multiplied: the poles of their series are defective and cost digits, and time.
-    """
-    if (chain := coupling.in_series(loop.T)) is None:
-        nominal = Member("", loop.environment)
-        return _thinly(loop, coupling, thin) if thin > 1 else _required(loop, coupling, nominal).ratio
-    E = loop.E()
-    delayed = delay(loop.psi, loop.T) @ E
-
-    def needed(w: Array) -> Array:
-        F = loop.late(coupling.around(Sampled.of(delayed, on_circle(w)[None])))
-        demand = this_environment_demand(F, loop)
-        return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
-
-    grid = frequencies(E, chain, low=_LOWEST)
-    return float(needed(grid[::thin]).max()) if thin > 1 else supremum(needed, grid)[0]
-
-
-def _thinly(loop: Loop, coupling: Coupling, thin: int) -> float:
-    """`ratio_in` at every `thin`-th frequency."""
-    try:
-        F = loop.F(coupling)
-        demand = this_environment_demand(F, loop)
-    except SingularLoop:
-        return np.inf
-    return float(least_scale(demand, frequencies(F)[::thin]).max()) if F.is_stable() else np.inf
+def _delay_and_weights(theta: int, c: Sequence[Any], T: Number) -> Lti:
+    """[z^-theta; N] of one channel, over one line of delays."""
+    lags = range(1, len(c) + 1)
+    size = max(theta + 1, len(c))
+    late = [int(k == theta) for k in range(size)]
+    weights = [-sum([numbers(c[j - 1], T) * (j - k) for j in lags if j > k], int(k <= theta)) for k in range(size)]
+    first, second = taps(late, T), taps(weights, T)
+    return Lti(first.A, first.B, np.vstack([first.C, second.C]), np.vstack([first.D, second.D]), T)

@@ -17,8 +17,8 @@ from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.certificate import Verdict, lag
 from design.coupling_file import Stored
-from design.guarantees import HERE, RANGES, switching_guarantee
-from design.result import listed
+from design.guarantees import HERE, RANGES
+from design.result import listed, switching_guarantee
 
 # ----------------------------------------------------------------------------------------------------
 # What is exported: one state-space block, the order in which its sums are taken, and a test vector in that order.

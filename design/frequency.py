@@ -224,9 +224,15 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
     return top, where
 
 
-def peaks(response: Response, grid: Array, above: float) -> Array:
-    """Where the 32 highest local maxima of `response` over [grid[0], grid[-1]] exceed `above`; (peaks,)."""
-    _, _, bracket, _ = _narrowed(response, *_brackets(response(grid), grid, -np.inf))
+def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -> Array:
+    """Where the 32 highest local maxima of `response` over [grid[0], grid[-1]] exceed `above`; (peaks,).
+
+    Of those only that come as `near` to the highest, relatively.
+    """
+    values = response(grid)
+    top = float(values.max())
+    least = top - near * abs(top) if np.isfinite(top) and near < np.inf else -np.inf
+    _, _, bracket, _ = _narrowed(response, *_brackets(values, grid, least))
     value, w, *_ = _narrowed(response, *bracket)
     return w[value > above]
 

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,19 +21,10 @@ from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Complex, Sampled
-from design.conditions import even_damping, this_environment, this_environment_demand
+from design.conditions import Demand, even_damping, this_environment, this_environment_demand
+from design.environments import LIMITER, SWITCHING
 from design.frequency import frequencies, hermitian, on_circle
 from design.lmi import RESERVE
-from design.multipliers import (
-    BETA,
-    Lags,
-    half_widths,
-    limiter_demand,
-    limiter_lag,
-    switching_block,
-    switching_sweep,
-)
-from design.multipliers import limiter as limiter_proof
 from design.result import Requirement
 from design.transparency import BAND_HZ, transparency
 
@@ -83,7 +73,6 @@ class SampledLoop:
         low, high = (per_hz * f for f in band_hz)
         self.delta = even_damping(loop)
         self.root = np.sqrt(loop.T / self.delta)
-        self.reserved = msgspec.structs.replace(loop, delta=tuple((1 - _SAMPLED_RESERVE) * d for d in loop.delta))
         self.band = frequencies(self.E, low=low, high=min(high, np.pi), points=80)
         E = Sampled.of(self.E, on_circle(self.band)[None])
         one = Sampled(E.z, np.broadcast_to(np.eye(loop.channels, dtype=complex), E.G.shape), E.T)
@@ -108,16 +97,20 @@ class SampledLoop:
         """What the refined sweep of its condition says of the gains at x."""
         return this_environment(self.loop.F(self.coupling(x)), self.loop)
 
+    def demand(self, G: Sampled, mu: Array) -> Demand[Sampled]:
+        """What must be positive real, affine in G and the multiplier mu (active,)."""
+        return this_environment_demand(self.loop.late(G), self.loop)
+
     def block(self, G: Sampled, mu: Array) -> Sampled:
-        """What must be positive real at the damping that is spent, affine in G and the multiplier mu (active,)."""
-        demand = this_environment_demand(self.loop.late(G), self.reserved)
-        return demand.free + demand.gain
+        """The same at the damping that is spent."""
+        demand = self.demand(G, mu)
+        return demand.free + demand.gain * (1 - _SAMPLED_RESERVE)
 
     def mu(self, x: Array) -> tuple[Array, Array]:
         """The multiplier in x and its derivative by what is in x, (active,) each."""
         return np.zeros(0), np.zeros(0)
 
-    def multiplier(self, x: Array) -> Lags | None:
+    def multiplier(self, x: Array) -> Sequence[Sequence[float]] | None:
         """The limiter's multiplier c in x, where the condition has one."""
         return None
 
@@ -260,30 +253,29 @@ class SampledLoop:
 class SwitchingLoop(SampledLoop):
     """Safe under any switching of the delays: x = (log K, B/delta, log alpha T/delta of the channels whose varies).
 
-    What is returned passes the sweep of `switching_sweep`, which knows nothing of the multiplier found here.
+    What is returned passes the sweep of `SWITCHING`, which knows nothing of the multiplier found here.
     """
 
     bounds = (np.log(1e-4), np.log(10.0))
     _first = 0.5  # alpha T/delta that a search begins with where the start has none
 
     def __init__(self, loop: Loop, lo: Sequence[int], hi: Sequence[int]) -> None:
-        self.active = np.flatnonzero(half_widths(lo, hi))
+        self.active = np.flatnonzero(np.subtract(hi, lo))
         super().__init__(loop.switching(DelayRange(tuple(lo), tuple(hi))))
 
     def point(self, coupling: SpringDamper) -> Array:
         """The gains with their best multiplier."""
-        found = switching_sweep(self.loop.sent(coupling), self.loop)
-        a = np.array(found.alpha)[self.active] * (self.loop.T / self.delta)[self.active]
-        a = np.where(np.isfinite(a), a, self._first)
+        unit = self.delta / self.loop.T
+        a = (np.array(SWITCHING.required(self.loop, coupling).multiplier or self._first * unit) / unit)[self.active]
         return np.concatenate([super().point(coupling), np.clip(np.log(np.maximum(a, 1e-300)), *self.bounds)])
 
     def judged(self, x: Array) -> Requirement:
-        return switching_sweep(self.loop.sent(self.coupling(x)), self.loop).requirement
+        return SWITCHING.required(self.loop, self.coupling(x))
 
-    def block(self, G: Sampled, mu: Array) -> Sampled:
+    def demand(self, G: Sampled, mu: Array) -> Demand[Sampled]:
         alpha = np.zeros(self.loop.channels)
         alpha[self.active] = mu
-        return switching_block(G, self.reserved, alpha)[0]
+        return SWITCHING.block(G, self.loop, alpha)
 
     def mu(self, x: Array) -> tuple[Array, Array]:
         alpha = np.exp(x[2 * self.loop.channels :]) * (self.delta / self.loop.T)[self.active]
@@ -297,7 +289,7 @@ class LimiterLoop(SampledLoop):
     _first = 0.5  # the weight that a search begins with
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
-        self.rho, self.active = limiter_lag(loop.delta, loop.T, BETA), np.arange(loop.channels)
+        self.active = np.arange(loop.channels)
         super().__init__(loop, band_hz)
 
     def point(self, coupling: SpringDamper) -> Array:
@@ -305,17 +297,15 @@ class LimiterLoop(SampledLoop):
         return np.append(super().point(coupling), np.full(self.loop.channels, self._first))
 
     def judged(self, x: Array) -> Requirement:
-        sent, c = self.loop.sent(self.coupling(x)), self.mu(x)[0][:, None].tolist()
-        return limiter_proof(sent, self.loop, self.rho, c).requirement
+        return LIMITER.required(self.loop, self.coupling(x), self.mu(x)[0])
 
-    def block(self, G: Sampled, mu: Array) -> Sampled:
-        demand = limiter_demand(G, self.reserved, self.rho, mu[:, None].tolist())
-        return demand.free + demand.gain
+    def demand(self, G: Sampled, mu: Array) -> Demand[Sampled]:
+        return LIMITER.block(G, self.loop, mu)
 
     def mu(self, x: Array) -> tuple[Array, Array]:
         return np.maximum(x[2 * self.loop.channels :], 0.0), np.ones(self.loop.channels)
 
-    def multiplier(self, x: Array) -> Lags:
+    def multiplier(self, x: Array) -> Sequence[Sequence[float]]:
         return np.round(self.mu(x)[0][:, None], 6).tolist()
 
 
@@ -340,7 +330,7 @@ def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, i
 
 def least_rms(
     sampled: Callable[[], SampledLoop], starts: Iterable[SpringDamper], band_hz: tuple[float, float] = BAND_HZ
-) -> tuple[SpringDamper | None, float, int, Lags | None]:
+) -> tuple[SpringDamper | None, float, int, Sequence[Sequence[float]] | None]:
     """(gains, rms mismatch as a ratio, searches, multiplier) of the best local optimum; gains None if none was found.
 
     `sampled` makes the condition, fresh for every start. Of more than FEW devices, where starts hardly matter and

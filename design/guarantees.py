@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.coupling import Coupling
-from controller.loop import DelayRange, Loop
+from controller.loop import Loop
 from design.conditions import encoder_friction
 from design.result import MAKING, Requirement
 
@@ -29,11 +29,6 @@ CAVEATS = (
     "not for periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
     "friction pays for, velocity filters or friction compensation."
 )
-
-
-def switching_guarantee(span: DelayRange) -> str:
-    """Which delays of the forces a coupling is certified for that bears switching, in the environment of its loop."""
-    return f"delays switching within {span}"
 
 
 def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_ranges: bool = False) -> str | None:

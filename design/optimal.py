@@ -19,17 +19,17 @@ from controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design import program
-from design.certificate import prove, prove_limiter
-from design.conditions import Condition
+from design.certificate import prove, prove_limiter, required_damping
+from design.conditions import Condition, ratio_in
 from design.conditions import this_environment as requirement_of
 from design.coupling_file import Certificate, LimiterCertificate
-from design.environments import THIS_ENVIRONMENT, Searched, in_each, ratio_in, search_ranges, worst
+from design.environments import BETA, LIMITER, THIS_ENVIRONMENT, Limiter, in_each, worst
 from design.guarantees import ANY
-from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.result import Design, DesignFailed, NotProved, from_ratio
 from design.robustness import Nearby, Spread, at, robustness_nearby, vertices
 from design.spring_damper import design as design_spring_damper
 from design.transparency import Transparency, decibels, transparency
+from design.worst_member import Searched, search_ranges
 
 _PRICED = 15.0  # [s] of the processor: what the price of a range may take, a third of it for proofs
 _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
@@ -178,7 +178,7 @@ class _Search:
             if options.objective == "sup" and not cases:
                 asked.append(program.worst_mismatch(there, options.band_hz))
             cases.append(program.Case(there, there.E(), tuple(asked), weight=0.0 if cases else 1.0))
-        if options.limiter and (reason := limiter_refusal(loop)):
+        if options.limiter and (reason := LIMITER.beyond(loop)):
             raise ValueError(reason)
         needs = in_each(loop, NoCoupling(), loop.members())
         if not np.isfinite(bare := max(each.ratio for each in needs)):
@@ -272,7 +272,7 @@ class _Search:
         problem = program.Problem(self.span(taps, poles), self.asked(slip), self.options, soft, heavier=heavier)
         coupling, needs = self.kept_in_all(problem, [0])
         if slip:
-            needs.append(min(limiter_requirement(self.loop, coupling, slip.beta).requirement.ratio, 1 + _TOLERATED))
+            needs.append(min(required_damping(self.loop, coupling, Limiter(slip.beta)).ratio, 1 + _TOLERATED))
         for share in (0.95, 1.5, 2.5, 15.0, 50.0):  # of the margin, which stays unused until the rung is proved
             limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
@@ -302,7 +302,7 @@ class _Search:
         """(the coupling scaled until no environment needs more than `limit` of the damping, what each needs then)."""
         needs = [ratio_in(case.loop, coupling) for case in self.cases]
         if slip:
-            needs[0] = max(needs[0], limiter_requirement(self.loop, coupling, slip.beta).requirement.ratio)
+            needs[0] = max(needs[0], required_damping(self.loop, coupling, Limiter(slip.beta)).ratio)
         scale = min(1.0, limit / max(needs))
         scaled = _scaled(coupling, scale)
         return self._assessed(scaled, scaled.g), [scale * need for need in needs]

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Any, Literal
 
-import msgspec
 import numpy as np
 import scipy  # its parts load when they are used
 from numpy.typing import NDArray
@@ -26,8 +25,8 @@ from controller.lti import Array, Complex, Lti, Sampled, as_like
 from design.arguments import number, one_of
 from design.barrier import MatrixInequality, Program, centre, joined, towards
 from design.conditions import Demand, even_damping, this_environment_demand
+from design.environments import SWITCHING, Limiter
 from design.frequency import frequencies, hermitian, on_circle, peaks
-from design.multipliers import SPARE, limiter_demand, limiter_lag, switching_block
 from design.transparency import BAND_HZ
 
 OBJECTIVES = ("rms", "sup")
@@ -119,15 +118,16 @@ def _demand(loop: Loop, F: Any) -> Demand[Any]:
 
 
 def switching(loop: Loop, span: DelayRange) -> _Constraint:
-    """design.multipliers.switching_block for delays that switch within the span; alpha T/Delta are its unknowns."""
+    """SWITCHING for delays that switch within the span; alpha T/Delta are its unknowns."""
     scale = even_damping(loop) / loop.T
-    usable = msgspec.structs.replace(loop, delta=tuple((1 - MARGIN) * d for d in loop.delta), varying_delay=span)
+    switched = loop.switching(span)
     moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
 
     def block(G: Sampled, own: Array) -> Sampled:
         alpha = np.zeros(scale.size)
         alpha[moves] = own * scale[moves]
-        return switching_block(G, usable, alpha.tolist())[0]
+        demand = SWITCHING.block(G, switched, alpha)
+        return demand.free + demand.gain * (1 - MARGIN)
 
     unit = 1 / np.sqrt(np.concatenate([scale, scale[moves]]))
     return _Constraint("switching delays", block, unit, start=(0.5,) * moves.size, cost=(0.0,) * moves.size)
@@ -140,18 +140,22 @@ class Slip:
     beta: float  # rho = beta delta/T
     c: tuple[tuple[float, ...], ...]  # (m, lags)
 
+    @property
+    def condition(self) -> Limiter:
+        return Limiter(self.beta, len(self.c[0]))
+
     @classmethod
     def even(cls, loop: Loop, beta: float, c: float) -> Slip:
         return cls(beta, ((c,),) * loop.channels)
 
 
 def limiter(loop: Loop, slip: Slip) -> _Constraint:
-    """design.multipliers.limiter_demand: forces that are limited. A little of rho stays unused, as of the damping."""
-    rho = limiter_lag(loop.delta, loop.T, slip.beta)
-    spare = np.diag([*rho, *rho]) * SPARE
+    """design.environments.Limiter: forces that are limited. A little of rho stays unused, as of the damping."""
+    condition, c = slip.condition, [v for row in slip.c for v in row]
+    spare = np.diag(condition.unknowns(loop).spare)
 
     def block(G: Sampled, own: Array) -> Sampled:
-        demand = limiter_demand(G, loop, rho, slip.c)
+        demand = condition.block(G, loop, c)
         return demand.free + demand.gain * (1 - MARGIN) - spare
 
     return _Constraint("limiter", block, np.tile(1 / np.sqrt(even_damping(loop) / loop.T), 2))

@@ -43,6 +43,8 @@ class Requirement(Generic[C]):
     frequency_hz: float | None  # where it binds
     reason: str | None = None  # why the figure is infinite
     proof: str = "sampled"
+    multiplier: tuple[Any, ...] | None = None  # at which it asks so much, of a condition that has one
+    bound: float | None = None  # no multiplier asks a smaller ratio, on the frequencies that its search has looked at
     guarantee: str | None = None  # for which environments it is, in words, where a condition has judged a loop
     lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of a limiter that it covers without further proof
 
@@ -94,6 +96,11 @@ def refusal(condition: C, available: tuple[float, ...], reason: str) -> Requirem
 def finite(value: float) -> float | None:
     """JSON knows neither infinity nor not-a-number."""
     return float(value) if math.isfinite(value) else None
+
+
+def switching_guarantee(span: DelayRange) -> str:
+    """Which delays of the forces a coupling is certified for that bears switching, in the environment of its loop."""
+    return f"delays switching within {span}"
 
 
 class NotProved(ValueError):

@@ -21,6 +21,7 @@ from controller.lti import Array, Lti, hstack, taps, vstack
 from design.certificate import named
 from design.conditions import even_damping, theta_hat, this_environment
 from design.cone import ConeProgram, Inequality
+from design.environments import LIMITER
 from design.frequency import on_circle, peaks, too_long
 from design.gain_search import FEW, LimiterLoop, SampledLoop, SwitchingLoop, damper_rate, least_rms, likeliest_first
 from design.lmi import (
@@ -34,9 +35,6 @@ from design.lmi import (
     packed,
     symmetric_from,
     usable,
-)
-from design.multipliers import (
-    limiter_refusal,
 )
 from design.result import Design, DesignFailed, Infeasible, Requirement
 from design.transparency import BAND_HZ, transparency
@@ -242,7 +240,7 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
         _require_few(loop, _MOST_LIMITED, "the limiter's block: leave the limiter out")
     if limiter is False or loop.channels > _MOST_LIMITED:
         return design(loop, condition, **options)
-    refusal = limiter_refusal(loop)
+    refusal = LIMITER.beyond(loop)
     if limiter and refusal:
         raise ValueError(refusal)
     if refusal or options.get("switching"):

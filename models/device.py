@@ -144,7 +144,7 @@ _OMNI, _PREMIUM = _SHEET.format("Phantom Omni"), _SHEET.format("Phantom Premium 
 
 
 @dataclass(frozen=True)
-class _Listed:
+class Listed:
     """A real device along one axis; None stands for a number without a published source."""
 
     title: str
@@ -165,28 +165,28 @@ class _Listed:
 
 _IDENTIFIED = _Known(1.37, "section 6 of the paper: a first-order model identified on an Omega")
 
-CATALOGUE: Mapping[str, _Listed] = {
-    "omega.3": _Listed(
+CATALOGUE: Mapping[str, Listed] = {
+    "omega.3": Listed(
         "Force Dimension omega.3",
         damping=_IDENTIFIED,
         force_limit=_Known(12.0, _DELTA),
         stiffness=_Known(5000.0, _DELTA),
         framework_damping=_Known(30.0, _DELTA),
     ),
-    "delta.3": _Listed(
+    "delta.3": Listed(
         "Force Dimension delta.3",
         force_limit=_Known(20.0, _DELTA),
         stiffness=_Known(5000.0, _DELTA),
         framework_damping=_Known(30.0, _DELTA),
     ),
-    "falcon": _Listed(
+    "falcon": Listed(
         "Novint Falcon",
         force_limit=_Known(8.0, _FALCON),
         encoder_step=_Known(63.5e-6, "more than 400 dpi, H3D API's page of the Falcon"),
         stiffness=_Known(3000.0, _FALCON),
         framework_damping=_Known(20.0, _FALCON),
     ),
-    "touch": _Listed(
+    "touch": Listed(
         "3D Systems Touch (SensAble Phantom Omni)",
         mass=_Known(0.045, _OMNI),
         force_limit=_Known(3.3, _OMNI),
@@ -195,7 +195,7 @@ CATALOGUE: Mapping[str, _Listed] = {
         stiffness=_Known(700.0, _PHANTOM),
         framework_damping=_Known(5.0, _PHANTOM),
     ),
-    "phantom-premium": _Listed(
+    "phantom-premium": Listed(
         "SensAble Phantom Premium 1.5",
         mass=_Known(0.075, _PREMIUM),
         force_limit=_Known(8.5, _PREMIUM),
@@ -204,15 +204,15 @@ CATALOGUE: Mapping[str, _Listed] = {
         stiffness=_Known(800.0, _PHANTOM + " (1.5 6DOF)"),
         framework_damping=_Known(5.0, _PHANTOM + " (1.5 6DOF)"),
     ),
-    "haply-2diy": _Listed("Haply 2DIY"),
-    "inverse3": _Listed("Haply Inverse3"),
-    "hapkit": _Listed("Hapkit"),
+    "haply-2diy": Listed("Haply 2DIY"),
+    "inverse3": Listed("Haply Inverse3"),
+    "hapkit": Listed("Hapkit"),
 }
 _OTHER_NAMES = {"omni": "touch", "omega": "omega.3", "delta": "delta.3", "2diy": "haply-2diy"}
 _NEEDED = ("damping", "force_limit")  # of a simulated device; for mass and encoder a RigidDevice has an assumption
 
 
-def listed_device(name: str) -> tuple[str, _Listed]:
+def listed_device(name: str) -> tuple[str, Listed]:
     """The catalogue's device of this name, and its spelling there. Raises ValueError that lists the names."""
     key = _OTHER_NAMES.get(name.lower(), name.lower())
     if key not in CATALOGUE:

@@ -20,7 +20,7 @@ from design.files import unseen
 from models.device import credible_force
 from models.hold import HeldPlant
 from sim.engines import EXPONENTIAL, default_integrator, pace, quiet_warnings
-from sim.run import AnyEngine, Progress, Simulation, engine_name, make_engine, run
+from sim.run import AnyEngine, EngineSettings, Progress, Simulation, engine_name, make_engine, run
 from sim.scenario import InputError
 from sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode
 from sim.trace import Trace
@@ -131,7 +131,7 @@ def measure_all(
         for done, (engine, integrator, substeps) in enumerate(settings):
             progress(done, len(settings))
             try:
-                if integrator and substeps and step_radius(coupled, integrator, substeps) > 1 + NEUTRAL:
+                if integrator and substeps and _step_radius(coupled, integrator, substeps) > 1 + _NEUTRAL:
                     raise InputError("outside the stable region")
                 rows.append(measure(truth, engine, integrator, substeps))
             except ValueError as error:
@@ -188,7 +188,7 @@ def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: in
     """The larger growth-rate error of the two loops, and whether both verdicts are right."""
     errors, right = [], True
     for simulation in (truth.coupled, truth.uncoupled):
-        held = measured_hold(simulation, engine, integrator, substeps)
+        held = _measured_hold(simulation, engine, integrator, substeps)
         own, exact = dominant_mode(close(held, simulation.F)).growth, exact_growth(simulation)
         errors.append(float(own - exact))
         right &= bool(unstable(own) == unstable(exact))
@@ -385,7 +385,7 @@ def compare_engines(
     _require_motion(truth)
     choices = []
     for name, n in settings:
-        if name != EXPONENTIAL and step_radius(linear, name, n) > 1 + NEUTRAL:
+        if name != EXPONENTIAL and _step_radius(linear, name, n) > 1 + _NEUTRAL:
             continue
         own, cost = runs.get((name, n)) or _positions(simulation, ticks, "mujoco", name, n, progress)
         right = not disagree(exact_growth(linear), simulated_growth(linear, name, n))
@@ -414,23 +414,20 @@ class CrossCheck:
     agrees: bool
 
 
-def cross_check(
-    simulation: Simulation, trace: Trace, engine: AnyEngine, integrator: str | None, own_substeps: int | None
-) -> CrossCheck:
+def cross_check(simulation: Simulation, trace: Trace, settings: EngineSettings) -> CrossCheck:
     """The run again by RK4, which shares no matrix with the exponential and the exact engine; by it, if RK4 ran.
 
-    `simulation` is what ran, with its net; integrator and substeps are MuJoCo's, else None. Positions are
-    compared as far as neither ended before its time.
+    `simulation` is what ran, with its net. Positions are compared as far as neither ended before its time.
     """
-    other = EXPONENTIAL if integrator == "RK4" else "RK4"
+    other = EXPONENTIAL if settings.integrator == "RK4" else "RK4"
     linear = simulation.smooth.even
     substeps = default_substeps(linear, other)
     beside = run(simulation, make_engine(simulation, "mujoco", other, substeps), ticks=trace.t.size)
     ticks, m = min(trace.t.size, beside.t.size), simulation.process.channels
     growth = simulated_growth(linear, other, substeps)
     own = exact_growth(linear)
-    if engine != "exact":
-        own = simulated_growth(linear, integrator, own_substeps, engine)
+    if settings.engine != "exact":
+        own = simulated_growth(linear, settings.integrator, settings.substeps, settings.engine)
     apart = _apart(trace.s[:ticks, :m], beside.s[:ticks, :m])
     agrees = not disagree(own, growth) and trace.diverged == beside.diverged
     return CrossCheck(other, substeps, apart, growth, growth - own, agrees)
@@ -517,7 +514,7 @@ def _apart(own: Array, truth: Array) -> float:
 
 MOST = 10_000  # substeps
 _MODE_LOST = "it damps fast modes away"
-NEUTRAL = 1e-6  # a passive plant's free motion has eigenvalues at 1, which rounding splits by about 1e-8
+_NEUTRAL = 1e-6  # a passive plant's free motion has eigenvalues at 1, which rounding splits by about 1e-8
 #: basis states and inputs are this long: the plant is linear, and no actuator limit is so small
 _UNIT = 1e-6
 
@@ -542,7 +539,7 @@ def settle(
     if substeps is None and integrator != EXPONENTIAL:
         return integrator, default_substeps(simulation, integrator), []
     substeps = default_substeps(simulation, integrator) if substeps is None else substeps
-    return integrator, substeps, check_substeps(simulation, integrator, substeps)
+    return integrator, substeps, _check_substeps(simulation, integrator, substeps)
 
 
 def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
@@ -566,7 +563,7 @@ def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
     return count
 
 
-def check_substeps(simulation: Simulation, integrator: str, substeps: int) -> list[str]:
+def _check_substeps(simulation: Simulation, integrator: str, substeps: int) -> list[str]:
     """Remarks on a number of substeps that was asked for. Raises InputError outside the stable region."""
     if integrator == EXPONENTIAL:
         nearer = "of first order where devices rub, RK4 is nearer at equal cost (--cross-check: by how much)."
@@ -574,9 +571,9 @@ def check_substeps(simulation: Simulation, integrator: str, substeps: int) -> li
         return [f"{integrator} x {substeps}: {nearer}"] if rubs else []
     simulation = simulation.smooth.even
     speed, h = pace(simulation.scene.plant.A), simulation.scenario.T / substeps
-    radius = step_radius(simulation, integrator, substeps)
+    radius = _step_radius(simulation, integrator, substeps)
     what = f"{integrator} x {substeps}: {speed.hardest(h)}"
-    if not radius <= 1 + NEUTRAL:
+    if not radius <= 1 + _NEUTRAL:
         instead = _instead(simulation, integrator)
         raise InputError(f"--substeps {substeps}: {what}, outside the stable region of {integrator}; {instead}")
     remarks = [] if speed.within(h) else [f"{what}: stable but coarse; {_instead(simulation, integrator)}."]
@@ -589,14 +586,14 @@ def check_substeps(simulation: Simulation, integrator: str, substeps: int) -> li
     return remarks
 
 
-def step_radius(simulation: Simulation, integrator: str, substeps: int) -> float:
+def _step_radius(simulation: Simulation, integrator: str, substeps: int) -> float:
     """Spectral radius of one substep on the plant alone, which is passive: above 1 the integrator is unstable."""
-    step = measured_hold(simulation, "mujoco", integrator, 1, simulation.scenario.T / substeps)
+    step = _measured_hold(simulation, "mujoco", integrator, 1, simulation.scenario.T / substeps)
     return float(np.abs(np.linalg.eigvals(step.A)).max()) if np.isfinite(step.A).all() else np.inf
 
 
 def _agrees(simulation: Simulation, integrator: str, substeps: int) -> bool:
-    if step_radius(simulation, integrator, substeps) > 1 + NEUTRAL:
+    if _step_radius(simulation, integrator, substeps) > 1 + _NEUTRAL:
         return False
     return not disagree(exact_growth(simulation), simulated_growth(simulation, integrator, substeps))
 
@@ -608,7 +605,7 @@ def _instead(simulation: Simulation, integrator: str) -> str:
         return "use --engine exact"
 
 
-def measured_hold(
+def _measured_hold(
     simulation: Simulation,
     engine: AnyEngine = "mujoco",
     integrator: str | None = None,
@@ -639,7 +636,7 @@ def simulated_growth(
     simulation: Simulation, integrator: str | None, substeps: int | None, engine: AnyEngine = "mujoco"
 ) -> float:
     """The growth rate [1/s] of the loop that an engine simulates with these settings; of walls, in the worst state."""
-    held = measured_hold(simulation, engine, integrator, substeps)
+    held = _measured_hold(simulation, engine, integrator, substeps)
     return max(float(dominant_mode(close(held, F)).growth) for F in simulation.process.law.frozen().values())
 
 

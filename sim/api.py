@@ -17,7 +17,7 @@ from sim.accuracy import MOST, EngineChoice, compare_engines, pick, settle
 from sim.couplings import given, limits_of
 from sim.engines import INTEGRATORS, Engine
 from sim.passivity_layer import EnergyNet, Plugged, Wanted, netted
-from sim.run import ENGINES, AnyEngine, Progress, Simulation, assemble, engine_name, make_engine, run
+from sim.run import ENGINES, AnyEngine, EngineSettings, Progress, Simulation, assemble, engine_name, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
 from sim.stability import stability_of
 from sim.switching import Period, switching
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sim import crowds
 
 _MOST_HUMANS = 1_000_000
+_USUAL = EngineSettings()
 _SCENARIO = 'a Scenario, as load("omega-pair") gives it'
 
 
@@ -38,9 +39,7 @@ class ScenarioRun:
     ran: Simulation  # the same, with the net that was asked for
     period: Period | None  # of the worst switching found, where the delays switch
     choices: tuple[EngineChoice, ...]  # what was compared for the error that was asked, the cheapest first
-    engine: AnyEngine
-    integrator: str | None  # of MuJoCo; None for other engines, and so are the substeps
-    substeps: int | None
+    settings: EngineSettings  # as they were settled
     remarks: list[str]  # on a number of substeps that was asked for
     trace: Trace
     wall_s: float
@@ -49,7 +48,7 @@ class ScenarioRun:
     @cached_property
     def exact(self) -> Trace | None:
         """The exact engine's trace of the same loop; None where friction makes it another one than the linear."""
-        if self.engine == "exact":
+        if self.settings.engine == "exact":
             return self.trace
         return None if self.simulation.friction else run(self.ran, "exact", ticks=self.trace.t.size)
 
@@ -58,37 +57,33 @@ def run_scenario(
     scenario: Scenario,
     coupling: Coupling,
     lag: tuple[float, ...] | None = None,
-    *,
-    engine: AnyEngine = "mujoco",
-    integrator: str | None = None,
-    substeps: int | None = None,
-    error: float | None = None,
+    settings: EngineSettings = _USUAL,
     seed: int = 0,
     net: Wanted | None = None,
     progress: Progress = lambda done, ticks: None,
 ) -> ScenarioRun:
     """Close the loop for the scenario's duration: what `sim.run` and `simulate` have in common.
 
-    With `lag`, rho (m,) [N/m], forces leave through a limiter; with `error`, relative rms of the positions, MuJoCo's
-    engine is the cheapest that keeps it; `net` stands between the forces and the devices. Raises InputError for
-    settings that cannot be.
+    With `lag`, rho (m,) [N/m], forces leave through a limiter; `net` stands between the forces and the devices. Raises
+    InputError for settings that cannot be.
     """
     simulation = assemble(scenario, coupling, lag, seed)
     period, choices, remarks = None, (), []
     if scenario.switches:
         simulation, period = switching(simulation, seed, scenario.samples)
     ran = simulation if net is None else netted(simulation, net)
-    if error is not None:
-        choices = compare_engines(ran, error, progress=progress)
-        kept = pick(choices, error)
+    if settings.error is not None:
+        choices = compare_engines(ran, settings.error, progress=progress)
+        kept = pick(choices, settings.error)
         integrator, substeps = kept.integrator, kept.substeps
     else:
-        integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)
-    stepped = make_engine(simulation, engine, integrator, substeps)
+        integrator, substeps, remarks = settle(simulation, settings.engine, settings.integrator, settings.substeps)
+    settled = EngineSettings(settings.engine, integrator, substeps)
+    stepped = make_engine(simulation, settings.engine, integrator, substeps)
     begin = time.perf_counter()
     trace = run(ran, stepped, progress=progress)
     wall = time.perf_counter() - begin
-    return ScenarioRun(simulation, ran, period, choices, engine, integrator, substeps, remarks, trace, wall, seed)
+    return ScenarioRun(simulation, ran, period, choices, settled, remarks, trace, wall, seed)
 
 
 def simulate(
@@ -138,15 +133,14 @@ def simulate(
         net = Plugged(environment, energy_budget or 0.0)
     elif energy_budget is not None:
         net = EnergyNet(energy_budget)
-    steps = {"engine": engine, "integrator": integrator, "substeps": substeps}
-    done = run_scenario(scenario, chosen.coupling, limits.rho, **steps, seed=seed, net=net)
+    done = run_scenario(scenario, chosen.coupling, limits.rho, EngineSettings(engine, integrator, substeps), seed, net)
     trace = done.trace
     meta = {
         "scenario": scenario.name,
         "scenario_digest": scenario.digest,
         "engine": engine_name(engine),
-        "integrator": done.integrator,
-        "substeps": done.substeps,
+        "integrator": done.settings.integrator,
+        "substeps": done.settings.substeps,
         "seed": seed,
         "limiter": plain(limits),
         "stability": None if scenario.switches or environment else plain(stability_of(done.simulation, trace)),

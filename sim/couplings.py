@@ -19,10 +19,10 @@ from design.coverage import Limits, RangesFigures, covered_limits
 from design.designs import KINDS, design_by_kind, name_and_own, own_coupling, usual_condition
 from design.environments import THIS_ENVIRONMENT
 from design.files import unseen
-from design.guarantees import guarantee_of, switching_guarantee
+from design.guarantees import guarantee_of
 from design.lmi import ANY_ENVIRONMENT
 from design.own import called, place_of
-from design.result import CONDITIONS, Chosen, Design, DesignFailed, Requirement
+from design.result import CONDITIONS, Chosen, Design, DesignFailed, Requirement, switching_guarantee
 from sim import design_cache
 from sim.scenario import InputError, Scenario
 
@@ -138,7 +138,7 @@ def limits_of(
         return Limits(None, "limited forces are proved for constant delays", force_limit=within)
     loop = scenario.loop("I")  # the reference does not matter
     coupling, proof = chosen.coupling, chosen.limiter
-    asked = requirements or assess(loop, coupling, chosen.phi, chosen.certificate, own=chosen.own)
+    asked = requirements or assess(loop, coupling, chosen.certificate, own=chosen.own)
     return covered_limits(loop, coupling, asked, proof, chosen.certificate).within(within)
 
 
@@ -276,6 +276,6 @@ def judge(
 ) -> Judged:
     """The coupling in the scenario's loop; conditions are asked of `met`, one environment of its ranges."""
     whole = check_ranges(scenario.loop(case), chosen.coupling, seed, progress=progress)
-    requirements = assess(met.loop(case), chosen.coupling, chosen.phi, chosen.certificate, own=chosen.own)
+    requirements = assess(met.loop(case), chosen.coupling, chosen.certificate, own=chosen.own)
     limits = limits_of(met, chosen, requirements, limiter)
     return Judged.of(chosen, met.loop(case), requirements, whole, limits)

@@ -179,13 +179,13 @@ class Findings:
 
 
 #: what Findings have one entry of for every set of humans
-COLUMNS = tuple(f.name for f in fields(Findings) if f.name not in ("simulated", "interrupted", "lost"))
+_COLUMNS = tuple(f.name for f in fields(Findings) if f.name not in ("simulated", "interrupted", "lost"))
 
 
 def _merge(parts: Sequence[Findings]) -> Findings:
     """The findings of the groups of a batch as one."""
     order = np.argsort(np.concatenate([p.index for p in parts]), kind="stable")
-    joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts])[order] for name in COLUMNS}
+    joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts])[order] for name in _COLUMNS}
     return Findings(**joined, simulated=math.fsum(p.simulated for p in parts))
 
 
@@ -193,7 +193,7 @@ def _merge(parts: Sequence[Findings]) -> Findings:
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # the same bits in every process, wherever it runs
-def examine(
+def _examine(
     validation: Validation, indices: Sequence[int], ticked: Callable[[int], None] = lambda ticks: None
 ) -> Findings:
     """Decide and simulate the humans of `indices`, who all meet the same environment.
@@ -307,7 +307,7 @@ class Table:
         """With `resume` the unfinished file of the same question goes on. Raises InputError where there is none."""
         self._batches = question.batches()
         self._path = folder / f"unfinished-{question.digest}.npy" if folder else None
-        shape = len(COLUMNS) + 2, question.humans  # the last two: simulated seconds, and whether it is done
+        shape = len(_COLUMNS) + 2, question.humans  # the last two: simulated seconds, and whether it is done
         self._memory = None if self._path else np.zeros(shape)
         if self._path and resume and not self._path.is_file():
             raise InputError(f"--resume: {self._path.parent} holds nothing unfinished of these humans and this loop")
@@ -332,7 +332,7 @@ class Table:
         """The findings of a batch; that it is done is written last."""
         batch, table = self._batches[number], self._open("r+")
         where = slice(batch.start, batch.stop, batch.step)
-        for row, name in zip(table, COLUMNS, strict=False):
+        for row, name in zip(table, _COLUMNS, strict=False):
             row[where] = getattr(part, name)
         table[-2, where] = part.simulated / len(batch)
         table[-1, where] = 1
@@ -340,7 +340,7 @@ class Table:
     def findings(self, interrupted: bool = False, lost: str = "") -> Findings:
         """Of all batches that are done; the file goes where that is all of them."""
         table = self._open("r")
-        done, rows = table[-1] != 0, dict(zip(COLUMNS, table, strict=False))
+        done, rows = table[-1] != 0, dict(zip(_COLUMNS, table, strict=False))
         if not done.all():
             rows = {name: row[done] for name, row in rows.items()}
         elif self._path:
@@ -384,7 +384,7 @@ def _here(question: Validation, table: Table, progress: Progress) -> None:
         progress(done, ticks * len(batches))
 
     for n, number in enumerate(missing, start=len(batches) - len(missing) + 1):
-        table.put(number, examine(question, batches[number], ticked))
+        table.put(number, _examine(question, batches[number], ticked))
         done = n * ticks
         progress(done, ticks * len(batches))
 
@@ -407,12 +407,12 @@ def _pool(question: Validation, table: Table, missing: list[int], shards: int, p
     # a forked child would inherit locks of MuJoCo's threads and of the progress bar
     context = multiprocessing.get_context("spawn")
     strangers = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(shards, mp_context=context, initializer=as_worker)
+    pool = ProcessPoolExecutor(shards, mp_context=context, initializer=_as_worker)
     left, running = iter(missing), dict[Future[Findings], int]()
     try:
         while True:
             for number in left:
-                running[pool.submit(examine, alone, batches[number])] = number
+                running[pool.submit(_examine, alone, batches[number])] = number
                 if len(running) >= _AHEAD * shards:
                     break
             if not running:
@@ -441,7 +441,7 @@ def _finished(running: dict[Future[Findings], int], table: Table) -> int:
     return len(ready)
 
 
-def as_worker() -> None:
+def _as_worker() -> None:
     """Ignore Ctrl-C, which reaches every process of a terminal and is the parent's; end with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
@@ -525,9 +525,9 @@ _one_at_a_time = threading.Lock()  # MuJoCo's clock and warning handler are glob
 
 
 def _examine_alone(question: Validation, indices: Sequence[int]) -> Findings:
-    """`examine`, one at a time in every worker process, however many threads that has."""
+    """`_examine`, one at a time in every worker process, however many threads that has."""
     with _one_at_a_time:
-        return examine(question, indices)
+        return _examine(question, indices)
 
 
 @contextmanager

@@ -57,6 +57,16 @@ _BLOCK = 2048  # ticks between two looks at the clock, the keyboard and the numb
 _AHEAD = 8  # blocks for which outside forces are asked at once
 
 
+@dataclass(frozen=True)
+class EngineSettings:
+    """What moves the plant, and by which steps; None for what the plant asks."""
+
+    engine: AnyEngine = "mujoco"
+    integrator: str | None = None  # of MuJoCo, and so are the substeps
+    substeps: int | None = None  # per period
+    error: float | None = None  # in place of both: relative rms of the positions, which the cheapest keeps
+
+
 @dataclass(frozen=True, eq=False)
 class Simulation:
     """A scenario with its coupling, ready to run: what the computer does every tick, and the plant that it moves."""

@@ -160,13 +160,13 @@ def run_report(
 
 
 def _ran(run: ScenarioRun, lam: tuple[int, ...], environment: str, check: bool) -> Ran:
-    simulation, trace, steps = run.simulation, run.trace, (run.engine, run.integrator, run.substeps)
+    simulation, trace, settings = run.simulation, run.trace, run.settings
     scenario, process, samples = simulation.scenario, simulation.process, trace.t.size
     duration = float(beginnings(scenario.T, simulation.timing, samples, 1)[0])
     return Ran(
-        engine=engine_name(run.engine),
-        integrator=run.integrator,
-        substeps=run.substeps,
+        engine=engine_name(settings.engine),
+        integrator=settings.integrator,
+        substeps=settings.substeps,
         duration_s=duration,
         samples=samples,
         wall_s=run.wall_s,
@@ -178,7 +178,7 @@ def _ran(run: ScenarioRun, lam: tuple[int, ...], environment: str, check: bool) 
         timing=simulation.timing and UnevenTicks.of(simulation.timing, scenario),
         seed=run.seed,
         engines=run.choices or None,
-        cross_check=accuracy.cross_check(run.ran, trace, *steps) if check else None,
+        cross_check=accuracy.cross_check(run.ran, trace, settings) if check else None,
         interrupted=trace.interrupted,
         scenario_digest=scenario.digest,
         encoder_step_m=process.encoder_step,

@@ -175,7 +175,7 @@ def exact_growth(simulation: Simulation) -> float:
     return float(worst_mode(simulation).growth)
 
 
-NOT_EXCITED = "not excited: nothing in this run moves the dominant mode; the verdict is that of the eigenvalues"
+_NOT_EXCITED = "not excited: nothing in this run moves the dominant mode; the verdict is that of the eigenvalues"
 _VECTOR_ROUNDING = 1e-12  # of the largest entry: what an eigenvector's entries may be off
 _UNLIKE = 0.05  # rms of what y does beside the mode, relative to it: above, it is no such mode but noise
 
@@ -211,7 +211,7 @@ def _measured_growth(
     eigenvalue = np.array(np.vdot(y[:-1], y[1:] - pushed) / weight if weight else 0.0, dtype=np.complex128)
     rest = y[1:] - pushed - eigenvalue * y[:-1]
     if weight <= _NOISE_FLOOR**2 * squares or float(np.vdot(rest, rest).real) > _UNLIKE**2 * weight:
-        return None, NOT_EXCITED
+        return None, _NOT_EXCITED
     return float(Mode(eigenvalue, loop.T).growth), None
 
 
@@ -291,7 +291,7 @@ def stability_of(simulation: Simulation, trace: Trace) -> Stability:
     found = "unstable" if trace.diverged else None if growth is None else verdict(growth)
     return Stability(
         **vars(exact),
-        verdict=exact.exact_verdict if reason == NOT_EXCITED else found,
+        verdict=exact.exact_verdict if reason == _NOT_EXCITED else found,
         clipped_ticks=int(trace.clipped(simulation.process.force_limit).sum()),
         growth_rate_per_s=growth,
         frequency_hz=trace.dominant_frequency_hz(),

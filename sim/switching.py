@@ -26,8 +26,7 @@ from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
 from design.coverage import Switching
 from design.files import unseen
-from design.guarantees import switching_guarantee
-from design.result import Chosen
+from design.result import Chosen, switching_guarantee
 from models.hold import HeldPlant, hold
 from models.scene import Scene, Variants
 from sim.engines import Engine, ExactEngine, ExactTimedEngine

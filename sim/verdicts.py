@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
-import msgspec
 import numpy as np
 
+from controller.environment import Network
 from controller.lti import Array
 from design.files import unseen
 from design.result import finite
-from models.human import Human
+from models.human import Hand, Human, Link, Person
 from sim.adversary import Worst
 from sim.crowds import Findings, Validation
 from sim.run import engine_name
@@ -67,23 +67,41 @@ class EnvironmentsMet:
         return f"{self.count} of {self.of}, in turn; unstable in: {'; '.join(self.unstable_in) or 'none'}"
 
 
+@dataclass(frozen=True, eq=False)
+class _Held:
+    """A channel's human: links, or of a user's own class what the handle feels of it."""
+
+    links: tuple[Link, ...] | None = unseen("given", None)
+    class_: str | None = unseen("given", None)
+    mass: Array | None = unseen("given", None)
+    across: Array | None = unseen("given", None)
+    damping: Array | None = unseen("given", None)
+    stiffness: Array | None = unseen("given", None)
+
+    @classmethod
+    def of(cls, human: Hand) -> _Held:
+        if isinstance(human, Human):
+            return cls(human.links)
+        port = human.port()
+        return cls(None, type(human).__name__, port.mass, port.across, port.damping, port.stiffness)
+
+
 @dataclass(frozen=True)
 class DrawnHumans:
     """A set of humans that the population drew, and the environment that it met."""
 
     seed: int
     index: int
-    human: list[dict[str, Any]]
-    person: list[dict[str, Any]]
+    human: list[_Held]
+    person: tuple[Person, ...]
     environment: str | None = unseen("given", None)
-    network: dict[str, Any] | None = unseen("given", None)
+    network: Network | None = unseen("given", None)
 
     @classmethod
     def of(cls, question: Validation, index: int) -> DrawnHumans:
         crowd, member = question.crowd(index), question.environment(index)
-        humans, persons = _humans(crowd.humans(0)), msgspec.to_builtins(crowd.persons(0))
-        where, network = (member.name, msgspec.to_builtins(member.network)) if member else (None, None)
-        return cls(question.seed, index, humans, persons, where, network)
+        where = (member.name, member.network) if member else (None, None)
+        return cls(question.seed, index, _held(crowd.humans(0)), crowd.persons(0), *where)
 
 
 @dataclass(frozen=True)
@@ -216,15 +234,15 @@ class Attacked:
     frequency_hz: float
     evaluated: int
     required_over_available_damping: float | None
-    human: list[dict[str, Any]]
-    person: list[dict[str, Any]]
+    human: list[_Held]
+    person: tuple[Person, ...]
     holds: bool
 
     @classmethod
     def of(cls, worst: Worst, ratio: float, certified: bool) -> Attacked:
-        humans, persons = _humans(worst.humans), msgspec.to_builtins(worst.persons)
         figures = worst.spectral_radius, worst.growth, worst.frequency_hz, worst.evaluated
-        return cls(worst.destabilises, *figures, finite(ratio), humans, persons, not (certified and worst.destabilises))
+        held = _held(worst.humans), worst.persons
+        return cls(worst.destabilises, *figures, finite(ratio), *held, not (certified and worst.destabilises))
 
     def __str__(self) -> str:
         grows = f"a human that grows at {self.growth_rate_per_s:+.4g} 1/s"
@@ -233,15 +251,8 @@ class Attacked:
         return f"{found} among {self.evaluated}; {close}"
 
 
-def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
-    """Links of each channel's human; of a user's own class what the handle feels of it."""
-    parts = ("mass", "across", "damping", "stiffness")
-    return [
-        {"links": msgspec.to_builtins(human.links)}
-        if isinstance(human, Human)
-        else {"class": type(human).__name__} | {name: getattr(human.port(), name) for name in parts}
-        for human in humans
-    ]
+def _held(humans: tuple[Hand, ...]) -> list[_Held]:
+    return [_Held.of(human) for human in humans]
 
 
 def largest(values: Array) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from controller.environment import GROUND, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
-from design import conditions, environments, multipliers
+from design import conditions, environments
 
 
 def loop(T, delta, theta=None, walls=(), psi=None, environment=None, **further) -> Loop:
@@ -47,24 +47,39 @@ def walls_demand(G, delta, slopes, g, lam=None):
 
 
 def walls_proof(G, delta, slopes, g=None):
-    return environments.walls_proof(G, loop(G.T, delta, walls=slopes), g)
+    return environments.THIS_ENVIRONMENT.required_of(G, loop(G.T, delta, walls=slopes), g)
 
 
 def _switching(G, lo, hi, delta, T_max=None):
     return loop(G.T, delta, lo, T_max=T_max, varying_delay=DelayRange(tuple(lo), tuple(hi)))
 
 
-def switching_block(G, lo, hi, delta, alpha, T_max=None):
-    return multipliers.switching_block(G, _switching(G, lo, hi, delta, T_max), alpha)
+def switching_demand(G, lo, hi, delta, alpha, T_max=None):
+    return environments.SWITCHING.block(G, _switching(G, lo, hi, delta, T_max), alpha)
 
 
 def switching_sweep(G, lo, hi, delta, alpha=None, T_max=None):
-    return multipliers.switching_sweep(G, _switching(G, lo, hi, delta, T_max), alpha)
+    return environments.SWITCHING.required_of(G, _switching(G, lo, hi, delta, T_max), alpha)
+
+
+class _Lagging(environments.Limiter):
+    """The limiter of any lag."""
+
+    lag_given = ()
+
+    def rho(self, loop):
+        return tuple(self.lag_given)
+
+
+def _lagging(rho, lags):
+    return type("Lagging", (_Lagging,), {"lag_given": rho})(lags=lags)
 
 
 def limiter_demand(G, theta, delta, rho, c, T_max=None):
-    return multipliers.limiter_demand(G, loop(G.T, delta, theta, T_max=T_max), rho, c)
+    flat = [v for row in c for v in row]
+    return _lagging(rho, len(c[0])).block(G, loop(G.T, delta, theta, T_max=T_max), flat)
 
 
 def limiter(G, theta, delta, rho, c=None, lags=1, T_max=None):
-    return multipliers.limiter(G, loop(G.T, delta, theta, T_max=T_max), rho, c, lags)
+    flat = None if c is None else [v for row in c for v in row]
+    return _lagging(rho, len(c[0]) if c else lags).required_of(G, loop(G.T, delta, theta, T_max=T_max), flat)

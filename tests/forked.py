@@ -39,7 +39,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
         (designs.design_by_kind, (cli.design, api, compare, couplings)),
         (bound.bound, (bound, compare)),
         (optimal.spread, (optimal,)),
-        (coverage.limiter_requirement, (coverage,)),
+        (coverage.required_damping, (coverage,)),
         (alternatives.assess, (alternatives,)),
         (api.instead, (api,)),
     ):

@@ -19,7 +19,7 @@ from controller.tick import StepBuffer
 from models.device import CompliantDevice
 from models.hold import hold
 from models.scene import crowds, plant, variants
-from sim.accuracy import default_substeps, measured_hold, pace, simulated_growth
+from sim.accuracy import _measured_hold, default_substeps, pace, simulated_growth
 from sim.engines import EXPONENTIAL, ExactEngine, MujocoBatchEngine, _discretised, profiler_off
 from sim.run import assemble, make_engine, run, run_block
 from sim.scenario import load
@@ -190,7 +190,7 @@ def test_how_long_a_period_may_be(benchmark):
     simulation = assemble(SCENES["transmission of 1.45e6 N/m"], PUBLISHED["I"])
     T, turns = 0.1, pace(plant(simulation.scene.model).A).mode * 0.1
     step = benchmark.pedantic(
-        lambda: measured_hold(simulation, "mujoco", EXPONENTIAL, 1, T), rounds=3, iterations=1, warmup_rounds=1
+        lambda: _measured_hold(simulation, "mujoco", EXPONENTIAL, 1, T), rounds=3, iterations=1, warmup_rounds=1
     )
     error = np.abs(step.A - hold(plant(simulation.scene.model), T).A).max() / np.abs(step.A).max()
     print(f"\none step of {T} s, {turns:.0f} rad of the fastest mode: map within {error:.1e}")

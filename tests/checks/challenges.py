@@ -23,8 +23,7 @@ from controller.loop import Loop
 from controller.lti import Array
 from controller.tick import Process, StepBuffer
 from design.conditions import any_environment, encoder_friction, this_environment
-from design.environments import THIS_ENVIRONMENT
-from design.multipliers import BETA, limiter, limiter_lag
+from design.environments import LIMITER, THIS_ENVIRONMENT
 from models.device import RigidDevice
 from models.hold import HeldPlant, hold
 from models.human import Human, Link
@@ -239,9 +238,8 @@ _FREE = np.full(2, np.inf), np.zeros(2)  # limits of the actuators and steps of 
 
 def _limits(rng: np.random.Generator, factor: float) -> _Case:
     loop, coupling = _pair(rng)
-    rho = limiter_lag(loop.delta, loop.T, BETA)
-    needed = limiter(loop.sent(coupling), loop, rho).requirement.required
-    process = Process(loop.law(coupling, (2.0, 1.0), rho), *_FREE)
+    needed = LIMITER.required(loop, coupling).required
+    process = Process(loop.law(coupling, (2.0, 1.0), LIMITER.rho(loop)), *_FREE)
     return _Case(lambda nsim, ticks: process, factor * np.array(needed), loop.T, 1e-3)
 
 

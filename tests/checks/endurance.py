@@ -19,7 +19,7 @@ from hw.monitor import LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import session_for
 from sim.couplings import choose
-from sim.crowds import Validation, as_worker, validate
+from sim.crowds import Validation, _as_worker, validate
 from sim.scenario import load
 from sim.stability import unstable
 from tests.checks.faults import person
@@ -92,7 +92,7 @@ def endurance(_seed: int) -> Iterator[_Endured]:
 
 def _alone(work: _Work, allowed: float, there: Connection) -> None:
     """Run in a process of its own, which ends when the waiting one does."""
-    as_worker()
+    _as_worker()
     there.send(_endure(work, allowed))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from controller.coupling import PUBLISHED, Coupling, SpringDamper
 from models.device import CompliantDevice
 from models.human import Human, Link
-from sim.accuracy import check_substeps, default_substeps, position_error, simulated_growth
+from sim.accuracy import _check_substeps, default_substeps, position_error, simulated_growth
 from sim.run import Simulation, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, load
 from sim.stability import exact_growth
@@ -94,7 +94,7 @@ def cases() -> tuple[_Hard, ...]:
 def faults(loop: Simulation, integrator: str, substeps: int) -> dict[str, float]:
     """What is wrong with a setting, and by how much: nothing where it holds."""
     try:
-        check_substeps(loop, integrator, substeps)
+        _check_substeps(loop, integrator, substeps)
     except InputError:
         return {"refused": np.inf}
     exact, own = exact_growth(loop), simulated_growth(loop, integrator, substeps)

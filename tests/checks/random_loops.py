@@ -23,7 +23,7 @@ from models.human import Human, Population, Voluntary
 from sim.accuracy import settle
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, Scenario
-from sim.stability import NOT_EXCITED, disagree, stability_of
+from sim.stability import _NOT_EXCITED, disagree, stability_of
 
 _TOO_CLOSE = 1e-4  # of the damping: a proof needs some room
 _HANDS = Population()
@@ -148,7 +148,7 @@ def traces(seed: int, count: int = 460) -> Iterator[_TraceVerdict]:
             continue
         part = stability_of(simulation, trace)
         growth, exact = part.growth_rate_per_s, part.exact_growth_rate_per_s
-        silent, other = part.reason == NOT_EXCITED, growth is not None and bool(disagree(exact, growth))
+        silent, other = part.reason == _NOT_EXCITED, growth is not None and bool(disagree(exact, growth))
         opposite = other or (growth is None and part.verdict not in (None, part.exact_verdict))
         yield _TraceVerdict(number, engine, exact, growth, part.verdict, part.reason, silent, not opposite)
         number += 1

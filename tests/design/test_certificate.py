@@ -27,7 +27,7 @@ from design import certificate as design_certificate
 from design import environments, exact, spring_damper
 from design.certificate import Verdict, prove, required_damping, verify
 from design.coupling_file import Stored, digest, load, save, sealed
-from design.environments import THIS_ENVIRONMENT
+from design.environments import LIMITER, THIS_ENVIRONMENT
 from design.files import InputError
 from design.frequency import frequencies, on_circle, rounding
 from design.lmi import ANY_ENVIRONMENT
@@ -54,8 +54,10 @@ def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
     assert stored.certificate.guarantee == "this environment"
     assert set(stored.certificate.matrices) == {"P", "P_E", "Phi"}
     assert verify(stored) == Verdict(True)
-    with pytest.raises(NotProved, match="needs a multiplier Phi"):
-        prove(loop, found.coupling, "any-environment")
+    least = prove(loop, found.coupling, "any-environment")  # which finds the least Phi itself
+    assert verify(Stored.of(loop, found.coupling, least)) == Verdict(True)
+    with pytest.raises(NotProved, match="needs a multiplier Phi, one entry per channel"):
+        prove(loop, found.coupling, "any-environment", [0.1])
     with pytest.raises(NotProved, match="E-hat \\+ Phi is not passive"):
         prove(loop, found.coupling, "any-environment", 0.9 * found.phi)
     forged = sealed(change(stored.certificate, matrices=stored.certificate.matrices | {"Phi": (("1/100", "1/100"),)}))
@@ -157,7 +159,7 @@ def test_environment_delay_is_proved_by_the_this_environment_condition_only():
     loop = change(DEFAULT, psi=(1, 1), delta=(2.5, 2.5))
     damped = SpringDamper((2000.0, 2000.0), (3.0, 3.0))
     assert verify(certified(loop, damped, "this-environment")).proved
-    with pytest.raises(NotProved, match="psi >= 1 needs a multiplier"):
+    with pytest.raises(NotProved, match=r"^needs 5\.76"):
         prove(loop, damped, "any-environment")
 
 
@@ -450,7 +452,8 @@ def test_exact_arithmetic_that_takes_too_long_is_given_up_in_one_line(monkeypatc
     assert {requirement.proof for requirement in design_certificate.assess(PAIR, SOFT).values()} == {"sampled"}
     with pytest.raises(NotProved, match=words):
         design_certificate.prove_limiter(PAIR, SpringDamper((3000.0, 2000.0), (0.1, 0.1)))
-    assert words in str(design_certificate.prove_switching(PAIR.switching(DelayRange((1, 2), (1, 3))), SOFT))
+    with pytest.raises(NotProved, match=words):
+        prove(PAIR.switching(DelayRange((1, 2), (1, 3))), SOFT, "this-environment")
 
 
 # bodies that drift
@@ -483,14 +486,14 @@ def test_the_proof_succeeds_exactly_where_the_sweep_says_so_on_any_network():
 
 def test_every_block_is_measured_before_it_is_proved(monkeypatch):
     """The states that each exact block will have: so many are one too many, and that is said."""
-    loop, coupling, c = scenario("omega-pair").loop("I"), SpringDamper((400.0, 300.0), (0.1, 0.1)), ((1.0,), (1.0,))
+    loop, coupling = scenario("omega-pair").loop("I"), SpringDamper((400.0, 300.0), (0.1, 0.1))
     wall, one = scenario("one-wall").loop("I"), SpringDamper((400.0,), (0.1,))
     limited = loop.sent(coupling).order + 2 * loop.channels + sum(loop.theta)
     blocks = {
         coupling.compliance(loop.T).order + sum(loop.theta): lambda: design_certificate._blocks(
             loop, coupling, ANY_ENVIRONMENT, None
         ),
-        limited: lambda: design_certificate._limiter_block(loop, coupling, (0.0, 0.0), c),
+        limited: lambda: design_certificate._blocks(loop, coupling, LIMITER, (1.0, 1.0)),
         wall.walled(one).order: lambda: design_certificate._blocks(wall, one, THIS_ENVIRONMENT, [Fraction(1)]),
     }
     for states, make in blocks.items():

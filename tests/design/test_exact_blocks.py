@@ -6,6 +6,7 @@ refused and none is found. Then `prove` and `verify` with their sweep disarmed, 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 
 import msgspec
@@ -14,7 +15,7 @@ import pytest
 from asked import (
     any_environment_demand,
     limiter_demand,
-    switching_block,
+    switching_demand,
     this_environment_demand,
     walls_demand,
 )
@@ -28,11 +29,11 @@ from controller.loop import DelayRange, Loop
 from controller.lti import Lti
 from controller.ranges import Ranges, UncertainSpring
 from design import certificate
-from design.certificate import condition_block, prove, verify
+from design.certificate import prove, verify
 from design.conditions import delayed_environment_demand
 from design.coupling_file import Stored, digest, sealed
+from design.environments import SWITCHING, Limiter
 from design.exact import find_storage, prove_positive_real
-from design.multipliers import SwitchingSweep
 from design.result import NotProved, from_ratio
 
 CLOSE = 1e-6  # relative, on either side of a limit
@@ -244,7 +245,7 @@ def test_switching_against_a_spring(lo, hi, weight):
     limit = T * (alpha / 2 + (h * K) ** 2 / (2 * alpha) + K * ((lo + hi) / 2 + 0.5))
     if weight == 1:
         assert limit == pytest.approx((hi + 0.5) * K * T)
-    assert_limit(lambda d: switching_block(G, [lo], [hi], [d], [alpha])[0], limit)
+    assert_limit(lambda d: both(switching_demand(G, [lo], [hi], [d], [alpha])), limit)
 
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((0, 2), (3, 2))])
@@ -261,7 +262,7 @@ def test_switching_against_a_dense_sweep(lo, hi):
         return np.linalg.eigvalsh(T * (np.diag(alpha / 2) + cost - he(nominal))).max(axis=1)
 
     G = loop(FIGURE_4, (0, 0)).sent(STIFF, exact=True)
-    assert_limit(lambda d: switching_block(G, lo, hi, [d, d], alpha.tolist())[0], highest(needed))
+    assert_limit(lambda d: both(switching_demand(G, lo, hi, [d, d], alpha.tolist())), highest(needed))
 
 
 # periods, latency, limits and walls
@@ -276,7 +277,7 @@ def test_the_longest_period_scales_each_block(longest):
     needs = any_environment_limit(900.0, 0.4, 1) * longest / T
     assert_limit(lambda d: both(any_environment_demand(V, (1,), [d], longest)), needs)
     G = loop(to_ground(1000.0), (0,)).sent(rigid, exact=True)
-    assert_limit(lambda d: switching_block(G, [1], [3], [d], [1000.0], longest)[0], 3.5 * 1000 * longest)
+    assert_limit(lambda d: both(switching_demand(G, [1], [3], [d], [1000.0], longest)), 3.5 * 1000 * longest)
 
 
 @pytest.mark.parametrize(("first", "last", "longest"), [(1.3e-4, 1.3e-4, T), (0.0, 5e-4, T), (2e-4, 6e-4, 1.5e-3)])
@@ -323,14 +324,11 @@ def test_a_wall_on_the_device_itself(theta, g):
 def disarmed(monkeypatch):
     """The sweeps find half of the damping enough, whatever the loop."""
 
-    def content(asked: Loop, coupling, condition, phi=None):
-        return from_ratio(condition, 0.5, asked.delta, 1.0)
-
-    def switching(asked: Loop, coupling, alpha=None):
-        return SwitchingSweep(from_ratio("switching", 0.5, asked.delta, 1.0), alpha or ALPHA, 0.5)
+    def content(asked: Loop, coupling, condition, multiplier=None):
+        usual = ALPHA if condition is SWITCHING else None
+        return replace(from_ratio("any", 0.5, asked.delta, 1.0), multiplier=multiplier or usual)
 
     monkeypatch.setattr(certificate, "required_damping", content)
-    monkeypatch.setattr(certificate.multipliers, "swept", switching)
 
 
 ALPHA = (500.0, 250.0)
@@ -451,13 +449,11 @@ def test_an_asymmetry_of_1e_12_is_refused_behind_delay_and_for_switching_too():
     skew = crossed(1e-4 * (1 + 1e-12))
     assert forged(asked, skew, made) == "V(1) is not exactly symmetric"
     switching = change(asked, psi=(0, 0)).switching(DelayRange((0, 0), (1, 1)))
-    assert condition_block(switching, crossed(1e-4), ALPHA).order
-    with pytest.raises(ValueError, match="not exactly symmetric and positive semidefinite"):
-        condition_block(switching, skew, ALPHA)
-    limited = (change(asked, psi=(0, 0)), crossed(1e-4), (10.0, 10.0), ((), ()))
-    assert certificate._limiter_block(*limited).order
-    with pytest.raises(NotProved, match=r"^F\(1\) is not exactly symmetric"):
-        certificate._limiter_block(limited[0], skew, *limited[2:])
+    limited = change(asked, psi=(0, 0))
+    for there, condition, multiplier in ((switching, SWITCHING, ALPHA), (limited, Limiter(0.01, 0), ())):
+        assert certificate._blocks(there, crossed(1e-4), condition, multiplier)["P"].order
+        with pytest.raises(NotProved, match=r": F\(1\) is not exactly symmetric"):
+            certificate._blocks(there, skew, condition, multiplier)
 
 
 def test_a_static_stiffness_that_is_indefinite_by_1e_12_is_refused():
@@ -471,9 +467,9 @@ def test_a_static_stiffness_that_is_indefinite_by_1e_12_is_refused():
     assert forged(asked, model(0.0), made) is None
     assert forged(asked, model(1e-18), made).startswith("F(1) is not positive semidefinite")
     switching = asked.switching(DelayRange((0, 0), (1, 1)))
-    assert condition_block(switching, model(0.0), ALPHA).order
-    with pytest.raises(ValueError, match="not exactly symmetric and positive semidefinite"):
-        condition_block(switching, model(1e-18), ALPHA)
+    assert certificate._blocks(switching, model(0.0), SWITCHING, ALPHA)["P"].order
+    with pytest.raises(NotProved, match=r": F\(1\) is not positive semidefinite"):
+        certificate._blocks(switching, model(1e-18), SWITCHING, ALPHA)
 
 
 def test_a_multiplier_is_below_the_damping_and_covers_the_environment(monkeypatch):

@@ -14,25 +14,25 @@ from controller.environment import Network, Wall
 from controller.loop import DelayRange
 from controller.lti import Lti, Sampled, taps
 from controller.ranges import Ranges
-from design import multipliers
-from design.certificate import lag, prove, prove_limiter, verify
+from design import environments
+from design.certificate import lag, prove, prove_limiter, required_damping, verify
 from design.conditions import least_multiple
 from design.coupling_file import Certificate, LimiterCertificate, Stored, load, save, sealed
+from design.environments import LIMITER, Limiter
 from design.frequency import hermitian, on_circle
 from design.gain_search import LimiterLoop
 from design.lmi import RESERVE
-from design.multipliers import limiter_lag, limiter_requirement
 from design.result import NotProved
 from design.spring_damper import design
 from design.transparency import transparency
 from sim.scenario import InputError
 
-LAG = limiter_lag(DELTA, T, 0.01)
+LAG = LIMITER.rho(PAIR)
 BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # designed with the limiter's block
 
 
 def required(coupling, c=None, lag=LAG) -> float:
-    return limiter(PAIR.sent(coupling), PAIR.theta, DELTA, lag, c).requirement.required[0]
+    return limiter(PAIR.sent(coupling), PAIR.theta, DELTA, lag, c).required[0]
 
 
 def test_the_block_of_one_channel():
@@ -86,19 +86,17 @@ def test_closed_forms_of_a_spring(theta):
     G = Lti.constant([[K]], T)
 
     def needed(c):
-        return limiter(G, (theta,), (1.0,), (1e-9,), c).requirement.required[0]
+        return limiter(G, (theta,), (1.0,), (1e-9,), c).required[0]
 
     assert needed(((0.0,),)) == pytest.approx((theta + 1) ** 2 * K * T / 2, rel=1e-6)
     assert needed(((float(theta),),)) == pytest.approx((theta + 0.5) * K * T, rel=1e-6)
-    assert limiter(G, (theta,), (1.0,), (1e-9,)).requirement.required[0] == pytest.approx(
-        (theta + 0.5) * K * T, rel=1e-5
-    )
+    assert limiter(G, (theta,), (1.0,), (1e-9,)).required[0] == pytest.approx((theta + 0.5) * K * T, rel=1e-5)
 
 
 @pytest.mark.parametrize(("c", "factor"), [(0.0, 2.0), (0.25, 1.6875), (0.5, 1.5625), (1.0, 1.5), (2.0, 1.6)])
 def test_a_delayed_spring_by_its_multiplier(c, factor):
     G = Lti.constant([[1000.0]], T)
-    assert limiter(G, (1,), (1.0,), (1e-9,), ((c,),)).requirement.ratio == pytest.approx(factor * 1000 * T, rel=1e-6)
+    assert limiter(G, (1,), (1.0,), (1e-9,), ((c,),)).ratio == pytest.approx(factor * 1000 * T, rel=1e-6)
 
 
 def test_the_coupling_designed_with_the_block():
@@ -106,9 +104,9 @@ def test_the_coupling_designed_with_the_block():
     assert this_environment(PAIR.F(BUILT), DELTA).required[0] == pytest.approx(1.30132, abs=5e-6)
     for c, expected in (((0, 0), 1.42465), ((0.3, 0.3), 1.34059), ((0.278, 0.632), 1.32327)):
         assert required(BUILT, tuple((float(v),) for v in c)) == pytest.approx(expected, abs=5e-6)
-    refused = limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG, ((1.0,), (1.0,))).requirement
+    refused = limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG, ((1.0,), (1.0,)))
     assert not refused.certified
-    assert "no limiter is proved for this coupling" in str(refused.reason)
+    assert "no multiplier c was found with which any damping is enough" in str(refused.reason)
 
 
 @pytest.mark.parametrize(
@@ -124,46 +122,48 @@ def test_the_coupling_designed_with_the_block():
 )
 def test_the_default_loop_with_its_best_multiplier(coupling, expected):
     found = limiter(PAIR.sent(coupling), PAIR.theta, DELTA, LAG)
-    assert found.requirement.required[0] == pytest.approx(expected, abs=1e-4)
-    assert found.requirement.ratio <= found.bound * (1 + 2e-5)
-    assert required(coupling, found.c) == pytest.approx(found.requirement.required[0], rel=1e-9)
+    assert found.required[0] == pytest.approx(expected, abs=1e-4)
+    assert found.ratio <= found.bound * (1 + 2e-5)
+    assert required(coupling, [[v] for v in found.multiplier]) == pytest.approx(found.required[0], rel=1e-9)
     linear = this_environment(PAIR.F(coupling), DELTA).required[0]
-    assert found.requirement.required[0] >= linear * (1 - 1e-9)  # the block's first row is that of the linear loop
+    assert found.required[0] >= linear * (1 - 1e-9)  # the block's first row is that of the linear loop
 
 
 def test_no_multiplier_on_a_grid_is_better():
-    best = limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG).requirement.ratio
+    best = limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG).ratio
     grid = product(np.linspace(0.1, 0.6, 6), np.linspace(0.4, 0.9, 6))
-    others = [limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG, ((a,), (b,))).requirement.ratio for a, b in grid]
+    others = [limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG, ((a,), (b,))).ratio for a, b in grid]
     assert min(others) >= best * (1 - 1e-6)
 
 
 def test_for_many_devices_no_multiplier_is_sought(monkeypatch):
     """The search grows with the fourth power of their number; at c = 0 one sweep is left, which asks for more."""
-    best = limiter_requirement(PAIR, BUILT)
-    monkeypatch.setattr(multipliers, "_MOST_SEARCHED", 1)
-    monkeypatch.setattr(multipliers._LimiterSearch, "least", None)
-    simple = limiter_requirement(PAIR, BUILT)
-    assert simple.c == ((0.0,), (0.0,))
-    assert simple.requirement.required[0] == pytest.approx(required(BUILT, simple.c))
-    assert simple.requirement.required[0] >= best.requirement.required[0]
-    assert limiter_requirement(PAIR, BUILT, c=best.c).requirement.required == pytest.approx(best.requirement.required)
+    best = required_damping(PAIR, BUILT, LIMITER)
+    monkeypatch.setattr(environments, "_MOST_ROWS", 3)
+    monkeypatch.setattr(environments._Search, "best", None)
+    simple = required_damping(PAIR, BUILT, LIMITER)
+    assert simple.multiplier == (0.0, 0.0)
+    assert simple.required[0] == pytest.approx(required(BUILT, ((0.0,), (0.0,))))
+    assert simple.required[0] >= best.required[0]
+    assert required_damping(PAIR, BUILT, LIMITER, best.multiplier).required == pytest.approx(best.required)
 
 
 def test_unequal_weights_need_enough_lag():
     """F(1) couples the channels: c = (0.2, 0.4) is infeasible at beta = 1e-4 and fine at 0.01."""
     unequal = ((0.2,), (0.4,))
-    assert np.isinf(required(BUILT, unequal, limiter_lag(DELTA, T, 1e-4)))
+    assert np.isinf(required(BUILT, unequal, Limiter(1e-4).rho(PAIR)))
     assert required(BUILT, unequal) < 1.36
 
 
 def test_bad_requests_are_named():
     G = PAIR.sent(BUILT)
-    with pytest.raises(ValueError, match="one entry for each of 2 channels"):
-        limiter(G, (1, 2), DELTA, LAG[:1])
+    with pytest.raises(ValueError, match="as many for each channel"):
+        limiter(G, (1, 2), DELTA, LAG, ((0.1,),))
+    with pytest.raises(ValueError, match=r"beta is -0\.01, expected a number >= 0"):
+        Limiter(-0.01)
     with pytest.raises(ValueError, match="expected numbers >= 0"):
         limiter(G, (1, 2), DELTA, LAG, ((-0.1,), (0.0,)))
-    swinging = limiter(PAIR.sent(SpringDamper((1e6, 1e6), (50.0, 50.0))), (9, 9), DELTA, LAG).requirement
+    swinging = limiter(PAIR.sent(SpringDamper((1e6, 1e6), (50.0, 50.0))), (9, 9), DELTA, LAG)
     assert not swinging.certified
 
 
@@ -234,8 +234,9 @@ def tampered(stored, **fields):
     ("fields", "reason"),
     [
         ({"c": ((0.5,), (0.5,))}, "limiter: required is"),
-        ({"c": ((1.0,), (1.0,))}, "limiter: required is"),
-        ({"c": ((-0.1,), (0.7,))}, "rho and c must be numbers >= 0"),
+        ({"c": ((1.0,), (1.0,))}, "limiter: no multiplier c was found"),
+        ({"c": ((0.3, 0.1), (0.6,))}, "one row of c each"),
+        ({"c": ((-0.1,), (0.7,))}, "limiter: c is [-0.1, 0.7], expected numbers >= 0"),
         ({"c": ((0.3,),)}, "one row of c each"),
         ({"beta": 0.02}, "rho is"),
         ({"margin": 1.1}, "limiter: margin is 1.1"),
@@ -264,7 +265,7 @@ def test_a_storage_matrix_of_something_else_proves_nothing(stored):
 )
 def test_loops_that_are_not_covered_are_refused_in_words(change, reason):
     loop = msgspec.structs.replace(PAIR, **change)
-    assert reason in str(limiter_requirement(loop, BUILT).requirement.reason)
+    assert reason in str(required_damping(loop, BUILT, LIMITER).reason)
 
 
 def test_delay_in_the_environment_is_open_under_any_environment():
@@ -306,19 +307,18 @@ def test_the_command_stores_a_coupling_that_is_proved_with_limited_forces(tmp_pa
 def test_the_best_multiplier_attains_its_bound_and_no_other_does_better():
     """Delays of 0 and 3 samples, where lines through the worst directions never settled: 1.263, not 31."""
     loop = msgspec.structs.replace(PAIR, theta=(0, 3), lam=(0, 0))
-    G, rho = loop.sent(BUILT), limiter_lag(loop.delta, loop.T, 0.01)
+    G, rho = loop.sent(BUILT), LIMITER.rho(loop)
     found = limiter(G, loop.theta, loop.delta, rho)
-    assert found.requirement.ratio <= found.bound * (1 + 1e-5)
+    assert found.ratio <= found.bound * (1 + 1e-5)
     for c in np.random.default_rng(0).uniform(0, 1.5, (5, 2, 1)).tolist():
-        assert limiter(G, loop.theta, loop.delta, rho, c).requirement.ratio > found.requirement.ratio * (1 - 1e-3)
+        assert limiter(G, loop.theta, loop.delta, rho, c).ratio > found.ratio * (1 - 1e-3)
 
 
 def test_the_parts_of_the_block_that_a_search_makes_are_those_of_the_block():
     sampled = LimiterLoop(PAIR)
     x = np.array([7.0, 6.5, 0.2, 0.9, 0.3, 0.6])
     G = Sampled.of(PAIR.sent(sampled.coupling(x)), on_circle(sampled.conditions)[None])
-    rho = limiter_lag(DELTA, T, multipliers.BETA)
-    demand = multipliers.limiter_demand(G, PAIR, rho, [[0.3], [0.6]])
+    demand = LIMITER.block(G, PAIR, [0.3, 0.6])
     block = hermitian((demand.free + (1 - 1.5 * RESERVE) * demand.gain).G[0])
     first, cross, corner = sampled.parts(x)
     for made, part in (

@@ -22,9 +22,9 @@ from controller.lti import Lti, Sampled
 from design.barrier import EntryInequality, MatrixInequality, Program, centre
 from design.bound import BoundBeside, _causal, bound
 from design.certificate import verify
+from design.conditions import ratio_in
 from design.coupling_file import Stored, save
 from design.coupling_file import load as load_file
-from design.environments import ratio_in
 from design.frequency import hermitian, on_circle
 from design.optimal import design, spread
 from design.program import MARGIN, Options, Problem, Span, span_of, static_weight

@@ -1,6 +1,7 @@
 """A condition and a coupling of one's own: what they do not say is not taken for said."""
 
 from dataclasses import dataclass
+from fractions import Fraction
 
 import msgspec
 import numpy as np
@@ -12,7 +13,8 @@ from controller.lti import Lti, as_like, constant_like, numbers, taps
 from design import compare
 from design.certificate import lag, prove, required_damping, verify
 from design.conditions import BEYOND, Condition, Demand
-from design.coupling_file import Stored, filed
+from design.coupling_file import Stored, filed, sealed
+from design.environments import SWITCHING, Switching
 from design.files import InputError
 from design.result import NotProved
 from sim import load
@@ -122,6 +124,26 @@ def test_a_map_and_a_comparison_ask_it_as_they_ask_ours():
     wall = load("one-wall").loop("I")
     one = SpringDamper([400.0] * wall.channels, [0.1] * wall.channels)
     assert "the loop has walls" in compare.judge(wall, one, own=[plain]).requirements["plain"].reason
+
+
+class Shifting(Switching):
+    """Delays that switch, by a condition of one's own with a multiplier."""
+
+    name, covers = "shifting", ("varying_delay",)
+
+
+def test_the_multiplier_of_ones_own_is_searched_stored_and_checked():
+    loop, own = PAIR.switching(DelayRange(PAIR.theta, tuple(n + 1 for n in PAIR.theta))), Shifting()
+    found, shipped = required_damping(loop, SOFT, own), required_damping(loop, SOFT, SWITCHING)
+    assert found.required == shipped.required
+    assert found.bound == pytest.approx(found.ratio, rel=1e-6)
+    stored = Stored.of(loop, SOFT, prove(loop, SOFT, own))
+    matrices = stored.certificate.matrices
+    assert [float(Fraction(v)) for v in matrices["alpha"][0]] == list(found.multiplier)
+    assert verify(stored, own).proved
+    for other in ({"P": matrices["P"]}, matrices | {"alpha": (("1", "1"),)}, matrices | {"alpha": (("-1", "1"),)}):
+        forged = change(stored.certificate, matrices=other)
+        assert not verify(change(stored, certificate=sealed(forged)), own).proved
 
 
 def test_limited_forces_are_not_covered_by_ones_own():

@@ -19,7 +19,7 @@ from controller.loop import DelayRange, Loop
 from design.certificate import assess, prove, prove_limiter, required_damping, verify
 from design.conditions import even_damping
 from design.coupling_file import Stored, digest
-from design.multipliers import limiter_requirement, swept
+from design.environments import LIMITER, SWITCHING
 from design.spring_damper import design
 
 T, LONG = 1e-3, 1.6e-3
@@ -53,7 +53,7 @@ def test_the_longest_period_scales_the_required_damping(condition):
 
 def test_so_it_does_with_delays_that_switch_and_with_the_multiplier_of_a_delayed_environment():
     switching = change(LOOP, varying_delay=DelayRange((0, 1), (1, 2)))
-    even, uneven = (swept(change(switching, T_max=longest), SOFT).requirement for longest in (None, LONG))
+    even, uneven = (required_damping(change(switching, T_max=longest), SOFT, SWITCHING) for longest in (None, LONG))
     assert uneven.required == pytest.approx([1.6 * b for b in even.required], rel=1e-6)  # of the search for alpha
     soft = msgspec.structs.replace(
         FIGURE_4, springs=tuple(change(s, stiffness=s.stiffness / 8, damping=0.2) for s in FIGURE_4.springs)
@@ -70,7 +70,7 @@ def test_so_it_does_while_forces_are_limited():
     """The lag of the limiter is a number of the controller, which no period changes; proved exactly, too."""
     loop, c = change(LOOP, delta=(3.0, 3.0)), ((0.3,), (0.3,))
     longer = change(loop, T_max=LONG)
-    even, uneven = (limiter_requirement(one, SOFT, c=c).requirement for one in (loop, longer))
+    even, uneven = (required_damping(one, SOFT, LIMITER, (0.3, 0.3)) for one in (loop, longer))
     assert uneven.required == pytest.approx([1.6 * b for b in even.required], rel=1e-9)
     assert prove_limiter(longer, SOFT, c=c).required == uneven.required
 

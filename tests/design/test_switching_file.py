@@ -6,7 +6,7 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
-from asked import switching_block, switching_sweep, this_environment
+from asked import switching_demand, switching_sweep, this_environment
 from worlds import DELTA, FIGURE_4, PAIR, SOFT, STIFF, T, force_map
 
 from cli.audit import main as audit_main
@@ -19,12 +19,13 @@ from controller.coupling import SpringDamper
 from controller.delay import LOST, VaryingDelay, ages
 from controller.environment import environment
 from controller.loop import DelayRange, Loop
-from controller.lti import Sampled
+from controller.lti import Lti, Sampled
 from controller.ranges import Ranges, UncertainSpring
 from design import certify
 from design import exact as positive_real
-from design.certificate import condition_block, prove, refuted, verify
+from design.certificate import prove, verify
 from design.coupling_file import Certificate, Stored, digest, load, save, sealed
+from design.environments import SWITCHING
 from design.exact import Matrix
 from design.files import InputError
 from design.frequency import hermitian
@@ -66,7 +67,7 @@ def test_the_proof_survives_the_file(stored, file):
     assert read == stored
     assert verify(read).proved
     proof = read.certificate.switching
-    assert proof.required == pytest.approx(switching_sweep(sent(SOFT), *[(1, 1), (2, 2)], DELTA).requirement.required)
+    assert proof.required == pytest.approx(switching_sweep(sent(SOFT), *[(1, 1), (2, 2)], DELTA).required)
     assert 1.07 < proof.required[0] < 1.08
     assert proof.margin == pytest.approx(1.37 / proof.required[0])
 
@@ -76,9 +77,9 @@ def test_what_is_on_file_is_a_witness_on_a_dense_sweep(stored):
     the KYP inequality in floating point."""
     proof = stored.certificate.switching
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
-    block, _ = switching_block(Sampled.of(sent(SOFT), z[None]), (1, 1), (2, 2), DELTA, proof.alpha)
-    assert np.linalg.eigvalsh(hermitian(block.G)).min() > 0
-    G = condition_block(LOOP, SOFT, proof.alpha)
+    demand = switching_demand(Sampled.of(sent(SOFT), z[None]), (1, 1), (2, 2), DELTA, proof.alpha)
+    assert np.linalg.eigvalsh(hermitian(demand.free.G + demand.gain.G)).min() > 0
+    G = exact_block(LOOP, SOFT, proof.alpha)
     F, S = G.floats(), Matrix.of(proof.P).floats()
     A, B, C, D = F.A, F.B, F.C, F.D
     kyp = np.block([[S - A.T @ S @ A, (C - B.T @ S @ A).T], [C - B.T @ S @ A, D + D.T - B.T @ S @ B]])
@@ -98,7 +99,7 @@ def test_other_ranges_are_proved_too(lo, hi):
 @pytest.mark.parametrize("coupling", [SOFT, STIFF])
 def test_every_constant_delay_of_the_range_asks_no_more(coupling):
     """Why a file that is proved for switching covers constants: by the energy, which knows no z."""
-    switching = switching_sweep(sent(coupling), (1, 0), (2, 3), DELTA).requirement.ratio
+    switching = switching_sweep(sent(coupling), (1, 0), (2, 3), DELTA).ratio
     for theta in product((1, 2), (0, 1, 2, 3)):
         F = force_map(environment(FIGURE_4, T), coupling, theta, (0, 0))
         assert this_environment(F, DELTA).ratio <= switching * (1 + 1e-9)
@@ -131,6 +132,11 @@ def test_a_changed_file_is_refused(stored):
     proof = change(stored.certificate.switching, alpha=(100.0, 100.0))
     forged = change(stored, certificate=change(stored.certificate, switching=proof))
     assert "seal differs" in verify(forged).reason
+
+
+def exact_block(loop, coupling, alpha) -> Lti:
+    demand = SWITCHING.exact_demands(loop, coupling, alpha)["P"]
+    return demand.free + demand.gain
 
 
 def forged(stored: Stored, loop: Loop = LOOP, **fields) -> str:
@@ -171,8 +177,7 @@ def test_a_multiplier_below_zero_lends_no_damping():
     loop = PAIR.switching(DelayRange((1, 2), (2, 2)))
     found = switching_sweep(sent(STIFF), (1, 2), (2, 2), DELTA)
     with pytest.raises(ValueError, match="expected a positive number where the delay varies and 0 elsewhere"):
-        condition_block(loop, STIFF, (found.alpha[0], -1e6))
-    assert refuted(loop, STIFF, msgspec.UNSET).endswith("no proof is on file")
+        exact_block(loop, STIFF, (found.multiplier[0], -1e6))
 
 
 @pytest.mark.parametrize(
@@ -298,7 +303,7 @@ def test_validate_and_audit_say_the_same(file, constant_file, tmp_path, capsys):
 
 def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, monkeypatch):
     """A limit on states between the two models: said in the report, and the file claims no switching."""
-    monkeypatch.setattr(positive_real, "LARGEST", condition_block(LOOP, SOFT, (1.0, 1.0)).order - 1)
+    monkeypatch.setattr(positive_real, "LARGEST", exact_block(LOOP, SOFT, (1.0, 1.0)).order - 1)
     out = str(tmp_path / "c.json")
     options = ["--condition", "this-environment", "--varying-delay", "1,2", "--out", out]
     code, outcome = told(capsys, design_main, *options)

@@ -6,7 +6,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from analysis import solve
-from asked import switching_block, switching_sweep, this_environment
+from asked import switching_demand, switching_sweep, this_environment
 from worlds import DELTA, FIGURE_4, SOFT, STIFF, T, force_map
 
 from cli.audit import main
@@ -14,11 +14,12 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, environment
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
-from design.certificate import prove_switching, storage, switching_requirement
+from design.certificate import judged, prove
 from design.coverage import Switching
-from design.exact import Matrix
+from design.environments import SWITCHING
+from design.exact import find_storage
 from design.frequency import hermitian
-from design.multipliers import half_widths
+from design.result import NotProved
 from sim.scenario import InputError
 
 
@@ -30,15 +31,19 @@ def loop_of(lo, hi, delta=DELTA, network=FIGURE_4) -> Loop:
     return Loop(T, lo, (0,) * len(lo), lo, delta, network, varying_delay=DelayRange(lo, hi))
 
 
+def both(demand):
+    return demand.free + demand.gain
+
+
 def condition(z, G, alpha, lo, hi, damping, T=T):
     """The condition's matrix at each z (k,), to be positive: (k, 2m, 2m) from G (k, m, m)."""
-    block, _ = switching_block(Sampled(z[None], G[None], T), lo, hi, damping, alpha)
-    return hermitian(block.G[0])
+    demand = switching_demand(Sampled(z[None], G[None], T), lo, hi, damping, alpha)
+    return hermitian(both(demand).G[0])
 
 
 def block(z, G, alpha, lo, hi, damping):
     """The same for cvxpy at one z, affine in G (m, m), alpha (m,) and damping (m,) [N s/m]."""
-    c, h = (z ** -np.array(lo) + z ** -np.array(hi)) / 2 / (z - 1), half_widths(lo, hi)
+    c, h = (z ** -np.array(lo) + z ** -np.array(hi)) / 2 / (z - 1), np.subtract(hi, lo) / 2
     passing, error = cp.diag(cp.Constant(c)) @ G, cp.diag(cp.Constant(h)) @ G
     upper = (passing + cp.conj(passing).T) / 2 + cp.diag(damping / T - alpha / 2)
     return cp.bmat([[upper, cp.conj(error).T], [error, cp.diag(2 * alpha)]])
@@ -52,14 +57,14 @@ def test_a_spring_needs_what_its_longest_delay_needs(lo, hi):
     """
     K = 800.0
     found = switching_sweep(Lti.constant([[K]], T), [lo], [hi], [1.37])
-    assert found.requirement.required[0] == pytest.approx(K * T * (hi + 0.5), rel=1e-6)  # SETTLED is 1e-7
-    assert found.alpha[0] == pytest.approx(K * (hi - lo) / 2, rel=1e-2, abs=1e-9)  # flat around its optimum
+    assert found.required[0] == pytest.approx(K * T * (hi + 0.5), rel=1e-6)  # SETTLED is 1e-7
+    assert found.multiplier[0] == pytest.approx(K * (hi - lo) / 2, rel=1e-2, abs=1e-9)  # flat around its optimum
 
 
 @pytest.mark.parametrize("theta", [(1, 2), (0, 3)])
 def test_a_range_of_one_delay_is_the_this_environment_condition(theta):
     F = force_map(environment(FIGURE_4, T), STIFF, theta, (0, 0))
-    found = switching_sweep(sent(), theta, theta, DELTA).requirement
+    found = switching_sweep(sent(), theta, theta, DELTA)
     assert found.required == pytest.approx(this_environment(F, DELTA).required, rel=1e-12)
     assert found.frequency_hz == pytest.approx(this_environment(F, DELTA).frequency_hz, rel=1e-4)
 
@@ -70,7 +75,7 @@ def test_the_least_factor_is_that_of_a_convex_solver():
     G, delta = sent(), np.array([1.37, 0.9])
     found = switching_sweep(G, lo, hi, delta)
     per_hz = 2 * np.pi * T
-    near = found.requirement.frequency_hz * per_hz * np.linspace(0.98, 1.02, 5)
+    near = found.frequency_hz * per_hz * np.linspace(0.98, 1.02, 5)
     w = np.concatenate([near, np.geomspace(3e-2, 3, 8)])
     z = np.exp(1j * w)
     s, a = cp.Variable(), cp.Variable(2, nonneg=True)  # alpha in units of delta/T, G in units of 1000 N/m
@@ -81,7 +86,7 @@ def test_the_least_factor_is_that_of_a_convex_solver():
     ]
     problem = cp.Problem(cp.Minimize(s), [c + 0j >> 0 for c in conditions])
     solve(problem)
-    assert s.value == pytest.approx(found.requirement.ratio, rel=2e-4)  # a peak 0.5 % off its sample, squared
+    assert s.value == pytest.approx(found.ratio, rel=2e-4)  # a peak 0.5 % off its sample, squared
     np.testing.assert_allclose(
         conditions[0].value,
         condition(z[:1], G.at(z[:1]) / scale, a.value, lo, hi, s.value * delta / scale)[0],
@@ -94,23 +99,23 @@ def test_a_dense_sweep_agrees(lo, hi):
     """20000 frequencies: positive just above the requirement, not just below; no alpha does with 0.1 % less."""
     G, found = sent(), switching_sweep(sent(), lo, hi, DELTA)
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
-    alpha, needed, response = np.array(found.alpha), np.array(found.requirement.required), G.at(z)
+    alpha, needed, response = np.array(found.multiplier), np.array(found.required), G.at(z)
 
     def least(share):
         return np.linalg.eigvalsh(condition(z, response, alpha, lo, hi, share * needed)).min()
 
-    if all(half_widths(lo, hi)):
+    if all(np.subtract(hi, lo)):
         assert least(1 + 1e-5) > 0
     assert least(1 - 1e-3) < 0
-    assert found.bound == pytest.approx(found.requirement.ratio, rel=1e-5)
+    assert found.bound == pytest.approx(found.ratio, rel=1e-5)
 
 
 def test_the_energy_holds_for_the_worst_ages_of_any_motion():
     """The claim itself, without z: sum f'dx + sum dx'(Delta/T)dx >= 0 from rest, with ages chosen against it."""
     G, lo, hi = sent(), 1, 3
-    needed = np.array(switching_sweep(G, (lo, lo), (hi, hi), DELTA).requirement.required)
+    needed = np.array(switching_sweep(G, (lo, lo), (hi, hi), DELTA).required)
     rng, ticks = np.random.default_rng(0), 3000
-    w = 2 * np.pi * T * switching_sweep(G, (lo, lo), (hi, hi), DELTA).requirement.frequency_hz
+    w = 2 * np.pi * T * switching_sweep(G, (lo, lo), (hi, hi), DELTA).frequency_hz
     spare = []
     for trial in range(12):
         x = np.sin(w * rng.uniform(0.6, 1.4) * np.arange(ticks)[:, None] + rng.uniform(0, 6, 2)) * rng.normal(size=2)
@@ -133,13 +138,13 @@ def test_the_energy_holds_for_the_worst_ages_of_any_motion():
 def test_what_is_refused():
     floating = switching_sweep(sent(NoCoupling()), (1, 1), (2, 2), DELTA)
     assert (
-        floating.requirement.ratio
+        floating.ratio
         > this_environment(force_map(environment(FIGURE_4, T), NoCoupling(), (2, 2), (0, 0)), DELTA).ratio
     )
     unstable = Lti([[1.1]], [[1.0]], [[1.0]], [[1.0]], T)
     found = switching_sweep(unstable, [1], [2], [1.0])
-    assert not found.requirement.certified
-    assert "pole" in found.requirement.reason
+    assert not found.certified
+    assert "pole" in found.reason
     with pytest.raises(ValueError, match="lo <= hi"):
         switching_sweep(sent(), (2, 2), (1, 1), DELTA)
     with pytest.raises(ValueError, match="has 1 entries"):
@@ -148,9 +153,9 @@ def test_what_is_refused():
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((1, 1), (1, 3)), ((1, 2), (1, 2))])
 def test_what_holds_is_proved_exactly(lo, hi):
-    found = switching_requirement(loop_of(lo, hi), SOFT)
-    assert found.requirement.certified
-    assert found.requirement.proof == "rational"
+    found = judged(loop_of(lo, hi), SOFT, SWITCHING)
+    assert found.certified
+    assert found.proof == "rational"
     part = Switching.of(loop_of(lo, hi), SOFT)
     # equal where nothing varies
     assert part.playout.required_damping[0] <= part.requirement.required[0] * (1 + 1e-9)
@@ -159,22 +164,27 @@ def test_what_holds_is_proved_exactly(lo, hi):
 
 def test_what_does_not_hold_has_no_exact_proof():
     loop = loop_of((1, 1), (2, 2))
-    found = switching_requirement(loop, STIFF)
-    assert not found.requirement.certified
-    assert found.requirement.proof == "sampled"
-    assert str(prove_switching(loop, STIFF)).startswith("needs 2.041")
-    assert "violated" in storage(loop, STIFF, found.alpha)
-    required = np.array(found.requirement.required)
+    found = judged(loop, STIFF, SWITCHING)
+    assert not found.certified
+    assert found.proof == "sampled"
+    with pytest.raises(NotProved, match=r"^delays switching within \[1, 2\] samples: needs 2\.041"):
+        prove(loop, STIFF, "this-environment")
+
+    def storage(loop: Loop):
+        return find_storage(both(SWITCHING.exact_demands(loop, STIFF, found.multiplier)["P"]))
+
+    assert "violated" in storage(loop)[1]
+    required = np.array(found.required)
     more, less = (loop_of((1, 1), (2, 2), tuple((required * f).tolist())) for f in (1 + 1e-4, 1 - 1e-4))
-    assert isinstance(storage(more, STIFF, found.alpha), Matrix)
-    assert isinstance(storage(less, STIFF, found.alpha), str)
+    assert storage(more)[0] is not None
+    assert storage(less)[0] is None
 
 
 def test_a_wall_with_damping():
     """One channel, K = 2000 N/m and B = 1 N s/m, 0 to 1 samples: above the delay-free KT/2 + B and the constant 1."""
     wall = Network(("a",), (Spring(("a", GROUND), 2000.0, 1.0),))
     G = environment(wall, T)
-    needs = switching_sweep(G, [0], [1], [1.37]).requirement.required[0]
+    needs = switching_sweep(G, [0], [1], [1.37]).required[0]
     constant = [this_environment(force_map(G, NoCoupling(), [n], [0]), [1.37]).required[0] for n in (0, 1)]
     assert constant[0] == pytest.approx(2000 * T / 2 + 1)
     assert needs >= max(constant) * (1 - 1e-6)
@@ -228,5 +238,5 @@ def test_the_multiplier_is_the_best_one_in_random_loops():
             G, lo.tolist(), (lo + rng.integers(0, 4, channels)).tolist(), rng.uniform(0.1, 5, channels)
         )
         # SETTLED is 1e-7, and ten times that for what the sweep finds between grid points
-        assert found.bound <= found.requirement.ratio * (1 + 1e-9)
-        assert found.requirement.ratio == pytest.approx(found.bound, rel=2e-6)
+        assert found.bound <= found.ratio * (1 + 1e-9)
+        assert found.ratio == pytest.approx(found.bound, rel=2e-6)

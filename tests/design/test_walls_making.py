@@ -13,10 +13,9 @@ from controller.environment import GROUND, Network, Spring, Wall
 from controller.loop import Loop
 from controller.lti import Lti
 from controller.ranges import Ranges
-from design.certificate import assess, prove, verify
+from design.certificate import assess, prove, required_damping, verify
 from design.coupling_file import Stored, sealed
 from design.designs import design_by_kind
-from design.environments import walls_of
 from design.exact import find_storage
 from design.guarantees import MAKING, guarantee_of, making_covered
 from design.result import NotProved
@@ -58,12 +57,12 @@ BOTH = SpringDamper([500.0, 400.0], [0.3, 0.3])
 @pytest.mark.parametrize(("stiffness", "g", "needs"), [(3000.0, 0.6, 1.244369), (1e9, 0.3, 1.251404)])
 def test_what_a_wall_asks(stiffness, g, needs):
     loop = held(stiffness)
-    given = walls_of(loop, COUPLING, [g]).requirement
+    given = required_damping(loop, COUPLING, "this-environment", [g])
     assert given.required[0] == pytest.approx(needs, abs=1e-6)
-    found = walls_of(loop, COUPLING)
-    assert needs - 5e-4 < found.requirement.required[0] < needs
+    found = required_damping(loop, COUPLING, "this-environment")
+    assert needs - 5e-4 < found.required[0] < needs
     each = [this_environment(loop.at(state).F(COUPLING), loop.delta) for state in loop.environment.frozen()]
-    assert found.requirement.ratio > max(r.ratio for r in each)
+    assert found.ratio > max(r.ratio for r in each)
     if stiffness == 3000.0:
         assert [r.required[0] for r in each] == pytest.approx([1.244099, 1.242139], abs=1e-6)
 
@@ -89,7 +88,7 @@ def test_the_block_written_out():
 def test_without_walls_to_speak_of_it_is_the_plain_condition():
     soft = held(1e-6)
     plain = this_environment(soft.at(change(soft.environment, walls=())).F(COUPLING), soft.delta)
-    assert walls_of(soft, COUPLING).requirement.required == pytest.approx(plain.required, rel=1e-6)
+    assert required_damping(soft, COUPLING, "this-environment").required == pytest.approx(plain.required, rel=1e-6)
 
 
 def steps_of(loop, coupling, damping):
@@ -97,11 +96,11 @@ def steps_of(loop, coupling, damping):
     slopes = [w.slope(loop.T) for w in loop.environment.walls]
     proof = walls_proof(loop.walled(coupling), damping, slopes)
     G = loop.walled(coupling, exact=True)
-    demand = walls_demand(G, damping, slopes, proof.g)
+    demand = walls_demand(G, damping, slopes, proof.multiplier)
     P, reason = find_storage(demand.free + demand.gain)
     assert P is not None, reason
     static = np.array(demand.static["the static map of devices and walls"], dtype=float)
-    return G.floats(), P.floats() / 2, static, np.array(proof.g)  # the matrix of (KYP) is twice the balance
+    return G.floats(), P.floats() / 2, static, np.array(proof.multiplier)  # the matrix of (KYP) is twice the balance
 
 
 def walls_by_hand(loop):
@@ -119,7 +118,7 @@ def test_every_step_of_the_proof(loop):
     A wall is (h, e): its depth, and the step that its damper feels, p = K h + (b/T) e, never more than lets p vanish.
     """
     rng = np.random.default_rng(0)
-    need = walls_of(loop, BOTH).requirement.ratio
+    need = required_damping(loop, BOTH, "this-environment").ratio
     delta = 1.01 * need * np.array(loop.delta)
     G, P, S, g = steps_of(loop, BOTH, delta.tolist())
     stiff, b, gap, slope = walls_by_hand(loop)
@@ -166,7 +165,7 @@ def test_every_step_of_the_proof(loop):
 def test_frozen_motions_fall_to_a_nonnegative_value(loop):
     """The step that bounds Z from below: x held, pressed walls kept as spring-dampers; from any state whatever."""
     rng = np.random.default_rng(5)
-    delta = (1.01 * walls_of(loop, BOTH).requirement.ratio * np.array(loop.delta)).tolist()
+    delta = (1.01 * required_damping(loop, BOTH, "this-environment").ratio * np.array(loop.delta)).tolist()
     G, P, S, g = steps_of(loop, BOTH, delta)
     stiff, damped, gap, _ = walls_by_hand(loop)
     for _trial in range(6):
@@ -220,7 +219,9 @@ def test_it_is_proved_stored_and_verified(loop, coupling):
 
 def test_longer_periods_scale_it():
     loop = change(held(3000.0), T_max=1.5e-3)
-    assert walls_of(loop, COUPLING, [0.6]).requirement.required[0] == pytest.approx(1.5 * 1.244369, rel=1e-6)
+    assert required_damping(loop, COUPLING, "this-environment", [0.6]).required[0] == pytest.approx(
+        1.5 * 1.244369, rel=1e-6
+    )
 
 
 def test_what_is_not_covered_is_said():
@@ -233,7 +234,7 @@ def test_what_is_not_covered_is_said():
     with pytest.raises(NotProved, match="linear model of the environment"):
         prove(loop, InternalModel(np.zeros(1), np.zeros((2, 1, 1))), "this-environment")
     one_way = Compliance(Lti.constant([[1e-3, 5e-4], [0.0, 1e-3]], PAIR.T))
-    assert "not symmetric" in walls_of(PAIR, one_way).requirement.reason
+    assert "not symmetric" in required_damping(PAIR, one_way, "this-environment").reason
     judged = assess(pressed_at_rest(), SpringDamper([1300.0], [0.45]))
     assert not judged["any-environment"].certified
     assert guarantee_of(judged, pressed_at_rest()) == MAKING
@@ -285,7 +286,7 @@ def swinging(loop, coupling, damping, seed=11):
 @pytest.mark.parametrize(("damping", "short"), [(0.0, 0.8), (2.0, 0.55)])
 def test_hands_come_to_rest_at_the_requirement_and_some_swing_below(damping, short):
     loop, coupling = pressed_at_rest(damping), SpringDamper([1300.0], [0.45])
-    need = walls_of(loop, coupling).requirement.required[0]
+    need = required_damping(loop, coupling, "this-environment").required[0]
     fastest, made = swinging(loop, coupling, 1.02 * need)
     assert made > (300 if damping else 500)
     assert fastest < 0.02  # and falling: 60 hands, the slowest of them heavy

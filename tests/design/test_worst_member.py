@@ -17,9 +17,9 @@ from design.api import certify, store
 from design.certificate import check_ranges, prove, verify
 from design.coupling_file import Stored, load, save
 from design.coverage import RangesFigures
-from design.environments import search
 from design.program import Options
 from design.result import Design
+from design.worst_member import search
 from sim import scenario
 from sim.scenario import SCENARIOS
 

@@ -59,7 +59,15 @@ AT_HOME = (
 )
 #: where they stand as data: what a design is made for, the rows of a table, the styles of a picture, one figure's key
 NAMED_IN = (
-    *("design/api", "design/compare", "design/designs", "design/fixed_order", "design/optimal", "design/program"),
+    *(
+        "design/api",
+        "design/certificate",
+        "design/compare",
+        "design/designs",
+        "design/fixed_order",
+        "design/optimal",
+        "design/program",
+    ),
     *("design/spring_damper", "sim/alternatives", "sim/baselines", "sim/map_plot", "sim/plots", "sim/report"),
     *("hw/control", "cli/validate"),
 )

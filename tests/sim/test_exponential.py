@@ -18,12 +18,12 @@ from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
 from sim import engines
 from sim.accuracy import (
+    _check_substeps,
+    _measured_hold,
     _missed,
-    check_substeps,
     compare_engines,
     cross_check,
     default_substeps,
-    measured_hold,
     pace,
     pick,
     simulated_growth,
@@ -39,7 +39,7 @@ from sim.engines import (
     default_integrator,
 )
 from sim.passivity_layer import EnergyNet
-from sim.run import assemble, make_engine, run
+from sim.run import EngineSettings, assemble, make_engine, run
 from sim.scenario import InputError, VaryingDelay, load
 from sim.stability import exact_growth
 
@@ -97,7 +97,7 @@ def test_one_step_is_exact_whatever_the_stiffness(stiffness, T):
     generator = np.zeros((states + inputs, states + inputs))
     generator[:states, :states], generator[:states, states:] = continuous.A, continuous.B
     unit = np.r_[np.ones(states // 2), np.full(states // 2, fastest), np.ones(inputs)]
-    step = measured_hold(loop, "mujoco", EXPONENTIAL, 1, T)
+    step = _measured_hold(loop, "mujoco", EXPONENTIAL, 1, T)
     own = np.hstack([step.A, step.B]) * unit / unit[:states, None]
     allowed = 1e-14 * (1 + fastest * T)
     exact, scipys = longer(generator * T * unit / unit[:, None]), expm(generator * T) * unit / unit[:, None]
@@ -247,8 +247,8 @@ def test_the_default_follows_from_the_scene(simulation):
     # no rule asks for more on a stiff linear scene, where Runge-Kutta takes 32
     assert default_substeps(stiff(1.45e6), EXPONENTIAL) == 1
     assert default_substeps(stiff(1.45e6), "RK4") == 32
-    assert check_substeps(stiff(1.45e6), EXPONENTIAL, 1) == []
-    assert check_substeps(rubbing, EXPONENTIAL, 8) == [
+    assert _check_substeps(stiff(1.45e6), EXPONENTIAL, 1) == []
+    assert _check_substeps(rubbing, EXPONENTIAL, 8) == [
         "exponential x 8: of first order where devices rub, RK4 is nearer at equal cost (--cross-check: by how much)."
     ]
     assert default_substeps(rubbing, EXPONENTIAL) == 4
@@ -369,8 +369,8 @@ def test_a_wrong_verdict_is_shown_and_never_chosen():
 def test_speed_against_error_is_of_the_run_with_its_budget_and_its_delays():
     scenario, found = SCENARIO.replace(duration=0.5, varying_delay=VaryingDelay((1, 1), (3, 2))), []
     for net in (None, EnergyNet(0.0)):
-        done = run_scenario(scenario, NoCoupling(), error=1e-9, net=net)
-        assert (done.integrator, done.substeps) == (EXPONENTIAL, 1)
+        done = run_scenario(scenario, NoCoupling(), settings=EngineSettings(error=1e-9), net=net)
+        assert (done.settings.integrator, done.settings.substeps) == (EXPONENTIAL, 1)
         truth, own = (run(done.ran, make_engine(done.ran, *how)).x for how in (("exact",), ("mujoco", "RK4", 2)))
         apart = np.sqrt(np.mean((own - truth) ** 2) / np.mean(truth**2))
         found += [c.position_relative_rms for c in done.choices if c.name == "RK4 x 2"]
@@ -381,13 +381,17 @@ def test_speed_against_error_is_of_the_run_with_its_budget_and_its_delays():
 def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
     """The exponential engine with a J that is off by one part in a thousand; RK4 knows no J."""
     loop = assemble(SCENARIO.replace(duration=0.5), PUBLISHED["I"])
-    sound = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), "mujoco", EXPONENTIAL, 1)
+    sound = cross_check(
+        loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), EngineSettings("mujoco", EXPONENTIAL, 1)
+    )
     assert (sound.integrator, sound.substeps, sound.agrees) == ("RK4", 4, True)
     assert sound.position_relative_rms < 1e-6  # of RK4 x 4 here
     assert abs(sound.growth_rate_difference_per_s) < 1e-3
     wrong_step = exponential_step(1.001 * loop.scene.plant.A[None], SCENARIO.T, loop.scene.model.nv)[0]
     monkeypatch.setattr(engines, "_step_of", lambda *_: wrong_step)
-    wrong = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), "mujoco", EXPONENTIAL, 1)
+    wrong = cross_check(
+        loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), EngineSettings("mujoco", EXPONENTIAL, 1)
+    )
     assert wrong.position_relative_rms > 30 * sound.position_relative_rms
     assert abs(wrong.growth_rate_difference_per_s) > 1e-3
 

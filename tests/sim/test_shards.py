@@ -61,15 +61,15 @@ def test_workers_that_die_again_and_again_leave_what_is_done(tmp_path, monkeypat
     """Then the command goes on where it was, and ends with what it would have found at once."""
     whole = validate(QUESTION)
     table = Table(QUESTION, tmp_path)
-    table.put(1, shards.examine(QUESTION, QUESTION.batches()[1]))
-    monkeypatch.setattr(shards, "as_worker", die)
+    table.put(1, shards._examine(QUESTION, QUESTION.batches()[1]))
+    monkeypatch.setattr(shards, "_as_worker", die)
     found = validate(QUESTION, 2, table=table)
     assert found.lost == "worker processes died 3 times in a row"
     np.testing.assert_array_equal(found.index, np.arange(_BATCH, 2 * _BATCH))
     monkeypatch.undo()
     again, examined = Table(QUESTION, tmp_path, resume=True), []
-    real = shards.examine
-    monkeypatch.setattr(shards, "examine", lambda *words: examined.append(words[1]) or real(*words))
+    real = shards._examine
+    monkeypatch.setattr(shards, "_examine", lambda *words: examined.append(words[1]) or real(*words))
     same(validate(QUESTION, table=again), whole)
     assert QUESTION.batches()[1] not in examined
     assert not list(tmp_path.iterdir())
@@ -80,7 +80,7 @@ def die() -> None:
 
 
 def test_the_command_says_what_is_missing(tmp_path, monkeypatch, capsys):
-    real, calls = shards.examine, []
+    real, calls = shards._examine, []
 
     def fails(*words):
         calls.append(words)
@@ -88,7 +88,7 @@ def test_the_command_says_what_is_missing(tmp_path, monkeypatch, capsys):
             raise MemoryError
         return real(*words)
 
-    monkeypatch.setattr(shards, "examine", fails)
+    monkeypatch.setattr(shards, "_examine", fails)
     assert main([*OPTIONS, "--out", str(tmp_path)]) == 3
     assert f"memory ran out; {_BATCH} humans that were finished are kept" in " ".join(
         capsys.readouterr().out.replace("│", " ").split()

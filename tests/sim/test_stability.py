@@ -6,7 +6,7 @@ import pytest
 from controller.coupling import PUBLISHED, NoCoupling
 from sim.run import assemble, run
 from sim.scenario import load
-from sim.stability import NOT_EXCITED, Mode, _left_eigenvector, _measured_growth, close, dominant_mode, verdict
+from sim.stability import _NOT_EXCITED, Mode, _left_eigenvector, _measured_growth, close, dominant_mode, verdict
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_a_trace_that_says_nothing_gives_a_reason():
     assert growth is None
     assert "only 82 ticks" in reason
     still = run(simulation, "exact", lambda first, ticks: np.zeros((ticks, simulation.scene.outside)), 300)
-    assert _measured_growth(loop, still, limit) == (None, NOT_EXCITED)
+    assert _measured_growth(loop, still, limit) == (None, _NOT_EXCITED)
 
 
 def test_verdicts():

@@ -11,12 +11,12 @@ from models.device import CompliantDevice
 from models.human import Human, Link, Person
 from models.scene import plant
 from sim.accuracy import (
-    check_substeps,
+    _check_substeps,
+    _measured_hold,
+    _step_radius,
     default_substeps,
-    measured_hold,
     pace,
     simulated_growth,
-    step_radius,
 )
 from sim.engines import INTEGRATORS, _PlantSpeed
 from sim.run import assemble, make_engine, run
@@ -49,7 +49,7 @@ def test_the_default_scenario_needs_no_more_than_four(simulation):
 
 
 def test_the_exact_engine_is_its_own_map(simulation):
-    held = measured_hold(simulation, "exact")
+    held = _measured_hold(simulation, "exact")
     np.testing.assert_allclose(held.A, simulation.plant.A, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(held.B, simulation.plant.B, rtol=1e-9, atol=1e-12)
 
@@ -59,7 +59,7 @@ def test_the_exact_engine_is_its_own_map(simulation):
 def test_the_map_is_what_a_run_does(simulation, integrator):
     """Stepping the map closed with the process gives the simulated trace."""
     record = run(simulation, make_engine(simulation, "mujoco", integrator, 4), ticks=300)
-    held = measured_hold(simulation, "mujoco", integrator, 4)
+    held = _measured_hold(simulation, "mujoco", integrator, 4)
     for k in range(299):
         follows = held.A @ record.s[k] + held.B @ np.concatenate([record.w[k], record.f[k]])
         np.testing.assert_allclose(follows, record.s[k + 1], rtol=1e-9, atol=1e-12)
@@ -69,7 +69,7 @@ def test_the_map_is_what_a_run_does(simulation, integrator):
 def test_euler_once_per_period_hides_the_instability(substeps, wrong):
     loop = assemble(SCENARIO, NoCoupling())
     assert (simulated_growth(loop, "Euler", substeps) < 0 < exact_growth(loop)) == wrong
-    assert any("WRONG VERDICT" in remark for remark in check_substeps(loop, "Euler", substeps)) == wrong
+    assert any("WRONG VERDICT" in remark for remark in _check_substeps(loop, "Euler", substeps)) == wrong
 
 
 def test_a_default_that_would_be_wrong_is_doubled_or_refused():
@@ -87,10 +87,10 @@ def test_a_default_that_would_be_wrong_is_doubled_or_refused():
 def test_outside_the_stable_region_is_refused_with_what_to_use():
     loop = assemble(STIFF, PUBLISHED["I"])
     with pytest.raises(InputError, match=r"the mode at 688.* outside the stable region of RK4; use --substeps 26"):
-        check_substeps(loop, "RK4", 1)
-    (remark,) = check_substeps(loop, "RK4", 4)
+        _check_substeps(loop, "RK4", 1)
+    (remark,) = _check_substeps(loop, "RK4", 4)
     assert "stable but coarse; use --substeps 26" in remark
-    assert check_substeps(loop, "RK4", 26) == []
+    assert _check_substeps(loop, "RK4", 26) == []
 
 
 @pytest.mark.parametrize(("integrator", "edge"), [("RK4", 2.828), ("Euler", 2.0), ("implicitfast", 2.0)])
@@ -103,7 +103,7 @@ def test_edges_of_the_stable_regions(integrator, edge):
     for factor, stable in ((0.99, True), (1.01, False)):
         h = factor * edge / mode
         shorter = assemble(loop.scenario.replace(T=h), PUBLISHED["I"])
-        assert (step_radius(shorter, integrator, 1) <= 1 + 1e-6) == stable
+        assert (_step_radius(shorter, integrator, 1) <= 1 + 1e-6) == stable
 
 
 def test_the_rule_knows_who_holds_devices_that_rub():

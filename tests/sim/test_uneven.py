@@ -17,7 +17,7 @@ from design.files import InputError
 from models.hold import at_the_latch, hold
 from models.scene import Plant, plant
 from sim import load
-from sim.crowds import Validation, examine
+from sim.crowds import Validation, _examine
 from sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
 from sim.run import assemble, make_engine, run
 from sim.stability import close, dominant_mode
@@ -221,7 +221,7 @@ def test_the_audit_of_late_forces_sees_what_a_coupling_gives():
     """Nothing at any tick with one that is certified; without one some loops give energy, all of them unstable."""
     late = PAIR.replace(latency=LATE)
     for coupling, gives in ((SOFT, False), (NoCoupling(), True)):
-        found = examine(Validation(late, coupling, 0, 24, 1, "exact", 1.0), range(24))
+        found = _examine(Validation(late, coupling, 0, 24, 1, "exact", 1.0), range(24))
         gave = found.energy < -1e-9 * found.audited
         assert gave.any() == gives
         assert (found.exact[gave] > 0).all()

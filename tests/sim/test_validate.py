@@ -254,7 +254,7 @@ def test_a_wrong_engine_is_found_out(tmp_path, monkeypatch):
 
 
 def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
-    calls, real = [], examine_module.examine
+    calls, real = [], examine_module._examine
 
     def interrupted(question, batch, ticked):
         calls.append(batch)
@@ -262,7 +262,7 @@ def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return real(question, batch, ticked)
 
-    monkeypatch.setattr(examine_module, "examine", interrupted)
+    monkeypatch.setattr(examine_module, "_examine", interrupted)
     options = ["--humans", "300", "--engine", "exact", "--duration", "0", "--no-plot"]
     assert main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 130
     report = json.loads((tmp_path / "r.json").read_text())
@@ -371,7 +371,7 @@ class OwnEngine(ExactEngine):
 def test_an_engine_of_one_s_own_decides_of_everyone(delays):
     """Made anew for each set of humans, it says of the period and of the traces what the stacked exact engine says."""
     scenario = load().replace(varying_delay=delays)
-    found = examine_module.examine(Validation(scenario, PUBLISHED["I"], 0, 6, MIXED, OwnEngine, 0.5), range(6))
+    found = examine_module._examine(Validation(scenario, PUBLISHED["I"], 0, 6, MIXED, OwnEngine, 0.5), range(6))
     np.testing.assert_allclose(found.mujoco, found.exact, rtol=1e-6)
     np.testing.assert_allclose(found.trace, found.exact, rtol=1e-5)
     np.testing.assert_allclose(found.switching_mujoco, found.switching, rtol=1e-6)
@@ -381,4 +381,4 @@ def test_an_engine_of_one_s_own_decides_of_everyone(delays):
 def test_an_engine_of_one_s_own_needs_even_ticks():
     question = Validation(load().replace(latency=((0.0, 1e-4),) * 2), PUBLISHED["I"], 0, 2, 1, OwnEngine, 0.5)
     with pytest.raises(InputError, match=r"OwnEngine: uneven ticks \(period, latency\) run in mujoco and exact"):
-        examine_module.examine(question, range(2))
+        examine_module._examine(question, range(2))
