@@ -262,12 +262,6 @@ class Drive:
 # couplings that are certified for a link
 
 
-def link_delay(ages: monitor.Ages, T_us: float, quantile: float, guard_us: float) -> int:
-    """Ticks from a sample to its latch: what a fraction of the answers keeps, with a guard, and at least one."""
-    needed = ages.quantile(quantile) + guard_us
-    return max(1, int(-(-needed // T_us)))
-
-
 def timed(
     scenario: Scenario, ages: monitor.Ages, quantile: float, guard_us: float, at_once: bool = False
 ) -> tuple[Scenario, int]:
@@ -282,7 +276,7 @@ def timed(
     if longest > 1e6 * known:
         scenario = scenario.replace(T_max=1e-6 * longest)
     if not at_once:
-        return scenario, link_delay(ages, T_us, quantile, guard_us)
+        return scenario, ages.link_delay(T_us, quantile, guard_us)
     least, most = max(0.0, min(ages.values) - guard_us), ages.quantile(quantile) + guard_us
     if most >= min((T_us, *ages.ticks)):
         raise SafetyStop(f"answers come up to {most:.0f} us after their tick, T is {T_us:g} us: latch at ticks")
