@@ -159,7 +159,7 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
 def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Judged:
     """What each condition asks of the coupling, by a sweep and an exact proof, and the limiter that it may have."""
     held, searched = design.certificate, design.searched if isinstance(design, Optimal) else None
-    requirements = assess(loop, design.coupling, design.phi, held, own=design.own)
+    requirements = assess(loop, design.coupling, held, own=design.own)
     samples = SAMPLES if args.samples is None else args.samples
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
         whole = check_ranges(loop, design.coupling, args.seed, samples, move, searched, held)

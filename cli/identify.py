@@ -18,12 +18,11 @@ from rich.table import Table
 from cli import options, render
 from cli.session_cli import add_link_options, check_link, hold_session, steady_scenario
 from design.files import plain, unseen, write
-from hw.control import link_delay
 from hw.emulator import nobody
 from hw.identify import Estimate, Excitation, capped, chirp, estimate, held, settled
 from hw.limits import Stage
 from hw.monitor import Ages, LinkSettings
-from hw.recording import Recorder, result_of
+from hw.recording import Recorder
 from hw.session import Session, session_for
 from hw.session_report import SessionReport, outcome
 from models.device import RigidDevice
@@ -132,7 +131,7 @@ def _sitting(args: argparse.Namespace, scenario: Scenario, settings: LinkSetting
         return chirp(scenario.channels, scenario.T, link, args.force, args.band, args.seconds)
 
     def plan(ages: Ages) -> Sequence[Excitation]:
-        return [played(link_delay(ages, 1e6 * scenario.T, args.quantile, 1e6 * args.guard))]
+        return [played(ages.link_delay(1e6 * scenario.T, args.quantile, 1e6 * args.guard))]
 
     if args.port and number > 1:
         told = "let go of every handle" if args.same_place else "take every handle 5 mm or more away and let go"
@@ -152,7 +151,7 @@ def _sitting(args: argparse.Namespace, scenario: Scenario, settings: LinkSetting
         reason = f"the session ended in {session.stage}: {session.cause}"
     trace = None
     if len(recorder):
-        trace = result_of(recorder, session.units, scenario.T, plain(report)).save_npz(out / f"trace-{number}.npz")
+        trace = recorder.trace(session.units, scenario.T, plain(report)).save_npz(out / f"trace-{number}.npz")
     return _Sitting(axes, reason, report, session, trace, live.signals)
 
 

@@ -206,11 +206,14 @@ def hold_session(
             if seen:
                 _show(session)
 
+        def planned(ages: Ages) -> Sequence[Armable]:
+            _clear()  # for what a plan prints
+            return plan(ages)
+
         operator = Operator(args.arm or args.emulate, seconds, _deadman(args.deadman))
-        live = Live(session, device, plan, operator, keyboard, glance, args.pace)
+        live = Live(session, device, planned, operator, keyboard, glance, args.pace)
+        stack.callback(_clear)
         live.run()
-        if seen:
-            print(file=sys.stderr)
     return _Held(live.signals, device.dropped if isinstance(device, SerialDevice) else 0)
 
 
@@ -284,6 +287,11 @@ def _show(session: Session) -> None:
     line = " · ".join(words)[: shutil.get_terminal_size().columns - 1]
     if select.select([], [sys.stderr], [], 0)[1]:
         os.write(sys.stderr.fileno(), f"\r\x1b[K{line}".encode())
+
+
+def _clear() -> None:
+    if sys.stderr.isatty():
+        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -71,30 +71,32 @@ class MatrixInequality:
 
 @dataclass(frozen=True, eq=False)
 class EntryInequality:
-    """He[sum_n t_n(w) root X_n root] + sum_a x_a slope_a > 0 at k frequencies, with real matrices X_n.
+    """constant + He[sum_n t_n(w) left X_n right] + sum_a x_a slope_a > 0 at k frequencies, with real matrices X_n.
 
     Unknowns are the X_n, entry by entry, and the x_a. S^-1 weighs all pairs of functions of two entries alike, so that
     the Hessian is a product of the pairs of functions by the pairs of entries, over the frequencies.
     """
 
+    constant: Array  # (k, r^2): `packed`
     functions: Complex  # (k, n)
-    root: Array  # (r,)
+    left: Complex  # (k, r, r)
+    right: Complex  # (k, r, r)
     slope: Array  # (k, r^2, a): `packed`
 
     @property
     def degree(self) -> int:
-        return len(self.functions) * self.root.size
+        return len(self.functions) * self.left.shape[-1]
 
     def at(self, x: Array) -> Complex:
         """S(x), shape (k, r, r)."""
-        r = self.root.size
-        X, own = np.split(x, [r * r * self.functions.shape[1]])
-        S = (self.functions @ X.reshape(r * r, -1).T).reshape(-1, r, r) * np.outer(self.root, self.root)
-        return hermitian(S) + _unpacked(self.slope @ own)
+        return _unpacked(self.constant) + self.moved(x)
 
     def moved(self, step: Array) -> Complex:
         """What a step adds to S, (k, r, r)."""
-        return self.at(step)
+        r = self.left.shape[-1]
+        X, own = np.split(step, [r * r * self.functions.shape[1]])
+        filtered = (self.functions @ X.reshape(r * r, -1).T).reshape(-1, r, r)
+        return hermitian(self.left @ filtered @ self.right) + _unpacked(self.slope @ own)
 
     @cached_property
     def _pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
@@ -106,12 +108,14 @@ class EntryInequality:
 
     def newton(self, x: Array) -> tuple[Array, Array]:
         """Gradient of -log det S, and the upper triangle of its Hessian."""
-        (k, n), r, scale = self.functions.shape, self.root.size, np.outer(self.root, self.root)
+        (k, n), r = self.functions.shape, self.left.shape[-1]
+        L, V, adjoint = self.left, self.right, lambda X: np.conj(np.swapaxes(X, 1, 2))
         P = hermitian(np.linalg.inv(self.at(x)).astype(np.complex128, copy=False))
         row, column = (v.ravel() for v in np.indices((r, r)))
         one, two = np.triu_indices(r * r)
-        (i, j), (g, h), Q = (row[one], column[one]), (row[two], column[two]), P * scale
-        along, against = Q[:, h, i] * Q[:, j, g] / 2, Q[:, g, i] * Q[:, j, h] / 2
+        (i, j), (g, h) = (row[one], column[one]), (row[two], column[two])
+        across, of_left, of_right = V @ P @ L, adjoint(L) @ P @ L, V @ P @ adjoint(V)
+        along, against = across[:, h, i] * across[:, j, g] / 2, of_left[:, g, i] * of_right[:, j, h] / 2
         first, second, even, odd = self._pairs
         even = even @ np.concatenate([along.real, -along.imag, against.real])
         odd = odd @ against.imag
@@ -121,7 +125,8 @@ class EntryInequality:
         entries[one, :, two] = between
         # inner products with S^-1 and S^-1 slope_a S^-1
         turned = np.concatenate([packed(P)[..., None], _turned(P) @ self.slope], axis=2)
-        entry = (_unpacked(np.swapaxes(turned, 1, 2)) * scale)[:, :, column, row].reshape(k, -1)
+        through = V[:, None] @ _unpacked(np.swapaxes(turned, 1, 2)) @ L[:, None]
+        entry = through[:, :, column, row].reshape(k, -1)
         beside = self.functions.real.T @ entry.real - self.functions.imag.T @ entry.imag
         beside = beside.reshape(n, -1, r * r).transpose(2, 0, 1).reshape(r * r * n, -1)
         own = self.slope.reshape(k * r * r, -1).T @ turned.reshape(k * r * r, -1)

@@ -174,7 +174,8 @@ class _Dual:
         """D > 0 at these frequencies, scaled by root(delta) from both sides."""
         further = np.swapaxes(packed(hermitian(self.further(w))), 1, 2)
         functions = 4 / self.loop.T * _causal(self.grid, self.heights, w)
-        return EntryInequality(functions, np.sqrt(np.asarray(self.loop.delta)), np.ascontiguousarray(further))
+        root = np.tile(np.diag(np.sqrt(self.loop.delta)).astype(complex), (w.size, 1, 1))
+        return EntryInequality(np.zeros(further.shape[:2]), functions, root, root, np.ascontiguousarray(further))
 
     def best(self) -> float:
         """The bound on the mean square: along the barrier's path, with further frequencies where D fails between."""

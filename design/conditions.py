@@ -152,7 +152,7 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     return Demand(-taken, gain, {"V(1)": V1})
 
 
-def delayed_environment_demand(delayed: Lti, phi: Sequence[Any]) -> Demand[Lti]:
+def delayed_environment_demand(delayed: Lti, phi: Sequence[Any] | Array) -> Demand[Lti]:
     """E-hat + Phi without its pole must be positive real; `delayed` is Psi E.
 
     E-hat = T z/(z-1) Psi E = T E(1) z/(z-1) + T z R(z), and the Hermitian part of z/(z-1) on the circle is 1/2:
@@ -160,6 +160,17 @@ def delayed_environment_demand(delayed: Lti, phi: Sequence[Any]) -> Demand[Lti]:
     """
     T, E1 = delayed.T, delayed.dc()
     return Demand(T * regular_part(delayed), Lti.constant(np.diag(numbers(phi, T)), T), {"E(1)": E1}, ("E(1)",))
+
+
+def uncovered(environment: Lti, psi: Sequence[int], phi: Sequence[float] | Array) -> tuple[float, float]:
+    """The most that E-hat + Phi lacks of being passive [N s/m], > 0 where phi (m,) is too small, and at which w."""
+    demand = delayed_environment_demand(delay(psi, environment.T) @ environment, phi)
+    block = demand.free + demand.gain
+
+    def short(w: Array) -> Array:
+        return largest_eigenvalue(-hermitian(block.at(on_circle(w))))
+
+    return supremum(short, np.concatenate([[0.0], frequencies(block)]))
 
 
 #: 1 - |a| of a matrix [1, a; a*, 1] below which it is singular in floating point; a diagonal entry that is rounding.
@@ -237,7 +248,6 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
 
 
 #: What a loop may have beyond even ticks, constant delays of its forces and one linear environment, by its field.
-#: What a loop may have beyond even ticks, constant delays of its forces and one linear environment, by its field.
 BEYOND = ("psi", "T_max", "latency", "varying_delay", "walls", "ranges")
 
 
@@ -282,7 +292,8 @@ class Condition(ABC):
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         """w (k,) [rad/sample] -> required over available damping there; None for a coupling without such a curve."""
-        return partial(least_scale, self.demand(loop, coupling))
+        more = {} if multiplier is None else {"multiplier": multiplier}
+        return partial(least_scale, self.demand(loop, coupling, **more))
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
         """Required over available damping, (n,), where loop or coupling is a stack; None: ask them one by one."""
@@ -464,7 +475,7 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
     V1 = demand.static["V(1)"]
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
-    if phi is not None and uncovered(loop.E(), loop.psi, np.diag(phi)) > _ROUNDING * max(even_damping(loop)):
+    if phi is not None and uncovered(loop.E(), loop.psi, phi)[0] > _ROUNDING * max(even_damping(loop)):
         return refused("E-hat + Phi is not passive for this multiplier")
     least = partial(least_scale, demand) if phi is not None else partial(_scale_beside_zeros, V, demand)
     ratio, w = supremum(least, np.concatenate([[0.0], frequencies(V)]))
@@ -569,17 +580,6 @@ def encoder_friction(F: Lti, steps: Sequence[float]) -> Array:
     if q.shape != (F.inputs,) or not (q >= 0).all():
         raise ValueError(f"steps is {q.tolist()}, expected {F.inputs} encoder steps >= 0 in m")
     return l1_gain(F) @ (q / 2)
-
-
-def uncovered(environment: Lti, psi: Sequence[int], Phi: Array) -> float:
-    """sup over frequency of the largest eigenvalue of -He E-hat - Phi [N s/m]; > 0 where Phi is too small."""
-    delayed = delay(psi, environment.T) @ environment
-    regular = regular_part(delayed)
-
-    def short(w: Array) -> Array:
-        return -np.linalg.eigvalsh(environment.T * hermitian(regular.at(on_circle(w))) + Phi)[:, 0]
-
-    return supremum(short, np.concatenate([[0.0], frequencies(delayed)]))[0]
 
 
 # Many couplings or environments at once: a row for each, as a map asks for them.

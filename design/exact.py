@@ -319,10 +319,10 @@ def _whitening(W: Floats) -> Floats | None:
 LARGEST = 800  # states of a model that a proof is tried for: .3 s at 100, 1 s at 200, 5 s at 400, 30 s at 800
 _MOST_BITS = 4000  # of the common denominator of a stored P, a power of two of some hundred bits when we made it
 _STORED_BITS = 48  # of each entry of P, relative to its diagonal
-_WORD = 60  # binary digits of what is multiplied exactly, relative to the largest
-_LEAST_MOVED = 1e-12  # of the largest: a smaller variance of states that move by as much each is taken for this
+_WORDS = 6  # digits of what is multiplied exactly, relative to the largest: more than extended precision has
+_LEAST_MOVED = 1e-10  # of the largest: a smaller variance of states that move by as much each is taken for this
 _MOST_DOUBLINGS = 60
-_MOST_STEPS, _LEFT = 3, 0.02  # of Newton, and part of the drive that rounding may leave of the Riccati equation
+_MOST_STEPS, _LEFT = 4, 0.02  # of Newton, and part of the drive that rounding may leave of the Riccati equation
 _UNIT = 2.0**-53  # of double precision
 _ACCURACIES = (48, 112), (192, 192)  # binary digits of P, and of A, B, C and D, that a proof is tried with
 _MOST_UNITS = 2.0**50
@@ -458,16 +458,17 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     if not G.floats().is_stable():
         return None, "the block has a pole on or outside the unit circle"
     G = reached(G)
-    block, half = _scaled(G)
+    parts, half = _scaled(G)
+    block = _double(parts)
     margin, w = _least_eigenvalue(block)
     if margin <= 0:
         return None, f"the condition is violated at {w:.6g} rad/sample"
     if G.order == 0:
         return Matrix.zeros(0, 0), prove_positive_real(G, Matrix.zeros(0, 0))
     reason: str | None = None
-    for share, white in ((0.5, True), (0.5, False), (0.9, True), (0.1, True)):
+    for share, white in ((0.5, True), (0.5, False), (0.9, True)):
         try:
-            out, riccati = _solved(block, margin, share, white)
+            out, riccati = _solved(parts, margin, share, white)
         except np.linalg.LinAlgError as error:
             reason = f"the Riccati equation has no solution: {error}"
             continue
@@ -479,28 +480,43 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     return None, reason
 
 
-def _solved(G: Lti, margin: float, share: float, white: bool) -> tuple[Array, Array]:
+def _solved(parts: _Parts, margin: float, share: float, white: bool) -> tuple[Array, Array]:
     """(the change to independent coordinates, P there), or of the states as they are. Raises LinAlgError."""
+    (A, B, C, D), G = parts, _double(parts)
     with np.errstate(all="ignore"):
-        if not white:
-            return np.eye(G.order), _riccati(G, margin, share)
-        out, into = _independent(_doubled(G.A, G.B @ G.B.T))
-        return out, _riccati(Lti(out @ G.A @ into, out @ G.B, G.C @ into, G.D, 1.0), margin, share)
+        out, into = _independent(_doubled(G.A, G.B @ G.B.T)) if white else (np.eye(G.order),) * 2
+        into = into @ (2 * np.eye(G.order) - out.astype(np.longdouble) @ into)  # out^-1, to more than double precision
+        return out, _riccati((out @ A @ into, out @ B, C @ into, D), margin, share)
 
 
-def _scaled(G: Lti) -> tuple[Lti, NDArray[np.int64]]:
-    """G in floating point with states and channels of about size one, and the powers of two that the states had.
+_Parts = tuple[Array, Array, Array, Array]  # A, B, C, D in extended precision
+
+
+def _double(parts: _Parts) -> Lti:
+    return Lti(*(part.astype(np.float64) for part in parts), 1.0)
+
+
+def _extended(M: Array) -> Array:
+    """Fractions, or floats, in extended precision: 64 binary digits where the machine has it."""
+    found = np.asarray(M, dtype=np.float64).astype(np.longdouble)
+    if M.dtype == object:
+        for place in zip(*np.nonzero(M), strict=True):
+            found[place] += float(M[place] - Fraction(float(found[place])))
+    return found
+
+
+def _scaled(G: Lti) -> tuple[_Parts, NDArray[np.int64]]:
+    """G with states and channels of about size one, and the powers of two that the states had.
 
     The size of a state is the largest gain from the scaled inputs to it, over frequency.
     """
-    F = G.floats()
-    A, B, C, D = F.A, F.B, F.C, F.D
-    channel = 1 / np.sqrt(np.maximum(np.abs(np.diag(D)), 1e-300))
+    A, B, C, D = map(_extended, (G.A, G.B, G.C, G.D))
+    channel = 1 / np.sqrt(np.maximum(np.abs(np.diag(D)), np.longdouble(1e-300)))
     B, C, D = B * channel, channel[:, None] * C, channel[:, None] * D * channel
-    size = np.linalg.norm(_states(Lti(A, B, C, D, 1.0)), axis=2).max(axis=0)
+    size = np.linalg.norm(_states(_double((A, B, C, D))), axis=2).max(axis=0)
     half = np.frexp(np.where(size > 0, size, 1.0))[1].astype(np.int64)
     size = np.exp2(half)
-    return Lti(A * size / size[:, None], B / size[:, None], C * size, D, 1.0), half
+    return (A * size / size[:, None], B / size[:, None], C * size, D), half
 
 
 def _states(G: Lti) -> NDArray[np.complex128]:
@@ -527,25 +543,30 @@ def _independent(covariance: Array) -> tuple[Array, Array]:
     return (V / root).T / deviation, deviation[:, None] * V * root
 
 
-def _riccati(G: Lti, margin: float, share: float) -> Array:
+def _riccati(parts: _Parts, margin: float, share: float) -> Array:
     """P (n, n) of the equation by doubling: what the first 2^k samples can give back, its limit from below.
 
-    What rounding leaves of the equation, Newton's steps take off while there is more of it than a part of the drive.
-    Raises LinAlgError where there is no solution.
+    What rounding leaves of the equation, Newton's steps take off while there is more of it than a part of the drive:
+    in extended precision, since a lightly damped mode has room for little. Raises LinAlgError where there is no
+    solution.
     """
+    G, (A, B, C, _) = _double(parts), parts
     one = np.eye(G.order)
     gain = np.linalg.norm(_states(G), 2, axis=(1, 2)).max() ** 2
     drive = (1 - share) * margin / max(gain, 1.0)
     R = G.D + G.D.T - 2 * share * margin * np.eye(G.inputs)
     BR = np.linalg.solve(R, G.B.T).T
     P = -_doubled(G.A - BR @ G.C, -drive * one - G.C.T @ np.linalg.solve(R, G.C), BR @ G.B.T)
+    P = P.astype(np.longdouble)
     for _ in range(_MOST_STEPS):
-        PA, cross = P @ G.A, G.C - G.B.T @ P @ G.A
-        feedback = np.linalg.solve(R - G.B.T @ P @ G.B, cross)
-        left = G.A.T @ PA + cross.T @ feedback + drive * one - P
+        PA = P @ A
+        cross, gap = C - B.T @ PA, R - B.T @ P @ B
+        feedback = np.linalg.solve(gap.astype(float), cross.astype(float))  # at the best one its error counts squared
+        half = cross.T @ feedback
+        left = A.T @ PA - P + half + half.T - feedback.T @ gap @ feedback + drive * one
         if np.abs(left).max() < _LEFT * drive:
             break
-        P = P + _doubled((G.A - G.B @ feedback).T, (left + left.T) / 2)
+        P = P + _doubled((G.A - G.B @ feedback).T, ((left + left.T) / 2).astype(float))
     return P
 
 
@@ -575,8 +596,13 @@ def _congruent(out: Array, P: Array, half: NDArray[np.int64]) -> Matrix:
     """out' P out, with rows and columns divided by powers of two; exact of `out` and P as they are rounded here."""
 
     def digits(a: Array) -> tuple[Floats, int]:
-        power = _WORD - int(np.frexp(np.abs(a).max())[1])
-        return _carried(np.round(np.ldexp(a, power)).astype(np.int64)[None]), power
+        power, found = -int(np.frexp(np.abs(a).max())[1]), []
+        a = np.ldexp(a, power)
+        for _ in range(_WORDS):
+            a = np.ldexp(a, _DIGIT)
+            found.append(np.rint(a).astype(np.int64))
+            a = a - found[-1]
+        return _carried(np.array(found[::-1])), power + _WORDS * _DIGIT
 
     (left, one), (middle, other) = digits(out), digits((P + P.T) / 2)
     numbers = _integers(_times(_transposed(left), _times(middle, left)))

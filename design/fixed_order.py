@@ -74,8 +74,6 @@ class FixedOrder:
     """
 
     def __init__(self, shaping: lmi.Shaping, phi: Array | None = None, order: int = 1, diagonal: bool = True) -> None:
-        if order < 1:
-            raise ValueError(f"order is {order}, expected one state per channel or more")
         self.shaping, self.order, self.units = shaping, order, _Units(shaping, phi)
         one, row = np.eye(shaping.loop.channels), np.eye(order)[:1]
         self.F = np.kron(one, row)  # reads the first state of every channel
@@ -214,6 +212,9 @@ def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Ar
 # enters linearly, and there is no bisection. In state coordinates where Q0 = I the tangent is 2I - Q.
 
 
+_Judge = Callable[[Array, float], bool]  # whether the coupling p is certified and its norm at most mu, from p alone
+#: Descent ends when a step improves the norm by less than this, relatively.
+_SETTLED = 1e-4
 #: Room above the start's norm for its first certificate, relatively.
 _FIRST_ROOM = 0.05
 #: Bounds on Q and U in coordinates where they were I: a state that little reaches leaves them free to degenerate.
@@ -230,6 +231,23 @@ def descend(family: FixedOrder, p: Array, norm: float) -> Iterator[Array]:
     while min(np.linalg.eigvalsh(Q)[0], np.linalg.eigvalsh(U)[0]) > 0:
         p, Q, U = _step(_Lemmas(family, p, Q, U, norm))
         yield p
+
+
+def _descended(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
+    """(the best coupling, SDPs spent)."""
+    steps, sdps = descend(family, p, norm), 0
+    while sdps < budget:
+        try:
+            trial = next(steps, None)
+        except DesignFailed:
+            break  # the solver's accuracy is exhausted: what the steps before reached stands
+        if trial is None or not holds(trial, norm):
+            break
+        before, norm, p = norm, family.shaping.norm(family.coupling(trial))[0], trial
+        sdps += 1
+        if before - norm < _SETTLED * norm:
+            break
+    return p, sdps
 
 
 def _step(lemmas: _Lemmas) -> tuple[Array, Array, Array]:
@@ -268,10 +286,8 @@ _PATIENCE = 20
 _WIDTH = 5e-3
 
 
-def _bisect(
-    family: FixedOrder, p: Array, norm: float, holds: Callable[[Array, float], bool], budget: int
-) -> tuple[Array, int]:
-    """(the best coupling, SDPs spent). `holds(p, mu)` judges a coupling from itself alone; p holds for its norm."""
+def _bisect(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
+    """(the best coupling, SDPs spent); p holds for its norm."""
     Q, U = np.linalg.inv(_passivity_storage(family, p)), _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
     lemmas = _Lemmas(family, p, Q, U, norm)
     low, high, best, sdps = 0.5 * norm, norm, p, 0
@@ -286,9 +302,7 @@ def _bisect(
     return best, sdps
 
 
-def _complementary(
-    lemmas: _Lemmas, mu: float, holds: Callable[[Array, float], bool], patience: int
-) -> tuple[Array | None, int]:
+def _complementary(lemmas: _Lemmas, mu: float, holds: _Judge, patience: int) -> tuple[Array | None, int]:
     """(a coupling that holds for mu or None, SDPs spent)."""
     sizes = (lemmas.LQ.shape[0],) * 2 + (lemmas.LU.shape[0],) * 2  # of Q, Y, U and X
     ends = np.cumsum([lemmas.at.size, *map(lmi.packed, sizes)])
@@ -401,18 +415,9 @@ class FixedPoles:
 
 #: The start is designed for this much less damping, so that it is strictly feasible.
 _START_ROOM = 1e-3
-#: Descent ends when a step improves the norm by less than this, relatively.
-_SETTLED = 1e-4
 
 
-def design(
-    loop: Loop,
-    order: int = 1,
-    diagonal: bool = True,
-    method: str = "inner",
-    start: SpringDamper | None = None,
-    most_sdps: int = 100,
-) -> Design:
+def design(loop: Loop, order: int = 1, diagonal: bool = True, method: str = "inner", most_sdps: int = 100) -> Design:
     """The coupling with `order` states per channel that `method` finds, from strictly feasible spring-damper gains.
 
     Raises Infeasible if Theorem 4 admits no spring-damper to start from, DesignFailed if no result is certified.
@@ -422,83 +427,33 @@ def design(
     one_of("method", method, _METHODS)
     if method == "fixed-poles" and (order, diagonal) != (1, True):
         raise ValueError("method 'fixed-poles' is for one state per channel, diagonal")
-    started = time.perf_counter()
-    search = _Search(loop, order, diagonal, start)
-    V = search.run(method, most_sdps)
-    return Design(
-        coupling=Compliance(V),
-        condition="any-environment",
-        figure="loop-norm",
-        objective=search.shaping.norm(V)[0],
-        requirement=search.requirement(V),
-        sdps=search.sdps,
-        wall_s=time.perf_counter() - started,
-        phi=search.phi,
-    )
+    started, shaping, phi = time.perf_counter(), lmi.Shaping(loop), lmi.least_phi(loop)
+    reserved = msgspec.structs.replace(loop, delta=tuple((1 - _START_ROOM) * d for d in loop.delta))
+    first = spring_damper.design(reserved)
+    gains = first.coupling
+    assert isinstance(gains, SpringDamper)
 
+    def judged(V: Lti) -> Requirement:
+        return lmi.ANY_ENVIRONMENT.required(loop, Compliance(V), phi)
 
-class _Search:
-    """One run: the family of couplings, the judge, and the count of problems solved."""
+    if method == "fixed-poles":
+        problem = FixedPoles(shaping, phi)
+        V, _ = problem.search((gains.B / (gains.B + gains.K * loop.T)).tolist(), most_sdps)
+        sdps = problem.sdps
+    else:
+        family = FixedOrder(shaping, phi, order, diagonal)
 
-    def __init__(self, loop: Loop, order: int, diagonal: bool, start: SpringDamper | None) -> None:
-        self.loop, self.shaping, self.sdps = loop, lmi.Shaping(loop), 0
-        self.phi = lmi.least_phi(loop)
-        self.family = FixedOrder(self.shaping, self.phi, order, diagonal)
-        self.gains = start or self._structured()
+        def holds(p: Array, mu: float) -> bool:
+            """Whether the coupling p is certified and ||W1 L W2||_inf <= mu, from the coupling alone."""
+            V = family.coupling(p)
+            return V.is_stable() and judged(V).certified and shaping.norm(V)[0] <= mu
 
-    def requirement(self, V: Lti) -> Requirement:
-        return lmi.ANY_ENVIRONMENT.required(self.loop, Compliance(V), self.phi)
-
-    def run(self, method: str, most_sdps: int) -> Lti:
-        """The coupling found, certified."""
-        if method == "fixed-poles":
-            V = self._fixed_poles(most_sdps)
-        else:
-            p = self.family.start(self.gains)
-            if method == "inner":
-                p = self._inner(p, most_sdps)
-            else:
-                p, spent = _bisect(self.family, p, self._norm(p), self._holds, most_sdps)
-                self.sdps += spent
-            V = self.family.coupling(p)
-        if not self.requirement(V).certified:
-            raise DesignFailed(None, (), f"{method} gave no coupling that Theorem 4 certifies")
-        return V
-
-    def _structured(self) -> SpringDamper:
-        reserved = msgspec.structs.replace(self.loop, delta=tuple((1 - _START_ROOM) * d for d in self.loop.delta))
-        found = spring_damper.design(reserved)
-        self.sdps += found.sdps
-        assert isinstance(found.coupling, SpringDamper)
-        return found.coupling
-
-    def _inner(self, p: Array, most_sdps: int) -> Array:
-        norm = self._norm(p)
-        steps = descend(self.family, p, norm)
-        for _ in range(most_sdps):
-            try:
-                trial = next(steps, None)
-            except DesignFailed:
-                break  # the solver's accuracy is exhausted: what the steps before reached stands
-            if trial is None or not self._holds(trial, norm):
-                break
-            self.sdps += 1
-            before, norm, p = norm, self._norm(trial), trial
-            if before - norm < _SETTLED * norm:
-                break
-        return p
-
-    def _norm(self, p: Array) -> float:
-        return self.shaping.norm(self.family.coupling(p))[0]
-
-    def _fixed_poles(self, most_sdps: int) -> Lti:
-        problem = FixedPoles(self.shaping, self.phi)
-        rate = self.gains.B / (self.gains.B + self.gains.K * self.loop.T)
-        V, _ = problem.search(rate.tolist(), most_sdps)
-        self.sdps += problem.sdps
-        return V
-
-    def _holds(self, p: Array, mu: float) -> bool:
-        """Whether the coupling p is certified and ||W1 L W2||_inf <= mu, from the coupling alone."""
-        V = self.family.coupling(p)
-        return V.is_stable() and self.requirement(V).certified and self.shaping.norm(V)[0] <= mu
+        search = _descended if method == "inner" else _bisect
+        p = family.start(gains)
+        p, sdps = search(family, p, shaping.norm(family.coupling(p))[0], holds, most_sdps)
+        V = family.coupling(p)
+    requirement = judged(V)
+    if not requirement.certified:
+        raise DesignFailed(None, (), f"{method} gave no coupling that Theorem 4 certifies")
+    norm, wall_s = shaping.norm(V)[0], time.perf_counter() - started
+    return Design(Compliance(V), "any-environment", "loop-norm", norm, requirement, first.sdps + sdps, wall_s, phi=phi)

@@ -6,7 +6,7 @@ be positive (semi)definite; its arguments are numbers or cvxpy expressions.
 Two transfer matrices of the paper can never satisfy the strict inequalities printed for them:
   E-hat = z/(z-1) Psi E has a pole at z = 1 wherever E has static stiffness, and A'PA - P < 0 excludes it (15), (17).
       Remedy: the Hermitian part of E(1) z/(z-1) on |z| = 1 is the constant E(1)/2, so what is left, E-hat less
-      its pole plus E(1)/2, carries the same condition and is stable (`e_hat_regular`).
+      its pole plus E(1)/2, carries the same condition and is stable (`design.conditions.delayed_environment_demand`).
   V-hat = (1 - 1/z)(V - Theta-hat) vanishes at z = 1, where (2) asks 0 > 0.
       Remedy: divide by |1 - 1/z|^2 (`design.conditions.v_hat`).
 """
@@ -28,10 +28,10 @@ from controller.loop import Loop
 from controller.lti import Array, Lti
 from controller.ranges import Member
 from design import conditions
-from design.conditions import Condition, Demand, even_damping, regular_part, uncovered
+from design.conditions import Condition, Demand, delayed_environment_demand, even_damping, uncovered
 from design.cone import ConeProgram, Inequality
 from design.exact import require_size
-from design.frequency import Response, frequencies, hermitian, on_circle, supremum
+from design.frequency import Response, frequencies, on_circle, supremum
 from design.result import DesignFailed, Guarantee, Infeasible, NotProved, Requirement, refusal
 
 #: Designs ask for (1 - RESERVE) of the available damping, so that they are certified as stored.
@@ -63,13 +63,8 @@ def check_passive(E: Lti, tolerance: float = 1e-9) -> None:
         raise ValueError("environment is not passive: its static stiffness E(1) is not symmetric")
     if np.linalg.eigvalsh((static + static.T) / 2)[0] < -tolerance * scale:
         raise ValueError("environment is not passive: its static stiffness E(1) has a negative direction")
-    regular = regular_part(E)
-
-    def active(w: Array) -> Array:
-        return -np.linalg.eigvalsh(hermitian(regular.at(on_circle(w))))[:, 0]
-
-    worst, w = supremum(active, np.concatenate([[0.0], frequencies(E)]))
-    if worst > tolerance * scale:
+    worst, w = uncovered(E, (0,) * E.inputs, np.zeros(E.inputs))
+    if worst > tolerance * scale * E.T:
         raise ValueError(f"environment is not passive: it produces energy at {w / (2 * np.pi * E.T):.4g} Hz")
 
 
@@ -154,13 +149,7 @@ def symmetric_from(vector: Array, n: int) -> Array:
 def unit_environment(E: Lti, delta: Sequence[float] | Array) -> Lti:
     """E in units where T = 1 and Delta_D = I: T Delta_D^-1/2 E Delta_D^-1/2."""
     root = 1 / np.sqrt(np.asarray(delta))
-    return _scaled(E, E.T * root, root)
-
-
-def unit_coupling(V: Lti, delta: Sequence[float]) -> Lti:
-    """V in the same units: Delta_D^1/2 V Delta_D^1/2 / T, so that E V keeps its eigenvalues."""
-    root = np.sqrt(np.asarray(delta))
-    return _scaled(V, root / V.T, root)
+    return Lti(E.A, E.B * root, E.T * root[:, None] * E.C, E.T * root[:, None] * E.D * root, 1.0)
 
 
 def balanced(G: Lti, negligible: float = 1e-11) -> Lti:
@@ -192,10 +181,6 @@ def _root(A: Array, B: Array) -> Array:
     W = scipy.linalg.solve_discrete_lyapunov(A, B @ B.T)
     values, basis = np.linalg.eigh((W + W.T) / 2)
     return basis * np.sqrt(np.maximum(values, 0.0))
-
-
-def _scaled(G: Lti, left: Array, right: Array) -> Lti:
-    return Lti(G.A, G.B * right, left[:, None] * G.C, left[:, None] * G.D * right, 1.0)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -237,7 +222,7 @@ def least_phi(loop: Loop) -> Array | None:
     if not any(loop.psi):
         return None
     phi = least_multiplier(loop) + _ROOM * even_damping(loop)
-    short = uncovered(loop.E(), loop.psi, np.diag(phi))
+    short, _ = uncovered(loop.E(), loop.psi, phi)
     if short > 0:
         raise DesignFailed(None, (), f"the multiplier Phi = {phi.tolist()} leaves {short:.2e} N s/m uncovered")
     return phi
@@ -253,10 +238,11 @@ def least_multiplier(loop: Loop) -> Array:
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
-    least = uncovered(unit, loop.psi, np.zeros((loop.channels,) * 2))  # of a full Phi, and of least on every channel
+    none = np.zeros(loop.channels)
+    least, _ = uncovered(unit, loop.psi, none)  # of a full Phi, and of least on every channel
     if least >= 1:
         raise Infeasible(None, (), _needs(loop.psi, delta, least))
-    regular = e_hat_regular(unit, loop.psi)
+    regular = delayed_environment_demand(delay(loop.psi, 1.0) @ unit, none).free
     if regular.order > _MOST_STATES:
         return max(least, 0.0) * delta
     # halfway between the least largest entry and Delta_D: least trace alone may touch Delta_D
@@ -453,11 +439,6 @@ def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matri
         [C, D, np.zeros((p, n)), np.eye(p)],
     ]
     return symmetric(rows)
-
-
-def e_hat_regular(E: Lti, psi: Sequence[int]) -> Lti:
-    """E-hat less its pole at z = 1, plus E(1)/2; E(1) must be symmetric and >= 0."""
-    return regular_part(delay(psi, E.T) @ E)
 
 
 def symmetric(rows: list[list[_Matrix]]) -> _Matrix:

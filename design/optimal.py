@@ -35,16 +35,19 @@ _PRICED = 15.0  # [s] of the processor: what the price of a range may take, a th
 _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
 _FIRST = 3  # of the environments: those that the nominal design misses most are imposed first
 _SETTLED_DB = 0.05  # a rung that gains less ends the climb
+_LARGE = 26  # taps: a rung of more that gains less is not taken
 _FEWEST_RUNGS = 3
+_MOST_REFUSED = 2  # rungs without a proof, one after the other, after which a larger one has none either
 _KEPT_STIFFNESS = 0.5  # of the most static stiffness of a rung that was best: one that renders less is not taken
 _LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # (beta, c) of a limiter to begin with: without psi the first alone
 _HOPELESS = 0.9  # relative mismatch from which on the climb is compared with other couplings
 _TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
-_MOST_STATES = 200  # of the loop, up to which a rung is tried: half a minute with five devices
+_MOST_STATES = 270  # of the loop, up to which a rung is tried
 _MOST_PROOFS = 30 * 112**2.7  # and (environments) states^2.7: a minute
 _SEARCHED = 0.2  # of the time limit, at least: what the search between the vertices of ranges may take
 _TRIED = 3  # rungs, the best first, until one is proved at every vertex of ranges
-_MOST_WORK = 1.2e7  # (channels x unknowns)^2 up to which a rung is tried
+_MOST_UNKNOWNS = 1600  # up to which a rung is tried: ten seconds
+_MOST_BESIDE = 3500  # unknowns by channels, the same where more than this-environment is asked
 
 
 @dataclass(frozen=True)
@@ -132,12 +135,14 @@ def design(
         rungs.append(rung)
         progress(rung)
         gained = np.inf if rung.reason or best is None else decibels(climb.merit(best)) - decibels(climb.merit(found))
-        if rung.reason is None and (best is None or (found.g >= floor and climb.merit(found) < climb.merit(best))):
+        worth = gained > (0 if taps <= _LARGE else _SETTLED_DB)
+        if rung.reason is None and (best is None or (found.g >= floor and worth)):
             best, floor = found, max(floor if best else 0.0, _KEPT_STIFFNESS * found.g)
             better.append(found)
         settled = gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS
         hurried = not settled and climb.elapsed > options.seconds
-        if settled or hurried:
+        hopeless = len(rungs) >= _MOST_REFUSED and not any(each.proved for each in rungs[-_MOST_REFUSED:])
+        if settled or hurried or (hopeless and not loop.ranges):
             break
     if loop.ranges:
         for found in better[: -_TRIED - 1 : -1]:
@@ -240,17 +245,20 @@ class _Search:
         return found if found.proved or not self.options.limiter else None
 
     def span(self, taps: int, poles: int) -> program.Span:
-        return program.span_of(self.cases[0].E, taps, poles, self.options.band_hz[1])
+        simple = not (self.constrained or self.loop.latency or self.loop.ranges)
+        full = program.FULL if simple else program.FULL_BESIDE
+        return program.span_of(self.cases[0].E, taps, poles, self.options.band_hz[1], full)
 
     def room(self, taps: int, poles: int, before: int) -> bool:
         """Whether a rung is tried: by its states, as many on a busy machine, which are more than `before`."""
         span, loop = self.span(taps, poles), self.loop
         m = loop.channels
-        own = int((span.used.sum(axis=1) > 0)[:, :m].sum())
-        states = own + (len(span.used) - own // m if m > program.FULL else 0)
+        own, full = int((span.used.sum(axis=1) > 0)[:, :m].sum()), span.used.shape[2] == m
+        states = own + (0 if full else len(span.used) - own // m)
         states += self.cases[0].E.order + sum(loop.theta) + sum(loop.psi)
         proofs = len(self.cases) * states**2.7  # what they take, in seconds
-        return before < states <= _MOST_STATES and (m * span.unknowns) ** 2 <= _MOST_WORK and proofs <= _MOST_PROOFS
+        solved = span.unknowns <= (_MOST_UNKNOWNS if full and not self.constrained else _MOST_BESIDE / m)
+        return before < states <= _MOST_STATES and solved and proofs <= _MOST_PROOFS
 
     def rung(self, taps: int, poles: int, before: Optimal | None, floor: float) -> tuple[Optimal, _Rung]:
         """The optimum over a basis, scaled until every sweep passes, and proved where there are no ranges.
@@ -273,7 +281,7 @@ class _Search:
         coupling, needs = self.kept_in_all(problem, [0])
         if slip:
             needs.append(min(required_damping(self.loop, coupling, Limiter(slip.beta)).ratio, 1 + _TOLERATED))
-        for share in (0.95, 1.5, 2.5, 15.0, 50.0):  # of the margin, which stays unused until the rung is proved
+        for share in (0.95, 2.5, 50.0):  # of the margin, which stays unused until the rung is proved
             limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Any, Literal
@@ -23,7 +23,7 @@ from controller.delay import delay
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Complex, Lti, Sampled, as_like
 from design.arguments import number, one_of
-from design.barrier import MatrixInequality, Program, centre, joined, towards
+from design.barrier import EntryInequality, MatrixInequality, Program, centre, joined, packed, towards
 from design.conditions import Demand, even_damping, this_environment_demand
 from design.environments import SWITCHING, Limiter
 from design.frequency import frequencies, hermitian, on_circle, peaks
@@ -31,14 +31,16 @@ from design.transparency import BAND_HZ
 
 OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # share of the damping that stays unused: what an exact proof always finds room in
-LADDER = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10))  # taps, real poles; the last where the one before is too large
+LADDER = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10), (32, 24), (48, 34))  # taps, real poles: those with room
 _FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # distance to 1 of the real poles' ends
 _FASTER = 0.25  # modes of smaller radius are left to the filter of the sum of all forces
 _NEAR = 0.3  # of its distance to 1: a real pole so close to a mode gives way to it
 _SLOWER = 0.999  # modes of larger radius get no section
-RICH, _EDGED = 4, 20  # channels up to which, and taps from which on, there are sections at the band's end
+RICH = 8  # channels up to which there are sections at the band's end
+_EDGED = {1: 20, 2: 20}  # by channels, the taps from which on there are
+_EDGED_OF_MANY = 6
 _EDGES = (0.2, 0.07, 0.02)  # their damping ratios: they crowd at the band's end, where the error may jump
-FULL = 5  # channels up to which every force has a filter to every device
+FULL, FULL_BESIDE = 8, 5  # channels up to which every force has a filter to every device; where more is asked
 _STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weight of g - 1 beside the relative mismatch; for more than RICH channels
 HIGH_HZ = 100.0  # above it the force is kept low by a soft row, or capped
 SOFT = 0.05, 0.3  # the soft row's weight: the first number times the mismatch so far, which counts up to the second
@@ -93,6 +95,7 @@ class _Constraint:
     high: float = np.pi
     start: tuple[float, ...] = ()  # own unknowns for which R = kappa I is strictly feasible for a small kappa
     cost: tuple[float, ...] = ()  # of the own unknowns in the objective
+    through: bool = False  # whether the block is a constant and L(z) G, with as many rows as there are forces
 
     def at(self, G: Sampled, own: Array) -> Complex:
         """The scaled matrices, (n, k, r, r)."""
@@ -110,7 +113,7 @@ def this_environment(loop: Loop) -> _Constraint:
         return demand.free + demand.gain * (1 - MARGIN)
 
     gain = _demand(loop, Lti.constant(np.zeros((loop.channels, loop.channels)), loop.T)).gain
-    return _Constraint("this-environment", block, 1 / np.sqrt(np.diag(gain.D)))
+    return _Constraint("this-environment", block, 1 / np.sqrt(np.diag(gain.D)), through=loop.latency is None)
 
 
 def _demand(loop: Loop, F: Any) -> Demand[Any]:
@@ -239,17 +242,17 @@ class Span:
         return ForceFilter(self.poles, self.pairs, one).filter(T)
 
 
-def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1]) -> Span:
+def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int = FULL) -> Span:
     """Taps, real poles even in the logarithm of the time constant, and the modes of E and of its inverse.
 
     Poles are decimals from the start; a larger basis for one or two channels has slower ones, and sections where the
-    band ends. With more than FULL channels every device has a filter of its own force and one of the sum of all, and
+    band ends. With more than `full` channels every device has a filter of its own force and one of the sum of all, and
     fast modes are left to the latter.
     """
     m = E.inputs
     modes = np.concatenate([E.poles(), _zeros(E)])
     modes = modes[(np.abs(modes) < _SLOWER) & (np.abs(modes) > 0.02) & (modes.imag >= 0)]
-    large = m <= RICH and taps >= _EDGED
+    large = m <= RICH and taps >= _EDGED.get(m, _EDGED_OF_MANY)
     slowest = _SLOWEST_OF_LARGE if large else _SLOWEST
     slow = np.round(1 - np.geomspace(_FASTEST, slowest, poles), 4) if poles else np.zeros(0)
     own_real = modes[np.abs(modes.imag) <= 1e-6].real
@@ -257,7 +260,7 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1]) -> Span:
     for mode in _distinct(modes):
         if abs(mode.imag) > 1e-6:
             pairs.append((-2 * mode.real, abs(mode) ** 2))
-        elif m > FULL and abs(mode) < _FASTER:
+        elif m > full and abs(mode) < _FASTER:
             fast.append(float(mode.real))
         elif not any(abs(mode.real - a) < 0.02 * (1 - abs(a)) for a in real):
             real.append(float(mode.real))
@@ -270,7 +273,7 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1]) -> Span:
     all_poles = np.concatenate([np.zeros(taps - 1), np.round(real, 4)])
     count = all_poles.size + 2 * len(pairs)
     used = np.ones((count, m, m), dtype=bool)
-    if m > FULL:
+    if m > full:
         used = np.zeros((count, m, m + 1), dtype=bool)
         used[:own, np.arange(m), np.arange(m)] = True
         used[:, :, m] = True
@@ -290,6 +293,9 @@ def _distinct(modes: Complex) -> list[complex]:
             kept.append(mode)
     return kept
 
+
+_Asked = list[tuple["Case", _Constraint]]
+_Posed = tuple[Program, Array, Callable[[Array], Array]]
 
 # the problem -----------------------------------------------------------------------------------------------------
 
@@ -338,22 +344,21 @@ class Problem:
         return x
 
     def objective(self) -> tuple[Array, Array, Array]:
-        """A, b, c of |A x - b|^2 + c'x: squared relative mismatch, soft rows, and the share of static stiffness."""
-        rows, right = [], []
-        for case in self.cases:
-            if not case.weight:
-                continue
-            loop = case.loop
-            low, high = _band(loop, self.options.band_hz)
-            if self.options.objective == "rms":
-                w = frequencies(case.E, low=low, high=high, points=80)
-                logarithm = np.log(w)
-                weight = np.gradient(logarithm) / (logarithm[-1] - logarithm[0])
-                self._force_rows(case, w, np.sqrt(case.weight * weight), loop.lam, rows, right)
-            edge = 2 * np.pi * HIGH_HZ * loop.T
-            if edge < np.pi and self.soft > 0:
-                w = np.geomspace(edge, np.pi, 20)
-                self._force_rows(case, w, np.full(20, self.soft * np.sqrt(case.weight / 20)), None, rows, right)
+        """A, b, c of |A x - b|^2 + c'x: squared relative mismatch, soft rows, and the share of static stiffness.
+
+        The forces of a device are those of its own row of R: each row is a least-squares problem beside g, of which the
+        triangle is kept.
+        """
+        parts = [part for case in self.cases if case.weight for part in self._weighed(case)]
+        rows, right, row_of = [], [], np.argwhere(self.span.used)[:, 1]
+        for i in range(self.cases[0].E.inputs):
+            mine = np.concatenate([[0], 1 + np.flatnonzero(row_of == i)])
+            stacked = np.vstack([np.zeros((0, mine.size + 1)), *(self._force_rows(*part, i, mine) for part in parts)])
+            R = np.asarray(np.linalg.qr(stacked, mode="r"))
+            slope = np.zeros((len(R), self.unknowns))
+            slope[:, mine] = R[:, :-1]
+            rows.append(slope)
+            right.append(R[:, -1])
         static = np.zeros((1, self.unknowns))
         static[0, 0] = held = self.heavier * static_weight(self.cases[0].loop)
         cost = np.zeros(self.unknowns)
@@ -361,22 +366,38 @@ class Problem:
         small = _SMALL * np.eye(self.span.unknowns, self.unknowns)
         return np.vstack([*rows, static, small]), np.concatenate([*right, [held], np.zeros(len(small))]), cost
 
-    def _force_rows(
-        self, case: Case, w: Array, weight: Array, lam: Sequence[int] | None, rows: list[Array], right: list[Array]
-    ) -> None:
-        """Rows of weight |F - Lambda E|/|E| with a little of `_evened`, and of weight |F|/|E| where lam is None."""
+    def _weighed(self, case: Case) -> list[tuple[Case, Array, Complex, Complex]]:
+        """(case, w, L, target): the squares of (F - target') L count, with weight/|E| and `_evened` in L."""
+        loop, found = case.loop, []
+
+        def add(w: Array, weight: Array, ideal: bool) -> None:
+            E, z = case.E.at(on_circle(w)), on_circle(w)
+            size = np.linalg.norm(E, axis=(1, 2))
+            L = (weight / size)[:, None, None] * (_evened(E, size) if ideal else np.eye(case.E.inputs))
+            target = (z[:, None] ** -np.asarray(loop.lam))[..., None] * E if ideal else np.zeros_like(E)
+            found.append((case, w, L, target @ L))
+
+        low, high = _band(loop, self.options.band_hz)
+        if self.options.objective == "rms":
+            w = frequencies(case.E, low=low, high=high, points=80)
+            logarithm = np.log(w)
+            weight = np.gradient(logarithm) / (logarithm[-1] - logarithm[0])
+            add(w, np.sqrt(case.weight * weight), ideal=True)
+        edge = 2 * np.pi * HIGH_HZ * loop.T
+        if edge < np.pi and self.soft > 0:
+            add(np.geomspace(edge, np.pi, 20), np.full(20, self.soft * np.sqrt(case.weight / 20)), ideal=False)
+        return found
+
+    def _force_rows(self, case: Case, w: Array, L: Complex, target: Complex, i: int, mine: NDArray[np.intp]) -> Array:
+        """Row i of F L by these unknowns, and that of the target, as real rows."""
         z = on_circle(w)
-        E = case.E.at(z)
-        size = np.linalg.norm(E, axis=(1, 2))
-        right_of = (weight / size)[:, None, None] * (np.eye(case.E.inputs) if lam is None else _evened(E, size))
-        turn = z[:, None] ** -np.asarray(case.loop.theta)
-        slope: Complex = np.zeros((self.unknowns, E.size), dtype=complex)
-        moved = self._slopes(case, z).G * turn[..., None] @ right_of
-        slope[: self.span.unknowns] = moved.reshape(-1, E.size)
-        ideal = np.zeros_like(E) if lam is None else (z[:, None] ** -np.asarray(lam))[..., None] * E
-        target = ideal @ right_of
-        rows.extend([np.ascontiguousarray(part(slope).T) for part in (np.real, np.imag)])
-        right.extend([part(target).ravel() for part in (np.real, np.imag)])
+        moved = case.delayed(z).G[0] @ L * (z ** -float(case.loop.theta[i]))[:, None, None]
+        functions, signals = self.span.responses(z), self.span.sources() @ moved
+        function, _, source = np.argwhere(self.span.used)[mine[1:] - 1].T
+        through = functions[:, function, None] * signals[:, source]  # (k, unknowns, m)
+        slope = np.concatenate([moved[:, i, None], through, target[:, i, None]], axis=1).swapaxes(1, 2)
+        slope = slope.reshape(-1, slope.shape[2])
+        return np.vstack([slope.real, slope.imag])
 
     def _slopes(self, case: Case, z: Complex) -> Sampled:
         """What each of g, R_1, R_2, .. adds to the forces G as they leave, (unknowns, k, m, m)."""
@@ -403,11 +424,59 @@ class Problem:
             slope[a] = (constraint.at(nothing, unit) - constant)[0]
         return MatrixInequality.of(constant[0], np.swapaxes(slope, 0, 1))
 
-    def positive(self) -> MatrixInequality:
-        """g > 0."""
+    def _positive(self, at: int) -> MatrixInequality:
+        """g > 0, where g is this unknown."""
         slope = np.zeros((1, self.unknowns, 1, 1), dtype=complex)
-        slope[0, 0] = 1
+        slope[0, at] = 1
         return MatrixInequality.of(np.zeros((1, 1, 1), dtype=complex), slope)
+
+    def _dense(
+        self, A: Array, b: Array, c: Array, asked: _Asked, imposed: list[Array], start: Array, x: Array
+    ) -> _Posed:
+        """(the program in other coordinates y, x there or what is feasible towards it, the way back)."""
+        parts = [self.block(*one, own, w) for one, own, w in zip(asked, self.own, imposed, strict=True)]
+        program = Program(A, b, c, joined([*parts, self._positive(0)]))
+        x = towards(start, x, program)
+        program, U = program.conditioned(x)
+        return program, U @ x, lambda y: scipy.linalg.solve_triangular(U, y)
+
+    @property
+    def _entries(self) -> bool:
+        """Whether R has every entry, for more than two devices, and nothing is asked but what it goes through."""
+        full = self.span.used.all() and self.span.used.shape[1] == self.span.used.shape[2] > 2
+        return bool(full) and all(constraint.through for case in self.cases for constraint in case.constraints)
+
+    def _by_entries(
+        self, A: Array, b: Array, c: Array, asked: _Asked, imposed: list[Array], start: Array, x: Array
+    ) -> _Posed:
+        """The same as `_dense` for R entry by entry, its functions balanced, and then g."""
+        n, m, _ = self.span.used.shape
+        z = on_circle(np.unique(np.concatenate(imposed)))
+        functions = self.span.responses(z)
+        rows = np.vstack([functions, functions / np.abs(z - 1)[:, None]])
+        U = np.asarray(scipy.linalg.qr(np.vstack([rows.real, rows.imag]), mode="r")[0])[:n]
+        turned = lambda X: scipy.linalg.solve_triangular(U, X, trans=1)  # noqa: E731
+
+        def there(x: Array) -> Array:
+            return np.append((U @ x[1:].reshape(n, -1)).T.ravel(), x[0])
+
+        def back(y: Array) -> Array:
+            return np.append(y[-1], scipy.linalg.solve_triangular(U, y[:-1].reshape(-1, n).T).ravel())
+
+        blocks: list[MatrixInequality | EntryInequality] = [self._positive(self.unknowns - 1)]
+        for (case, constraint), w in zip(asked, imposed, strict=True):
+            delayed = case.delayed(on_circle(w))
+            one = Sampled(delayed.z, np.tile(np.eye(m, dtype=complex), (1, w.size, 1, 1)), delayed.T)
+            none = np.zeros(0)
+            constant = constraint.block(0 * delayed, none).G[0]
+            left = constraint.unit[:, None] * (constraint.block(one, none).G[0] - constant)
+            still = packed(constraint.at(0 * delayed, none)[0])
+            g = packed(constraint.at(delayed, none)[0]) - still
+            own = turned(self.span.responses(delayed.z[0]).T).T
+            blocks.append(EntryInequality(still, own, left, delayed.G[0] * constraint.unit, g[..., None]))
+        by_entry = turned(A[:, 1:].T.reshape(n, -1)).reshape(n, m * m, -1).transpose(2, 1, 0).reshape(len(A), -1)
+        program = Program(np.column_stack([by_entry, A[:, 0]]), b, there(c), tuple(blocks))
+        return program, towards(there(start), there(x), program), back
 
     def least(self, case: Case, constraint: _Constraint, own: tuple[int, int], x: Array, w: Array) -> Array:
         """The least eigenvalue of a constraint at x, (k,)."""
@@ -466,29 +535,26 @@ class Problem:
         asked = [(case, constraint) for case in self.cases for constraint in case.constraints]
         imposed = [self.grid(case, constraint) for case, constraint in asked]
         A, b, c = self.objective()
+        posed = self._by_entries if self._entries else self._dense
         _, R = np.linalg.qr(np.column_stack([A, b]))
         A, b = R[:, :-1], R[:, -1]
         x, t, gaps = start, None, list(_GAPS[:1] if self.sparse else _GAPS)
         inner = start
         nothing = float(b @ b) + float(c.any())  # without any force; a supremum is 1 then
         demanding = any(len(case.constraints) > 1 for case in self.cases)  # else scaling, which is exact, does the rest
-        back = _STEEPER**4 if demanding else _STEEPER
+        lower = _STEEPER**4 if demanding else _STEEPER
         for _ in range(_MOST_SWEEPS):
-            parts = [self.block(*one, own, w) for one, own, w in zip(asked, self.own, imposed, strict=True)]
-            program = Program(A, b, c, joined([*parts, self.positive()]))
-            x = towards(start, x, program)
-            program, U = program.conditioned(x)
-            y = U @ x
-            t = program.degree / max(program.value(y), 1e-12) if t is None else t / back
+            program, y, back = posed(A, b, c, asked, imposed, start, x)
+            t = program.degree / max(program.value(y), 1e-12) if t is None else t / lower
             y = centre(program, y, t)
-            inner = scipy.linalg.solve_triangular(U, y)
+            inner = back(y)
             while True:
                 value = program.value(y)
                 if time.thread_time() > until or program.degree / t <= gaps[0] * max(min(value, nothing - value), 1e-9):
                     break
                 t *= _STEEPER
                 y = centre(program, y, t)
-            x = scipy.linalg.solve_triangular(U, y)
+            x = back(y)
             more, worst = self.missed(x)
             if (worst < forgiven and len(gaps) == 1) or time.thread_time() > until:
                 break

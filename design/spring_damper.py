@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.coupling import MovingAverage, SpringDamper
+from controller.coupling import Coupling, MovingAverage, SpringDamper
 from controller.loop import Loop
 from controller.lti import Array, Lti, hstack, taps, vstack
 from design.certificate import named
@@ -36,7 +36,7 @@ from design.lmi import (
     symmetric_from,
     usable,
 )
-from design.result import Design, DesignFailed, Infeasible, Requirement
+from design.result import Design, DesignFailed, Infeasible
 from design.transparency import BAND_HZ, transparency
 
 # ----------------------------------------------------------------------------------------------------
@@ -165,9 +165,7 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     N = shaping.loop.channels
     left, right, late = shaping.parts(w)
     basis = np.eye(N)[:, None, :] * np.ones((w.size, 1))  # (N, k, N): e_i at every frequency
-    g = np.concatenate(
-        [basis, basis * damper_rate(on_circle(w), 1.0)[:, None]]
-    )  # (2N, k, N): diagonals of g by variable
+    g = np.concatenate([basis, basis * damper_rate(on_circle(w), 1.0)[:, None]])  # (2N, k, N): its slopes, diagonals
     g0 = np.tensordot(at, g, axes=1)  # (k, N)
     scale = 1 / np.abs(g0)  # columns are divided by |g0|, rows by the norm
     rows = (left * (shaping.loop.T / shaping.usable)) @ right * scale[:, None, :] / norm
@@ -257,7 +255,7 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
     started, loop = time.perf_counter(), shaping.loop
     phi = least_phi(loop)
     certified = GainSet(loop, phi)
-    gains, sdps = _start(loop, certified, start)
+    gains, sdps = _start(loop, certified, start), 1
     norm, peak = shaping.norm(_coupling(loop, gains).compliance(loop.T))
     frequencies = [peak]
     for _ in range(_MOST_STEPS):
@@ -270,10 +268,7 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
     coupling = _short(_coupling(loop, gains))
     if loop.channels > FEW:
         norm, _ = shaping.norm(coupling.compliance(loop.T))
-    requirement = _verified(loop, coupling, phi)
-    return Design(
-        coupling, "any-environment", "loop-norm", norm, requirement, sdps, time.perf_counter() - started, phi=phi
-    )
+    return _verified(loop, coupling, phi, "loop-norm", norm, sdps, started)
 
 
 def _short(coupling: SpringDamper) -> SpringDamper:
@@ -344,19 +339,6 @@ def _default_starts(loop: Loop) -> list[SpringDamper]:
     return starts
 
 
-def stiffest(loop: Loop) -> Design:
-    """The gains of largest total stiffness (each channel's own largest) that satisfy Theorem 4; objective in N/m."""
-    started = time.perf_counter()
-    phi = least_phi(loop)
-    gains, sdps = _start(loop, GainSet(loop, phi), None)
-    coupling = _coupling(loop, gains)
-    requirement = _verified(loop, coupling, phi)
-    total = float(coupling.K.sum())
-    return Design(
-        coupling, "any-environment", "stiffness", total, requirement, sdps, time.perf_counter() - started, phi=phi
-    )
-
-
 def moving_average(loop: Loop) -> Design:
     """The stiffest linear coupling that Theorem 4 admits; objective in N/m, of all channels together.
 
@@ -367,20 +349,19 @@ def moving_average(loop: Loop) -> Design:
     phi = least_phi(loop)
     weight, terms = loop.T / (2 * even_damping(loop)), np.array(loop.theta) + 1
     coupling = MovingAverage(weight, terms.tolist(), RESERVE / (1 - RESERVE) * terms**2 * weight)
-    requirement = _verified(loop, coupling, phi)
-    total = float(coupling.stiffness.sum())
-    return Design(
-        coupling, "any-environment", "stiffness", total, requirement, 0, time.perf_counter() - started, phi=phi
-    )
+    return _verified(loop, coupling, phi, "stiffness", float(coupling.stiffness.sum()), 0, started)
 
 
-def _verified(loop: Loop, coupling: SpringDamper | MovingAverage, phi: Array | None) -> Requirement:
-    """Theorem 4's requirement from the coupling alone; raises DesignFailed unless it is certified."""
+def _verified(
+    loop: Loop, coupling: Coupling, phi: Array | None, figure: str, objective: float, sdps: int, started: float
+) -> Design:
+    """The design, with Theorem 4's requirement from the coupling alone; raises DesignFailed unless it is certified."""
     requirement = ANY_ENVIRONMENT.required(loop, coupling, phi)
     if not requirement.certified:
         why = requirement.reason or f"it requires {max(requirement.required):.6g} N s/m"
         raise DesignFailed(None, (), f"the designed coupling is not certified by any_environment: {why}")
-    return requirement
+    wall_s = time.perf_counter() - started
+    return Design(coupling, "any-environment", figure, objective, requirement, sdps, wall_s, phi=phi)
 
 
 def _coupling(loop: Loop, gains: Array) -> SpringDamper:
@@ -388,8 +369,8 @@ def _coupling(loop: Loop, gains: Array) -> SpringDamper:
     return SpringDamper(k * spend / loop.T, np.where(b < _NEGLIGIBLE, 0.0, b) * spend)
 
 
-def _start(loop: Loop, certified: GainSet, start: SpringDamper | None) -> tuple[Array, int]:
-    """The gains of the set nearest to `start`, or the stiffest of the set; and the number of convex problems, one."""
+def _start(loop: Loop, certified: GainSet, start: SpringDamper | None) -> Array:
+    """The gains of the set nearest to `start`, or the stiffest of the set."""
     N, more = loop.channels, []
     cost = np.repeat([-1.0, 0.0], N)
     if start is not None:  # of least t with |gains - wanted| <= t
@@ -406,4 +387,4 @@ def _start(loop: Loop, certified: GainSet, start: SpringDamper | None) -> tuple[
     except Infeasible as error:
         line = f"Theorem 4 admits no spring-damper with theta = {loop.theta}, psi = {loop.psi}, delta = {loop.delta}"
         raise Infeasible(error.problem, error.results, line) from error
-    return x[: 2 * N], 1
+    return x[: 2 * N]

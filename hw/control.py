@@ -262,12 +262,6 @@ class Drive:
 # couplings that are certified for a link
 
 
-def link_delay(ages: monitor.Ages, T_us: float, quantile: float, guard_us: float) -> int:
-    """Ticks from a sample to its latch: what a fraction of the answers keeps, with a guard, and at least one."""
-    needed = ages.quantile(quantile) + guard_us
-    return max(1, int(-(-needed // T_us)))
-
-
 def timed(
     scenario: Scenario, ages: monitor.Ages, quantile: float, guard_us: float, at_once: bool = False
 ) -> tuple[Scenario, int]:
@@ -282,7 +276,7 @@ def timed(
     if longest > 1e6 * known:
         scenario = scenario.replace(T_max=1e-6 * longest)
     if not at_once:
-        return scenario, link_delay(ages, T_us, quantile, guard_us)
+        return scenario, ages.link_delay(T_us, quantile, guard_us)
     least, most = max(0.0, min(ages.values) - guard_us), ages.quantile(quantile) + guard_us
     if most >= min((T_us, *ages.ticks)):
         raise SafetyStop(f"answers come up to {most:.0f} us after their tick, T is {T_us:g} us: latch at ticks")
@@ -411,7 +405,7 @@ def certified_coupling(
         chosen = choose(slower, case, name, condition, limiter) if own is None else given(own)
     except DesignFailed as error:
         raise SafetyStop(f"no coupling for a link of {link} tick{'s' if link > 1 else ''}: {error}") from None
-    requirements = assess(slower.loop(case), chosen.coupling, chosen.phi, own=chosen.own)
+    requirements = assess(slower.loop(case), chosen.coupling, own=chosen.own)
     limits = limits_of(slower, chosen, requirements, limiter)
     waits = min(MAX_THETA, *slower.theta) if link else 0  # what is longer, the host waits for
     made = CertifiedCoupling(waits, slower, case, chosen, requirements, limits)

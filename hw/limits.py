@@ -148,6 +148,52 @@ class SafetyLimits:
                 speed = abs(now - then) / seconds
                 raise SafetyStop(f"axis {i} moves at {speed:.3g} m/s, allowed are {self.speed:g} m/s while forces act")
 
+    def objections(self, info: Info, scenario: Scenario, baud: int | None) -> list[str]:
+        """Why this device may not run this scenario over this line; empty where all is right. baud None: no UART."""
+        if info.version != PROTOCOL:
+            spoken = f"the device speaks version {info.version} of the protocol, this host version {PROTOCOL}"
+            return [f"{spoken}: give it the firmware of this version (hw/firmware)"]
+        m = scenario.channels
+        if info.axes != m:
+            return [f"the device has {info.axes} ax{'i' if info.axes == 1 else 'e'}s, the scenario {m} channels"]
+        reasons = []
+        period_ns = round(1e9 * scenario.T)
+        if info.period_ns != period_ns:
+            reasons.append(f"the device ticks every {info.period_ns} ns, the scenario's T is {period_ns} ns")
+        if baud is not None:
+            seconds, arithmetic = _wire_time(baud, m)
+            if seconds > scenario.T:
+                more = f"more than T = {1e6 * scenario.T:g} us (of a link without UART say --baud none)"
+                reasons.append(f"one STATE and one FORCE take {arithmetic}, {more}")
+        for i in range(m):
+            if wrong := _impossible(i, info):
+                return [wrong]
+            damping, strongest = 1e-6 * info.osp_damping[i], 1e-6 * info.hard_limit[i] * info.force_step[i]
+            if damping < scenario.delta[i] * (1 - 1e-6):
+                reasons.append(
+                    f"axis {i + 1} guarantees {damping:g} N s/m, the certificate needs delta = {scenario.delta[i]:g}"
+                )
+            reasons += _coarse(i, info, self, scenario.T)
+            if strongest < self.cap[i] * (1 - 1e-3):
+                reasons.append(f"axis {i + 1} can do {strongest:g} N, the force limit is {self.cap[i]:g} N")
+        return reasons
+
+    def configuration(self, info: Info, theta: int) -> Config:
+        """The CONFIG for the device: never more than the host allows itself, nor than the device can do."""
+        T_ns = info.period_ns
+        ramp = max(1, min(0xFF, math.ceil(1000 * _RAMP_US / T_ns)))
+        steps = [1e-6 * step for step in info.force_step]
+        most = [int(cap / step + 1e-9) for cap, step in zip(self.cap, steps, strict=True)]
+        slew = [min(0xFFFF, math.ceil(self.slew * 1e-9 * T_ns / step - 1e-6)) for step in steps]
+        return Config(
+            theta=theta,
+            hold=max(0, min(_HOLD, MAX_RELEASE_NS // T_ns - ramp)),
+            ramp=ramp,
+            ramp_in=min(0xFFFF, math.ceil(1e9 * self.ramp_in / T_ns)),
+            cap=tuple(map(min, info.hard_limit, most)),
+            slew=tuple(slew),
+        )
+
 
 @dataclass
 class Gain:
@@ -236,37 +282,6 @@ def _wire_time(baud: int, axes: int) -> tuple[float, str]:
     return seconds, f"({up} + {down}) bytes x {_BITS_PER_BYTE} bits / {baud} baud = {1e6 * seconds:.0f} us"
 
 
-def objections(info: Info, scenario: Scenario, limits: SafetyLimits, baud: int | None) -> list[str]:
-    """Why this device may not run this scenario over this line; empty where nothing is wrong. baud None: no UART."""
-    if info.version != PROTOCOL:
-        spoken = f"the device speaks version {info.version} of the protocol, this host version {PROTOCOL}"
-        return [f"{spoken}: give it the firmware of this version (hw/firmware)"]
-    m = scenario.channels
-    if info.axes != m:
-        return [f"the device has {info.axes} ax{'i' if info.axes == 1 else 'e'}s, the scenario {m} channels"]
-    reasons = []
-    period_ns = round(1e9 * scenario.T)
-    if info.period_ns != period_ns:
-        reasons.append(f"the device ticks every {info.period_ns} ns, the scenario's T is {period_ns} ns")
-    if baud is not None:
-        seconds, arithmetic = _wire_time(baud, m)
-        if seconds > scenario.T:
-            more = f"more than T = {1e6 * scenario.T:g} us (of a link without UART say --baud none)"
-            reasons.append(f"one STATE and one FORCE take {arithmetic}, {more}")
-    for i in range(m):
-        if wrong := _impossible(i, info):
-            return [wrong]
-        damping, strongest = 1e-6 * info.osp_damping[i], 1e-6 * info.hard_limit[i] * info.force_step[i]
-        if damping < scenario.delta[i] * (1 - 1e-6):
-            reasons.append(
-                f"axis {i + 1} guarantees {damping:g} N s/m, the certificate needs delta = {scenario.delta[i]:g}"
-            )
-        reasons += _coarse(i, info, limits, scenario.T)
-        if strongest < limits.cap[i] * (1 - 1e-3):
-            reasons.append(f"axis {i + 1} can do {strongest:g} N, the force limit is {limits.cap[i]:g} N")
-    return reasons
-
-
 def _impossible(i: int, info: Info) -> str | None:
     """Values of axis i that docs/protocol.md does not allow."""
     allowed = {"encoder_step": 0xFFFFFFFF, "force_step": 0xFFFFFFFF, "hard_limit": 0x7FFF, "range": 0x7FFFFFFF}
@@ -303,20 +318,3 @@ def watchdog_for(T: float) -> int:
         most = MAX_RELEASE_NS / 5e9
         raise ValueError(f"T is {T:g} s, a serial link is for at most {most:g} s: the host's watchdog is five ticks")
     return silence
-
-
-def configuration(info: Info, limits: SafetyLimits, theta: int) -> Config:
-    """The CONFIG for the device: never more than the host allows itself, nor than the device can do."""
-    T_ns = info.period_ns
-    ramp = max(1, min(0xFF, math.ceil(1000 * _RAMP_US / T_ns)))
-    steps = [1e-6 * step for step in info.force_step]
-    most = [int(cap / step + 1e-9) for cap, step in zip(limits.cap, steps, strict=True)]
-    slew = [min(0xFFFF, math.ceil(limits.slew * 1e-9 * T_ns / step - 1e-6)) for step in steps]
-    return Config(
-        theta=theta,
-        hold=max(0, min(_HOLD, MAX_RELEASE_NS // T_ns - ramp)),
-        ramp=ramp,
-        ramp_in=min(0xFFFF, math.ceil(1e9 * limits.ramp_in / T_ns)),
-        cap=tuple(map(min, info.hard_limit, most)),
-        slew=tuple(slew),
-    )

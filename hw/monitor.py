@@ -74,6 +74,10 @@ class Ages:
             raise SafetyStop(f"{part:.2g} % of the answers never arrived: no delay keeps {100 * q:g} % (--quantile)")
         return ordered[place]
 
+    def link_delay(self, T_us: float, q: float, guard_us: float) -> int:
+        """Ticks from a sample to its latch: what a fraction q of the answers keeps, with a guard, and at least one."""
+        return max(1, int(-(-(self.quantile(q) + guard_us) // T_us)))
+
     @property
     def median(self) -> int:
         """Of those that arrived [us]."""

@@ -61,46 +61,45 @@ class Recorder:
         rows = np.frombuffer(bytes(self._rows), self._row)
         return {name: rows[name] for name in rows.dtype.names or ()}
 
+    def steady_ticks(self, force_step: Sequence[float], cap: Sequence[float]) -> list[list[int]]:
+        """[first, stop) of each arming in which the loop was one linear loop: full gain, until cap or slew rate cuts.
 
-def steady_ticks(recorder: Recorder, force_step: Sequence[float], cap: Sequence[float]) -> list[list[int]]:
-    """[first, stop) of each arming in which the loop was one linear loop: full gain, until a cap or the slew rate cuts.
+        Missed ticks are not left out. `force_step` and `cap` (m,) [N].
+        """
+        link = self.link()
+        asked = -np.round(link["asked"] / np.array(force_step))
+        cut = link["received"] & np.any((link["sent"] != asked) | (np.abs(link["asked"]) >= cap), axis=1)
+        stretches = []
+        for arming in np.unique(link["arming"]):
+            full = np.flatnonzero((link["arming"] == arming) & (link["gain"] == 1.0))
+            if full.size:
+                count = int(np.argmax(cut[full])) if cut[full].any() else full.size
+                stretches.append([int(full[0]), int(full[0]) + count])
+        return stretches
 
-    Missed ticks are not left out. `force_step` and `cap` (m,) [N].
-    """
-    link = recorder.link()
-    asked = -np.round(link["asked"] / np.array(force_step))
-    cut = link["received"] & np.any((link["sent"] != asked) | (np.abs(link["asked"]) >= cap), axis=1)
-    stretches = []
-    for arming in np.unique(link["arming"]):
-        full = np.flatnonzero((link["arming"] == arming) & (link["gain"] == 1.0))
-        if full.size:
-            count = int(np.argmax(cut[full])) if cut[full].any() else full.size
-            stretches.append([int(full[0]), int(full[0]) + count])
-    return stretches
+    def trace(self, units: Units, T: float, meta: dict[str, Any]) -> Trace:
+        """The trace in the terms of sim.run. Handles and outside forces are not measured: nan, and no column."""
+        link = self.link()
+        n, m = len(self), self.channels
+        last = np.maximum.accumulate(
+            np.where(link["received"], np.arange(n), 0)
+        )  # a force is held until the next is known
+        f = -link["applied"][last] * np.array(units.force_step)
+        unknown = np.full((n, m), np.nan)
+        t = np.arange(n, dtype=float) * T
+        return Trace(t, link["x"], f, unknown, unknown, np.zeros((n, 0)), meta)
 
+    def save(self, path: Path, result: Trace) -> Path:
+        """An npz that sim.trace reads, with the arrays of _LINK beside its own."""
+        recorded = self.link()
+        link = {f"link_{name}": recorded[name] for name in _LINK}
+        own = {name: getattr(result, name) for name in ("t", "x", "f", "x_handle", "v_handle", "w")}
+        arrays: dict[str, Any] = {**own, **link, "meta": np.array(json.dumps(result.meta))}
 
-def result_of(recorder: Recorder, units: Units, T: float, meta: dict[str, Any]) -> Trace:
-    """The trace in the terms of sim.run. Handles and outside forces are not measured: nan, and no column."""
-    link = recorder.link()
-    n, m = len(recorder), recorder.channels
-    last = np.maximum.accumulate(np.where(link["received"], np.arange(n), 0))  # a force is held until the next is known
-    f = -link["applied"][last] * np.array(units.force_step)
-    unknown = np.full((n, m), np.nan)
-    t = np.arange(n, dtype=float) * T
-    return Trace(t, link["x"], f, unknown, unknown, np.zeros((n, 0)), meta)
+        def content(file: BinaryIO) -> None:
+            np.savez_compressed(file, allow_pickle=False, digest=np.array(_digest(arrays)), **arrays)
 
-
-def save_npz(path: Path, result: Trace, recorder: Recorder) -> Path:
-    """An npz that sim.trace reads, with the arrays of _LINK beside its own."""
-    recorded = recorder.link()
-    link = {f"link_{name}": recorded[name] for name in _LINK}
-    own = {name: getattr(result, name) for name in ("t", "x", "f", "x_handle", "v_handle", "w")}
-    arrays: dict[str, Any] = {**own, **link, "meta": np.array(json.dumps(result.meta))}
-
-    def content(file: BinaryIO) -> None:
-        np.savez_compressed(file, allow_pickle=False, digest=np.array(_digest(arrays)), **arrays)
-
-    return write(path, content)
+        return write(path, content)
 
 
 def _digest(arrays: Mapping[str, Array]) -> str:

@@ -26,7 +26,7 @@ from hw.haptic_device import PortLost, SerialDevice
 from hw.limits import ENDED, Stage
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import Phase
-from hw.recording import Recorder, result_of
+from hw.recording import Recorder
 from hw.session import Driver, Operator, Said, Session, session_for
 from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from sim.trace import Trace
@@ -321,6 +321,6 @@ def _outcome(
         coupling=first and first.chosen.coupling,
         requirements=first.requirements if first else {},
         guarantee=guarantee_of(first.requirements, first.scenario.loop(first.case)) if first else None,
-        result=result_of(recorder, session.units, scenario.T, meta) if ran and len(recorder) else None,
+        result=recorder.trace(session.units, scenario.T, meta) if ran and len(recorder) else None,
         zero_after=rehearsal.zero_after(stopped[0]) if stopped and ran else None,
     )

@@ -22,8 +22,6 @@ from hw.limits import (
     SafetyLimits,
     Stage,
     Units,
-    configuration,
-    objections,
     probe_delay,
     watchdog_for,
 )
@@ -228,7 +226,7 @@ class Session:
         return self._end(Stage.LOST, f"no answer to {question} within {waited:.1f} s{noise}")
 
     def _on_info(self, info: wire.Info) -> Said:
-        if reasons := objections(info, self.scenario, self.limits, self.settings.baud):
+        if reasons := self.limits.objections(info, self.scenario, self.settings.baud):
             return self._end(Stage.REFUSED, "; ".join(reasons))
         self.info, self._units = info, Units.of(info)
         name = "".join(c if c.isprintable() else "?" for c in info.firmware) or "device"
@@ -247,7 +245,7 @@ class Session:
     def _configure(self, theta: int, cause: str) -> Said:
         assert self.info
         self._enter(Stage.CONFIGURING, cause)
-        self.config = configuration(self.info, self.limits, theta)
+        self.config = self.limits.configuration(self.info, theta)
         return ()
 
     def _take(self, index: int, cause: str) -> Said:

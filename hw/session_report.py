@@ -16,7 +16,7 @@ from controller.budget import BudgetFigures
 from design.files import plain, unseen, write_json
 from hw.control import CertifiedCoupling, ProgramFigures
 from hw.protocol import NO_MARGIN
-from hw.recording import Recipe, Recorder, result_of, save_npz, steady_ticks
+from hw.recording import Recipe, Recorder
 from hw.session import Session
 from sim.scenario import InputError
 from sim.trace import Growth, growths
@@ -147,10 +147,10 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     steady, ticks, T = list[list[int]](), len(recorder), session.scenario.T
     if coupled := isinstance(session.program, CertifiedCoupling):
         program = session.program.figures(session.limits.cap)
-        steady = steady_ticks(recorder, session.units.force_step, session.limits.cap) if ticks else []
+        steady = recorder.steady_ticks(session.units.force_step, session.limits.cap) if ticks else []
     step = list(session.units.encoder_step) if ticks else None
     ran = _Ran(ticks, ticks * T, T, session.scenario.digest, pace, step, steady)
-    trace = result_of(recorder, session.units, T, {"run": asdict(ran)}) if coupled and ticks else None
+    trace = recorder.trace(session.units, T, {"run": asdict(ran)}) if coupled and ticks else None
     return SessionReport(
         case,
         session.scenario.name,
@@ -172,8 +172,8 @@ def save(out: Path, session: Session, recorder: Recorder, report: SessionReport,
     files = []
     if len(recorder):
         replay = [Recipe.of(arming, session.limits, session.units) for arming in session.armings]
-        result = result_of(recorder, session.units, session.scenario.T, plain(report) | {"replay": replay})
-        files += [save_npz(out / "trace.npz", result, recorder), result.save_csv(out / "trace.csv")]
+        result = recorder.trace(session.units, session.scenario.T, plain(report) | {"replay": replay})
+        files += [recorder.save(out / "trace.npz", result), result.save_csv(out / "trace.csv")]
         if plot:
             from sim.plots import plot_run
 

@@ -9,18 +9,28 @@ from dataclasses import dataclass
 import cvxpy as cp
 import numpy as np
 
+from controller.delay import delay
 from controller.lti import Array, Lti, taps
-from design.conditions import dampings
+from design.conditions import dampings, regular_part
 from design.lmi import (
     Ports,
     balanced,
     check_passive,
-    e_hat_regular,
     lemma1,
     symmetric,
-    unit_coupling,
     unit_environment,
 )
+
+
+def unit_coupling(V: Lti, delta: Sequence[float]) -> Lti:
+    """V where T = 1 and Delta_D = I: Delta_D^1/2 V Delta_D^1/2 / T, so that E V keeps its eigenvalues."""
+    root = np.sqrt(np.asarray(delta))
+    return Lti(V.A, V.B * root, root[:, None] / V.T * V.C, root[:, None] / V.T * V.D * root, 1.0)
+
+
+def e_hat_regular(E: Lti, psi: Sequence[int]) -> Lti:
+    """E-hat less its pole at z = 1, plus E(1)/2; E(1) must be symmetric and >= 0."""
+    return regular_part(delay(psi, E.T) @ E)
 
 
 def theta_hat(theta: Sequence[int]) -> Lti:

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from hw.control import CertifiedCoupling, certified_couplings, link_delay
+from hw.control import CertifiedCoupling, certified_couplings
 from hw.emulator import Emulator, FaultInjection, info_of
 from hw.limits import ENDED, SafetyLimits, Stage
 from hw.monitor import Ages, LinkSettings
@@ -306,7 +306,7 @@ def _plan(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) 
     def plan(ages: Ages) -> tuple[CertifiedCoupling, ...]:
         if not case.designed:
             return made[:1]
-        link = link_delay(ages, 1e6 * scenario.T, 0.99, 100.0)
+        link = ages.link_delay(1e6 * scenario.T, 0.99, 100.0)
         if (link, case.coupling) == (1, None):
             return made
         return certified_couplings(scenario, "I", case.coupling, None, link, spare=0)

@@ -3,7 +3,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
-from analysis import analysis, solve, theta_hat, v_hat_ports
+from analysis import analysis, e_hat_regular, solve, theta_hat, unit_coupling, v_hat_ports
 from asked import any_environment
 from worlds import DELTA, FIGURE_4, T
 
@@ -16,11 +16,9 @@ from design.frequency import frequencies, hermitian, on_circle
 from design.lmi import (
     Ports,
     balanced,
-    e_hat_regular,
     lemma1,
     lemma2,
     lemma3,
-    unit_coupling,
     unit_environment,
 )
 

@@ -19,6 +19,7 @@ from controller.coupling import ForceFilter, NoCoupling, SpringDamper, basis
 from controller.environment import Network, Spring
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
+from design import program
 from design.barrier import EntryInequality, MatrixInequality, Program, centre
 from design.bound import BoundBeside, _causal, bound
 from design.certificate import verify
@@ -428,19 +429,31 @@ def test_the_barrier_finds_what_a_cone_solver_finds():
 
 
 def test_an_inequality_by_entries_is_the_one_that_is_written_out():
-    """He[root X root], each entry of X a sum of two functions, and a further unknown that makes it positive."""
+    """He[left X right], each entry of X a sum of two functions, and a further unknown that makes it positive."""
     rng = np.random.default_rng(4)
-    k, r, root = 5, 3, np.array([1.0, 2.0, 0.5])
-    functions = rng.normal(size=(k, 2)) + 1j * rng.normal(size=(k, 2))
-    units = np.eye(r * r).reshape(r * r, 1, r, r) * np.outer(root, root)
-    entries = hermitian((functions[:, None, :, None, None] * units).reshape(k, -1, r, r))
-    further = np.tile(np.eye(r, dtype=complex), (k, 1, 1, 1))
-    dense = MatrixInequality.of(np.zeros((k, r, r), dtype=complex), np.concatenate([entries, further], axis=1))
-    split = EntryInequality(functions, root, dense.slope[:, :, -1:])
-    x = np.append(rng.normal(size=2 * r * r), 30.0)
+    k, r = 5, 3
+    functions, left, right = (rng.normal(size=(k, *s)) + 1j * rng.normal(size=(k, *s)) for s in ((2,), (r, r), (r, r)))
+    units = left[:, None] @ np.eye(r * r).reshape(r * r, r, r) @ right[:, None]
+    entries = hermitian((functions[:, None, :, None, None] * units[:, :, None]).reshape(k, -1, r, r))
+    one = np.tile(np.eye(r, dtype=complex), (k, 1, 1, 1))
+    dense = MatrixInequality.of(one[:, 0], np.concatenate([entries, one], axis=1))
+    split = EntryInequality(dense.constant, functions, left, right, dense.slope[:, :, -1:])
+    x = np.append(rng.normal(size=2 * r * r), 100.0)
     np.testing.assert_allclose(split.at(x), dense.at(x), atol=1e-12)
     for one, other in zip(split.newton(x), dense.newton(x), strict=True):
         np.testing.assert_allclose(np.triu(one), np.triu(other), atol=1e-12)
+
+
+def test_three_devices_by_entries_are_those_of_the_dense_program(monkeypatch):
+    loop = loop_of("n5")
+    case = program.Case(loop, loop.E(), (program.this_environment(loop),))
+    problem = Problem(span_of(loop.E(), 3, 2), (case,), Options(), 0.05)
+    found = [problem.solve(problem.start(0.3))]
+    monkeypatch.setattr(Problem, "_entries", False)
+    found.append(problem.solve(problem.start(0.3)))
+    A, b, _ = problem.objective()
+    one, other = (np.linalg.norm(A @ x - b) for x in found)
+    assert one == pytest.approx(other, rel=0.005)
 
 
 ORDINARY = {
@@ -564,11 +577,11 @@ def test_what_no_filter_can_be(poles, pairs, R, message):
 
 
 def test_a_basis_has_more_for_few_than_for_many():
-    five, eight = (span_of(loop_of(n).E(), 4, 3) for n in ("o09", "n8"))
-    assert isinstance(five, Span)
-    assert five.used.all()
-    assert eight.used.shape[2] == 9
-    assert eight.used[:, :, 8].all()
+    eight, beside = (span_of(loop_of("n8").E(), 4, 3, full=most) for most in (8, 5))
+    assert isinstance(eight, Span)
+    assert eight.used.all()
+    assert beside.used.shape[2] == 9
+    assert beside.used[:, :, 8].all()
 
 
 def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):

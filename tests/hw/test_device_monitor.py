@@ -24,7 +24,7 @@ from hw.monitor import (
     _ClockDrift,
 )
 from hw.protocol import NO_MARGIN, Command, Config, Force, Phase, Reason, Refused, SafetyStop, State, Stop, encode
-from hw.recording import Recorder, result_of
+from hw.recording import Recorder
 from hw.rehearsal import Rehearsal
 from hw.session import Driver, Session, _check_state
 from hw.session_report import outcome
@@ -317,7 +317,7 @@ def test_an_identification_closes_no_loop_that_could_grow(scenario):
     report = outcome("identify", session, recorder, 0)
     assert len(recorder) > 400
     assert report.growth == report.run.steady_ticks == []
-    assert growths(result_of(recorder, session.units, scenario.T, plain(report))) == []
+    assert growths(recorder.trace(session.units, scenario.T, plain(report))) == []
 
 
 def test_an_estop_is_repeated_where_nobody_says_that_it_was_heard(scenario):

@@ -15,8 +15,6 @@ from hw.limits import (
     Stage,
     Units,
     _wire_time,
-    configuration,
-    objections,
     probe_delay,
     watchdog_for,
 )
@@ -96,10 +94,10 @@ def test_limits_cannot_be_loosened(field, least, most):
 
 def test_what_a_device_is_told_is_what_the_limits_say():
     """0.25 s and 2000 N/s in ticks of 1.2 ms and steps of 0.4 mN; 4 ticks held and 5 ms to zero."""
-    config = configuration(INFO, SafetyLimits((12.0, 3.0)), 2)
+    config = SafetyLimits((12.0, 3.0)).configuration(INFO, 2)
     assert (config.theta, config.hold, config.ramp, config.ramp_in) == (2, 4, 5, 209)
     assert (config.cap, config.slew) == ((30_000, 7500), (6000, 6000))
-    slow = configuration(INFO._replace(period_ns=10_000_000), SafetyLimits((12.0, 3.0)), 0)
+    slow = SafetyLimits((12.0, 3.0)).configuration(INFO._replace(period_ns=10_000_000), 0)
     assert (slow.hold, slow.ramp, slow.ramp_in) == (1, 1, 25)  # 20 ms without a force are the most
 
 
@@ -169,7 +167,7 @@ def test_wire_time_is_what_the_frames_take(baud, microseconds):
 
 
 def test_115200_baud_is_refused_with_the_arithmetic():
-    reasons = objections(INFO, load(), SafetyLimits((12.0, 12.0)), 115_200)
+    reasons = SafetyLimits((12.0, 12.0)).objections(INFO, load(), 115_200)
     assert reasons == [
         "one STATE and one FORCE take (32 + 16) bytes x 10 bits / 115200 baud = 4167 us, more than T = 1200 us "
         "(of a link without UART say --baud none)"
@@ -177,12 +175,12 @@ def test_115200_baud_is_refused_with_the_arithmetic():
 
 
 def test_a_fitting_device_meets_no_objection():
-    assert objections(INFO, load(), SafetyLimits((12.0, 12.0)), 921_600) == []
+    assert SafetyLimits((12.0, 12.0)).objections(INFO, load(), 921_600) == []
 
 
 def test_every_objection_is_named():
     poor = INFO._replace(period_ns=10**6, osp_damping=(1_370_000, 10**6), hard_limit=(15000, 30000))
-    reasons = objections(poor, load(), SafetyLimits((12.0, 12.0)), 115_200)
+    reasons = SafetyLimits((12.0, 12.0)).objections(poor, load(), 115_200)
     assert len(reasons) == 4
     for reason, word in zip(reasons, ("1000000 ns", "baud", "axis 1 can do 6 N", "axis 2 guarantees 1"), strict=True):
         assert word in reason
@@ -190,7 +188,7 @@ def test_every_objection_is_named():
 
 @given(st.integers(100_000, 20_000_000))
 def test_the_configuration_never_exceeds_the_protocol(period_ns):
-    config = configuration(INFO._replace(period_ns=period_ns), LIMITS, 1)
+    config = LIMITS.configuration(INFO._replace(period_ns=period_ns), 1)
     encode(config)  # raises where a field cannot travel
     assert config.cap == (30000, 15000)  # 12 N and 6 N in steps of 0.4 mN
     assert (config.hold + config.ramp) * period_ns <= MAX_RELEASE_NS
@@ -228,14 +226,14 @@ def test_the_probe_is_the_longest_delay_whose_margin_can_be_told():
     ],
 )
 def test_a_device_too_coarse_or_impossible_is_refused(change, reason):
-    assert any(reason in one for one in objections(INFO._replace(**change), load(), SafetyLimits((12.0, 12.0)), None))
+    assert any(reason in one for one in SafetyLimits((12.0, 12.0)).objections(INFO._replace(**change), load(), None))
 
 
 def test_a_force_step_is_never_more_than_the_slew_limit():
     """Else one step, the least that can be sent, would be the jump that the limit is there against."""
     slow = SafetyLimits((12.0, 12.0), slew=100.0)  # 0.12 N in a tick
-    assert objections(INFO._replace(force_step=(100_000, 100_000), hard_limit=(120, 120)), load(), slow, None) == []
-    (reason,) = objections(INFO._replace(force_step=(130_000, 100_000), hard_limit=(120, 120)), load(), slow, None)
+    assert slow.objections(INFO._replace(force_step=(100_000, 100_000), hard_limit=(120, 120)), load(), None) == []
+    (reason,) = slow.objections(INFO._replace(force_step=(130_000, 100_000), hard_limit=(120, 120)), load(), None)
     assert "0.13 N, at most 0.12 N" in reason
 
 
@@ -364,7 +362,7 @@ def test_a_force_step_is_judged_by_what_the_output_can_really_do():
     """Eight bits of PWM for 12 N: fine for a cap of 2 N, too coarse for one of 0.5 N; twelve bits are not."""
     eight = INFO._replace(force_step=(47_059,) * 2, hard_limit=(255,) * 2)
     twelve = INFO._replace(force_step=(2930,) * 2, hard_limit=(4095,) * 2)
-    assert objections(eight, load(), SafetyLimits((2.0, 2.0)), None) == []
-    coarse = objections(eight, load(), SafetyLimits((0.5, 0.5)), None)
+    assert SafetyLimits((2.0, 2.0)).objections(eight, load(), None) == []
+    coarse = SafetyLimits((0.5, 0.5)).objections(eight, load(), None)
     assert coarse[0] == "one force step of axis 1 is 0.047059 N, at most 0.03125 N is allowed"
-    assert objections(twelve, load(), SafetyLimits((0.5, 0.5)), None) == []
+    assert SafetyLimits((0.5, 0.5)).objections(twelve, load(), None) == []

@@ -17,7 +17,7 @@ from design.files import plain
 from hw.control import CertifiedCoupling, certified_coupling, fill
 from hw.emulator import Emulator
 from hw.limits import SafetyLimits, Stage, Units
-from hw.recording import Recorder, _digest, _recipes_of, load, replay, result_of, save_npz, steady_ticks
+from hw.recording import Recorder, _digest, _recipes_of, load, replay
 from hw.rehearsal import Rehearsal
 from hw.session import Session
 from hw.session_report import outcome, save
@@ -114,7 +114,7 @@ def test_a_trace_whose_recipe_is_broken_is_bad_input(trace, tmp_path):
     broken = Trace(
         result.t, result.x, result.f, result.x_handle, result.v_handle, result.w, result.meta | {"replay": {}}
     )
-    path = save_npz(tmp_path / "trace.npz", broken, trace[1])
+    path = trace[1].save(tmp_path / "trace.npz", broken)
     with pytest.raises(InputError, match="cannot be replayed"):
         replay(*load(path))
 
@@ -204,7 +204,7 @@ def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
 
     session.record = record
     Rehearsal(session, Emulator(scenario), lambda ages: rungs).run_until_armed(1.2)
-    ((first, stop),) = steady_ticks(recorder, session.units.force_step, session.limits.cap)
+    ((first, stop),) = recorder.steady_ticks(session.units.force_step, session.limits.cap)
     assert (recorder.link()["gain"][first:] == 1.0).all()
     full = np.diff(cuts, prepend=0)[first:]
     assert 0 <= stop - first - int(np.argmax(full > 0)) <= 2
@@ -272,6 +272,6 @@ def test_result_of_holds_the_last_known_force(trace):
     """Where no STATE came, the trace shows the force that was known last."""
     _, recorder = trace
     link = recorder.link()
-    result = result_of(recorder, Units((1e-6,) * 2, (4e-4,) * 2, (10**5,) * 2), 1.2e-3, {})
+    result = recorder.trace(Units((1e-6,) * 2, (4e-4,) * 2, (10**5,) * 2), 1.2e-3, {})
     k = int(np.flatnonzero(~link["received"])[0])
     np.testing.assert_array_equal(result.f[k], result.f[k - 1])

@@ -12,13 +12,13 @@ from cli import bridge
 from controller.law import Law
 from design.coupling_file import Stored
 from design.coupling_file import save as save_coupling
-from hw.control import HostController, certified_coupling, certified_couplings, link_delay
+from hw.control import HostController, certified_coupling, certified_couplings
 from hw.emulator import Emulator, FaultInjection
 from hw.haptic_device import SerialDevice
 from hw.limits import SafetyLimits, Stage
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import Command, Decoder, Force, Hello, Phase, SafetyStop, State, Stop, encode
-from hw.recording import Recorder, _recipes_of, load, replay, result_of
+from hw.recording import Recorder, _recipes_of, load, replay
 from hw.rehearsal import Rehearsal
 from hw.session import Driver, Session
 from hw.session_report import outcome, save
@@ -208,7 +208,7 @@ def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
     [([130] * 100, 1), ([1150] * 100, 2), ([130] * 995 + [9000] * 5, 1), ([130] * 900 + [2000] * 100, 2)],
 )
 def test_theta_is_a_quantile_with_a_guard_not_the_maximum(ages, expected):
-    assert link_delay(Ages(tuple(ages)), 1200.0, 0.99, 100.0) == expected
+    assert Ages(tuple(ages)).link_delay(1200.0, 0.99, 100.0) == expected
 
 
 def test_softer_couplings_are_softer_and_certified(scenario, rungs):
@@ -411,7 +411,7 @@ def test_a_thief_under_the_bridge_is_limited_and_hands_get_no_more_than_the_budg
         (part,) = report.energy_budget
         path = save(tmp_path, run.session, recorder, report, False)[0]
         assert replay(*load(path)).identical
-        trace = result_of(recorder, run.session.units, scenario.T, {})
+        trace = recorder.trace(run.session.units, scenario.T, {})
         dx = np.diff(trace.x, axis=0)
         lost = (dx**2 * np.array(scenario.delta)).sum(axis=1) / scenario.T
         taken[budget] = np.cumsum(-(trace.f[:-1] * dx).sum(axis=1) - lost).max()

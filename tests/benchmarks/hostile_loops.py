@@ -1,0 +1,85 @@
+"""Random loops at the ends of what devices and objects are: is each one answered, proved, and how close to the bound?
+
+    PYTHONPATH=. python tests/benchmarks/hostile_loops.py --count 20 --seed 1
+
+One to three devices, delays 0 to 16 and inside the object 0 to 2 samples, dampings of .02 to 5 N s/m, masses of 1 g to
+100 kg, stiffnesses of .01 to 1e6 N/m, dampings of the object from none to a critical one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+
+from controller.environment import GROUND, Network, Spring
+from controller.loop import Loop
+from design.bound import bound
+from design.optimal import design
+
+
+def hostile(rng: np.random.Generator) -> Loop:
+    """A loop with every figure drawn evenly, those with units in their logarithms."""
+
+    def drawn(low: float, high: float) -> float:
+        return float(f"{np.exp(rng.uniform(np.log(low), np.log(high))):.3g}")
+
+    m = int(rng.integers(1, 4))
+    names = "abc"[:m]
+    inner = [f"n{i}" for i in range(int(rng.integers(0, 4)))]
+    masses = {name: drawn(1e-3, 100.0) for name in inner}
+    places = [*names, *inner, GROUND]
+
+    def spring(one: str, other: str) -> Spring:
+        stiffness = drawn(1e-2, 1e6)
+        weight = min((masses[name] for name in (one, other) if name in masses), default=0.1)
+        damping = rng.choice([0.0, 0.001, 0.02, 1.0]) * 2 * np.sqrt(stiffness * weight)
+        return Spring((one, other), stiffness, float(f"{damping:.3g}"))
+
+    chain = [*names[:1], *inner, *names[1:]] if len(names) + len(inner) > 1 else [names, GROUND]
+    springs = [spring(one, other) for one, other in pairwise(chain)]
+    for _ in range(int(rng.integers(0, 3))):
+        one, other = rng.choice(len(places), 2, replace=False)
+        springs.append(spring(places[one], places[other]))
+    theta, psi = (tuple(int(v) for v in rng.integers(0, most + 1, m)) for most in (16, 2))
+    late = tuple(t + p for t, p in zip(theta, psi, strict=True))
+    delta = tuple(drawn(0.02, 5.0) for _ in range(m))
+    period = float(rng.choice([5e-4, 1e-3, 2e-3]))
+    return Loop(period, theta, psi, late, delta, Network(contacts=tuple(names), springs=tuple(springs), masses=masses))
+
+
+def loops(count: int, seed: int) -> Iterator[tuple[int, Loop]]:
+    """So many, by their seeds."""
+    for number in range(seed, seed + count):
+        yield number, hostile(np.random.default_rng(number))
+
+
+def main() -> None:
+    """Print a line per loop; exit with 1 where one is not answered or not proved."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--bound", action="store_true", help="what any linear coupling can reach, too")
+    args, missed = parser.parse_args(), 0
+    for number, loop in loops(args.count, args.seed):
+        started = time.process_time()
+        found = design(loop)
+        seconds = time.process_time() - started
+        reached = 20 * np.log10(max(found.figures.rms_mismatch, 1e-9))
+        least = 20 * np.log10(max(bound(loop).value, 1e-9)) if args.bound else np.nan
+        missed += not found.proved
+        delays = f"{','.join(map(str, loop.theta))}/{','.join(map(str, loop.psi))}"
+        kind, told = type(found.coupling).__name__, found.reason or "proved"
+        figures = f"{reached:8.2f} dB, bound {least:8.2f}, g {found.g:.3f}"
+        print(
+            f"{number:5d} {delays:16s} {figures} {kind:13s} {found.states:4d} states {seconds:5.1f} s  {told}",
+            flush=True,
+        )
+    raise SystemExit(missed > 0)
+
+
+if __name__ == "__main__":
+    main()
