@@ -88,7 +88,7 @@ def add_optimal_options(parser: options.Parser, title: str) -> None:
     parser.add_band(to=group)
     gain = "limit of |F|/|E| above 100 Hz (default none: the force there is kept low, not limited)"
     group.add_argument("--high-gain", type=options.number(), metavar="G", help=gain)
-    limit = "begin no larger basis after this time [s] (default 60)"
+    limit = "no basis beyond the first after this time [s]; ranges are searched for a fifth of it at least (default 60)"
     group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
     parser.add_older_optimal(to=group)
 
@@ -159,7 +159,7 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
 def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Judged:
     """What each condition asks of the coupling, by a sweep and an exact proof, and the limiter that it may have."""
     held, searched = design.certificate, design.searched if isinstance(design, Optimal) else None
-    requirements = assess(loop, design.coupling, design.phi, held, own=design.own)
+    requirements = assess(loop, design.coupling, held, own=design.own)
     samples = SAMPLES if args.samples is None else args.samples
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
         whole = check_ranges(loop, design.coupling, args.seed, samples, move, searched, held)

@@ -119,10 +119,10 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     SingularLoop where their algebraic loop has no solution.
     """
     of_kind("loop", loop, Loop, _LOOP)
-    phi, own = (coupling.phi, coupling.own) if isinstance(coupling, Design) else (None, None)
+    own = coupling.own if isinstance(coupling, Design) else None
     alone = fitting(loop, coupling)
     _, asked = name_and_own(condition)
-    requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi, own=asked or own))
+    requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, own=asked or own))
     if whole := check_ranges(loop, alone, samples=0):
         _, worst = whole.worst if whole.proved else whole.worst_found
         here = requirements[worst.condition].guarantee

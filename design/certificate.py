@@ -16,7 +16,7 @@ import scipy
 from controller.arithmetic import SingularLoop, TooLong, rational, within
 from controller.coupling import Coupling
 from controller.loop import Loop
-from controller.lti import Array, Lti
+from controller.lti import Lti
 from controller.older import AUDITS as OLDER
 from controller.ranges import Member, inside, number_of_vertices
 from design.conditions import Condition, Demand
@@ -205,9 +205,9 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
         states = loop.sent(coupling).order
     except SingularLoop:
         return  # the sweep says where
-    states += 0 if condition is ANY_ENVIRONMENT else sum(loop.theta)
+    members = len(condition.members(loop))
+    states += sum(loop.theta) if members else 0  # what holds in any environment has V's states alone
     require_size(states)
-    members = len(condition.members(loop)) or 1
     if members * states**3 > _MOST_COST * LARGEST**3:
         raise NotProved(f"a proof in {members} environments over {states} states each takes long")
 
@@ -436,14 +436,11 @@ def _block(demand: Demand[Lti]) -> Lti:
 def assess(
     loop: Loop,
     coupling: Coupling,
-    phi: Array | None = None,
     known: Certificate | None = None,
     more: bool = True,
     own: Condition | None = None,
 ) -> dict[str, Requirement]:
-    """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
-
-    Beside those with names that of the user's `own`, if there is one.
+    """Required damping by each condition that has a name, and by the user's `own`, if there is one.
 
     this-environment is about the nominal environment alone (design.coverage.RangesFigures asks for the rest of its
     ranges) and the constant theta (sim.switching.DelaysCovered asks for the rest of its range). What `known`, a
@@ -453,7 +450,7 @@ def assess(
     conditions = (*_NAMED.values(), *([named(own)] if own else []))
     proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
 
-    asked = [(each, each.judge(loop, coupling, phi if each is ANY_ENVIRONMENT else None)) for each in conditions]
+    asked = [(each, each.judge(loop, coupling)) for each in conditions]
 
     def judged(each: Condition, needs: Requirement) -> Requirement:
         if each.name == proved:

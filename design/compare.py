@@ -67,18 +67,19 @@ class Curves:
     demands: dict[str, Array | None] = field(metadata={"json": "table"})  # (k,) required over available damping
 
 
-def judge(loop: Loop, coupling: Coupling, phi: Array | None = None, own: Sequence[Condition] = ()) -> Demands:
+def judge(loop: Loop, coupling: Coupling, own: Sequence[Condition] = ()) -> Demands:
     """Every condition of a coupling, as figures and over frequency, before walls while all touch. Raises SingularLoop.
 
-    `phi` is Theorem 4's multiplier that the coupling was designed with, if any; `own` are conditions of the user's.
+    `own` are conditions of the user's.
     """
-    F, loop = loop.F(coupling), loop.at(loop.environment.frozen()[-1])
+    F, touching = loop.F(coupling), loop.at(loop.environment.frozen()[-1])
     requirements: dict[str, Requirement] = {}
     demands: dict[str, Response | None] = {}
     for each in (*map(named, CONDITIONS), *own):
-        found, _ = each.least_multiplier(loop) if phi is None else (phi, None)
-        needs = requirements[each.name] = each.judge(loop, coupling, found)
-        demands[each.name] = each.over_frequency(loop, coupling, found) if np.isfinite(needs.ratio) else None
+        here = loop.at(loop.environment) if each.beyond(loop.at(loop.environment)) else touching  # refused, or judged
+        needs = requirements[each.name] = each.judge(here, coupling)
+        curve = each.over_frequency(here, coupling, needs.multiplier) if np.isfinite(needs.ratio) else None
+        demands[each.name] = curve
     return Demands(F, requirements, demands)
 
 

@@ -250,7 +250,6 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
 
 
 #: What a loop may have beyond even ticks, constant delays of its forces and one linear environment, by its field.
-#: What a loop may have beyond even ticks, constant delays of its forces and one linear environment, by its field.
 BEYOND = ("psi", "T_max", "latency", "varying_delay", "walls", "ranges")
 
 
@@ -295,7 +294,8 @@ class Condition(ABC):
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         """w (k,) [rad/sample] -> required over available damping there; None for a coupling without such a curve."""
-        return partial(least_scale, self.demand(loop, coupling))
+        more = {} if multiplier is None else {"multiplier": multiplier}
+        return partial(least_scale, self.demand(loop, coupling, **more))
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
         """Required over available damping, (n,), where loop or coupling is a stack; None: ask them one by one."""

@@ -105,7 +105,7 @@ def design_by_kind(
             raise ValueError(f"coupling {kind} is {found!r} for this loop, expected a design.result.Design")
         if own:
             needs = own.judge(loop.at(loop.environment), found.coupling)
-            return replace(found, condition=own.name, own=own, requirement=needs)
+            return replace(found, condition=own.name, own=own, requirement=needs, phi=None)
         if name not in (None, found.condition):
             raise ValueError(f"condition is {condition!r}, but {kind} is designed for {found.condition}")
         return found

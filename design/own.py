@@ -20,12 +20,13 @@ _OTHERS = ("<", f"{sys.prefix}{os.sep}", f"{sys.base_prefix}{os.sep}", *_OURS)
 
 def named(option: str, text: str) -> Any:
     """What `text` names, in a module of the working directory or an installed one. Raises InputError."""
-    module, _, name = text.partition(":")
-    if module.endswith(".py"):  # a file of the working directory, or below it
-        module = module.removeprefix("./").removesuffix(".py").replace("/", ".")
+    module, _, name = text.rpartition(":")
+    file = Path(module).resolve() if module.endswith(".py") else None
+    if file:
+        module = file.stem
     if not all(part.isidentifier() for part in (*module.split("."), name)):
         raise InputError(f"{option} is {text!r}, expected package.module:Name or FILE.py:Name")
-    place = reach_working_directory()
+    place = reach_working_directory(str(file.parent) if file else None)
     try:
         found = import_module(module)
     except ModuleNotFoundError as error:
@@ -35,15 +36,17 @@ def named(option: str, text: str) -> Any:
         raise InputError(f"{option} is {text!r}: {absent}") from None
     except SyntaxError as error:
         raise InputError(f"{option} is {text!r}: {error.filename}, line {error.lineno}: {error.msg}") from None
+    if file and Path(str(found.__file__)).resolve() != file:
+        raise InputError(f"{option} is {text!r}: another module of the name {module} is loaded, rename the file")
     if not hasattr(found, name):
         there = ", ".join(n for n, value in vars(found).items() if getattr(value, "__module__", "") == module)
         raise InputError(f"{option} is {text!r}: {module} has no {name}, but {there or 'no class and no function'}")
     return getattr(found, name)
 
 
-def reach_working_directory() -> str:
-    """Let modules be found in it, as under `python -m`, and as a console script does not."""
-    if (place := os.getcwd()) not in sys.path:
+def reach_working_directory(instead: str | None = None) -> str:
+    """Let modules be found in it, or in another folder, as under `python -m`, and as a console script does not."""
+    if (place := instead or os.getcwd()) not in sys.path:
         sys.path.insert(0, place)
     return place
 

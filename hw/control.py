@@ -405,7 +405,7 @@ def certified_coupling(
         chosen = choose(slower, case, name, condition, limiter) if own is None else given(own)
     except DesignFailed as error:
         raise SafetyStop(f"no coupling for a link of {link} tick{'s' if link > 1 else ''}: {error}") from None
-    requirements = assess(slower.loop(case), chosen.coupling, chosen.phi, own=chosen.own)
+    requirements = assess(slower.loop(case), chosen.coupling, own=chosen.own)
     limits = limits_of(slower, chosen, requirements, limiter)
     waits = min(MAX_THETA, *slower.theta) if link else 0  # what is longer, the host waits for
     made = CertifiedCoupling(waits, slower, case, chosen, requirements, limits)

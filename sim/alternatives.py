@@ -120,7 +120,7 @@ def _alternative(
     except ValueError as error:
         return Alternative(kind, condition, reason=str(error))
     known = chosen.certificate
-    requirements = own.requirements if own else assess(loop, chosen.coupling, chosen.phi, known, False, also)
+    requirements = own.requirements if own else assess(loop, chosen.coupling, known, False, also)
     simulation = assemble(scenario, chosen.coupling, own.limiter.rho if own else _lag(scenario, chosen, requirements))
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)

@@ -126,7 +126,7 @@ class Comparison:
         """Of the couplings chosen, by name; `failed` says what could not be designed."""
         loop = scenario.loop(case)
         own = {c.condition: c.own for c in chosen.values() if c.own}
-        judged = {name: compare.judge(loop, c.coupling, c.phi, [*own.values()]) for name, c in chosen.items()}
+        judged = {name: compare.judge(loop, c.coupling, [*own.values()]) for name, c in chosen.items()}
         hz = compare.grid(loop, list(judged.values()))
         couplings = [ComparedCoupling.of(loop, name, c, judged[name], hz) for name, c in chosen.items()]
         notes = [*(f"{name}: {note}" for name, c in chosen.items() for note in c.notes), *failed]

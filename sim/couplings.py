@@ -138,7 +138,7 @@ def limits_of(
         return Limits(None, "limited forces are proved for constant delays", force_limit=within)
     loop = scenario.loop("I")  # the reference does not matter
     coupling, proof = chosen.coupling, chosen.limiter
-    asked = requirements or assess(loop, coupling, chosen.phi, chosen.certificate, own=chosen.own)
+    asked = requirements or assess(loop, coupling, chosen.certificate, own=chosen.own)
     return covered_limits(loop, coupling, asked, proof, chosen.certificate).within(within)
 
 
@@ -276,6 +276,6 @@ def judge(
 ) -> Judged:
     """The coupling in the scenario's loop; conditions are asked of `met`, one environment of its ranges."""
     whole = check_ranges(scenario.loop(case), chosen.coupling, seed, progress=progress)
-    requirements = assess(met.loop(case), chosen.coupling, chosen.phi, chosen.certificate, own=chosen.own)
+    requirements = assess(met.loop(case), chosen.coupling, chosen.certificate, own=chosen.own)
     limits = limits_of(met, chosen, requirements, limiter)
     return Judged.of(chosen, met.loop(case), requirements, whole, limits)

@@ -214,7 +214,7 @@ def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
 
 def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> PreparedLoop:
     loop = scenario.loop(menu.case)
-    requirements = assess(loop, chosen.coupling, chosen.phi, own=chosen.own)
+    requirements = assess(loop, chosen.coupling, own=chosen.own)
     limits = limits_of(scenario, chosen, requirements, menu.limiter)
     simulation, guarantee = assemble(scenario, chosen.coupling, limits.rho), guarantee_of(requirements, loop)
     return PreparedLoop(menu, label, chosen, simulation, worst_mode(simulation), requirements, guarantee, limits)

@@ -10,6 +10,7 @@ import pytest
 from controller.coupling import Compliance, Coupling, SpringDamper
 from controller.loop import DelayRange
 from controller.lti import Lti, as_like, constant_like, numbers, taps
+from design import compare
 from design.certificate import lag, prove, required_damping, verify
 from design.conditions import BEYOND, Condition, Demand
 from design.coupling_file import Stored, filed, sealed
@@ -17,6 +18,7 @@ from design.environments import SWITCHING, Switching
 from design.files import InputError
 from design.result import NotProved
 from sim import load
+from sim.zwidth import CouplingSweep, EnvironmentSweep
 
 PAIR = load("omega-pair").loop("I")
 SOFT = SpringDamper([400.0, 300.0], [0.1, 0.1])
@@ -104,6 +106,24 @@ def test_a_name_of_ours_is_refused(taken):
     ours = Stored.of(PAIR, SOFT, prove(PAIR, SOFT, "this-environment"))
     if taken == "this-environment":
         assert "condition Steal: its name is" in str(verify(ours, own).reason)
+
+
+def test_a_map_and_a_comparison_ask_it_as_they_ask_ours():
+    """One by one, where ours is asked as a stack; and over frequency."""
+    scenario, K, B = load("omega-pair"), np.array([300.0, 4e3]), np.array([0.1, 1.0])
+    plain, ours = Plain(), "this-environment"
+    sweeps = (
+        CouplingSweep(scenario.device, scenario.population, PAIR, own=plain),
+        EnvironmentSweep(scenario.device, scenario.population, PAIR, SOFT, own=plain),
+    )
+    for sweep in sweeps:
+        np.testing.assert_allclose(sweep.ratios("plain", K, B), sweep.ratios(ours, K, B), rtol=1e-7)
+        assert sweep.decisive == "plain"
+    judged, w = compare.judge(PAIR, SOFT, own=[plain]), np.geomspace(1e-3, 3, 50)
+    np.testing.assert_allclose(judged.demands["plain"](w), judged.demands[ours](w), rtol=1e-12)
+    wall = load("one-wall").loop("I")
+    one = SpringDamper([400.0] * wall.channels, [0.1] * wall.channels)
+    assert "the loop has walls" in compare.judge(wall, one, own=[plain]).requirements["plain"].reason
 
 
 class Shifting(Switching):

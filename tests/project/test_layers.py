@@ -49,17 +49,10 @@ def _tree(path: Path) -> ast.Module:
 
 #: conditions are asked what they say; only their homes know their names
 CONDITIONS = {"any-environment", "this-environment", "ANY_ENVIRONMENT", "THIS_ENVIRONMENT"}
-AT_HOME = (
-    "design/conditions",
-    "design/environments",
-    "design/lmi",
-    "design/result",
-    "design/certificate",
-    "controller/older",
-)
+AT_HOME = ("design/conditions", "design/environments", "design/lmi", "design/result", "controller/older")
 #: where they stand as data: what a design is made for, the rows of a table, the styles of a picture, one figure's key
 NAMED_IN = (
-    *("design/api", "design/compare", "design/designs", "design/fixed_order", "design/optimal", "design/program"),
+    *("design/api", "design/certificate", "design/compare", "design/fixed_order", "design/optimal", "design/program"),
     *("design/spring_damper", "sim/alternatives", "sim/baselines", "sim/map_plot", "sim/plots", "sim/report"),
     *("hw/control", "cli/validate"),
 )
