@@ -295,9 +295,11 @@ def robustness_rows(nearby: Nearby) -> Rows:
 
 def price_words(price: Spread) -> str:
     """What a design for more than one environment reaches and costs."""
-    costs = f"at most {max(price.price_db, 0.0):.2f} dB worse" if math.isfinite(price.price_db) else "not exact"
+    worse = f"at most {price.price_db:.2f} dB worse" if price.price_db >= 0 else f"{-price.price_db:.2f} dB better"
+    costs = worse if math.isfinite(price.price_db) else "not exact"
     proved = f"proved in {price.proved} of {price.environments} environments"
     rest = ", swept in the others" if price.proved < price.environments else ""
+    rest += f" ({price.reason})" if price.reason else ""
     return f"{price.mismatch_db:.2f} dB, {costs}: {proved}{rest}"
 
 
