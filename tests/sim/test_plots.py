@@ -185,7 +185,8 @@ def report(available=(1.37, 1.37), psi=(0, 0)):
     felt = SimpleNamespace(stiffness=np.full((3, 2), 2.0), damping=np.zeros((3, 2)))
     couplings = [coupling("soft", 0.5, 100.0), coupling("stiff", 40.0, 0.0)]
     data = {"frequency_hz": HZ, "available_damping": available, "psi": psi, "ideal": felt}
-    return SimpleNamespace(**data, sigma_E=[[4.0, 2.0]] * 3, couplings=couplings)
+    names = list(couplings[0].conditions)
+    return SimpleNamespace(**data, sigma_E=[[4.0, 2.0]] * 3, couplings=couplings, conditions=names)
 
 
 def test_what_binds_is_marked_on_its_curve_or_above_the_picture(drawn):
