@@ -370,16 +370,19 @@ class Switching(Multiplied):
         return replace(linear, free=free, gain=np.transpose(wide) @ linear.gain @ wide)
 
     def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
-        """h times the largest own force of each device per displacement: the best for springs."""
-        own = np.abs(np.diagonal(G.at(on_circle(frequencies(G, points=60))), axis1=1, axis2=2)).max(axis=0)
-        least = 1e-8 * np.array(self.unknowns(loop).units)
-        return np.maximum(_half_widths(loop) * own, least).tolist()
+        """h times the largest own force of each device per displacement, best for springs; of many a share of it."""
+        w, least = frequencies(G, points=60), 1e-8 * np.array(self.unknowns(loop).units)
+        most = _half_widths(loop) * np.abs(np.diagonal(G.at(on_circle(w)), axis1=1, axis2=2)).max(axis=0)
+        shares = _SHARES if 2 * loop.channels > _MOST_ROWS else (1.0,)
+        tried = [np.maximum(share * most, least).tolist() for share in shares]
+        return min(tried, key=lambda alpha: float(least_scale(self.block(G, loop, alpha), w).max()))
 
     def place(self, loop: Loop, matrix: str = "P") -> str:
         return f"{switching_guarantee(loop.delays)}: "
 
 
 SWITCHING = Switching()
+_SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # the best one is taken
 
 
 def _halves(lo: int, hi: int) -> list[Number]:

@@ -22,12 +22,11 @@ from models.hold import HeldPlant, hold
 from models.human import Population
 from models.scene import Crowd, Scene, crowds, variants
 from sim.engines import MujocoBatchEngine, pace, profiler_off, quiet_warnings
-from sim.run import run_block
+from sim.run import Progress, run_block
 from sim.stability import close
 from sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen
 
 Cells = NDArray[np.intp]
-Progress = Callable[[int, int], None]  # done, total
 
 # ----------------------------------------------------------------------------------------------------
 # The exact loop's eigenvalues, with every human.
