@@ -16,7 +16,7 @@ from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY, Audit, ConditionAudit, Help, audit
-from design.certificate import check_ranges
+from design.certificate import check_ranges, named
 from design.coverage import Switching
 from design.designs import KINDS, name_and_own
 from design.files import unseen
@@ -68,17 +68,18 @@ def main(argv: list[str]) -> int:
     scenario = options.scenario_from(args)
     loop = options.rigid_loop(args, scenario) if args.rigid else scenario.loop(args.case)
     coupling = _coupling(args, loop, scenario)
-    switching, (_, own) = _switching(args, loop), name_and_own(args.condition)
+    switching, asked = _switching(args, loop), named(args.condition) if args.condition else None
     out = options.out_folder(args, "audit")
 
     begin = time.perf_counter()
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
         whole = check_ranges(loop, coupling, args.seed, progress=move)
     with options.refused():
-        found = audit(loop, coupling, switching, whole, own)
+        found = audit(loop, coupling, switching, whole, asked)
     notes = ()
     if args.coupling and not _is_own(args):  # what its file is worth in the loop that is audited
-        notes = check_stored(read_coupling(args.coupling), scenario.loop(args.case).switching(switching), own).notes
+        notes = check_stored(read_coupling(args.coupling), scenario.loop(args.case).switching(switching), asked).notes
+    _, own = name_and_own(asked)
     notes = (*notes, own.claim) if own else notes
     report = _Report(
         args.case,
@@ -104,7 +105,7 @@ def _parser() -> options.Parser:
     coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m]; one is for all")
     stored = "a stored coupling, or a function of your own, in place of --K and --B"
     coupling.add_argument("--coupling", metavar="FILE.json|MODULE:NAME", help=stored)
-    parser.add_condition("a further condition that must hold, beside the two that are always asked", to=coupling)
+    parser.add_condition("the condition that must hold, of your own beside the two that are always asked", to=coupling)
     device = "its damping and, where no gains are given, the largest that CHAI3D allows it, on a rigid wall at 1 kHz"
     coupling.add_argument("--device", metavar="NAME", help=f"of the catalogue: {device}; other options go first")
     coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")
@@ -224,7 +225,7 @@ def _verdict(found: Audit) -> str:
     gains = f" K {listed(coupling.K)} N/m, B {listed(coupling.B or ())} N s/m" if coupling.K else ""
     verdict = f"[green]certified[/] for {guarantee}" if found.certified else "[red]not certified[/]"
     if guarantee and not found.certified:
-        verdict += f" for the ranges, only for {guarantee}"
+        verdict += f"{' for the ranges' if found.ranges else ''}, only for {guarantee}"
     return f"{coupling.kind}{gains}: {verdict}"
 
 

@@ -21,7 +21,7 @@ from design.certificate import named
 from design.files import plain, write_json
 from design.guarantees import CAVEATS
 from design.result import listed
-from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
+from hw.control import CertifiedCoupling, certified_couplings, timed
 from hw.limits import Stage
 from hw.monitor import Ages
 from hw.recording import Recorder
@@ -146,11 +146,16 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
     least, most = (f"{1e-3 * side(ages.ticks, default=1e6 * scenario.T):.4g}" for side in (min, max))
     span = least if least == most else f"{least} to {most}"
     longest = 1e3 * (scenario.T_max or scenario.T)
-    cost = overlong_tick(caps, scenario.delta)
+    cost = _overlong_tick(caps, scenario.delta)
     return (
         f"ticks of the device last {span} ms, certified up to {longest:.4g} ms; one longer tick "
         f"may give a hand at most {cost:.3g} mJ for every ms that it lasts (at the force cap)"
     )
+
+
+def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
+    """[W] what a tick longer than T_max may give a hand, at most, for each second of its length: sum f^2/(4 delta)."""
+    return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
 
 
 def _print_session(report: SessionReport, console: Console) -> None:

@@ -284,20 +284,27 @@ def transparency_error(figures: Transparency) -> str:
     return "{} at most, {} rms (0 dB: as wrong as no force)".format(*shown)
 
 
+_MUCH = 2.0  # times the damping that is needed nearby: then the report says what helps
+
+
 def robustness_rows(nearby: Nearby) -> Rows:
     """What a wrong model of the environment costs, and what a design that allows for it would."""
     if there := nearby.robustness:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
         yield "robustness", f"{words}, the worst within {there.percent:g} %"
+        if there.required_over_available > _MUCH and nearby.designed_for_it:
+            yield "", f"--ranges {there.percent:g}% gives a coupling that is safe in all of these environments"
     if price := nearby.designed_for_it:
         yield f"design for ±{there.percent if there else 10:g} %", price_words(price)
 
 
 def price_words(price: Spread) -> str:
     """What a design for more than one environment reaches and costs."""
-    costs = f"at most {max(price.price_db, 0.0):.2f} dB worse" if math.isfinite(price.price_db) else "not exact"
+    worse = f"at most {price.price_db:.2f} dB worse" if price.price_db >= 0 else f"{-price.price_db:.2f} dB better"
+    costs = worse if math.isfinite(price.price_db) else "not exact"
     proved = f"proved in {price.proved} of {price.environments} environments"
     rest = ", swept in the others" if price.proved < price.environments else ""
+    rest += f" ({price.reason})" if price.reason else ""
     return f"{price.mismatch_db:.2f} dB, {costs}: {proved}{rest}"
 
 

@@ -360,18 +360,18 @@ def audit(
     coupling: Coupling,
     switching: DelayRange | None = None,
     whole: RangesCheck | None = None,
-    own: Condition | None = None,
+    asked: Condition | None = None,
 ) -> Audit:
-    """What both conditions say of the loop's own environment and constant delays, and one of the user's `own`.
+    """What both conditions say of the loop's own environment and constant delays, and the one that is asked for.
 
     With a range of delays also the damping that any switching within it asks; `whole` is the same coupling over the
     ranges around the environment, if there is one. Raises ValueError naming the field of the loop that is wrong.
     """
     loop = loop.at(loop.environment).switching(None)
     check_loop(loop)
-    conditions = {each.name: each for each in (*map(named, reversed(CONDITIONS)), *([own] if own else []))}
+    asked = asked or THIS_ENVIRONMENT
+    conditions = {each.name: each for each in (*map(named, reversed(CONDITIONS)), asked)}
     requirements = {name: requirement(loop, coupling, each) for name, each in conditions.items()}
-    asked = own or THIS_ENVIRONMENT
     here = requirements[asked.name].certified
     fails = next((each for name, each in conditions.items() if here and not requirements[name].certified), asked)
     proved = bool(whole and whole.proved)

@@ -173,7 +173,7 @@ def uncovered(environment: Lti, psi: Sequence[int], phi: Sequence[float] | Array
     return supremum(short, np.concatenate([[0.0], frequencies(block)]))
 
 
-#: 1 - |a| of a matrix [1, a; a*, 1] below which it is singular in floating point; a diagonal entry that is rounding.
+#: The determinant beside the diagonal's product below which a pair is singular; a diagonal entry that is rounding.
 _SINGULAR, _NOTHING = 1e-12, 1e-15
 _CELLS = 2**19  # entries of a response that are looked at together
 
@@ -194,14 +194,16 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
     Where gain is singular, free must be positive on its null space; the rest is a Schur complement.
     """
     own = np.diagonal(gain, axis1=-2, axis2=-1).real
+    if gain.shape[-1] == 2 and (own > 0).all():
+        room = own[..., 0] * own[..., 1] - np.abs(gain[..., 0, 1]) ** 2
+        if gain[..., 0, 1].any() and (np.abs(room) > _SINGULAR * own[..., 0] * own[..., 1]).all():
+            return _of_pairs(free, gain, room)
     known = own > _NOTHING * own.max(axis=-1, keepdims=True)
     weight = 1 / np.sqrt(np.where(known, own, 1.0))
     free, gain = (weight[..., :, None] * part * weight[..., None, :] for part in (free, gain))
     diagonal = not (gain * (1 - np.eye(gain.shape[-1]))).any()
     if known.all() and diagonal:
         return largest_eigenvalue(-free)
-    if gain.shape[-1] == 2 and known.all() and (np.abs(np.abs(gain[..., 0, 1]) - 1) > _SINGULAR).all():
-        return _of_pairs(free, gain[..., 0, 1])
     if gain.ndim > 2 and (gain == gain[..., :1, :, :]).all():
         gain = gain[..., :1, :, :]  # the same at every frequency: one decomposition
     eigenvalues, basis = np.linalg.eigh(gain)
@@ -223,10 +225,10 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
     return needed.reshape(shape)
 
 
-def _of_pairs(H: Complex, a: Complex) -> Array:
-    """The least s with H + s [1, a; a*, 1] >= 0, (...,), a root of the determinant: LAPACK takes 20 times as long."""
-    room, last = 1 - np.abs(a) ** 2, H[..., 0, 0].real * H[..., 1, 1].real - np.abs(H[..., 0, 1]) ** 2
-    twice = H[..., 0, 0].real + H[..., 1, 1].real - 2 * (H[..., 0, 1] * np.conj(a)).real
+def _of_pairs(free: Complex, gain: Complex, room: Array) -> Array:
+    """`least_multiple` of pairs with det(gain) = room: a root of the determinant, 20 times as fast as LAPACK."""
+    (a, b, d), (p, q, r) = ((M[..., 0, 0].real, M[..., 0, 1], M[..., 1, 1].real) for M in (free, gain))
+    twice, last = a * r + d * p - 2 * (b.real * q.real + b.imag * q.imag), a * d - b.real**2 - b.imag**2
     root = np.sqrt(np.maximum(twice**2 - 4 * room * last, 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
         least = np.where(twice < 0, (root - twice) / (2 * room), -2 * last / (twice + root))

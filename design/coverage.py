@@ -16,6 +16,7 @@ from design.conditions import this_environment
 from design.coupling_file import Certificate, LimiterCertificate
 from design.environments import BETA, LIMITER, SWITCHING, THIS_ENVIRONMENT, Limiter, worst
 from design.files import unseen
+from design.guarantees import ANY
 from design.result import Design, DesignFailed, NotProved, Requirement
 from design.transparency import decibels, transparency
 from design.worst_member import SEARCH, Searched
@@ -33,6 +34,7 @@ class Limits:
     c: tuple[tuple[float, ...], ...] = ()  # its multiplier
     certificate: LimiterCertificate | None = None  # its proof
     force_limit: tuple[float, ...] = ()  # (m,) [N]
+    less: bool = False  # it is proved for this environment, while a guarantee holds for any
 
     def within(self, force_limit: Sequence[float]) -> Limits:
         """The same, of forces limited to so many N."""
@@ -48,7 +50,7 @@ class Limits:
             return f"clipped at {limit}: a guarantee holds while forces stay below ({why})"
         if not self.proved:
             return f"certified, also while forces are limited to {limit} ({self.reason})"
-        return f"proved, also while forces are limited to {limit}"
+        return f"proved, also while forces are limited to {limit}{', in this environment' if self.less else ''}"
 
     @property
     def proved(self) -> bool:
@@ -80,6 +82,14 @@ def covered_limits(
             return Limits(each.lag, f"{each.condition} covers limited forces")
     if not requirements[THIS_ENVIRONMENT.name].certified:
         return Limits(None, "no guarantee that it could extend")
+    less = any(each.certified and each.guarantee == ANY for each in requirements.values())
+    return replace(_by_its_own_block(loop, coupling, proof, known), less=less)
+
+
+def _by_its_own_block(
+    loop: Loop, coupling: Coupling, proof: LimiterCertificate | None, known: Certificate | None
+) -> Limits:
+    """The limiter of this-environment."""
     if proof:
         try:
             requirement = check_limiter(loop, coupling, proof, known)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -13,7 +14,7 @@ import numpy as np
 
 from controller.loop import Loop
 from design.conditions import Condition
-from design.environments import THIS_ENVIRONMENT
+from design.environments import LIMITER, THIS_ENVIRONMENT
 from design.guarantees import ANY
 from design.lmi import ANY_ENVIRONMENT
 from design.own import called, named
@@ -121,7 +122,11 @@ def design_by_kind(
         raise ValueError(f"condition is {asked!r}, for {kind} allowed are {', '.join(able)}")
     made_for = able[asked]
     if chosen.model and loop.environment.walls:
-        raise ValueError(f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls")
+        reason = f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls"
+        raise ValueError(f"{reason}{_instead(loop, '--coupling spring-damper', 'spring-damper')}")
+    if chosen.model and options.get("limiter") and (reason := LIMITER.beyond(loop)):
+        with_less = {**options, "limiter": False, "ladder": ((4, 3),)}
+        raise ValueError(f"{reason}{_instead(loop, 'without --limiter', kind, **with_less)}")
     further = {"condition": made_for.name, "progress": progress}
     further = {name: value for name, value in further.items() if name in chosen.takes}
     made = partial(getattr(import_module(chosen.module), chosen.function), **further, **options)
@@ -133,6 +138,15 @@ def design_by_kind(
     if chosen.model or made_for.guarantee(loop) == ANY or not (loop.latency or loop.environment.walls):
         return made(loop)
     return _with_less_damping(loop, made, made_for)
+
+
+def _instead(loop: Loop, words: str, kind: str, **options: Any) -> str:
+    """What else gives a coupling for this loop, as the end of a refusal: nothing where it does not when it is run."""
+    with suppress(ValueError, DesignFailed):
+        found = design_by_kind(loop, kind, **options)
+        if found.requirement.certified:
+            return f"; {words} gives one that needs {found.requirement.ratio:.3g} of the damping"
+    return ""
 
 
 def own_coupling(name: str, loop: Loop) -> Any:

@@ -108,14 +108,15 @@ class Multiplied(Condition):
         asked = self.block(G, loop, values)
         if reason := unsound(asked.free, delta) or self.unsound_static(G, loop, asked):
             return replace(refusal(self.name, delta, reason), multiplier=values)
-        search = _Search(lambda x: self.block(G, loop, x), unknowns, asked.free)
-        bound, values = search.best(values) if multiplier is None and search.pays else (0.0, values)
+        search, bound = _Search(lambda x: self.block(G, loop, x), unknowns, asked.free), None
+        if multiplier is None and search.pays:
+            bound, values = search.best(values)
         ratio, w = search.swept(values)
         if np.isinf(ratio):
             reason = f"no multiplier {unknowns.name} was found with which any damping is enough"
             return replace(refusal(self.name, delta, reason), multiplier=values)
         found = from_ratio(self.name, max(ratio, 0.0), tuple(delta), w / (2 * np.pi * loop.T))
-        return replace(found, multiplier=values, bound=min(bound, ratio))
+        return replace(found, multiplier=values, bound=bound and min(bound, ratio))
 
     def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
         """Why what the block says of z = 1 does not hold, beyond rounding."""
@@ -132,7 +133,7 @@ class Multiplied(Condition):
 
 
 _MOST_ROWS = 24  # of a block whose multiplier is searched: twelve devices with limited forces
-_MOST_STALLED = 3  # rounds in which the bound does not rise
+_MOST_ROUNDS, _MOST_STALLED = 40, 3  # rounds; those in which the bound does not rise
 _MOST_PEAKS = 3  # frequencies that join at once
 _NEAR = 0.1  # of the highest peak, relatively: lower ones do not join
 _SETTLED = 5e-7  # relative gap between what the multiplier asks and the bound
@@ -167,7 +168,9 @@ class _Search:
         blocks = [*low, Inequality.most(range(count), unknowns.most)]
         top, w = self._worst(values, bound)
         best, least, stalled = values, top, 0
-        while stalled < _MOST_STALLED and w.size:
+        for _ in range(_MOST_ROUNDS):
+            if not w.size or stalled == _MOST_STALLED:
+                break
             blocks.append(self._inequality(w))
             try:
                 found = ConeProgram(np.eye(count + 1)[-1], blocks).solve(f"the multiplier {unknowns.name}")
@@ -231,7 +234,25 @@ class ThisEnvironment(Multiplied):
         return G
 
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
-        return walls_demand(G, loop, multiplier)
+        """this-environment for walls of any stiffness and damping with k + 2 b/T up to that of the loop's, and any gap.
+
+        G takes [x; p] to [f; y], displacements (m,) and wall forces to the forces of the devices and the ways into the
+        walls, [[F, J], [H, Y]]. With the multiplier g (w,) and M = g (z-1) - 1 the block is, on (dx, dp),
+            [[F, J], [-M H, -M Y]]/(z-1) + diag(s Delta_D/T, g/slopes),
+        whose static part must be symmetric, J(1) = H(1)' and Y(1) = Y(1)', with F(1) >= 0 >= Y(1). docs/theory.md has a
+        weight of each wall beside g; it is 1 here.
+        """
+        T, m, w = G.T, loop.channels, len(loop.environment.walls)
+        none, g = numbers([0] * m, T), numbers(multiplier, T)
+        slopes: Any = numbers([wall.slope(T) for wall in loop.environment.walls], T)
+        S1, R = G.split_at_one()
+        steep = np.diag(np.concatenate([none, g]))
+        limits = np.concatenate([none, g / slopes])
+        free = np.hstack([numbers(np.eye(m + w), T), -steep]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
+        damping = np.concatenate([even_damping(loop, T) / T, numbers([0] * w, T)])
+        F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
+        static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
+        return Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         """With the multiplier of its walls; without one as if they all touched, where it has some."""
@@ -286,30 +307,6 @@ THIS_ENVIRONMENT = ThisEnvironment()
 _ROUNDING = 1e-9  # that a static map may miss of symmetry and of its signs
 
 
-def walls_demand(G: Block, loop: Loop, g: Any, lam: Sequence[Any] | None = None) -> Demand[Block]:
-    """this-environment for walls of any stiffness and damping with k + 2 b/T up to that of the loop's, and any gap.
-
-    G takes [x; p] to [f; y], displacements (m,) and wall forces to the forces of the devices and the ways into the
-    walls, [[F, J], [H, Y]]. With a multiplier g >= 0 and a weight lam > 0 for each wall (1 if not given) and
-    M = g (z-1) - 1 the block is, on (dx, dp),
-        [[F, J], [-lam M H, -lam M Y]]/(z-1) + diag(s Delta_D/T, lam g/slopes),
-    whose static part must be symmetric, J(1) = H(1)' lam and lam Y(1) = Y(1)' lam, with F(1) >= 0 >= lam Y(1).
-    """
-    T, m, w = G.T, loop.channels, len(loop.environment.walls)
-    slopes: Any = [wall.slope(T) for wall in loop.environment.walls]
-    gains, one = numbers(g, T), numbers(np.eye(m + w), T)
-    weights = numbers([1] * w if lam is None else lam, T)
-    weigh = np.diag(np.concatenate([numbers([1] * m, T), weights]))
-    S1, R = (weigh @ G).split_at_one()
-    steep = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
-    limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(slopes, T)])
-    free = np.hstack([one, -steep]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
-    damping = np.concatenate([even_damping(loop, T) / T, numbers([0] * w, T)])
-    F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
-    static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
-    return Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
-
-
 def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
     """The this-environment condition of this coupling around each of the members, every one frozen."""
     return [_in_one(loop, coupling, member) for member in members]
@@ -344,7 +341,7 @@ class Switching(Multiplied):
         return G
 
     def unknowns(self, loop: Loop) -> Unknowns:
-        units = tuple((even_damping(loop) / loop.T * (half_widths(loop) > 0)).tolist())
+        units = tuple((even_damping(loop) / loop.T * (_half_widths(loop) > 0)).tolist())
         return Unknowns("alpha", units, "a positive number where the delay varies and 0 elsewhere", 1e-8, 1e6)
 
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
@@ -373,23 +370,26 @@ class Switching(Multiplied):
         return replace(linear, free=free, gain=np.transpose(wide) @ linear.gain @ wide)
 
     def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
-        """h times the largest own force of each device per displacement: the best for springs."""
-        own = np.abs(np.diagonal(G.at(on_circle(frequencies(G, points=60))), axis1=1, axis2=2)).max(axis=0)
-        least = 1e-8 * np.array(self.unknowns(loop).units)
-        return np.maximum(half_widths(loop) * own, least).tolist()
+        """h times the largest own force of each device per displacement, best for springs; of many a share of it."""
+        w, least = frequencies(G, points=60), 1e-8 * np.array(self.unknowns(loop).units)
+        most = _half_widths(loop) * np.abs(np.diagonal(G.at(on_circle(w)), axis1=1, axis2=2)).max(axis=0)
+        shares = _SHARES if 2 * loop.channels > _MOST_ROWS else (1.0,)
+        tried = [np.maximum(share * most, least).tolist() for share in shares]
+        return min(tried, key=lambda alpha: float(least_scale(self.block(G, loop, alpha), w).max()))
 
     def place(self, loop: Loop, matrix: str = "P") -> str:
         return f"{switching_guarantee(loop.delays)}: "
 
 
 SWITCHING = Switching()
+_SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # the best one is taken
 
 
 def _halves(lo: int, hi: int) -> list[Number]:
     return [Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)]
 
 
-def half_widths(loop: Loop) -> Array:
+def _half_widths(loop: Loop) -> Array:
     """h = (hi - lo)/2, (m,)."""
     return (np.array(loop.delays.hi) - np.array(loop.delays.lo)) / 2
 

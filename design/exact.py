@@ -493,10 +493,11 @@ _Parts = tuple[Array, Array, Array, Array]  # A, B, C, D in extended precision
 
 
 def _double(parts: _Parts) -> Lti:
-    return Lti(*(part.astype(np.float64) for part in parts), 1.0)
+    A, B, C, D = (part.astype(np.float64) for part in parts)
+    return Lti(A, B, C, D, 1.0)
 
 
-def _extended(M: Array) -> Array:
+def _extended(M: Any) -> Array:
     """Fractions, or floats, in extended precision: 64 binary digits where the machine has it."""
     found = np.asarray(M, dtype=np.float64).astype(np.longdouble)
     if M.dtype == object:

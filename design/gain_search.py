@@ -76,7 +76,7 @@ class SampledLoop:
         self.band = frequencies(self.E, low=low, high=min(high, np.pi), points=80)
         E = Sampled.of(self.E, on_circle(self.band)[None])
         one = Sampled(E.z, np.broadcast_to(np.eye(loop.channels, dtype=complex), E.G.shape), E.T)
-        self.late = loop.late(one).G[0]  # Theta
+        self.late = np.diagonal(loop.late(one).G[0], axis1=1, axis2=2)[:, :, None]  # Theta
         self.size2 = (np.abs(E.G[0]) ** 2).sum(axis=(1, 2))
         self.target = delay(loop.lam, loop.T).at(E.z[0]) @ E.G[0]
         self._known: dict[str, _Around] = {}
@@ -157,13 +157,13 @@ class SampledLoop:
         return float(np.log(self._mean(x) / (log_w[-1] - log_w[0])))
 
     def _mean(self, x: Array) -> float:
-        M = self.late @ self._around(x, "band").G - self.target
+        M = self.late * self._around(x, "band").G - self.target
         return float(np.trapezoid((np.abs(M) ** 2).sum(axis=(1, 2)) / self.size2, np.log(self.band)))
 
     def square_mismatch_slope(self, x: Array) -> Array:
         """Its gradient by x; the unknowns behind the gains do not move it."""
         around = self._around(x, "band")
-        F = self.late @ around.G
+        F = self.late * around.G
         back = np.einsum("kij,kji->ki", around.G @ (F - self.target).conj().swapaxes(1, 2), F)
         moved = 2 * (back * around.by).real / self.size2[:, None]
         slope = np.trapezoid(moved, np.log(self.band), axis=1).ravel() / self._mean(x)

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from controller.arithmetic import TooLong, within
 from controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
@@ -31,7 +31,8 @@ from design.spring_damper import design as design_spring_damper
 from design.transparency import Transparency, decibels, transparency
 from design.worst_member import Searched, search_ranges
 
-_PRICED = 15.0  # [s] of the processor: what the price of a range may take, a third of it for proofs
+#: [s] of the processor, up to so many devices: what the price of a range may take, a third of it for proofs
+_PRICED = {2: 4.0, 4: 8.0, 10**3: 15.0}
 _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
 _FIRST = 3  # of the environments: those that the nominal design misses most are imposed first
 _SETTLED_DB = 0.05  # a rung that gains less ends the climb
@@ -131,7 +132,12 @@ def design(
     for taps, poles in options.ladder:
         if rungs and not climb.room(taps, poles, max((r.states for r in rungs if r.reason is None), default=0)):
             continue
-        found, rung = climb.rung(taps, poles, best, floor)
+        try:
+            with within(max(options.seconds - climb.elapsed, 0.0) if rungs else np.inf, "a larger basis"):
+                found, rung = climb.rung(taps, poles, best, floor)
+        except TooLong:
+            hurried = True
+            break
         rungs.append(rung)
         progress(rung)
         gained = np.inf if rung.reason or best is None else decibels(climb.merit(best)) - decibels(climb.merit(found))
@@ -320,18 +326,23 @@ class _Search:
         scaled = _scaled(coupling, scale)
         return self._assessed(scaled, scaled.g), [scale * need for need in needs]
 
-    def proofs(self, found: Optimal, needs: Sequence[float], slip: program.Slip | None, until: float) -> int:
-        """In how many environments it is proved until this time, the worst first. Raises NotProved."""
+    def proofs(
+        self, found: Optimal, needs: Sequence[float], slip: program.Slip | None, until: float
+    ) -> tuple[int, str | None]:
+        """In how many environments it is proved until this time, the worst first, and why it is not in the next."""
         here = self._proved(found, slip)
         if not here.proved:
-            raise NotProved(str(here.reason))
+            return 0, str(here.reason)
         worst_first = sorted(range(1, len(needs)), key=lambda i: -needs[i])
         for done, i in enumerate(worst_first, start=1):
             if time.thread_time() > until:
-                return done
+                return done, None
             swept = from_ratio("this-environment", needs[i], self.loop.delta, 0.0)
-            prove(self.cases[i].loop, found.coupling, "this-environment", swept=swept)
-        return len(needs)
+            try:
+                prove(self.cases[i].loop, found.coupling, "this-environment", swept=swept)
+            except NotProved as error:
+                return done, str(error)
+        return len(needs), None
 
     def between(self, found: Optimal) -> Optimal:
         """The coupling for ranges after the search between the vertices, and proved at each of them.
@@ -439,13 +450,14 @@ def spread(
     nominal: ForceFilter | NoCoupling,
     options: program.Options = program.DEFAULT,
     percent: float = 10.0,
-    seconds: float = _PRICED,
+    seconds: float | None = None,
 ) -> Spread:
     """The better of a design over a small basis and the nominal one scaled down, both safe over `vertices`.
 
     Each rung's own frequencies are those of the nominal environment; the vertices are imposed at few, and where sweeps
     find that they are missed.
     """
+    seconds = seconds or next(each for most, each in _PRICED.items() if loop.channels <= most)
     until = time.thread_time() + seconds
     climb = _Search.of(loop.at(loop.environment), options)
     if isinstance(nominal, NoCoupling):
@@ -461,14 +473,13 @@ def spread(
     hardest = np.argsort([-ratio_in(case.loop, nominal) for case in climb.cases])
     active = [0, *(int(i) for i in hardest if i)][: _FIRST + 1]
     tried = [nominal, climb.kept_in_all(problem, active, until - seconds / 3, forgiven=_TOLERATED)[0]]
-    proved = 0
     for limit in (1 - program.MARGIN, 1 - 2.5 * program.MARGIN):
         found, needs = min((climb.fitted(one, slip, limit) for one in tried), key=lambda one: climb.merit(one[0]))
-        with suppress(NotProved):
-            proved = climb.proofs(found, needs, slip, max(until, time.thread_time() + seconds / 3))
+        proved, reason = climb.proofs(found, needs, slip, max(until, time.thread_time() + seconds / 3))
+        if reason is None:
             break
     db = climb.decibels(found)
-    return Spread(db, db - before, found.g, max(needs[1:], default=needs[0]), found.states, len(needs), proved)
+    return Spread(db, db - before, found.g, max(needs[1:], default=needs[0]), found.states, len(needs), proved, reason)
 
 
 def nearby(

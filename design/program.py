@@ -64,7 +64,7 @@ class Options:
     band_hz: tuple[float, float] = BAND_HZ
     high_gain: float | None = None  # largest |F|/|E| above 100 Hz; None: kept low by a soft row
     limiter: bool = False  # covered also while forces are limited
-    seconds: float = 60.0  # no rung is begun later than this; the sizes of rungs end most climbs far earlier
+    seconds: float = 60.0  # rungs after the first are left then; the sizes of rungs end most climbs far earlier
     ladder: tuple[tuple[int, int], ...] = LADDER  # (taps, real poles)
 
     def __post_init__(self) -> None:

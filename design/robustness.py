@@ -41,6 +41,7 @@ class Spread:
     states: int  # of the loop
     environments: int  # with the nominal one
     proved: int  # of these, in exact arithmetic; the others by the refined sweep, when the time for proofs was over
+    reason: str | None = None  # or why the next one is not proved
 
 
 @dataclass(frozen=True)

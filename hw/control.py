@@ -48,7 +48,7 @@ class Controller(Protocol):
     def step(self, x: Sequence[float]) -> Sequence[float]: ...  # (m,) [N] fed back for the displacements x (m,) [m]
 
 
-class HostController:
+class _HostController:
     """A law at work, tick by tick and from rest."""
 
     def __init__(self, law: Law) -> None:
@@ -69,15 +69,15 @@ class HostController:
 
 def host_controller(
     loop: Loop, coupling: Coupling, link: int, cap: Sequence[float], lag: Sequence[float] | None = None
-) -> HostController:
+) -> Controller:
     """The loop as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where it is too long.
 
     With `lag`, rho (m,) [N/m], forces leave through a limiter of `cap` (m,) [N].
     """
-    return HostController(loop.delayed(tuple(n - link for n in loop.theta)).law(coupling, cap, lag))
+    return _HostController(loop.delayed(tuple(n - link for n in loop.theta)).law(coupling, cap, lag))
 
 
-def fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tuple[float, ...]]:
+def _fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tuple[float, ...]]:
     """Displacements for `ticks` ticks of which only the last was received: a straight line from `previous` to x.
 
     A step would look to a damper like a blow of (dx/T) times its B.
@@ -216,7 +216,7 @@ class Drive:
         if self.limits.continuous:
             self._heat.check(self.units.forces(state.applied), ticks)
         if ticks > 1 and self.x is not None:
-            self._miss(state, fill(self.x, x, ticks)[:-1])
+            self._miss(state, _fill(self.x, x, ticks)[:-1])
         asked = self.controller.step(x)
         test = self._test.force(state.counts, ticks) if self._test and direction > 0 else None
         if direction > 0 and test is None:
@@ -248,7 +248,7 @@ class Drive:
         if ticks == 1 or self.x is None:
             recent.append(x)
         else:
-            recent.extend(fill(self.x, x, ticks))
+            recent.extend(_fill(self.x, x, ticks))
         if (since := len(recent) - 1) >= self._window // 2:
             self.limits.check_speed(x, recent[0], since * self.T)
 
@@ -281,11 +281,6 @@ def timed(
     if most >= min((T_us, *ages.ticks)):
         raise SafetyStop(f"answers come up to {most:.0f} us after their tick, T is {T_us:g} us: latch at ticks")
     return scenario.replace(latency=((1e-6 * least, 1e-6 * most),) * scenario.channels), 0
-
-
-def overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
-    """[W] what a tick longer than T_max may give a hand, at most, for each second of its length: sum f^2/(4 delta)."""
-    return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
 
 
 class Armable(Protocol):
@@ -350,7 +345,7 @@ class CertifiedCoupling:
         span = self.chosen.switching
         return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
 
-    def controller(self, cap: Sequence[float]) -> HostController:
+    def controller(self, cap: Sequence[float]) -> Controller:
         return host_controller(self.scenario.loop(self.case), self.chosen.coupling, self.link, cap, self.limits.rho)
 
     def figures(self, cap: Sequence[float]) -> ProgramFigures:

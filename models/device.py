@@ -25,7 +25,20 @@ def require(field: str, value: float, low: float, high: float, unit: str) -> Non
 MOST_DAMPING = 1e4  # [N s/m]
 
 
-class CompliantDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="compliant", tag_field="kind"):
+class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What both kinds of a device, which declare the fields, have."""
+
+    @property
+    def passivity_level(self: Any) -> float:
+        """delta [N s/m]: the damping that the device guarantees to the design."""
+        return self.damping if self.delta is None else self.delta
+
+    def with_damping(self: Any, damping: float) -> Device:
+        """The same device with another motor damping, all of it guaranteed."""
+        return msgspec.structs.replace(self, damping=damping, delta=None)
+
+
+class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="compliant", tag_field="kind"):
     """A motor with encoder, joined to the handle by a transmission spring.
 
     Whatever hangs on the transmission, the port at motor and encoder dissipates at least `damping`: it is the
@@ -41,7 +54,7 @@ class CompliantDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, t
     encoder_step: float = 0.0  # [m] assumed 0: an ideal encoder
     friction: float = 0.0  # [N] Coulomb friction at the motor, assumed 0; only MuJoCo models it
     delta: float | None = None  # [N s/m] guaranteed damping; `damping` unless an identification bounds it lower
-    credible_force: float | None = None  # [N] in the transmission: more is the model's alone, see `credible_force`
+    credible_force: float | None = None  # [N] in the transmission: more is the model's alone, see `most_credible_force`
     credible_speed: float = 2.0  # [m/s] likewise; assumed: three times the 0.7 m/s that teleoperation masters exceed
     # in a fifth of the fast part of a tapping task (the abstract of such a study says so; not a figure of this device)
 
@@ -57,6 +70,15 @@ class CompliantDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, t
         """Damping [N s/m] and stiffness [N/m] between motor and handle."""
         return self.transmission_damping, self.transmission_stiffness
 
+    @property
+    def most_credible_force(self) -> float:
+        """What the transmission may carry [N] before the linear model of it is doubted.
+
+        The force at which a cable slips on its capstan is not published. Where a device declares none, it is three
+        times what its motor can push, because a transmission that is made for a motor need not hold more.
+        """
+        return 3.0 * self.force_limit if self.credible_force is None else self.credible_force
+
     def __post_init__(self) -> None:
         _check_common(self, ("motor_mass", "handle_mass"))
         require("transmission_stiffness", self.transmission_stiffness, 1.0, 1e9, "N/m")
@@ -65,7 +87,7 @@ class CompliantDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, t
             require("credible_force", self.credible_force, 1e-3, 1e6, "N")
 
 
-class RigidDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="rigid", tag_field="kind"):
+class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid", tag_field="kind"):
     """Motor, encoder and handle as one body."""
 
     mass: float = 0.25  # [kg] assumed
@@ -78,6 +100,7 @@ class RigidDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
 
     file: ClassVar[str] = "rigid"
     transmission: ClassVar[None] = None
+    most_credible_force: ClassVar[None] = None
 
     @property
     def bodies(self) -> dict[str, float]:
@@ -89,25 +112,6 @@ class RigidDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
 
 
 Device = CompliantDevice | RigidDevice
-
-
-def passivity_level(device: Device) -> float:
-    """delta [N s/m]: the damping that the device guarantees to the design."""
-    return device.damping if device.delta is None else device.delta
-
-
-def credible_force(device: CompliantDevice) -> float:
-    """What the transmission may carry [N] before the linear model of it is doubted.
-
-    The force at which a cable slips on its capstan is not published. Where a device declares none, it is three times
-    what its motor can push, because a transmission that is made for a motor need not hold more.
-    """
-    return 3.0 * device.force_limit if device.credible_force is None else device.credible_force
-
-
-def with_damping(device: Device, damping: float) -> Device:
-    """The same device with another motor damping, all of it guaranteed."""
-    return msgspec.structs.replace(device, damping=damping, delta=None)
 
 
 def _check_common(device: Device, masses: tuple[str, ...]) -> None:

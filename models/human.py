@@ -122,6 +122,30 @@ class Port:
             raise ValueError("port: an impedance belongs to one handle, and to each of many humans")
 
     @classmethod
+    def chain(cls, links: _Array) -> Self:
+        """A chain from the handle to the base; links (..., n, 3) are mass, damping and stiffness of each."""
+        n = links.shape[-2]
+        across = np.eye(n, n + 1, 1) - np.eye(n, n + 1)
+        return cls(links[..., 0], across, links[..., 1], links[..., 2])
+
+    @classmethod
+    def body(cls, hands: int, values: _Array) -> Self:
+        """A body on ground, and the hands joined one to the next; values (..., 5) as in Crowd.bodies."""
+        mass, damping, stiffness, cross_damping, cross_stiffness = np.moveaxis(values, -1, 0)[..., None]
+        across = np.eye(hands, hands + 2, 1) - np.eye(hands, hands + 2)
+        across[-1] = 0.0
+        across[-1, hands:] = -1.0, 1.0
+        nothing = np.repeat(np.zeros_like(mass), hands, axis=-1)
+        crossings = hands - 1
+        return cls(
+            np.concatenate([nothing, mass], axis=-1),
+            across,
+            np.concatenate([np.repeat(cross_damping, crossings, axis=-1), damping], axis=-1),
+            np.concatenate([np.repeat(cross_stiffness, crossings, axis=-1), stiffness], axis=-1),
+            handles=hands,
+        )
+
+    @classmethod
     def stack(cls, ports: Sequence[Self]) -> Self:
         """Many humans alike as one port with a leading axis. Raises ValueError where they are built differently."""
         first = ports[0]
@@ -178,30 +202,6 @@ class Hand(Protocol):
     def voluntary_force(self, t: _Array) -> _Array:
         """Force [N] at the times t [s] that contracts the spring-damper `pull` of the port."""
         ...
-
-
-def chain_port(links: _Array) -> Port:
-    """A chain from the handle to the base; links (..., n, 3) are mass, damping and stiffness of each."""
-    n = links.shape[-2]
-    across = np.eye(n, n + 1, 1) - np.eye(n, n + 1)
-    return Port(links[..., 0], across, links[..., 1], links[..., 2])
-
-
-def body_port(hands: int, values: _Array) -> Port:
-    """A body on ground, and the hands joined one to the next; values (..., 5) as in Crowd.bodies."""
-    mass, damping, stiffness, cross_damping, cross_stiffness = np.moveaxis(values, -1, 0)[..., None]
-    across = np.eye(hands, hands + 2, 1) - np.eye(hands, hands + 2)
-    across[-1] = 0.0
-    across[-1, hands:] = -1.0, 1.0
-    nothing = np.repeat(np.zeros_like(mass), hands, axis=-1)
-    crossings = hands - 1
-    return Port(
-        np.concatenate([nothing, mass], axis=-1),
-        across,
-        np.concatenate([np.repeat(cross_damping, crossings, axis=-1), damping], axis=-1),
-        np.concatenate([np.repeat(cross_stiffness, crossings, axis=-1), stiffness], axis=-1),
-        handles=hands,
-    )
 
 
 def _freeze(record: object, name: str, values: Any) -> None:
@@ -271,7 +271,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def port(self) -> Port:
         """The chain as the handle feels it."""
-        return chain_port(np.array([(link.mass, link.damping, link.stiffness) for link in self.links]))
+        return Port.chain(np.array([(link.mass, link.damping, link.stiffness) for link in self.links]))
 
     def voluntary_force(self, t: _Array) -> _Array:
         """k x_eq + b x_eq' [N] on the last mass, at times t [s]."""
@@ -340,7 +340,7 @@ class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Body and cross springs as the hands feel them; the arms end on the body, the last point."""
         cross = self.cross
         values = (self.mass, self.damping, self.stiffness, cross.damping, cross.stiffness)
-        return body_port(len(self.holds), np.array(values))
+        return Port.body(len(self.holds), np.array(values))
 
 
 def check_holds(held_by: Sequence[tuple[int, ...]], channels: int) -> None:

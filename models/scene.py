@@ -23,8 +23,6 @@ from models.human import (
     Person,
     Population,
     Port,
-    body_port,
-    chain_port,
     check_holds,
 )
 
@@ -521,12 +519,12 @@ class Crowd:
     @property
     def ports(self) -> tuple[Port, ...]:
         """One per device, each with a leading axis over the sets."""
-        return tuple(chain_port(self.links[:, i]) for i in range(self.links.shape[1]))
+        return tuple(Port.chain(self.links[:, i]) for i in range(self.links.shape[1]))
 
     @property
     def held(self) -> tuple[tuple[tuple[int, ...], Port], ...]:
         """The persons with several devices: their channels, and their port with a leading axis over the sets."""
-        return tuple((holds, body_port(len(holds), self.bodies[:, p])) for p, holds in enumerate(self.holds))
+        return tuple((holds, Port.body(len(holds), self.bodies[:, p])) for p, holds in enumerate(self.holds))
 
     def humans(self, i: int) -> tuple[Human, ...]:
         """The humans of set i, one per device."""

@@ -17,7 +17,6 @@ from controller.delay import delay
 from controller.lti import Array, Lti
 from controller.tick import StepBuffer
 from design.files import unseen
-from models.device import credible_force
 from models.hold import HeldPlant
 from sim.engines import EXPONENTIAL, default_integrator, pace, quiet_warnings
 from sim.run import AnyEngine, EngineSettings, Progress, Simulation, engine_name, make_engine, run
@@ -253,9 +252,9 @@ def credible(simulation: Simulation, trace: Trace) -> Credible:
         stretched, stretching = motor - trace.s[:, handle], trace.s[:, n + i] - trace.s[:, n + handle]
         damping, stiffness = device.transmission
         force = np.abs(stiffness * stretched + damping * stretching)
-        outside |= force > credible_force(device)
+        outside |= force > device.most_credible_force
         forces.append(float(force.max(initial=0.0)))
-    most_forces = [None if d.transmission is None else credible_force(d) for d in devices]
+    most_forces = [device.most_credible_force for device in devices]
     most_speeds = [device.credible_speed for device in devices]
     until = float(trace.t[np.argmax(outside)]) if outside.any() else None
     found = Credible(until, forces, speeds, most_forces, most_speeds)

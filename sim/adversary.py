@@ -145,7 +145,7 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
     ranked: list[tuple[float, tuple[Hand, ...]]] = []
     for alike in layouts.values():
         loops = _loops(scenario, F, HumanSets(tuple(alike), scenario.person))
-        fast, growth = (_growth(loops, least) for least in (_PASSES[0].min_frequency_hz, 0.0))
+        fast, growth = loops.growths(_PASSES[0].min_frequency_hz, 0.0)
         ranked += zip(np.where(growth > _DESTABILISED, growth, fast).tolist(), alike, strict=True)
     return ranked
 
@@ -174,14 +174,8 @@ def _loops(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets) -> ClosedLoop:
 def _losses(x: Array, scenario: Scenario, F: Lti, kind: _Pass) -> Array:
     """Minus the largest growth [1/s] among the modes looked at, for every column of x."""
     loops = _loops(scenario, F, _ladders(x.reshape(x.shape[0], -1), scenario.channels, kind))
-    return -_growth(loops, kind.min_frequency_hz)
-
-
-def _growth(loops: ClosedLoop, min_frequency_hz: float) -> Array:
-    """Growth of the modes above this frequency [1/s], (nsim,)."""
-    values, T = np.linalg.eigvals(loops.A), loops.T
-    fast = np.abs(np.angle(values)) / (2 * np.pi * T) >= min_frequency_hz
-    return np.log(np.where(fast, np.abs(values), 1e-300).max(axis=1)) / T
+    (growth,) = loops.growths(kind.min_frequency_hz)
+    return -growth
 
 
 def _worst(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets, evaluated: int) -> Worst:

@@ -19,7 +19,7 @@ from controller.tick import StepBuffer
 from design.result import CONDITIONS, Chosen, DesignFailed
 from models.hold import hold
 from models.scene import Crowd, variants
-from sim.accuracy import force_error
+from sim.accuracy import ForceError, force_error
 from sim.couplings import choose, limits_of
 from sim.engines import ExactEngine
 from sim.passivity_layer import BASELINES, Classic, EnergyNet, netted
@@ -120,8 +120,8 @@ def _judged(
     with_net = netted(simulation, net, most) if net else simulation
     trace = run(with_net, "exact")
     # of the force within its limits: what acted, whatever computed it
-    error = force_error(with_net, trace, scenario.loop(case).lam)
-    apart = _apart(trace.f, error.ideal) if not scenario.environment.walls else None
+    asked = force_error(with_net, trace, scenario.loop(case).lam)
+    applied = ForceError.of(trace.f, asked.ideal, asked.reason if with_net.process.walls else None)
     acted = trace.net.figures().limited_ticks if trace.net else 0
     moving, fastest = _left_alone(with_net)
     name, guarantee, source = (net.name, net.guarantee, net.source) if net else ("none, clipped", None, None)
@@ -133,19 +133,14 @@ def _judged(
         source is not None,
         guarantee,
         source,
-        apart,
+        applied.error_percent,
         _fast(trace.f, scenario.T),
         float(np.abs(trace.f).max(initial=0.0)),
         100 * acted / max(1, len(trace.t)),
         moving,
         fastest,
-        "walls have no linear ideal to compare with" if apart is None else None,
+        applied.reason,
     )
-
-
-def _apart(f: Array, ideal: Array) -> float | None:
-    size = float(np.sqrt(np.mean(ideal**2)))
-    return 100 * float(np.sqrt(np.mean((f - ideal) ** 2))) / size if size > 0 else None
 
 
 def _fast(f: Array, T: float) -> float:

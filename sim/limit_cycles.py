@@ -22,12 +22,11 @@ from models.hold import HeldPlant, hold
 from models.human import Population
 from models.scene import Crowd, Scene, crowds, variants
 from sim.engines import MujocoBatchEngine, pace, profiler_off, quiet_warnings
-from sim.run import run_block
+from sim.run import Progress, run_block
 from sim.stability import close
 from sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen
 
 Cells = NDArray[np.intp]
-Progress = Callable[[int, int], None]  # done, total
 
 # ----------------------------------------------------------------------------------------------------
 # The exact loop's eigenvalues, with every human.
@@ -94,12 +93,8 @@ class HeldDevices:
             if not chosen.any():
                 continue
             some = HeldPlant(plants.A[chosen], plants.B[chosen], plants.C, plants.T)
-            values = np.linalg.eigvals(close(some, F).A)
-            size = np.abs(values)
-            fast = np.abs(np.angle(values)) >= 2 * np.pi * min_frequency_hz * plants.T
-            with np.errstate(divide="ignore"):
-                everything[index[chosen]] = np.log(size.max(axis=1)) / plants.T
-                turning[index[chosen]] = np.log(np.where(fast, size, 0.0).max(axis=1)) / plants.T
+            at = index[chosen]
+            everything[at], turning[at] = close(some, F).growths(0.0, min_frequency_hz)
         return everything, turning
 
     def mode(self, F: Lti, human: int, min_frequency_hz: float) -> Array:

@@ -29,7 +29,7 @@ from controller.older import named_first, named_today
 from controller.ranges import Ranges, UncertainSpring
 from design.files import InputError, counted, printable, read_text, toml, write
 from design.own import called, named, place_of, reach_working_directory
-from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
+from models.device import MOST_DAMPING, Device, fields_of, require
 from models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
 CASES = ("none", "I", "II")
@@ -157,7 +157,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     @property
     def delta(self) -> tuple[float, ...]:
         """The guaranteed damping of each device [N s/m]: all that certificates know of it."""
-        return tuple(passivity_level(d) for d in self.device)
+        return tuple(device.passivity_level for device in self.device)
 
     @property
     def samples(self) -> int:
@@ -241,7 +241,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
                 damping = _strictly({"delta": delta}, _Damping).delta
                 if len(damping) != self.channels:
                     raise InputError(f"delta has {len(damping)} entries for {self.channels} channels")
-                fields["device"] = tuple(with_damping(d, b) for d, b in zip(self.device, damping, strict=True))
+                fields["device"] = tuple(d.with_damping(b) for d, b in zip(self.device, damping, strict=True))
             if not isinstance(fields["environment"], Network | dict):
                 fields["environment"] = _network(fields["environment"], fields["T"])
             if "human" in own:

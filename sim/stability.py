@@ -30,6 +30,7 @@ MARGINAL = 1e-9
 _CLEAR = 1e-3  # [1/s]: slower than this, a loop is too close to the margin for engines to disagree about
 _JUDGED = 4.0  # [s] of a loop whose ticks vary
 _DOUBTFUL, _LONGER = 1.0, 5  # [1/s]: slower growth is judged again, over so many times as long
+_NO_MODE = 1e-300  # of modulus, where none is fast enough
 _SHORTEST_TRACE = 200  # ticks below which a growth rate is not read from a trace
 
 
@@ -58,6 +59,12 @@ class ClosedLoop:
     A: Array  # (..., n, n)
     B: Array  # (..., n, outside)
     T: float  # [s]
+
+    def growths(self, *min_frequency_hz: float) -> list[Array]:
+        """[1/s] of the dominant mode among those from each of these frequencies on."""
+        values = np.linalg.eigvals(self.A)
+        size, hz = np.abs(values), np.abs(np.angle(values)) / (2 * np.pi * self.T)
+        return [np.log(np.where(hz >= least, size, _NO_MODE).max(axis=-1)) / self.T for least in min_frequency_hz]
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,6 +38,7 @@ from design.result import CONDITIONS, Requirement, refusal
 from models.device import Device
 from models.human import Population
 from sim import limit_cycles
+from sim.run import Progress
 from sim.scenario import InputError
 from sim.stability import MARGINAL
 
@@ -496,7 +497,7 @@ _Part = TypeVar("_Part")
 
 
 def _in_slices(
-    task: Callable[[slice], _Part], count: int, size: int, progress: limit_cycles.Progress
+    task: Callable[[slice], _Part], count: int, size: int, progress: Progress
 ) -> tuple[list[tuple[slice, _Part]], bool]:
     """task(slice) for slices of `size` that cover range(count), and whether the keyboard ended it before the last.
 

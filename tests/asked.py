@@ -42,8 +42,8 @@ def any_environment_per_channel(V, theta, delta):
     return conditions.any_environment_per_channel(V, loop(V[0].T, delta, theta))
 
 
-def walls_demand(G, delta, slopes, g, lam=None):
-    return environments.walls_demand(G, loop(G.T, delta, walls=slopes), g, lam)
+def walls_demand(G, delta, slopes, g):
+    return environments.THIS_ENVIRONMENT.block(G, loop(G.T, delta, walls=slopes), g)
 
 
 def walls_proof(G, delta, slopes, g=None):

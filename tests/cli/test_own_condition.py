@@ -74,6 +74,12 @@ def test_every_command_judges_by_it(command, words, folder, monkeypatch, capsys)
         assert "does not hold" not in text
 
 
+def test_an_audit_is_decided_by_the_condition_that_is_asked_for(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert import_module("cli.audit").main(["--coupling", "joined.json", "--condition", "any-environment"]) == 1
+    assert "not certified, only for this environment" in " ".join(capsys.readouterr().out.split())
+
+
 def test_a_file_says_so_where_its_condition_is_not_given(folder, monkeypatch):
     monkeypatch.chdir(folder)
     assert import_module("cli.check").main(["joined.json", *JSON]) == 1

@@ -506,7 +506,7 @@ def test_walls_without_a_solution_are_refused(monkeypatch):
     def singular(*_):
         raise SingularLoop("no solution")
 
-    monkeypatch.setattr(environments, "walls_demand", singular)
+    monkeypatch.setattr(environments.ThisEnvironment, "block", singular)
     loop, coupling = scenario("one-wall").loop("I"), SpringDamper((400.0,), (0.1,))
     with pytest.raises(NotProved, match="algebraic loop without solution"):
         design_certificate._blocks(loop, coupling, THIS_ENVIRONMENT, [Fraction(1)])

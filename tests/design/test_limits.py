@@ -188,7 +188,7 @@ def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
         (["--ladder", "--seconds", "3"], "--seconds is only with --over"),
         (["--ladder", "--case", "II"], "--ladder shows both cases"),
         (["--ladder", "long"], "argument --ladder: invalid choice: 'long'"),
-        (["--over", "order=1:500"], "--over order=1:500: the range 1:500 is none between 1 and 5 rungs"),
+        (["--over", "order=1:500"], "--over order=1:500: the range 1:500 is none between 1 and 7 rungs"),
         (["--over", "period=1e-9:1"], "--over period=1e-9:1: the range"),
         (["--over", "--delta", "0"], "expected positive dampings"),
     ],

@@ -11,11 +11,13 @@ from controller.coupling import Compliance, Coupling, SpringDamper
 from controller.loop import DelayRange
 from controller.lti import Lti, as_like, constant_like, numbers, taps
 from design import compare
-from design.certificate import lag, prove, required_damping, verify
+from design.certificate import assess, lag, prove, required_damping, verify
 from design.conditions import BEYOND, Condition, Demand
 from design.coupling_file import Stored, filed, sealed
+from design.coverage import covered_limits
 from design.environments import SWITCHING, Switching
 from design.files import InputError
+from design.guarantees import guarantee_of
 from design.result import NotProved
 from sim import load
 from sim.zwidth import CouplingSweep, EnvironmentSweep
@@ -149,6 +151,23 @@ def test_the_multiplier_of_ones_own_is_searched_stored_and_checked():
 def test_limited_forces_are_not_covered_by_ones_own():
     assert lag(PAIR, prove(PAIR, SOFT, Plain())) is None
     assert lag(PAIR, prove(PAIR, SOFT, "any-environment")) == (0.0, 0.0)
+
+
+class Anywhere(Plain):
+    name = "anywhere"
+
+    def guarantee(self, loop):
+        return "any passive environment"
+
+
+def test_what_it_says_of_environments_is_said_and_what_limits_are_proved_for_too():
+    stiff, own = SpringDamper([2000.0, 1500.0], [0.2, 0.2]), Anywhere()
+    needs = assess(PAIR, stiff, own=own)
+    assert guarantee_of(needs, PAIR) == "any passive environment"
+    assert not needs["any-environment"].certified
+    assert covered_limits(PAIR, stiff, needs).within((9.0, 9.0)).words.endswith("limited to 9 N, in this environment")
+    assert guarantee_of(assess(PAIR, stiff), PAIR) == "this environment"
+    assert covered_limits(PAIR, stiff, assess(PAIR, stiff)).within((9.0, 9.0)).words.endswith("limited to 9 N")
 
 
 @dataclass(frozen=True)

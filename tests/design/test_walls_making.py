@@ -69,9 +69,9 @@ def test_what_a_wall_asks(stiffness, g, needs):
 
 def test_the_block_written_out():
     """Against the definition at a few frequencies, for two channels and three walls."""
-    G, g, lam, s = PAIR.walled(BOTH), np.array([0.5, 1.5, 2.0]), np.array([1.0, 1.0, 1.0]), 0.9
+    G, g, s = PAIR.walled(BOTH), np.array([0.5, 1.5, 2.0]), 0.9
     stiffness = [w.stiffness for w in NETWORK.walls]
-    demand = walls_demand(G, PAIR.delta, stiffness, g, lam)
+    demand = walls_demand(G, PAIR.delta, stiffness, g)
     for w in (0.003, 0.2, 1.0, 3.0):
         z = np.exp(1j * w)
         response = G.at(z)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from cli.bridge import _overlong_tick
 from cli.bridge import main as bridge
 from cli.replay import main as replay
-from hw.control import certified_couplings, overlong_tick, timed
+from hw.control import certified_couplings, timed
 from hw.emulator import Emulator
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import SafetyStop
@@ -92,7 +93,7 @@ def test_what_one_overlong_tick_may_cost():
     """The most of -f v - delta v^2 over v is f^2/(4 delta), for every second that it lasts."""
     v = np.linspace(-3, 3, 100_001)
     most = sum((f * v - d * v**2).max() for f, d in ((2.0, 1.37), (1.5, 0.9)))
-    assert overlong_tick((2.0, 1.5), (1.37, 0.9)) == pytest.approx(most, rel=1e-6)
+    assert _overlong_tick((2.0, 1.5), (1.37, 0.9)) == pytest.approx(most, rel=1e-6)
 
 
 def test_the_report_names_the_latency():

@@ -14,7 +14,7 @@ from cli import replay as replay_command
 from cli import trace as trace_command
 from design.certificate import assess
 from design.files import plain
-from hw.control import CertifiedCoupling, certified_coupling, fill
+from hw.control import CertifiedCoupling, _fill, certified_coupling
 from hw.emulator import Emulator
 from hw.limits import SafetyLimits, Stage, Units
 from hw.recording import Recorder, _digest, _recipes_of, load, replay
@@ -30,8 +30,8 @@ from sim.trace import Trace
 
 
 def test_missing_samples_are_filled_by_a_straight_line():
-    assert fill((0.0, 3.0), (3.0, 0.0), 3) == [(1.0, 2.0), (2.0, 1.0), (3.0, 0.0)]
-    assert fill((0.0,), (1.0,), 1) == [(1.0,)]
+    assert _fill((0.0, 3.0), (3.0, 0.0), 3) == [(1.0, 2.0), (2.0, 1.0), (3.0, 0.0)]
+    assert _fill((0.0,), (1.0,), 1) == [(1.0,)]
 
 
 @pytest.fixture(scope="module")

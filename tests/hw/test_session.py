@@ -12,7 +12,7 @@ from cli import bridge
 from controller.law import Law
 from design.coupling_file import Stored
 from design.coupling_file import save as save_coupling
-from hw.control import HostController, certified_coupling, certified_couplings
+from hw.control import _HostController, certified_coupling, certified_couplings
 from hw.emulator import Emulator, FaultInjection
 from hw.haptic_device import SerialDevice
 from hw.limits import SafetyLimits, Stage
@@ -187,7 +187,7 @@ def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
     simulation = assemble(scenario, rungs[0].chosen.coupling)
     held = hold(plant(simulation.scene.model), scenario.T)
     n = len(recorder) - first
-    w, law = outside_forces(scenario, simulation.scene, 0, n), HostController(Law(simulation.F))
+    w, law = outside_forces(scenario, simulation.scene, 0, n), _HostController(Law(simulation.F))
     s, counts, applied = np.zeros(held.A.shape[0]), [], []
     for k in range(n):
         x = np.round(s[:2] / 1e-6)

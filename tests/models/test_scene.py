@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from models.device import CompliantDevice, RigidDevice, passivity_level, with_damping
+from models.device import CompliantDevice, RigidDevice
 from models.human import Cross, Human, Link, Person, Population, Voluntary
 from models.scene import _FILES, build, plant
 
@@ -177,9 +177,9 @@ def _forward(model):
 
 
 def test_guaranteed_damping_is_the_damping_unless_bounded():
-    assert passivity_level(CompliantDevice()) == 1.37
-    assert passivity_level(RigidDevice(damping=2.0, delta=1.5)) == 1.5
-    assert passivity_level(with_damping(RigidDevice(damping=2.0, delta=1.5), 0.7)) == 0.7
+    assert CompliantDevice().passivity_level == 1.37
+    assert RigidDevice(damping=2.0, delta=1.5).passivity_level == 1.5
+    assert RigidDevice(damping=2.0, delta=1.5).with_damping(0.7).passivity_level == 0.7
 
 
 def test_population_is_log_uniform_and_reproducible():

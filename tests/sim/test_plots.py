@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from design.result import CONDITIONS
 from sim import map_plot, plots
 from sim.trace import Trace
 from tests.checks.tightness import plot_tightness
@@ -169,10 +170,11 @@ def test_who_was_found_is_told_from_who_was_not(drawn):
 HZ = np.array([1.0, 10.0, 100.0])
 
 
-def coupling(name, ratio, at):
+def coupling(name, ratio, at, delayed):
     demand = np.array([0.1, ratio / 2, ratio])
-    part = SimpleNamespace(ratio=ratio, demand=demand, requirement=SimpleNamespace(frequency_hz=at))
-    none = SimpleNamespace(ratio=np.inf, demand=None)
+    part = SimpleNamespace(ratio=ratio, demand=demand, requirement=SimpleNamespace(frequency_hz=at, guarantee="here"))
+    met = SimpleNamespace(guarantee="with a multiplier" if delayed else CONDITIONS["any-environment"])
+    none = SimpleNamespace(ratio=np.inf, demand=None, requirement=met)
     felt = SimpleNamespace(
         stiffness=np.array([[1.0, 9.0], [-5.0, 9.0], [7.0, 9.0]]), damping=np.array([[0.1, 2.0]] * 3)
     )
@@ -183,9 +185,10 @@ def coupling(name, ratio, at):
 
 def report(available=(1.37, 1.37), psi=(0, 0)):
     felt = SimpleNamespace(stiffness=np.full((3, 2), 2.0), damping=np.zeros((3, 2)))
-    couplings = [coupling("soft", 0.5, 100.0), coupling("stiff", 40.0, 0.0)]
+    couplings = [coupling("soft", 0.5, 100.0, any(psi)), coupling("stiff", 40.0, 0.0, any(psi))]
     data = {"frequency_hz": HZ, "available_damping": available, "psi": psi, "ideal": felt}
-    return SimpleNamespace(**data, sigma_E=[[4.0, 2.0]] * 3, couplings=couplings)
+    names = list(couplings[0].conditions)
+    return SimpleNamespace(**data, sigma_E=[[4.0, 2.0]] * 3, couplings=couplings, conditions=names)
 
 
 def test_what_binds_is_marked_on_its_curve_or_above_the_picture(drawn):
