@@ -32,6 +32,7 @@ from design.program import MARGIN, Options, Problem, Span, span_of, static_weigh
 from design.robustness import ranges_around, robustness, vertices
 from design.transparency import transparency
 from sim.scenario import load
+from tests.benchmarks.hostile_loops import hostile
 
 LOOPS = Path(__file__).parents[1] / "loops"
 SHORT = Options(ladder=((4, 3), (8, 6)))
@@ -655,3 +656,12 @@ def test_limited_forces_are_not_proved_for_ranges():
     ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
     with pytest.raises(ValueError, match="limited forces are proved for one environment"):
         design(ranged, replace(SHORT, limiter=True))
+
+
+@pytest.mark.parametrize("seed", [11, 12, 14])
+def test_whatever_the_loop_there_is_an_answer_and_a_proof(seed):
+    """Drawn at the ends of what devices and objects are: 15 samples, 54 kg on .08 N/m, dampings of .04 N s/m."""
+    found = design(hostile(np.random.default_rng(seed)), Options(ladder=((4, 3),)))
+    assert found.proved
+    assert isinstance(found.coupling, ForceFilter)
+    assert found.ladder[0].proved
