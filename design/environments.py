@@ -244,10 +244,10 @@ class ThisEnvironment(Multiplied):
         """
         T, m, w = G.T, loop.channels, len(loop.environment.walls)
         none, g = numbers([0] * m, T), numbers(multiplier, T)
-        slopes: Any = numbers([wall.slope(T) for wall in loop.environment.walls], T)
+        slopes: Any = [wall.slope(T) for wall in loop.environment.walls]
         S1, R = G.split_at_one()
         steep = np.diag(np.concatenate([none, g]))
-        limits = np.concatenate([none, g / slopes])
+        limits = np.concatenate([none, g / numbers(slopes, T)])
         free = np.hstack([numbers(np.eye(m + w), T), -steep]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
         damping = np.concatenate([even_damping(loop, T) / T, numbers([0] * w, T)])
         F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]

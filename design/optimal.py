@@ -48,7 +48,7 @@ _MOST_PROOFS = 30 * 112**2.7  # and (environments) states^2.7: a minute
 _SEARCHED = 0.2  # of the time limit, at least: what the search between the vertices of ranges may take
 _TRIED = 3  # rungs, the best first, until one is proved at every vertex of ranges
 _MOST_UNKNOWNS = 1600  # up to which a rung is tried: ten seconds
-_MOST_BESIDE = 3500  # unknowns by channels, the same where more than this-environment is asked
+_MOST_BESIDE = 3500  # unknowns by channels, the same where more than this-environment is asked, and no large rung
 
 
 @dataclass(frozen=True)
@@ -205,6 +205,11 @@ class _Search:
         """Whether anything but this-environment is asked."""
         return self.options.limiter or any(len(case.constraints) > 1 for case in self.cases)
 
+    @property
+    def simply(self) -> bool:
+        """Whether this-environment is asked, in one environment and of forces that latch at the tick."""
+        return not (self.constrained or self.loop.latency or self.loop.ranges)
+
     def slips(self, before: Optimal | None) -> tuple[program.Slip | None, ...]:
         """The limiters that a rung is solved for: that of the rung before, with the best multiplier that it has."""
         if not self.options.limiter:
@@ -251,8 +256,7 @@ class _Search:
         return found if found.proved or not self.options.limiter else None
 
     def span(self, taps: int, poles: int) -> program.Span:
-        simple = not (self.constrained or self.loop.latency or self.loop.ranges)
-        full = program.FULL if simple else program.FULL_BESIDE
+        full = program.FULL if self.simply else program.FULL_BESIDE
         return program.span_of(self.cases[0].E, taps, poles, self.options.band_hz[1], full)
 
     def room(self, taps: int, poles: int, before: int) -> bool:
@@ -263,7 +267,8 @@ class _Search:
         states = own + (0 if full else len(span.used) - own // m)
         states += self.cases[0].E.order + sum(loop.theta) + sum(loop.psi)
         proofs = len(self.cases) * states**2.7  # what they take, in seconds
-        solved = span.unknowns <= (_MOST_UNKNOWNS if full and not self.constrained else _MOST_BESIDE / m)
+        beside = taps <= _LARGE and m * span.unknowns <= _MOST_BESIDE
+        solved = span.unknowns <= _MOST_UNKNOWNS if full and self.simply else beside
         return before < states <= _MOST_STATES and solved and proofs <= _MOST_PROOFS
 
     def rung(self, taps: int, poles: int, before: Optimal | None, floor: float) -> tuple[Optimal, _Rung]:
