@@ -329,7 +329,7 @@ def worst(requirements: Sequence[Requirement]) -> int:
 # Delays that switch within [lo, hi] at every tick and on every channel.
 
 
-class Switching(Multiplied):
+class SwitchingDelays(Multiplied):
     """Safe in the environment of the loop whatever its delays do within loop.delays."""
 
     name, covers = "switching", ("psi", "T_max", "varying_delay")
@@ -381,7 +381,7 @@ class Switching(Multiplied):
         return f"{switching_guarantee(loop.delays)}: "
 
 
-SWITCHING = Switching()
+SWITCHING = SwitchingDelays()
 _SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # the best one is taken
 
 
@@ -403,7 +403,7 @@ _SPARE = 0.02  # of rho: what the block keeps, however large the damping, so tha
 
 
 @dataclass(frozen=True)
-class Limiter(Multiplied):
+class LimitedForces(Multiplied):
     """this-environment also while forces are limited, by a limiter of lag rho = beta delta/T."""
 
     beta: float = BETA
@@ -472,7 +472,7 @@ class Limiter(Multiplied):
         return "limiter: "
 
 
-LIMITER = Limiter()
+LIMITER = LimitedForces()
 
 
 def _delay_and_weights(theta: int, c: Sequence[Any], T: Number) -> Lti:
