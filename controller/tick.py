@@ -30,9 +30,9 @@ from controller.environment import Wall
 from controller.law import Law, Transition
 from controller.lti import Array, Lti, ReadOnly, frozen
 
-Stretch = Callable[[int], None]  # so many ticks from row 0 on
+RunBlock = Callable[[int], None]  # so many ticks from row 0 on
 
-_PART = 128  # ticks of a stretch whose memory and views stay in the cache
+_PART = 128  # ticks of a block whose memory and views stay in the cache
 _CALM = 1 - 1e-9  # of the limiter's forces: above that they are being limited
 
 
@@ -124,7 +124,7 @@ class Process(ReadOnly):
 
 
 class StepBuffer:
-    """The record of a stretch of ticks, laid out so that the loop writes it without copying.
+    """The record of a block of ticks, laid out so that the loop writes it without copying.
 
     A row holds [z, s, w, f] of one tick for all simulations: process state, plant state (whose first
     `channels` entries are the measured positions x), outside forces, and forces fed back; the next row
@@ -206,7 +206,7 @@ class StepBuffer:
 
     @property
     def limited(self) -> bool:
-        """Whether the limiter or the actuators may limit a force, so that a stretch is taken back."""
+        """Whether the limiter or the actuators may limit a force, so that a block is taken back."""
         return bool(self._bounds)
 
     def linear_until(self, ticks: int, most: float = 1.0) -> int:
@@ -281,7 +281,7 @@ class StepBuffer:
         return np.concatenate([row[:-m], self.process.measured(row[-m:].T).T])
 
     def rewind(self, ticks: int) -> None:
-        """Start a new stretch where this one stood after `ticks` ticks."""
+        """Start a new block where this one stood after `ticks` ticks."""
         self.calm = self.calm or (self._straight and self.linear_until(ticks, _CALM) == ticks)
         self.z[0] = self.z[ticks]
         self.s[0] = self.s[ticks]

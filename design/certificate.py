@@ -31,7 +31,7 @@ from design.coupling_file import (
     own_fields,
     sealed,
 )
-from design.environments import BETA, SWITCHING, THIS_ENVIRONMENT, Limiter, Switching, in_each, worst
+from design.environments import BETA, SWITCHING, THIS_ENVIRONMENT, LimitedForces, SwitchingDelays, in_each, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, require_size, rows_of
 from design.frequency import frequencies, on_circle, rounding
 from design.lmi import ANY_ENVIRONMENT
@@ -127,7 +127,7 @@ def prove_limiter(
     swept: Requirement | None = None,
 ) -> LimiterCertificate:
     """An exact proof with the multiplier `c` or the best one; `swept` as in `prove`. Raises NotProved."""
-    limiter = Limiter(beta, len(c[0]) if c else 1)
+    limiter = LimitedForces(beta, len(c[0]) if c else 1)
     found, proof = _proof(limiter, loop, filed(loop, coupling), c and [v for row in c for v in row], swept)
     c = limiter.rows(loop, found.multiplier or ())
     return LimiterCertificate(beta, limiter.rho(loop), c, found.required, _margin(found), proof["P"])
@@ -315,7 +315,7 @@ def check_limiter(
 
     What `known`, a certificate that was proved in this process, contains is swept, and not proved again.
     """
-    limiter, lags = Limiter(proof.beta, len(proof.c[0]) if proof.c else 1), {len(row) for row in proof.c}
+    limiter, lags = LimitedForces(proof.beta, len(proof.c[0]) if proof.c else 1), {len(row) for row in proof.c}
     rho = limiter.rho(loop)
     if proof.rho != rho or len(proof.c) != loop.channels or len(lags) > 1:
         expected = f"expected beta delta/T with beta = {proof.beta:g}, one row of c each"
@@ -380,7 +380,7 @@ def _fractions(name: str, rows: Rows | None) -> Sequence[Fraction]:
 
 
 _NAMED: dict[str, Condition] = {each.name: each for each in (ANY_ENVIRONMENT, THIS_ENVIRONMENT)}
-_PARTS = Switching, Limiter  # of a certificate, beside its condition
+_PARTS = SwitchingDelays, LimitedForces  # of a certificate, beside its condition
 
 
 def named(condition: str | Condition) -> Condition:

@@ -14,7 +14,7 @@ from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, judged, prove_limiter, required_damping
 from design.conditions import this_environment
 from design.coupling_file import Certificate, LimiterCertificate
-from design.environments import BETA, LIMITER, SWITCHING, THIS_ENVIRONMENT, Limiter, worst
+from design.environments import BETA, LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, worst
 from design.files import unseen
 from design.guarantees import ANY
 from design.result import Design, DesignFailed, NotProved, Requirement
@@ -96,7 +96,7 @@ def _by_its_own_block(
             return Limits(proof.rho, _OWN_PROOF, requirement, proof.c, proof)
         except NotProved:  # made for another loop
             pass
-    limiter = Limiter(proof.beta if proof and 0 < proof.beta <= 1 else BETA)
+    limiter = LimitedForces(proof.beta if proof and 0 < proof.beta <= 1 else BETA)
     requirement = required_damping(loop, coupling, limiter)
     c = limiter.rows(loop, requirement.multiplier or ())
     if not requirement.certified:

@@ -103,7 +103,7 @@ def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
 
 #: [rad/sample] a figure is even at 0, so that 1e-4 stands for it up to 1e-8; what bends it nearer to 0, as slow poles
 #: of a model that is wrong do, is asked for at a few frequencies below
-_LOWEST, _BELOW = 1e-4, np.geomspace(1e-5, 0.9e-4, 8)
+_LOWEST, _BELOW = 1e-4, np.geomspace(1e-6, 0.9e-4, 8)
 _EVEN = 192  # even frequencies, as many again evenly in their logarithm; more where delays make lobes
 _PER_LOBE = 24
 _NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomspace(0.05, 20, 10)])  # in widths

@@ -23,7 +23,7 @@ from design.certificate import prove, prove_limiter, required_damping
 from design.conditions import Condition, ratio_in
 from design.conditions import this_environment as requirement_of
 from design.coupling_file import Certificate, LimiterCertificate
-from design.environments import BETA, LIMITER, THIS_ENVIRONMENT, Limiter, in_each, worst
+from design.environments import BETA, LIMITER, THIS_ENVIRONMENT, LimitedForces, in_each, worst
 from design.guarantees import ANY
 from design.result import Design, DesignFailed, NotProved, from_ratio
 from design.robustness import Nearby, Spread, at, robustness_nearby, vertices
@@ -306,7 +306,7 @@ class _Search:
         problem = program.Problem(self.span(taps, poles), self.asked(slip), self.options, soft, heavier=heavier)
         coupling, needs = self.kept_in_all(problem, [0])
         if slip:
-            needs.append(min(required_damping(self.loop, coupling, Limiter(slip.beta)).ratio, 1 + _TOLERATED))
+            needs.append(min(required_damping(self.loop, coupling, LimitedForces(slip.beta)).ratio, 1 + _TOLERATED))
         for share in (0.95, 2.5, 50.0):  # of the margin, which stays unused until the rung is proved
             limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
@@ -338,7 +338,7 @@ class _Search:
         """(the coupling scaled until no environment needs more than `limit` of the damping, what each needs then)."""
         needs = [ratio_in(case.loop, coupling) for case in self.cases]
         if slip:
-            needs[0] = max(needs[0], required_damping(self.loop, coupling, Limiter(slip.beta)).ratio)
+            needs[0] = max(needs[0], required_damping(self.loop, coupling, LimitedForces(slip.beta)).ratio)
         scale = min(1.0, limit / max(needs))
         scaled = _scaled(coupling, scale)
         return self._assessed(scaled, scaled.g), [scale * need for need in needs]

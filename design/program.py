@@ -25,7 +25,7 @@ from controller.lti import Array, Complex, Lti, Sampled, as_like
 from design.arguments import number, one_of
 from design.barrier import EntryInequality, MatrixInequality, Program, centre, joined, packed, towards
 from design.conditions import Demand, even_damping, this_environment_demand
-from design.environments import SWITCHING, Limiter
+from design.environments import SWITCHING, LimitedForces
 from design.frequency import frequencies, hermitian, on_circle, peaks
 from design.transparency import BAND_HZ
 
@@ -144,8 +144,8 @@ class Slip:
     c: tuple[tuple[float, ...], ...]  # (m, lags)
 
     @property
-    def condition(self) -> Limiter:
-        return Limiter(self.beta, len(self.c[0]))
+    def condition(self) -> LimitedForces:
+        return LimitedForces(self.beta, len(self.c[0]))
 
     @classmethod
     def even(cls, loop: Loop, beta: float, c: float) -> Slip:
@@ -153,7 +153,7 @@ class Slip:
 
 
 def limiter(loop: Loop, slip: Slip) -> _Constraint:
-    """design.environments.Limiter: forces that are limited. A little of rho stays unused, as of the damping."""
+    """design.environments.LimitedForces: forces that are limited. A little of rho stays unused, as of the damping."""
     condition, c = slip.condition, [v for row in slip.c for v in row]
     spare = np.diag(condition.unknowns(loop).spare)
 

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from controller.delay import Timing
 from controller.lti import Array
-from controller.tick import FusedTicks, StepBuffer, Stretch
+from controller.tick import FusedTicks, RunBlock, StepBuffer
 from design.files import InputError
 from models.hold import HeldPlant, Product, expm_each, exponential_step, hold, latched, product_of
 from models.scene import Plant, Scene, Variants
@@ -66,12 +66,12 @@ class Engine(Protocol):
         ...
 
     # One that can may also have, from `start` on:
-    #   stretch(ticks)   the linear law and `advance` for so many ticks from row 0 on, in fewer calls; or None
-    #   back(k)          after a stretch the plant goes back to the state of row k
+    #   run_block(ticks) the linear law and `advance` for so many ticks from row 0 on, in fewer calls; or None
+    #   back(k)          after it the plant goes back to the state of row k
 
 
 class _Exact:
-    stretch: Stretch | None = None
+    run_block: RunBlock | None = None
 
     def back(self, k: int) -> None:
         """The exact engines have no state of their own."""
@@ -96,18 +96,18 @@ class ExactEngine(_Exact):
 
         # what clips does so in long runs, and then bit for bit as tick by tick
         straight = buffer.calm and not buffer.clips and self._plant.ndim == 2
-        self.advance, self.stretch = advance, self._fused(buffer) if straight else None
+        self.advance, self.run_block = advance, self._fused(buffer) if straight else None
 
-    def _fused(self, buffer: StepBuffer) -> Stretch:
+    def _fused(self, buffer: StepBuffer) -> RunBlock:
         fused = FusedTicks(buffer, *np.split(self._plant, [len(self._plant)], axis=1))
         product, before, after = fused.product, fused.before, fused.next
 
-        def stretch(ticks: int) -> None:
+        def run_block(ticks: int) -> None:
             for count in fused.parts(ticks):
                 for now, then in zip(before[:count], after, strict=False):
                     product(now, then)
 
-        return stretch
+        return run_block
 
 
 class OneByOne:
@@ -331,7 +331,7 @@ class MujocoEngine:
         self.model = _discretised(scene, T, integrator, substeps)
         self.data = mujoco.MjData(self.model)
         self._warnings = self.data.warning.number
-        self.stretch: Stretch | None = None
+        self.run_block: RunBlock | None = None
         stacked, moves = _stacked(scene.plant), partial(_step_of, scene.plant, scene.model.nv)
         self._whole = moves if integrator == EXPONENTIAL and substeps == 1 else None
         self._timing, both, q, v = timing, (self.model, self.data), self.data.qpos, self.data.qvel
@@ -353,15 +353,15 @@ class MujocoEngine:
         self._rubs = default_integrator(scene) != EXPONENTIAL
 
     def start(self, buffer: StepBuffer) -> None:
-        self._buffer, self.stretch, access = buffer, None, self._access
+        self._buffer, self.run_block, access = buffer, None, self._access
         access.put(buffer, 0)
         self._warnings[:] = 0
         self._advance: Callable[[int], None] | None = None
         if buffer.calm and not self._timing and not (self._rubs and buffer.limited):
             if self._whole:
-                self.stretch = self._fused(buffer, self._whole(access.T))
+                self.run_block = self._fused(buffer, self._whole(access.T))
             elif not (access.move or access.kick):
-                self.stretch = self._stepped(buffer)
+                self.run_block = self._stepped(buffer)
 
     @property
     def advance(self) -> Callable[[int], None]:
@@ -369,14 +369,14 @@ class MujocoEngine:
         self._advance = self._advance or self._access.ticks(self._buffer, self._timing)
         return self._advance
 
-    def _fused(self, buffer: StepBuffer, move: Array) -> Stretch:
+    def _fused(self, buffer: StepBuffer, move: Array) -> RunBlock:
         access, states = self._access, len(move)
         fused = FusedTicks(buffer, move[:, :states], G=move[:, states:])
         ctrl, qacc, forward, (q, v) = access.ctrl.data, access.qacc.data, access.forward, access.state
         q, v = q.data, v.data
         rows, product = list(zip(*fused.copied(len(q)), fused.before, fused.next, strict=False)), fused.product
 
-        def stretch(ticks: int) -> None:
+        def run_block(ticks: int) -> None:
             for count in fused.parts(ticks):
                 for inputs, rate, q_then, v_then, now, then in rows[:count]:
                     ctrl[:] = inputs
@@ -386,9 +386,9 @@ class MujocoEngine:
                     q[:] = q_then
                     v[:] = v_then
 
-        return stretch
+        return run_block
 
-    def _stepped(self, buffer: StepBuffer) -> Stretch:
+    def _stepped(self, buffer: StepBuffer) -> RunBlock:
         access = self._access
         ctrl, state, step, count = access.ctrl, access.state, access.step, access.substeps
         rows, law, m = buffer.rows[:, :, 0], buffer.process.linear.dot, buffer.process.channels
@@ -396,14 +396,14 @@ class MujocoEngine:
         before, after = list(rows[:, : buffer.z.shape[1] + m]), list(buffer.after[:, :, 0])
         inputs = list(rows[:, -len(ctrl) :])
 
-        def stretch(ticks: int) -> None:
+        def run_block(ticks: int) -> None:
             for now, then, held, moved in zip(before, after[:ticks], inputs, states, strict=False):
                 law(now, then)
                 ctrl[...] = held
                 step(count)
                 moved[...] = state
 
-        return stretch
+        return run_block
 
     def back(self, k: int) -> None:
         """Put the plant into the state of row k; what was warned of since does not count."""

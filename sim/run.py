@@ -272,8 +272,8 @@ def run_blocks(
 def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
     """Close the loop for the first `ticks` rows of the buffer."""
     done, fast = 0, cast(Any, engine)
-    if buffer.calm and getattr(engine, "stretch", None):
-        fast.stretch(ticks)  # the same by the linear law, whose forces are looked at afterwards
+    if buffer.calm and getattr(engine, "run_block", None):
+        fast.run_block(ticks)  # the same by the linear law, whose forces are looked at afterwards
         done = buffer.linear_until(ticks)
         if done == ticks:
             return

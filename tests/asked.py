@@ -62,7 +62,7 @@ def switching_sweep(G, lo, hi, delta, alpha=None, T_max=None):
     return environments.SWITCHING.required_of(G, _switching(G, lo, hi, delta, T_max), alpha)
 
 
-class _Lagging(environments.Limiter):
+class _Lagging(environments.LimitedForces):
     """The limiter of any lag."""
 
     lag_given = ()

@@ -34,12 +34,12 @@ def driven(
 
 
 def tick_by_tick(engine):
-    """The engine without stretches: every tick is looked at before the next."""
+    """The engine without blocks of ticks: every tick is looked at before the next."""
     start = engine.start
 
     def begin(buffer: StepBuffer) -> None:
         start(buffer)
-        engine.stretch = None
+        engine.run_block = None
 
     engine.start = begin
     return engine

@@ -18,7 +18,7 @@ from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, environment
 from controller.loop import Loop
 from controller.lti import Lti
-from design.environments import Limiter
+from design.environments import LimitedForces
 from design.lmi import Infeasible, Shaping, least_multiplier
 from design.spring_damper import GainSet, step
 from models.device import RigidDevice
@@ -388,7 +388,7 @@ def test_saturation_is_outside_every_certificate():
     unlimited = replace(simulation, process=replace(simulation.process, force_limit=np.full(2, np.inf)))
     assert np.abs(late(unlimited)).max() < 0.01
     for beta in (0.0, 0.01):  # the limiter in the place of clipping: every start comes to rest
-        rho = Limiter(beta).rho(base.loop("I"))
+        rho = LimitedForces(beta).rho(base.loop("I"))
         law = base.loop("I").law(STIFF, (12.0, 5.657), rho)
         limiting = replace(simulation, process=replace(simulation.process, law=law))
         assert np.abs(late(limiting)).max() < 0.01

@@ -32,7 +32,7 @@ from design import certificate
 from design.certificate import prove, verify
 from design.conditions import delayed_environment_demand
 from design.coupling_file import Stored, digest, sealed
-from design.environments import SWITCHING, Limiter
+from design.environments import SWITCHING, LimitedForces
 from design.exact import find_storage, prove_positive_real
 from design.result import NotProved, from_ratio
 
@@ -450,7 +450,7 @@ def test_an_asymmetry_of_1e_12_is_refused_behind_delay_and_for_switching_too():
     assert forged(asked, skew, made) == "V(1) is not exactly symmetric"
     switching = change(asked, psi=(0, 0)).switching(DelayRange((0, 0), (1, 1)))
     limited = change(asked, psi=(0, 0))
-    for there, condition, multiplier in ((switching, SWITCHING, ALPHA), (limited, Limiter(0.01, 0), ())):
+    for there, condition, multiplier in ((switching, SWITCHING, ALPHA), (limited, LimitedForces(0.01, 0), ())):
         assert certificate._blocks(there, crossed(1e-4), condition, multiplier)["P"].order
         with pytest.raises(NotProved, match=r": F\(1\) is not exactly symmetric"):
             certificate._blocks(there, skew, condition, multiplier)

@@ -18,7 +18,7 @@ from design import environments
 from design.certificate import lag, prove, prove_limiter, required_damping, verify
 from design.conditions import least_multiple
 from design.coupling_file import Certificate, LimiterCertificate, Stored, load, save, sealed
-from design.environments import LIMITER, Limiter
+from design.environments import LIMITER, LimitedForces
 from design.frequency import hermitian, on_circle
 from design.gain_search import LimiterLoop
 from design.lmi import RESERVE
@@ -151,7 +151,7 @@ def test_for_many_devices_no_multiplier_is_sought(monkeypatch):
 def test_unequal_weights_need_enough_lag():
     """F(1) couples the channels: c = (0.2, 0.4) is infeasible at beta = 1e-4 and fine at 0.01."""
     unequal = ((0.2,), (0.4,))
-    assert np.isinf(required(BUILT, unequal, Limiter(1e-4).rho(PAIR)))
+    assert np.isinf(required(BUILT, unequal, LimitedForces(1e-4).rho(PAIR)))
     assert required(BUILT, unequal) < 1.36
 
 
@@ -160,7 +160,7 @@ def test_bad_requests_are_named():
     with pytest.raises(ValueError, match="as many for each channel"):
         limiter(G, (1, 2), DELTA, LAG, ((0.1,),))
     with pytest.raises(ValueError, match=r"beta is -0\.01, expected a number >= 0"):
-        Limiter(-0.01)
+        LimitedForces(-0.01)
     with pytest.raises(ValueError, match="expected numbers >= 0"):
         limiter(G, (1, 2), DELTA, LAG, ((-0.1,), (0.0,)))
     swinging = limiter(PAIR.sent(SpringDamper((1e6, 1e6), (50.0, 50.0))), (9, 9), DELTA, LAG)

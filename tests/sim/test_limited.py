@@ -79,7 +79,7 @@ def test_ticks_in_stretches_are_ticks_one_by_one(engine, apart, limit):
     which, integrator = ("exact", None) if engine == "exact" else ("mujoco", engine)
     fast, slow = (make_engine(simulation, which, integrator) for _ in range(2))
     found, expected = run(simulation, fast), run(simulation, tick_by_tick(slow))
-    assert vars(fast)["stretch"] is not None
+    assert vars(fast)["run_block"] is not None
     assert (0 < expected.clipped(np.array([limit] * 2)).mean() < 0.2) == (limit < 10)
     for name in ("s", "z", "f", "w"):
         rows = getattr(expected, name)

@@ -39,8 +39,8 @@ def optimal():
 
 
 def densely(sweep, coupling_force, K, B):
-    """Required over available damping at 60000 frequencies, from the network's equations alone."""
-    w = np.linspace(1e-5, np.pi, 60_000)
+    """Required over available damping at 60010 frequencies, from the network's equations alone."""
+    w = np.concatenate([np.geomspace(1e-6, 1e-5, 10), np.linspace(1e-5, np.pi, 60_000)])
     z = on_circle(w)
     T, (M, D, S) = sweep.loop.T, sweep.loop.network.matrices()
     network = sweep.loop.network
@@ -58,7 +58,10 @@ def densely(sweep, coupling_force, K, B):
 
 @pytest.mark.parametrize("scenario", [PAIR, STAR], ids=lambda s: s.name)
 def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
-    """1e-5: between points of the sweep 5e-5 apart a peak of width 0.01 rises by (2.5e-5/0.01)^2."""
+    """1e-5: between points of the sweep 5e-5 apart a peak of width 0.01 rises by (2.5e-5/0.01)^2.
+
+    Beside the slowest pole, 0.0015 from 1, what binds at 0 is larger by (1e-6/0.0015)^2 than at the map's first point.
+    """
     coupling = optimal[scenario.name]
     sweep = around(scenario, coupling)
     responses = {}
@@ -71,7 +74,7 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
     for K, B in ((90.0, 0.3), (350.0, 2.0), (1213.2, 2.54)):
         found = sweep.ratios("this-environment", np.array([K]), np.array([B]))[0]
         assert found == pytest.approx(densely(sweep, filtered, K, B), rel=1e-5)
-        assert sweep.requirement("this-environment", K, B).ratio == pytest.approx(found, rel=1e-7)
+        assert sweep.requirement("this-environment", K, B).ratio == pytest.approx(found, rel=1e-6)
 
 
 def test_forces_leave_through_the_limiter_of_the_coupling_in_every_environment():
