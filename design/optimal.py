@@ -278,9 +278,7 @@ class _Search:
         solved = span.unknowns <= _MOST_UNKNOWNS if full and self.simply else beside
         return before < states <= _MOST_STATES and solved and proofs <= _MOST_PROOFS
 
-    def rung(
-        self, taps: int, poles: int, before: Optimal | None, floor: float, least: float
-    ) -> tuple[Optimal, _Rung]:
+    def rung(self, taps: int, poles: int, before: Optimal | None, floor: float, least: float) -> tuple[Optimal, _Rung]:
         """The optimum over a basis, scaled until every sweep passes, and proved where it gains this much [dB].
 
         Where it renders less than this share of the static stiffness, that counts more.
