@@ -104,11 +104,14 @@ def switching_guarantee(span: DelayRange) -> str:
 
 
 class NotProved(ValueError):
-    """No proof of the condition was found; carries the requirement that the sweep found, if there is one."""
+    """No proof of the condition was found; carries the requirement that the sweep found, if there is one.
 
-    def __init__(self, reason: str, requirement: Requirement | None = None) -> None:
+    `refuted` where there is none: exact arithmetic contradicts the sweep.
+    """
+
+    def __init__(self, reason: str, requirement: Requirement | None = None, refuted: bool = False) -> None:
         super().__init__(reason)
-        self.requirement = requirement
+        self.requirement, self.refuted = requirement, refuted
 
 
 # ----------------------------------------------------------------------------------------------------
