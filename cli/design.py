@@ -196,7 +196,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         best=best and _Best(limit, best.g, best.ladder),
         sdps=design.sdps,
         stored=stored,
-        claim=design.own and design.own.claim,
+        claim=design.own and design.own.said(judged.requirements[design.condition]),
     )
 
 

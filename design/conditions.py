@@ -351,8 +351,12 @@ class Condition(ABC):
 
     @property
     def claim(self) -> str:
-        """What is said of one of the user's own."""
+        """What is said of one of the user's own where it holds."""
         return f"the block of {self.name} is what is proved; that it keeps this loop safe is yours to show"
+
+    def said(self, needs: Requirement) -> str:
+        """The same, or that it does not hold."""
+        return self.claim if needs.certified else f"fails the condition {self.name}: {needs.shortfall}"
 
     def words(self, loop: Loop) -> str:
         """The same in the words of a report."""

@@ -146,14 +146,15 @@ class _Search:
 
     def __init__(self, block: Callable[[Sequence[float]], Demand[Lti]], unknowns: Unknowns, system: Lti) -> None:
         self._block, self._unknowns, self._units = block, unknowns, np.array(unknowns.units)
-        self._searched, self._last = np.flatnonzero(self._units), ((), (0.0, 0.0))
+        self._searched = np.flatnonzero(self._units)
+        self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # what was swept last
         self._grid = np.concatenate([[0.0], frequencies(system)])
         self._spare = np.diag(np.broadcast_to(unknowns.spare, system.outputs))
         self.pays = system.outputs <= _MOST_ROWS and self._searched.size > 0
 
     def swept(self, values: Sequence[float]) -> tuple[float, float]:
         """(the ratio that the block asks at these values, where [rad/sample]), by a refined sweep."""
-        if self._last[0] != values:
+        if self._last is None or self._last[0] != values:
             asked = self._block(values)
             self._last = values, supremum(lambda w: least_scale(asked, w), self._grid)
         return self._last[1]
