@@ -32,7 +32,7 @@ from design.transparency import Transparency, decibels, transparency
 from design.worst_member import Searched, search_ranges
 
 #: [s] of the processor, up to so many devices: what the price of a range may take, a third of it for proofs
-_PRICED = {2: 3.0, 4: 6.0, 10**3: 9.0}
+_PRICED = {2: 3.0, 4: 6.0, 10**3: 12.0}
 _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
 _FIRST = 3  # of the environments: those that the nominal design misses most are imposed first
 _SETTLED_DB = 0.05  # a rung that gains less ends the climb
