@@ -94,17 +94,17 @@ def design_with(
 ) -> Optimal:
     """The optimal coupling for Options(**options), also safe while delays vary within `switching`, (lo, hi) [samples].
 
-    The rungs of its ladder are the steps that `progress` hears of.
+    Each rung of its ladder is a step of `progress`.
     """
     asked, done = program.Options(**options), 0
 
-    def heard(rung: _Rung) -> None:
+    def reached(rung: _Rung) -> None:
         nonlocal done
         done += 1
         progress(f"{rung.mismatch_db:.2f} dB after {rung.seconds:.1f} s", done, len(asked.ladder))
 
     span = None if switching is None else DelayRange(*(tuple(map(int, end)) for end in switching))
-    return design(loop.switching(span), asked, progress=heard)
+    return design(loop.switching(span), asked, progress=reached)
 
 
 def design(
