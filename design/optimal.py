@@ -35,9 +35,9 @@ from design.worst_member import Searched, search_ranges
 _PRICED = {2: 3.0, 4: 6.0, 10**3: 9.0}
 _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
 _FIRST = 3  # of the environments: those that the nominal design misses most are imposed first
-_SETTLED_DB = 0.05  # a rung that gains less ends the climb: it is not proved, and not taken
+_SETTLED_DB = 0.05  # a rung that gains less ends the climb
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
-_LARGE, _PROMISING_DB = 26, 0.1  # taps: one of more is tried where the rung before has gained so much
+_LARGE, _PROMISING_DB = 26, 0.1  # taps: one of more is tried after one that gains so much, proved if it is worth it
 _FEWEST_RUNGS = 3
 _MOST_REFUSED = 2  # rungs without a proof, one after the other, after which a larger one has none either
 _KEPT_STIFFNESS = 0.5  # of the most static stiffness of a rung that was best: one that renders less is not taken
@@ -137,15 +137,15 @@ def design(
             continue
         try:
             with within(max(options.seconds - climb.elapsed, 0.0) if rungs else np.inf, "a larger basis"):
-                least = _SETTLED_DB if len(rungs) + 1 >= _FEWEST_RUNGS else -np.inf
+                least = _SETTLED_DB if taps > _LARGE else -np.inf
                 found, rung = climb.rung(taps, poles, best, floor, least)
         except TooLong:
             hurried = True
             break
         rungs.append(rung)
         progress(rung)
-        settled = rung.reason == _SETTLED
         gained = np.inf if rung.reason else climb.gained(best, found)
+        settled = rung.reason == _SETTLED or (gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS)
         if rung.reason is None and (best is None or (found.g >= floor and gained > 0)):
             best, floor = found, max(floor if best else 0.0, _KEPT_STIFFNESS * found.g)
             better.append(found)
