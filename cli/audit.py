@@ -80,7 +80,7 @@ def main(argv: list[str]) -> int:
     if args.coupling and not _is_own(args):  # what its file is worth in the loop that is audited
         notes = check_stored(read_coupling(args.coupling), scenario.loop(args.case).switching(switching), asked).notes
     _, own = name_and_own(asked)
-    notes = (*notes, own.claim) if own else notes
+    notes = (*notes, own.said(found.parts[own.name].requirement)) if own else notes
     report = _Report(
         args.case,
         None if args.rigid else scenario.name,

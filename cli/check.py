@@ -15,6 +15,7 @@ from design.certificate import NotProved, Verdict, lag, named, prove, required_d
 from design.conditions import Condition
 from design.coupling_file import Stored, SwitchingProof
 from design.coverage import SearchFigures
+from design.files import unseen
 from design.guarantees import HERE, RANGES
 from design.result import CONDITIONS, listed, switching_guarantee
 from design.worst_member import Searched, search, search_ranges
@@ -51,6 +52,7 @@ class _Checked:
     wall_s: float = render.figure("seconds", "{:.6g}")
     switching: _Switching | None = field(default=None)
     claim: str | None = render.figure("claim", default=None, json="given")  # of a condition of the user's own
+    anew: bool = unseen(default=False)  # by another condition than the file's, whose certificate says nothing here
 
 
 def main(argv: list[str]) -> int:
@@ -60,13 +62,15 @@ def main(argv: list[str]) -> int:
     stored = read_coupling(args.coupling)
     with options.refused(f"{args.coupling}: "):
         own = named(args.condition) if args.condition else None
-        stored, verdict = _by_own(stored, own) if own else (stored, verify(stored))
+        anew = own is not None and not (stored.certificate and stored.certificate.condition == own.name)
+        stored, verdict = _anew(stored, own) if own and anew else (stored, verify(stored, own))
     searched = _searched(stored, own) if verdict.proved else None
     if searched and not searched.worst[0].ratio < 1:
         verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
     checked = _checked(stored, verdict, searched, time.perf_counter() - begin)
     if own and verdict.proved and own.name not in CONDITIONS:
         checked = replace(checked, claim=own.claim)
+    checked = replace(checked, anew=anew)
     render.publish(args, checked, [_table(checked)])
     return options.exit_code(verdict.proved)
 
@@ -75,12 +79,12 @@ def _parser() -> options.Parser:
     example = "python -m design.check coupling.json"
     parser = options.Parser("design.check", "Prove a stored coupling again, in exact arithmetic.", example)
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling")
-    parser.add_condition("prove the coupling by this condition, in place of the file's")
+    parser.add_condition("the condition of the file's certificate, or another one that is proved anew")
     parser.add_json()
     return parser
 
 
-def _by_own(stored: Stored, condition: Condition) -> tuple[Stored, Verdict]:
+def _anew(stored: Stored, condition: Condition) -> tuple[Stored, Verdict]:
     """The coupling with a certificate by this condition, proved and verified. Raises ValueError for a taken name."""
     coupling = stored.built()
     try:
@@ -131,7 +135,8 @@ def _table(checked: _Checked) -> Table:
     title = "not proved"
     if checked.proved:
         between = ", at every vertex; between them searched, not proved" if checked.between else ""
-        title = f"proved, in exact arithmetic{between}"
+        anew = "proved anew, not from the file" if checked.anew else "proved"
+        title = f"{anew}, in exact arithmetic{between}"
     rows = [*render.rows_of(checked), *(render.rows_of(checked.switching) if checked.switching else [])]
     if not checked.proved:  # what a file says that was refused
         claims = ("required", "margin", "switching, required", "switching, margin")

@@ -196,7 +196,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         best=best and _Best(limit, best.g, best.ladder),
         sdps=design.sdps,
         stored=stored,
-        claim=design.own and design.own.claim,
+        claim=design.own and design.own.said(judged.requirements[design.condition]),
     )
 
 
@@ -241,12 +241,12 @@ class _Best:
         rungs = (f"{rung.mismatch_db:.2f}{_why_left(rung)}" for rung in self.ladder)
         yield "ladder [dB]", ", ".join(rungs) or None
         yield "last not taken", next((rung.left for rung in reversed(self.ladder) if rung.left), None)
-        if missed := [rung.reason for rung in self.ladder if not rung.proved]:
+        if missed := [rung.reason for rung in self.ladder if not (rung.proved or rung.left)]:
             yield "last not proved", missed[-1]
 
 
 def _why_left(rung: Any) -> str:
-    return "" if rung.taken else " (not taken)" if rung.proved else " (not proved)"
+    return "" if rung.taken else " (not taken)" if rung.left else " (not proved)"
 
 
 def _switching_words(proof: coverage.Switching) -> str:

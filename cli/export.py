@@ -16,6 +16,7 @@ from cli import options, render
 from controller.lti import Array
 from design.certificate import Verdict, named, verify
 from design.coupling_file import Stored
+from design.designs import name_and_own
 from design.export import (
     SUFFIXES,
     ExportedBlock,
@@ -58,17 +59,20 @@ class _Exported:
     force_limit: Array | None = unseen()
     forces: str | None = render.figure("forces")
     test: dict[str, Any] = render.figure("test vector", "{[ticks]} ticks, in the file")
+    claim: str | None = render.figure("claim", json="given")  # of a condition of the user's own
 
 
 def main(argv: list[str]) -> int:
     """Export a stored coupling. 0: written, 1: written, but the certificate in its file does not hold."""
     args = _parser().parse_args(argv)
     stored = read_coupling(args.coupling)
+    own = name_and_own(args.condition)[1]
     try:
         verdict = verify(stored, args.condition and named(args.condition))
     except (ValueError, ArithmeticError) as error:
         verdict = Verdict(False, str(error))
-    block = _block(args, stored, verdict)
+    claim = own.claim if own and verdict.proved else None
+    block = _block(args, stored, verdict, claim)
     path = out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{SUFFIXES[args.format]}")
     test = trial(block, args.seed)
     write(path, content(args.format, block, test, path.name))
@@ -88,6 +92,7 @@ def main(argv: list[str]) -> int:
         block.limiter and block.limiter.limit,
         forces if args.process else None,
         {"ticks": len(test.inputs), "seed": args.seed, "largest_output": np.abs(test.outputs).max()},
+        claim,
     )
     title = f"{block.name} as {args.format}"
     render.publish(args, exported, [render.facts(title, render.rows_of(exported), left=True)])
@@ -115,7 +120,7 @@ def _parser() -> options.Parser:
     return parser
 
 
-def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> ExportedBlock:
+def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: str | None) -> ExportedBlock:
     """The block that was asked for, with lines on where it comes from. Raises InputError."""
     limit = options.per_channel("--force-limit", args.force_limit, stored.loop.channels) if args.force_limit else None
     try:
@@ -124,4 +129,4 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> Export
         raise InputError(f"{args.coupling}: {error} (--process)") from None
     except ValueError as error:  # coefficients beyond floating point
         raise InputError(f"{args.coupling}: {error}") from None
-    return with_origin(block, Path(args.coupling).name, stored, verdict)
+    return with_origin(block, Path(args.coupling).name, stored, verdict, claim)

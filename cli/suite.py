@@ -1,8 +1,8 @@
 """python -m sim.suite (make validate): all checks of this project, in one report, verdicts first.
 
-A check is another command with its options, run as a user would run it, or rows that tests/checks measures (these come
-with the repository alone); the report shows the command that repeats it beside its numbers. A further check is one more
-line in CHECKS, here or in tests/checks/ours.py.
+A check is another command with its options, run as a user would run it, or rows that tests/checks measures; the report
+shows the command that repeats it beside its numbers. A further check is one more line in CHECKS, here or in
+tests/checks/ours.py, which is in the repository and not in an installed package.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ import json
 import os
 import platform
 import shlex
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from importlib.metadata import version
 from io import StringIO
@@ -25,7 +27,6 @@ from typing import Any
 from cli import options, render
 from controller.arithmetic import SingularLoop
 from design.files import folder, write, write_json
-from design.own import named
 from design.result import CONDITIONS, DesignFailed
 from sim.scenario import InputError
 
@@ -117,15 +118,22 @@ CHECKS = (
     Check("map", "Which springs and dampers may a device render against a wall?", _MAP, _gain_map),
     Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", _accuracy),
 )
-_OURS = ("tightness", "delayed", "hard", "proofs", "traces", "uneven", "guarantees", "faults", "endurance")
 
 
-def _checks(names: Sequence[str]) -> list[Check]:
-    """The checks of these names. Raises InputError where those of ours are not there."""
-    known = {check.name: check for check in CHECKS}
-    if not set(names) <= set(known):
-        known |= {check.name: check for check in named("sim.suite", "tests.checks.ours:CHECKS")}
-    return [known[name] for name in names]
+@cache
+def _measuring() -> tuple[Check, ...]:
+    """The checks of tests/checks beside this package, wherever it is run; none where it was installed without them."""
+    repository = Path(__file__).parents[1]
+    if not (repository / "tests" / "checks" / "ours.py").is_file():
+        return ()
+    sys.path.insert(0, str(repository))  # for processes of their own, too
+    checks: tuple[Check, ...] = import_module("tests.checks.ours").CHECKS
+    return checks
+
+
+def _checks() -> dict[str, Check]:
+    """All that there are, by name, in the order of the report."""
+    return {check.name: check for check in (*CHECKS, *_measuring())}
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -222,7 +230,8 @@ def _measured(check: Check, place: Path, seed: int) -> int:
 def main(argv: list[str]) -> int:
     """Run the checks. 0: all hold, 1: one does not, 130: interrupted; what was done is in the report."""
     args = _parser().parse_args(argv)
-    checks = _checks(args.only or _names())
+    known = _checks()
+    checks = [known[name] for name in args.only or known]
     out, screen = folder(Path(args.out or "out/validate")), render.console(args)
     answers: list[_Answer] = []
     begin, interrupted = time.perf_counter(), False
@@ -247,6 +256,8 @@ def main(argv: list[str]) -> int:
         _machine(),
     )
     screen.print(report.headline)
+    if not _measuring():
+        screen.print(_LESS)
     if len(checks) == 1 and answers:
         _show(answers[0], screen)
     render.publish(args, report, (), (), out, [write(out / "report.md", _markdown(report))])
@@ -260,23 +271,23 @@ def _parser() -> options.Parser:
         " endurance (an hour of a session in virtual time, 100,000 hands).",
         "python -m sim.suite --only I,hard --humans 200",
     )
-    parser.add_argument("--only", type=_picked, metavar="NAME,..", help=f"of {','.join(_names())} (default all)")
+    parser.add_argument("--only", type=_picked, metavar="NAME,..", help=f"of {','.join(_checks())} (default all)")
     humans, count = "random humans per loop (default 300)", options.whole(1, 1_000_000)
     parser.add_argument("--humans", type=count, default=300, metavar="N", help=humans)
     parser.add_output(what="folder for the report (default out/validate)")
     return parser
 
 
-def _names() -> list[str]:
-    return [*(check.name for check in CHECKS), *_OURS]
+_LESS = "The checks that measure this project itself come with its repository."
 
 
 def _picked(text: str) -> list[str]:
     """Names of checks, in the order of the report."""
     for name in (asked := text.split(",")):
-        if name not in _names():
-            raise argparse.ArgumentTypeError(f"has {name!r}, allowed are {', '.join(_names())}")
-    return [name for name in _names() if name in asked]
+        if name not in _checks():
+            less = "" if _measuring() else f". {_LESS}"
+            raise argparse.ArgumentTypeError(f"has {name!r}, allowed are {', '.join(_checks())}{less}")
+    return [name for name in _checks() if name in asked]
 
 
 def _verdict(answer: _Answer) -> str:

@@ -289,6 +289,7 @@ def _reported(
     switching, timing = _varying(question, chosen, findings, certified)
     worst, drawn = (w and verdicts.Attacked.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))
     also = all(part.holds for part in (own, energy, switching, timing, worst, drawn) if part)
+    also = also and not chosen.fails(judged.requirements)
     traces = verdicts.Traces.of(question, findings) if question.ticks and any_done else None
     both, bad, grows = question.engine != "exact", unstable(findings.exact), unstable(findings.mujoco)
     disagreements, wrong = int(findings.disagreements.sum()), bad | (both & grows & (findings.mujoco > 1e-3))
@@ -326,5 +327,5 @@ def _reported(
         unfinished=findings.lost or None,
         wall_s=wall,
         simulated_s_per_s=findings.simulated / wall,
-        remarks=chosen.notes,
+        remarks=chosen.remarks(judged.requirements),
     )

@@ -235,6 +235,8 @@ def _remarks(report: MapReport) -> Iterator[str]:
     if report.fixed:
         yield from report.fixed.remarks
         yield _about(report.conditions)
+    if report.claim:
+        yield f"{report.claim}."
     for name in report.conditions:
         ratio = report.ratios[name]
         if ratio.reason:

@@ -4,7 +4,7 @@ One expression serves every use. `Lti` holds floats, a stack of systems (leading
 G(z) at points of the circle. They share the operators
 
     G @ H   series G(z) H(z)        G + H, G - H, -G, c * G        M @ G, G @ M, G + M   with a constant matrix M
-    G.feedback(H)   (I + G H)^-1 G                                 G.split_at_one()      G(1), (G(z) - G(1))/(z - 1)
+    G.feedback(H)   (I + G H)^-1 G                                 G.over_z_minus_one()  G(1), G/(z - 1) less its pole
 
 The period decides the arithmetic: built with a float T, blocks are floating point; with a Fraction T they are exact,
 and a stored float stands for its shortest decimal, the one that a person wrote: 0.0012 is 12/10000.
@@ -279,6 +279,14 @@ class Lti(ReadOnly):
         static, R = self._rest
         return static, Lti(self.A, self.B, -R, np.zeros_like(self.D), self.T)
 
+    def over_z_minus_one(self) -> tuple[Array, Lti]:
+        """G(1), and a block that is stable where G is, with the Hermitian part of G/(z - 1) on the circle but at z = 1.
+
+        It is (G - G(1))/(z - 1) - G(1)/2: the real part of 1/(z - 1) is -1/2 there, and G(1) must be symmetric.
+        """
+        static, quotient = self.split_at_one()
+        return static, quotient - static / 2
+
     def __matmul__(self, other: Lti | Array) -> Lti:
         B, D = self.B, self.D
         if not isinstance(other, Lti):
@@ -412,8 +420,8 @@ class Sampled:
     def inverse(self) -> Sampled:
         return self._with(1 / self.G if self.G.shape[-1] == 1 else np.linalg.inv(self.G))
 
-    def split_at_one(self) -> tuple[Array, Sampled]:
-        """0 and G/(z - 1): off z = 1 its Hermitian part is that of the split, since He[G(1)/(z - 1)] = -G(1)/2."""
+    def over_z_minus_one(self) -> tuple[Array, Sampled]:
+        """0, as responses do not tell G(1), and G/(z - 1) itself."""
         step = -0.5 - 0.5j / np.tan(np.angle(self.z) / 2)  # 1/(z - 1), whose real part 1 - z would lose near z = 1
         return np.zeros(self.G.shape[-2:]), self._with(self.G * step[..., None, None])
 

@@ -36,7 +36,7 @@ from design.result import Design
 from design.transparency import BAND_HZ, decibels
 
 _GRID = 250  # points, even and even in the logarithm, on which H is given
-_KNOTS = {1: 60, 2: 60, 3: 24, 4: 20, 5: 16}  # of h, by channels
+_KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # of h, by channels
 MOST = max(_KNOTS)  # channels for which there is a bound
 NO_BOUND = f"no bound for more than {MOST} devices: half a minute for one that is 1 dB off"
 _NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the ends of the band
@@ -49,7 +49,7 @@ _AROUND = np.array(
     [-8, -5, -3, -2, -1.4, -1, -0.7, -0.4, -0.2, 0, 0.2, 0.4, 0.7, 1, 1.4, 2, 3, 5, 8]
 )  # widths of a mode
 _DEGREE = 3  # of the splines that h is made of
-_FIRST, _STEEPER = 200.0, 6.0  # the barrier's first t, in degrees by the objective, and by how much it rises
+_FIRST, _STEEPER = 5.0, 6.0  # the barrier's first t, in degrees by the objective, and by how much it rises
 _GAP = 0.004  # of the bound, relatively, that the barrier leaves
 _LEAST = 1e-9  # mean square below which a bound says nothing
 _SWEEPS = 6

@@ -32,10 +32,10 @@ from design.coupling_file import (
     sealed,
 )
 from design.environments import BETA, SWITCHING, THIS_ENVIRONMENT, LimitedForces, SwitchingDelays, in_each, worst
-from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, require_size, rows_of
+from design.exact import LARGEST, Matrix, Violated, definiteness, find_storage, refuted_rows, require_size, rows_of
 from design.frequency import frequencies, on_circle, rounding
 from design.lmi import ANY_ENVIRONMENT
-from design.result import NotProved, Requirement
+from design.result import NotProved, Requirement, refusal
 from design.worst_member import Progress, Searched, search_ranges
 
 _CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
@@ -156,7 +156,8 @@ def _proof(
         P, reason = find_storage(real)
         if P is None:
             share = f"the sweep asks {requirement.ratio:.9f} of the available damping"
-            raise NotProved(f"{condition.place(loop, name)}{reason}; {share}", requirement)
+            refuted = isinstance(reason, Violated)
+            raise NotProved(f"{condition.place(loop, name)}{reason}; {share}", requirement, refuted)
         proof[name] = rows_of(P)
     return requirement, proof
 
@@ -176,14 +177,19 @@ def judged(
 
 
 def _with_proof(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> Requirement:
-    """The requirement with `proof` = 'rational' where an exact proof was found, as it is where not."""
+    """The requirement with `proof` = 'rational' where an exact proof was found, as it is where not.
+
+    One that exact arithmetic contradicts is refused, whatever the sweep said.
+    """
     if not needs.certified:
         return needs
     try:
         with _in_time():
             _proof(condition, loop, coupling, swept=needs)
-    except NotProved:
-        return needs
+    except NotProved as error:
+        if not error.refuted:
+            return needs
+        return replace(refusal(needs.condition, needs.available, str(error)), guarantee=needs.guarantee)
     return replace(needs, proof="rational")
 
 

@@ -414,11 +414,15 @@ LADDERS = {"short": SHORT, "full": _FULL}
 def compare_designs(
     loops: Mapping[str, Loop], entries: Sequence[_Entry], progress: _Progress, judge_nearby: _NearbyOf
 ) -> Iterator[LadderRow]:
-    """The rows of every case."""
+    """The rows of every case. What was designed for a case whose loop is the same is not designed again."""
     jobs = [(case, loop, entry) for case, loop in loops.items() for entry in entries]
+    known: dict[tuple[str, str], LadderRow] = {}
     for done, (case, loop, entry) in enumerate(jobs):
         progress(done, len(jobs))
-        yield ladder_row(case, loop, entry, judge_nearby)
+        same = digest(loop), _name(entry, case)
+        if same not in known:
+            known[same] = ladder_row(case, loop, entry, judge_nearby)
+        yield replace(known[same], case=case)
 
 
 def ladder_row(case: str, loop: Loop, entry: _Entry, judge_nearby: _NearbyOf) -> LadderRow:
@@ -438,7 +442,10 @@ def ladder_row(case: str, loop: Loop, entry: _Entry, judge_nearby: _NearbyOf) ->
     requirement = conditions.this_environment(F, loop)
     figures = transparency(F, loop.E(), loop.lam)
     begin, proof, reason = time.perf_counter(), None, requirement.reason
-    if design or requirement.certified:
+    held = design.certificate if design else None
+    if held and held.condition == entry.condition and held.scenario == digest(loop, coupling.form()):
+        proof = held.proof
+    elif design or requirement.certified:
         try:
             phi = None if design is None or design.phi is None else design.phi.tolist()
             proof = prove(loop, coupling, entry.condition, phi).proof

@@ -1,10 +1,9 @@
 """What a loop must satisfy so that no passive human can make it oscillate. Each condition states its block once.
 
 A condition is a block that must be strictly positive real: He[block] > 0 on |z| = 1. `Demand` holds it as
-free + s gain, where s multiplies the damping Delta_D that the devices guarantee. Poles at z = 1 are split off,
-G/(z - 1) into G(1)/(z - 1), whose Hermitian part on the circle is -G(1)/2, and the quotient (G - G(1))/(z - 1). The
-same expression is evaluated in floating point (a sweep: the required damping), over Fractions (an exact proof), over
-stacks and over sampled responses (maps and designs). docs/theory.md derives them.
+free + s gain, where s multiplies the damping Delta_D that the devices guarantee. Poles at z = 1 are split off by
+`over_z_minus_one`. The same expression is evaluated in floating point (a sweep: the required damping), over Fractions
+(an exact proof), over stacks and over sampled responses (maps and designs). docs/theory.md derives them.
 
 this-environment   `this_environment_demand`; of forces that latch a fraction of a sample late `_latency_demand`
 any-environment    Lemma 4 of the paper for any passive environment under backward Euler: `v_hat`,
@@ -82,8 +81,8 @@ def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
     """
     if loop.latency is not None:
         return _latency_demand(F, loop)
-    F1, R = F.split_at_one()
-    return Demand(R - F1 / 2, constant_like(F, np.diag(even_damping(loop, F.T) / F.T)), {"F(1)": F1}, ("F(1)",))
+    F1, regular = F.over_z_minus_one()
+    return Demand(regular, constant_like(F, np.diag(even_damping(loop, F.T) / F.T)), {"F(1)": F1}, ("F(1)",))
 
 
 def _latency_demand(F: Block, loop: Loop) -> Demand[Block]:
@@ -103,10 +102,10 @@ def _latency_demand(F: Block, loop: Loop) -> Demand[Block]:
     one = np.eye(m, dtype=int)
     before = one[late] @ delay((1,) * m, T)
     both = as_like(F, vstack(before, Lti.constant(one, T))) @ F @ np.hstack([one[:, late], one])
-    E1, R = both.split_at_one()
+    E1, regular = both.over_z_minus_one()
     damping = numbers(loop.delta, T)
     gain = np.concatenate([damping[late] / last[late], damping / (longest - first)])
-    return Demand(R - E1 / 2, constant_like(F, np.diag(gain)), {"F(1)": E1[..., len(late) :, len(late) :]}, ("F(1)",))
+    return Demand(regular, constant_like(F, np.diag(gain)), {"F(1)": E1[..., len(late) :, len(late) :]}, ("F(1)",))
 
 
 def theta_hat(theta: Sequence[int], damping: Any, T: Number) -> Lti:
@@ -121,8 +120,8 @@ def v_hat(H: Block) -> tuple[Array, Block]:
     z = 1, where nothing can be strict, so it is divided by |1 - 1/z|^2: (1 - 1/z) becomes 1/(1 - z), whose pole has
     the Hermitian part 1/2. It is linear in H, so V and Theta-hat may come one by one.
     """
-    H1, R = H.split_at_one()
-    return H1, H1 / 2 - R
+    H1, regular = H.over_z_minus_one()
+    return H1, -regular
 
 
 def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | None = None) -> Demand[Block]:
@@ -352,8 +351,12 @@ class Condition(ABC):
 
     @property
     def claim(self) -> str:
-        """What is said of one of the user's own."""
+        """What is said of one of the user's own where it holds."""
         return f"the block of {self.name} is what is proved; that it keeps this loop safe is yours to show"
+
+    def said(self, needs: Requirement) -> str:
+        """The same, or that it does not hold."""
+        return self.claim if needs.certified else f"fails the condition {self.name}: {needs.shortfall}"
 
     def words(self, loop: Loop) -> str:
         """The same in the words of a report."""
@@ -535,11 +538,8 @@ def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
 # Coulomb friction of at least W_i at the encoder's coordinate dissipates that.
 
 
-_SMALL_TAIL, _CHUNK, _MOST_CHUNKS = (
-    1e-9,
-    256,
-    20_000,
-)  # of the bound; ticks summed at once; where the sum ends at the latest
+_SMALL_TAIL = 1e-9  # of the bound
+_CHUNK, _MOST_CHUNKS = 256, 20_000  # ticks summed at once; where the sum ends at the latest
 
 
 def l1_gain(F: Lti) -> Array:
@@ -620,9 +620,6 @@ def _least_scales(demand: Demand[Sampled]) -> Array:
 
 
 def regular_part(E: Lti) -> Lti:
-    """R + E(1)/2, where E z/(z-1) = E(1) z/(z-1) + R: stable where E is.
-
-    The Hermitian part of z/(z-1) on the circle is 1/2, so this has the Hermitian part of E z/(z-1) there.
-    """
-    E1, quotient = E.split_at_one()
-    return Lti(E.A, E.B, quotient.C @ E.A, quotient.C @ E.B + E1 / 2, E.T)
+    """Stable where E is, with the Hermitian part of E z/(z-1) = E + E/(z-1) on the circle but at z = 1."""
+    _, regular = E.over_z_minus_one()
+    return Lti(E.A, E.B, E.C + regular.C, E.D + regular.D, E.T)

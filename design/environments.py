@@ -1,6 +1,7 @@
 """What this-environment asks of a coupling: around walls, over ranges, under delays that switch, with limited forces.
 
-Each of the last three weighs an error with a multiplier, in which its block is affine: `Multiplied` finds the best one.
+Walls, delays that switch and limited forces weigh an error with a multiplier, in which the block is affine:
+`Multiplied` finds the best one. Ranges are environments that are proved one by one.
 """
 
 from __future__ import annotations
@@ -145,14 +146,15 @@ class _Search:
 
     def __init__(self, block: Callable[[Sequence[float]], Demand[Lti]], unknowns: Unknowns, system: Lti) -> None:
         self._block, self._unknowns, self._units = block, unknowns, np.array(unknowns.units)
-        self._searched, self._last = np.flatnonzero(self._units), ((), (0.0, 0.0))
+        self._searched = np.flatnonzero(self._units)
+        self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # what was swept last
         self._grid = np.concatenate([[0.0], frequencies(system)])
         self._spare = np.diag(np.broadcast_to(unknowns.spare, system.outputs))
         self.pays = system.outputs <= _MOST_ROWS and self._searched.size > 0
 
     def swept(self, values: Sequence[float]) -> tuple[float, float]:
         """(the ratio that the block asks at these values, where [rad/sample]), by a refined sweep."""
-        if self._last[0] != values:
+        if self._last is None or self._last[0] != values:
             asked = self._block(values)
             self._last = values, supremum(lambda w: least_scale(asked, w), self._grid)
         return self._last[1]
@@ -245,10 +247,10 @@ class ThisEnvironment(Multiplied):
         T, m, w = G.T, loop.channels, len(loop.environment.walls)
         none, g = numbers([0] * m, T), numbers(multiplier, T)
         slopes: Any = [wall.slope(T) for wall in loop.environment.walls]
-        S1, R = G.split_at_one()
+        S1, regular = G.over_z_minus_one()
         steep = np.diag(np.concatenate([none, g]))
         limits = np.concatenate([none, g / numbers(slopes, T)])
-        free = np.hstack([numbers(np.eye(m + w), T), -steep]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
+        free = np.hstack([numbers(np.eye(m + w), T), -steep]) @ vstack(regular, G) + np.diag(limits)
         damping = np.concatenate([even_damping(loop, T) / T, numbers([0] * w, T)])
         F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
         static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
@@ -439,9 +441,9 @@ class LimitedForces(Multiplied):
         difference = Lti.diag(*(taps([1, -1], T) for _ in theta))
         steps: Any = hstack(G, as_like(G, difference @ np.diag(-numbers(self.rho(loop), T))))
         both = as_like(G, lines) @ steps
-        static, ramp = both.rows(slice(None, m)).split_at_one()  # [F(1), 0]: the slip's steps have no mean
+        static, regular = both.rows(slice(None, m)).over_z_minus_one()  # [F(1), 0]: the slip's steps have no mean
         zero = np.zeros((m, m), dtype=int)
-        free = vstack(ramp - static / 2, both.rows(slice(m, None)))
+        free = vstack(regular, both.rows(slice(m, None)))
         gain = np.block([[damping, zero], [2 * damping, damping]])
         return Demand(free, constant_like(G, gain), {"F(1)": static[..., :m]}, ("F(1)",))
 

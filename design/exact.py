@@ -447,6 +447,13 @@ def reached(G: Lti) -> Lti:
     return Lti(G.A[np.ix_(found, found)], G.B[found], G.C[:, found], G.D, G.T)
 
 
+class Violated(str):
+    """Why nothing proves a block: somewhere it is negative beyond rounding, as no proof that is only hard to find."""
+
+
+_CLEARLY = 1e-6  # below 0, of a block with inputs of size one
+
+
 def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     """(P, None) with a P that proves G strictly positive real, or (None, why there is none).
 
@@ -465,7 +472,8 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     block = _double(parts)
     margin, w = _least_eigenvalue(block)
     if margin <= 0:
-        return None, f"the condition is violated at {w:.6g} rad/sample"
+        kind = Violated if margin < -_CLEARLY else str
+        return None, kind(f"the condition is violated at {w:.6g} rad/sample")
     if G.order == 0:
         return Matrix.zeros(0, 0), prove_positive_real(G, Matrix.zeros(0, 0))
     reason: str | None = None

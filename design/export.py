@@ -596,10 +596,13 @@ def _row(values: Array) -> str:
 SUFFIXES = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}  # by format
 
 
-def with_origin(block: ExportedBlock, file: str, stored: Stored, verdict: Verdict) -> ExportedBlock:
-    """The block with lines on the file that it comes from, and on what is proved there."""
+def with_origin(
+    block: ExportedBlock, file: str, stored: Stored, verdict: Verdict, claim: str | None = None
+) -> ExportedBlock:
+    """The block with lines on the file that it comes from, and on what is proved there; `claim` is a further one."""
     written = f"Written by python -m design.export from {file}: {_gains(stored)}"
-    return replace(block, about=(written, *block.about, _guarantee(stored, verdict, block.limiter is not None)))
+    proved = _guarantee(stored, verdict, block.limiter is not None)
+    return replace(block, about=(written, *block.about, proved, *([claim] if claim else [])))
 
 
 def _gains(stored: Stored) -> str:

@@ -32,15 +32,13 @@ from design.transparency import Transparency, decibels, transparency
 from design.worst_member import Searched, search_ranges
 
 #: [s] of the processor, up to so many devices: what the price of a range may take, a third of it for proofs
-_PRICED = {2: 4.0, 4: 8.0, 10**3: 15.0}
+_PRICED = {2: 3.0, 4: 6.0, 10**3: 9.0}
 _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
 _FIRST = 3  # of the environments: those that the nominal design misses most are imposed first
-_SETTLED_DB = 0.05  # a rung that gains less ends the climb
-_LARGE = 26  # taps: a rung of more that gains less is not taken
-_FEWEST_TAPS = {
-    True: 22,
-    False: 14,
-}  # of a rung that may end the climb so, where this-environment alone is asked or not
+_SETTLED_DB = 0.05  # a rung that gains less ends the climb: it is not proved, and not taken
+_SETTLED = f"it gains less than {_SETTLED_DB:g} dB, the stiffness counted"
+_LARGE, _PROMISING_DB = 26, 0.1  # taps: one of more is tried where the rung before has gained so much
+_FEWEST_TAPS = {True: 22, False: 14}  # of a rung that may end the climb; whether this-environment alone is asked
 _MOST_REFUSED = 2  # rungs without a proof, one after the other, after which a larger one has none either
 _KEPT_STIFFNESS = 0.5  # of the most static stiffness of a rung that was best: one that renders less is not taken
 _FELT_STIFFNESS = 0.02  # of the environment's: where a rung renders less than this, merit alone decides
@@ -66,7 +64,7 @@ class _Rung:
     g: float  # rendered share of the static stiffness
     reason: str | None  # why it is not certified and proved
     seconds: float  # since the design began
-    left: str | None = None  # why it is not taken, though it is proved
+    left: str | None = None  # why it is not taken, though it is certified
 
     @property
     def proved(self) -> bool:
@@ -137,27 +135,30 @@ def design(
     best: Optimal | None = None
     better: list[Optimal] = []  # each than the one before
     rungs: list[_Rung] = []
-    hurried, floor = False, _felt(min(climb.simple, 1.0))
+    hurried, floor, gained = False, _felt(min(climb.simple, 1.0)), np.inf
     for taps, poles in options.ladder:
+        if taps > _LARGE and gained < _PROMISING_DB:
+            break
         if rungs and not climb.room(taps, poles, max((r.states for r in rungs if r.reason is None), default=0)):
             continue
         try:
             with within(max(options.seconds - climb.elapsed, 0.0) if rungs else np.inf, "a larger basis"):
-                found, rung = climb.rung(taps, poles, best, floor)
+                least = _SETTLED_DB if taps >= _FEWEST_TAPS[climb.simply] else -np.inf
+                found, rung = climb.rung(taps, poles, best, floor, least)
         except TooLong:
             hurried = True
             break
-        gained = np.inf if rung.reason or best is None else decibels(climb.merit(best)) - decibels(climb.merit(found))
-        if rung.reason is None and best and found.g < floor:
+        gained = np.inf if rung.reason else climb.gained(best, found)
+        if best and found.g < floor and rung.proved:
             rung = replace(rung, left=f"it renders {found.g:.3f} of the stiffness, less than half of another's")
-        elif gained <= (0 if taps <= _LARGE else _SETTLED_DB):
-            rung = replace(rung, left=f"it gains {gained:.2f} dB, with the stiffness counted")
+        elif gained <= 0 or rung.reason == _SETTLED:
+            rung = replace(rung, left=_SETTLED)
         rungs.append(rung)
         progress(rung)
+        settled = rung.reason == _SETTLED
         if rung.taken:
             best, floor = found, max(floor if best else 0.0, _felt(_KEPT_STIFFNESS * found.g))
             better.append(found)
-        settled = gained < _SETTLED_DB and taps >= _FEWEST_TAPS[climb.simply]
         hurried = not settled and climb.elapsed > options.seconds
         hopeless = len(rungs) >= _MOST_REFUSED and not any(each.proved for each in rungs[-_MOST_REFUSED:])
         if settled or hurried or (hopeless and not loop.ranges):
@@ -261,6 +262,10 @@ class _Search:
         static = program.static_weight(self.loop) * (found.g - 1) if np.isfinite(found.g) else 0.0
         return float(np.hypot(self.mismatch(found), static))
 
+    def gained(self, before: Optimal | None, found: Optimal) -> float:
+        """By how much it is better than the one before [dB]."""
+        return np.inf if before is None else decibels(self.merit(before)) - decibels(self.merit(found))
+
     @property
     def simple(self) -> float:
         """kappa for which this-environment holds of the environment scaled down, R = kappa I."""
@@ -292,20 +297,26 @@ class _Search:
         solved = span.unknowns <= _MOST_UNKNOWNS if full and self.simply else beside
         return before < states <= _MOST_STATES and solved and proofs <= _MOST_PROOFS
 
-    def rung(self, taps: int, poles: int, before: Optimal | None, floor: float) -> tuple[Optimal, _Rung]:
-        """The optimum over a basis, scaled until every sweep passes, and proved where there are no ranges.
+    def rung(self, taps: int, poles: int, before: Optimal | None, floor: float, least: float) -> tuple[Optimal, _Rung]:
+        """The optimum over a basis, scaled until every sweep passes, and proved where it gains this much [dB].
 
         Where it renders less than this share of the static stiffness, that counts more.
         """
         for heavier in (1.0, 2.5, 6.0):  # times its weight
-            tried = [self.solved(taps, poles, before, slip, heavier) for slip in self.slips(before)]
+            tried = [self.solved(taps, poles, before, slip, heavier, least) for slip in self.slips(before)]
             found = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
             if found.g >= floor or found.reason:
                 break
         return found, _Rung(taps, poles, found.states, self.decibels(found), found.g, found.reason, self.elapsed)
 
     def solved(
-        self, taps: int, poles: int, before: Optimal | None, slip: program.Slip | None, heavier: float
+        self,
+        taps: int,
+        poles: int,
+        before: Optimal | None,
+        slip: program.Slip | None,
+        heavier: float,
+        least: float,
     ) -> Optimal:
         error = self.mismatch(before) if before else 1.0
         soft = program.SOFT[0] * min(error, program.SOFT[1])
@@ -318,6 +329,8 @@ class _Search:
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
             found = self._assessed(scaled, scaled.g)
+            if self.gained(before, found) < least:
+                return replace(found, reason=_SETTLED)
             if self.loop.ranges or (found := self._proved(found, slip)).proved:
                 break
         return found

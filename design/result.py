@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Literal, TypeVar
 
@@ -104,11 +104,14 @@ def switching_guarantee(span: DelayRange) -> str:
 
 
 class NotProved(ValueError):
-    """No proof of the condition was found; carries the requirement that the sweep found, if there is one."""
+    """No proof of the condition was found; carries the requirement that the sweep found, if there is one.
 
-    def __init__(self, reason: str, requirement: Requirement | None = None) -> None:
+    `refuted` where there is none: exact arithmetic contradicts the sweep.
+    """
+
+    def __init__(self, reason: str, requirement: Requirement | None = None, refuted: bool = False) -> None:
         super().__init__(reason)
-        self.requirement = requirement
+        self.requirement, self.refuted = requirement, refuted
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -158,6 +161,14 @@ class Chosen:
     def asked(self) -> Any:
         """The condition as design.certificate takes it: the user's own, or a name."""
         return self.own or self.condition
+
+    def remarks(self, requirements: Mapping[str, Requirement]) -> tuple[str, ...]:
+        """Its notes, and whether the user's own condition holds."""
+        return (*self.notes, self.own.said(requirements[self.own.name])) if self.own else self.notes
+
+    def fails(self, requirements: Mapping[str, Requirement]) -> bool:
+        """Whether the user's own condition does not hold."""
+        return bool(self.own) and not requirements[self.own.name].certified
 
 
 @dataclass(frozen=True, eq=False)

@@ -326,7 +326,9 @@ class CertifiedCoupling:
 
     @property
     def certified(self) -> bool:
-        return any(requirement.certified for requirement in self.requirements.values())
+        """By any condition, and by the user's own where there is one."""
+        held = any(requirement.certified for requirement in self.requirements.values())
+        return held and not self.chosen.fails(self.requirements)
 
     @property
     def name(self) -> str:
@@ -365,16 +367,17 @@ class CertifiedCoupling:
         )
 
     def remarks(self) -> list[str]:
-        """What a reader should know of the coupling's file, and of the clock."""
+        """What a reader should know of the coupling's file, of a condition of the user's own, and of the clock."""
+        said = [*self.chosen.remarks(self.requirements)]
         if self.scenario.latency:
             least, most = (1e6 * t for t in self.scenario.latency[0])
             kept = f"periods up to {1e6 * (self.scenario.T_max or self.scenario.T):.0f} us"
             kept += f" and forces that act {least:.0f} to {most:.0f} us after their sample"
-            return [*self.chosen.notes, f"forces act as they come: certified for {kept}, as measured"]
+            return [*said, f"forces act as they come: certified for {kept}, as measured"]
         if self.held < 1:
-            return list(self.chosen.notes)
+            return said
         answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
-        return [*self.chosen.notes, f"a force that is held through {answers} is covered by the file's proof"]
+        return [*said, f"a force that is held through {answers} is covered by the file's proof"]
 
 
 def certified_coupling(

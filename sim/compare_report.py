@@ -129,7 +129,10 @@ class Comparison:
         judged = {name: compare.judge(loop, c.coupling, [*own.values()]) for name, c in chosen.items()}
         hz = compare.grid(loop, list(judged.values()))
         couplings = [ComparedCoupling.of(loop, name, c, judged[name], hz) for name, c in chosen.items()]
-        notes = [*(f"{name}: {note}" for name, c in chosen.items() for note in c.notes), *failed]
+        notes = [
+            *(f"{name}: {note}" for name, c in chosen.items() for note in c.remarks(judged[name].requirements)),
+            *failed,
+        ]
         for c in couplings:
             reasons = {name: c.conditions[name].reason for name in (*CONDITIONS, *own)}
             notes += [f"{c.name}, {condition}: {reason}" for condition, reason in reasons.items() if reason]

@@ -52,7 +52,7 @@ def choose(
         if place_of(error):  # in a class of the user's own
             raise
         raise InputError(str(error)) from None
-    return replace(found, own=own, notes=(*found.notes, own.claim)) if own else found
+    return replace(found, own=own)
 
 
 def _choose(

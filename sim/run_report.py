@@ -154,7 +154,7 @@ def run_report(
         energy_budget=budget and replace(budget, idle=idle(simulation, judged.requirements.values(), budget)),
         baseline=net if isinstance(net, BaselineFigures) else None,
         reproducibility=beside_the_paper(simulation.scenario, case, stability, judged.coupling),
-        remarks=(*run.remarks, *chosen.notes),
+        remarks=(*run.remarks, *chosen.remarks(judged.requirements)),
     )
     return replace(found, remarks=(*found.remarks, *found.notes()))
 

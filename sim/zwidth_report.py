@@ -211,6 +211,7 @@ class MapReport:
     fixed: FixedCoupling | None = unseen("beside")  # of a map over environments
     error: dict[str, MapError | None] | None = unseen("given")
     marks: list[_Marked] | None = unseen("given")
+    claim: str | None = unseen("given")  # of a condition of the user's own that certifies a cell
     not_covered: str = CAVEATS
 
     @classmethod
@@ -254,6 +255,7 @@ class MapReport:
             fixed,
             {name: map_error(sweep, drawn, name) for name in drawn.ratio} if whole else None,
             [_Marked.of(mark) for mark in marks] if whole else None,
+            sweep.own.claim if sweep.own and ratios[sweep.own.name].certified_cells else None,
         )
 
     @property

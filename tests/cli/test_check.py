@@ -72,7 +72,7 @@ def test_checking_imports_no_solver(path):
 
 
 def test_an_interruption_exits_with_130(path, monkeypatch):
-    def interrupted(stored):
+    def interrupted(*given):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("cli.check.verify", interrupted)

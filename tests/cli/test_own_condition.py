@@ -10,6 +10,7 @@ import pytest
 
 from design import certify, design_coupling
 from design.files import InputError
+from hw.control import SafetyStop, certified_coupling
 from sim import load
 
 PAGE = (Path(__file__).parents[2] / "docs/architecture.md").read_text()
@@ -70,6 +71,7 @@ def test_every_command_judges_by_it(command, words, folder, monkeypatch, capsys)
         return
     assert f'"{NAME}"' in text
     assert NAME in shown
+    assert "yours to show" in text
     if "joined.json" in words and command != "check":
         assert "does not hold" not in text
 
@@ -138,3 +140,50 @@ def test_in_python_it_is_the_class(folder, monkeypatch):
     # with Delta = 1.37 I in the place of the full matrix its block is that of this-environment, so s is between
     assert 1 / 1.57 < needs[NAME].ratio / needs["this-environment"].ratio / 1.37 < 1 / 1.17
     assert np.isfinite(needs["any-environment"].ratio)
+
+
+NEVER = """
+from dataclasses import replace
+from design.conditions import Condition, this_environment_demand
+
+class Never(Condition):
+    name = "never"
+    def demand(self, loop, coupling, exact=False):
+        linear = this_environment_demand(loop.F(coupling, exact), loop)
+        return replace(linear, free=linear.free * 2)
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "code"),
+    [
+        ("audit", [], 1),
+        ("run", ["--duration", ".1", "--no-plot", "--no-alternatives"], 0),
+        ("validate", ["--humans", "2", "--duration", "0", "--no-plot"], 1),
+        ("compare", ["--no-plot"], 0),
+    ],
+)
+def test_a_condition_that_fails_is_nowhere_claimed(command, words, code, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    (folder / "never.py").write_text(NEVER)
+    asked = ["--coupling", "joined.json", "--condition", "never.py:Never"]
+    assert import_module(f"cli.{command}").main([*asked, *words, *JSON]) == code
+    text = Path("report.json").read_text()
+    assert "fails the condition never: needs 2." in text
+    assert "yours to show" not in text
+
+
+def test_a_device_is_not_armed_by_another_condition_than_the_one_asked_for(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    (folder / "never.py").write_text(NEVER)
+    own = import_module("never").Never()
+    with pytest.raises(SafetyStop, match=r"is not certified for theta = \[1, 2\]: .*never needs 2\."):
+        certified_coupling(load("omega-pair"), "I", "joined.json", own, 1)
+
+
+def test_an_exported_block_says_what_is_proved(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert run("export", "joined.json", "--out", "joined.c", *JSON) == 0
+    assert "yours to show" in capsys.readouterr().out
+    assert "yours to show" in Path("joined.c").read_text().replace("\n *     ", " ")
+    assert "yours to show" in json.loads(Path("report.json").read_text())["claim"]

@@ -4,6 +4,8 @@ import json
 import os
 import re
 import shlex
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -23,7 +25,7 @@ QUICK = "sim.validate --case none --humans {humans} --links mixed --duration 0.3
 def only(monkeypatch, *checks):
     """The suite has these checks alone."""
     monkeypatch.setattr(suite, "CHECKS", checks)
-    monkeypatch.setattr(suite, "_OURS", ())
+    monkeypatch.setattr(suite, "_measuring", lambda: ())
 
 
 @pytest.fixture
@@ -49,9 +51,25 @@ def test_every_check_is_a_command_with_its_options(check, monkeypatch):
 
 
 def test_names_of_checks_are_folders_of_their_own():
-    names = suite._names()
-    assert len(set(names)) == len(names)
-    assert [check.name for check in suite._checks(names)] == names  # those of ours too
+    assert len(suite._checks()) == len(CHECKS) + len(ours.CHECKS)
+
+
+def test_from_another_folder_with_tests_of_its_own_all_checks_are_there(tmp_path):
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "__init__.py").write_text("raise SystemExit('not these')")
+    code = "from cli import suite; print(*suite._checks())"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.split()) == (0, list(suite._checks())), done.stderr
+
+
+def test_installed_without_the_repository_there_are_commands_alone(monkeypatch, tmp_path):
+    package = tmp_path / "cli" / "suite.py"
+    monkeypatch.setattr(suite, "__file__", str(package))
+    suite._measuring.cache_clear()
+    monkeypatch.setattr(suite, "_measuring", suite._measuring.__wrapped__)
+    assert list(suite._checks()) == [check.name for check in CHECKS]
+    with pytest.raises(InputError, match=r"has 'hard', allowed are none, .*\. The checks that .* come with its repos"):
+        main(["--only", "hard"])
 
 
 def test_the_report_begins_with_verdicts_and_every_number_has_its_command(tmp_path, quick):

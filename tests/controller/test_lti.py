@@ -8,7 +8,7 @@ import pytest
 
 from controller.arithmetic import SingularLoop, times
 from controller.delay import delay
-from controller.lti import Lti, Sampled, hstack
+from controller.lti import Lti, Sampled, hstack, taps
 
 Z = np.exp(1j * np.linspace(0.01, 3.1, 60))
 
@@ -69,20 +69,31 @@ def test_sampled_responses_obey_the_same_algebra(m):
             (g.inverse(), G.inverse()),
         ):
             close(sampled.G, system.at(z))
-        (_, sampled), (at_one, quotient) = g.split_at_one(), G.split_at_one()
+        (_, sampled), (at_one, quotient) = g.over_z_minus_one(), G.split_at_one()
         close(sampled.G - at_one / (z - 1)[..., None, None], quotient.at(z))
 
 
 def test_a_sampled_split_keeps_what_z_loses_near_one():
     """He[K/(z-1)] = -K/2 on the whole circle; 1 - cos w from z itself is off by 1e-16/w^2."""
     z = np.exp(1j * np.geomspace(1e-8, 3, 50))[None]
-    split = Sampled.of(Lti.constant([[800.0]], 1e-3), z).split_at_one()[1]
+    split = Sampled.of(Lti.constant([[800.0]], 1e-3), z).over_z_minus_one()[1]
     np.testing.assert_allclose(split.G.real, -400.0, rtol=1e-15)
 
 
 def test_quotient_at_one(blocks):
     G = blocks[0]
     close(G.split_at_one()[1].at(Z), (G.at(Z) - G.dc()) / (Z - 1)[:, None, None])
+
+
+def test_without_its_pole_a_block_over_z_minus_one_keeps_its_hermitian_part(blocks):
+    """Of blocks whose G(1) is symmetric; exactly (3 + 1/z has G(1) = 4, and leaves -1/z - 2)."""
+    G = blocks[0] + (blocks[0].dc().T - blocks[0].dc()) / 2
+    at_one, regular = G.over_z_minus_one()
+    whole, rest = G.at(Z) / (Z - 1)[:, None, None], regular.at(Z)
+    close(at_one, G.dc())
+    close(rest + np.conj(np.swapaxes(rest, -1, -2)), whole + np.conj(np.swapaxes(whole, -1, -2)))
+    at_one, regular = taps([3, 1], Fraction(1, 1000)).over_z_minus_one()
+    assert (at_one.item(), regular.D.item(), regular.dc().item()) == (4, -2, -3)
 
 
 @pytest.mark.parametrize("steps", [(0,), (3,), (1, 2), (0, 4, 50)])

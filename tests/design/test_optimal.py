@@ -27,7 +27,7 @@ from design.conditions import ratio_in
 from design.coupling_file import Stored, save
 from design.coupling_file import load as load_file
 from design.frequency import hermitian, on_circle
-from design.optimal import _Rung, design, spread
+from design.optimal import _SETTLED, _Rung, design, spread
 from design.program import MARGIN, Options, Problem, Span, span_of, static_weight
 from design.robustness import ranges_around, robustness, vertices
 from design.transparency import transparency
@@ -185,10 +185,11 @@ def test_every_rung_is_reported_as_it_is_finished():
 def test_a_climb_goes_on_over_small_steps_and_says_what_it_leaves(monkeypatch, script, taken):
     one, steps = best("n3"), iter(script)
 
-    def rung(climb, taps, poles, before, floor):
+    def rung(climb, taps, poles, before, floor, least):
         error, g = next(steps)
         found = replace(one, g=g, figures=replace(one.figures, rms_mismatch=error))
-        return found, _Rung(taps, poles, taps, climb.decibels(found), g, None, 0.0)
+        reason = _SETTLED if climb.gained(before, found) < least else None
+        return found, _Rung(taps, poles, taps, climb.decibels(found), g, reason, 0.0)
 
     monkeypatch.setattr("design.optimal._Search.rung", rung)
     found = design(loop_of("n3"), Options(ladder=program.LADDER[: len(script)]))

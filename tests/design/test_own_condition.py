@@ -15,7 +15,7 @@ from design.certificate import assess, lag, prove, required_damping, verify
 from design.conditions import BEYOND, Condition, Demand
 from design.coupling_file import Stored, filed, sealed
 from design.coverage import covered_limits
-from design.environments import SWITCHING, Switching
+from design.environments import SWITCHING, SwitchingDelays
 from design.files import InputError
 from design.guarantees import guarantee_of
 from design.result import NotProved
@@ -34,8 +34,8 @@ class Plain(Condition):
 
     def demand(self, loop, coupling, exact=False):
         F = loop.F(coupling, exact)
-        F1, R = F.split_at_one()
-        return Demand(R - F1 / 2, constant_like(F, np.diag(numbers(loop.delta, F.T) / F.T)), {"F(1)": F1}, ("F(1)",))
+        F1, regular = F.over_z_minus_one()
+        return Demand(regular, constant_like(F, np.diag(numbers(loop.delta, F.T) / F.T)), {"F(1)": F1}, ("F(1)",))
 
 
 class Uneven(Plain):
@@ -128,7 +128,7 @@ def test_a_map_and_a_comparison_ask_it_as_they_ask_ours():
     assert "the loop has walls" in compare.judge(wall, one, own=[plain]).requirements["plain"].reason
 
 
-class Shifting(Switching):
+class Shifting(SwitchingDelays):
     """Delays that switch, by a condition of one's own with a multiplier."""
 
     name, covers = "shifting", ("varying_delay",)

@@ -151,7 +151,7 @@ def test_a_human_who_destabilises_a_loop_with_enough_damping_fails_the_check(tmp
     rows = lambda seed: shortages(seed, ("none",), (0,), 5)  # noqa: E731
     check = Check("tightness", "How tight?", rows, tightness, plot_tightness)
     monkeypatch.setattr("cli.suite.CHECKS", (check,))
-    monkeypatch.setattr("cli.suite._OURS", ())
+    monkeypatch.setattr("cli.suite._measuring", lambda: ())
     assert suite(["--out", str(tmp_path)]) == 1
     assert (tmp_path / "tightness" / "tightness.png").stat().st_size > 10_000
     assert "| no coupling | 0.0% |" in (tmp_path / "report.md").read_text()

@@ -1,0 +1,87 @@
+"""Conditions of one's own whose code is wrong, or whose multiplier is empty: never counted as what they are not."""
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from worlds import PAIR, SOFT, STIFF
+
+from cli import check
+from controller.coupling import SpringDamper
+from design.certificate import assess, prove, required_damping, verify
+from design.conditions import Condition, this_environment_demand
+from design.coupling_file import Stored, save
+from design.environments import LimitedForces, Multiplied, Unknowns
+
+change = msgspec.structs.replace
+
+
+class PerWall(Multiplied):
+    """this-environment, with a multiplier of as many entries as there are walls."""
+
+    name, covers = "per-wall", ("walls",)
+
+    def unknowns(self, loop):
+        return Unknowns("g", (1.0,) * len(loop.environment.walls), "a number > 0 for each wall", 1e-3, 1e3)
+
+    def map(self, loop, coupling, exact=False):
+        return loop.F(coupling, exact)
+
+    def block(self, G, loop, multiplier=None):
+        return this_environment_demand(G, loop)
+
+
+class Scaled(Condition):
+    """this-environment for forces `times` as large: asks as many times the damping."""
+
+    name, times = "scaled", 2
+
+    def demand(self, loop, coupling, exact=False):
+        linear = this_environment_demand(loop.F(coupling, exact), loop)
+        return replace(linear, free=linear.free * self.times)
+
+
+class Contradicting(Scaled):
+    """Exact arithmetic sees ten times the forces that a sweep sees."""
+
+    name = "contradicting"
+
+    def demand(self, loop, coupling, exact=False):
+        linear = this_environment_demand(loop.F(coupling, exact), loop)
+        return replace(linear, free=linear.free * (10 if exact else 1))
+
+
+@pytest.mark.parametrize("coupling", [SOFT, SpringDamper([20000.0] * 2, [0.0] * 2)])
+def test_a_multiplier_without_entries_is_swept(coupling):
+    asked, here = (required_damping(PAIR, coupling, each) for each in (PerWall(), "this-environment"))
+    assert asked.ratio == pytest.approx(here.ratio, rel=1e-9)
+    assert required_damping(PAIR, coupling, LimitedForces(0.01, 0)).ratio >= here.ratio - 1e-9
+
+
+def test_a_proof_with_a_multiplier_without_entries_is_verified():
+    proved = Stored.of(PAIR, SOFT, prove(PAIR, SOFT, PerWall()))
+    assert verify(proved, PerWall()).proved
+
+
+def test_what_exact_arithmetic_contradicts_is_not_certified():
+    assert required_damping(PAIR, STIFF, Contradicting()).certified
+    found = assess(PAIR, STIFF, own=Contradicting())["contradicting"]
+    assert not found.certified
+    assert "violated at" in (found.reason or "")
+    assert found.required == (np.inf, np.inf)
+
+
+def test_check_does_not_replace_what_is_on_file(tmp_path, capsys):
+    stored = Stored.of(PAIR, SOFT, prove(PAIR, SOFT, PerWall()))
+    assert stored.certificate
+    edited = change(stored, loop=change(PAIR, delta=(5.0, 5.0)), certificate=change(stored.certificate, seal="0" * 64))
+    words = ["--condition", f"{__file__}:PerWall"]
+    for name, file in (("right", stored), ("edited", edited)):
+        save(file, tmp_path / f"{name}.json")
+    assert check.main([str(tmp_path / "right.json"), *words]) == 0
+    assert "anew" not in capsys.readouterr().out
+    assert check.main([str(tmp_path / "edited.json"), *words]) == 1
+    assert "digest differs" in " ".join(capsys.readouterr().out.split())
+    assert check.main([str(tmp_path / "right.json"), "--condition", "any-environment"]) == 0
+    assert "proved anew, not from the file" in " ".join(capsys.readouterr().out.split())
