@@ -67,7 +67,7 @@ def main(argv: list[str]) -> int:
     searched = _searched(stored, own) if verdict.proved else None
     if searched and not searched.worst[0].ratio < 1:
         verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
-    checked = _checked(stored, verdict, searched, time.perf_counter() - begin)
+    checked = _checked(stored, own, verdict, searched, time.perf_counter() - begin)
     if own and verdict.proved and own.name not in CONDITIONS:
         checked = replace(checked, claim=own.claim)
     checked = replace(checked, anew=anew)
@@ -107,7 +107,9 @@ def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
         return search(regions(loop.network, loop.ranges), lambda m: need(loop.at(m.network)).ratio, move)
 
 
-def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, seconds: float) -> _Checked:
+def _checked(
+    stored: Stored, condition: Condition | None, verdict: Verdict, searched: Searched | None, seconds: float
+) -> _Checked:
     loop, claim, proved = stored.loop, stored.certificate, verdict.proved
     span, switching = loop.varying_delay, None
     if span and claim and isinstance(delays := claim.switching, SwitchingProof):
@@ -118,7 +120,7 @@ def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, second
         proved,
         verdict.reason,
         claim and claim.condition,
-        claim.guarantee if claim and proved else None,
+        (condition or named(claim.condition)).words(loop) if claim and proved else None,
         claim.proof if claim and proved else None,
         len(loop.members()) - 1 if loop.ranges else None,
         searched and SearchFigures.of(searched),

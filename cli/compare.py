@@ -138,8 +138,8 @@ def _chosen(scenario: Scenario, args: argparse.Namespace, names: Sequence[str]) 
     for name in names:
         kind, condition = _named(name)
         try:
-            with render.designing() as heard:
-                chosen[name] = choose(scenario, args.case, kind, condition or args.condition, progress=heard)
+            with render.designing() as progress:
+                chosen[name] = choose(scenario, args.case, kind, condition or args.condition, progress=progress)
         except DesignFailed as error:
             failures[name] = error
     if not chosen:

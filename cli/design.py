@@ -148,8 +148,8 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
     asked = asked_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
         asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
-    with options.refused(args=args), render.designing(loop, args.coupling, args.condition) as heard:
-        return proved(loop, design_by_kind(loop, args.coupling, args.condition, heard, **asked))
+    with options.refused(args=args), render.designing(loop, args.coupling, args.condition) as progress:
+        return proved(loop, design_by_kind(loop, args.coupling, args.condition, progress, **asked))
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from sim.scenario import InputError
 
 
 def main(argv: list[str]) -> int:
-    """Emulate until told to stop. 0: the time was over or the cable was pulled, 130: interrupted."""
+    """Emulate until a signal comes. 0: the time was over or the cable was pulled, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario = steady_scenario(args, "hw.emulator")
     faults = tuple(FaultInjection.parse(text) for text in args.fault)

@@ -13,8 +13,8 @@ from sim.scenario import Scenario
 
 def chosen_by(args: argparse.Namespace, scenario: Scenario) -> Chosen:
     """The coupling of --coupling for --condition and --no-limiter, designed where it is asked for by name."""
-    with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
-        return choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
+    with render.designing(scenario.loop(args.case), args.coupling, args.condition) as progress:
+        return choose(scenario, args.case, args.coupling, args.condition, args.limiter, progress)
 
 
 def judge(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, met: Scenario | None = None) -> Judged:

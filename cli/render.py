@@ -83,7 +83,7 @@ def console(args: argparse.Namespace) -> Screen:
     return Screen(stderr=args.json == "-", highlight=False)
 
 
-_Heard = Callable[[str, int, int], None]  # (what, steps done, of how many)
+_Progress = Callable[[str, int, int], None]  # (what, steps done, of how many)
 
 
 class Move(Protocol):
@@ -106,7 +106,7 @@ def progress(description: str) -> Iterator[Move]:
 
 
 @contextmanager
-def designing(loop: Loop | None = None, kind: str | None = None, condition: str | None = None) -> Iterator[_Heard]:
+def designing(loop: Loop | None = None, kind: str | None = None, condition: str | None = None) -> Iterator[_Progress]:
     """The bar of a design: yields what `choose` and `design_by_kind` take as `progress`.
 
     Where the design of this `kind` (by default the spring-damper) fails for a `loop`, the error names what can be had.

@@ -201,8 +201,8 @@ def hold_session(
         if seen and keyboard is not None:
             console(args).print("keys: a arm · s stop · space e-stop · q quit")
 
-        def glance(session: Session) -> None:
-            incidents.glance(session)
+        def watch(session: Session) -> None:
+            incidents.update(session)
             if seen:
                 _show(session)
 
@@ -211,7 +211,7 @@ def hold_session(
             return plan(ages)
 
         operator = Operator(args.arm or args.emulate, seconds, _deadman(args.deadman))
-        live = Live(session, device, planned, operator, keyboard, glance, args.pace)
+        live = Live(session, device, planned, operator, keyboard, watch, args.pace)
         stack.callback(_clear)
         live.run()
     return _Held(live.signals, device.dropped if isinstance(device, SerialDevice) else 0)
@@ -252,14 +252,14 @@ def _rehearsed(
             move(0, 1, "designing the coupling")
             return plan(ages)
 
-        def glance(session: Session) -> None:
-            incidents.glance(session)
+        def watch(session: Session) -> None:
+            incidents.update(session)
             if session.now % _SHOWN_US < 1000:
                 move(session.now, round(1e6 * (1 + seconds)), f"rehearsing: {session.stage}")
 
         operator = Operator(True, seconds)
         Rehearsal(
-            session, emulator, planned, faults, args.seed, operator=operator, keep=False, glance=glance
+            session, emulator, planned, faults, args.seed, operator=operator, keep=False, watch=watch
         ).run_to_the_end(seconds + _SPARE)
     return _Held()
 

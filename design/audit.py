@@ -25,9 +25,10 @@ from design.certificate import RangesCheck, named
 from design.conditions import Condition
 from design.coverage import RangesFigures, Switching
 from design.environments import THIS_ENVIRONMENT
-from design.files import unseen
+from design.files import InputError, unseen
 from design.frequency import sweeping, too_long
 from design.guarantees import ANY, CAVEATS, guarantee_of
+from design.own import place_of
 from design.result import CONDITIONS, ConditionName, Requirement, listed, refusal
 
 # ----------------------------------------------------------------------------------------------------
@@ -46,9 +47,11 @@ def requirement(loop: Loop, coupling: Coupling, condition: _Asked) -> Requiremen
     asked = named(condition)
     try:
         return asked.judge(loop, coupling)
-    except TooLong:
+    except (TooLong, InputError):
         raise
     except ValueError as error:  # no solution of the algebraic loop
+        if place_of(error):  # in a class of the user's own
+            raise
         return refusal(asked.name, loop.delta, str(error))
 
 

@@ -376,13 +376,16 @@ def _margin(requirement: Requirement) -> float:
 
 
 def _fractions(name: str, rows: Rows | None) -> Sequence[Fraction]:
-    """A stored multiplier. Raises NotProved where it is no row of rationals."""
+    """A stored multiplier. Raises NotProved where it is no row of rationals that floating point reaches."""
     if rows is None:
         raise NotProved(f"no multiplier {name} is on file")
     try:
-        return [Fraction(value) for value in rows[0]]
-    except (IndexError, ValueError, ZeroDivisionError):
-        raise NotProved(f"{name} is no row of rational numbers") from None
+        (row,) = rows
+        found = [Fraction(value) for value in row]
+        [float(value) for value in found]
+    except (OverflowError, ValueError, ZeroDivisionError):
+        raise NotProved(f"{name} is no row of rational numbers within floating point") from None
+    return found
 
 
 _NAMED: dict[str, Condition] = {each.name: each for each in (ANY_ENVIRONMENT, THIS_ENVIRONMENT)}

@@ -34,6 +34,7 @@ from design.conditions import (
 )
 from design.cone import ConeProgram, Inequality
 from design.exact import require_size
+from design.files import InputError
 from design.frequency import frequencies, hermitian, on_circle, peaks, supremum, sweeping
 from design.result import MAKING, DesignFailed, Requirement, from_ratio, refusal, switching_guarantee
 
@@ -97,6 +98,8 @@ class Multiplied(Condition):
         try:
             with sweeping():
                 return self.required_of(self.map(loop, coupling), loop, multiplier)
+        except InputError:
+            raise
         except ValueError as error:  # SingularLoop, TooLong, or a multiplier that is none
             return refusal(self.name, loop.delta, str(error))
 
@@ -106,7 +109,7 @@ class Multiplied(Condition):
         assert unknowns
         values = tuple(float(v) for v in (self.usual(G, loop) if multiplier is None else multiplier))
         unknowns.check(values)
-        asked = self.block(G, loop, values)
+        asked = self.is_demand(self.block(G, loop, values))
         if reason := unsound(asked.free, delta) or self.unsound_static(G, loop, asked):
             return replace(refusal(self.name, delta, reason), multiplier=values)
         search, bound = _Search(lambda x: self.block(G, loop, x), unknowns, asked.free), None

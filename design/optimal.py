@@ -35,9 +35,9 @@ from design.worst_member import Searched, search_ranges
 _PRICED = {2: 3.0, 4: 6.0, 10**3: 9.0}
 _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
 _FIRST = 3  # of the environments: those that the nominal design misses most are imposed first
-_SETTLED_DB = 0.05  # a rung that gains less ends the climb: it is not proved, and not taken
-_SETTLED = f"it gains less than {_SETTLED_DB:g} dB, the stiffness counted"
-_LARGE, _PROMISING_DB = 26, 0.1  # taps: one of more is tried where the rung before has gained so much
+_SETTLED_DB = 0.05  # a rung that gains less ends the climb
+_SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
+_LARGE, _PROMISING_DB = 26, 0.1  # taps: one of more is tried after one that gains so much, proved if it is worth it
 _FEWEST_TAPS = {True: 22, False: 14}  # of a rung that may end the climb; whether this-environment alone is asked
 _MOST_REFUSED = 2  # rungs without a proof, one after the other, after which a larger one has none either
 _KEPT_STIFFNESS = 0.5  # of the most static stiffness of a rung that was best: one that renders less is not taken
@@ -100,17 +100,17 @@ def design_with(
 ) -> Optimal:
     """The optimal coupling for Options(**options), also safe while delays vary within `switching`, (lo, hi) [samples].
 
-    The rungs of its ladder are the steps that `progress` hears of.
+    Each rung of its ladder is a step of `progress`.
     """
     asked, done = program.Options(**options), 0
 
-    def heard(rung: _Rung) -> None:
+    def reached(rung: _Rung) -> None:
         nonlocal done
         done += 1
         progress(f"{rung.mismatch_db:.2f} dB after {rung.seconds:.1f} s", done, len(asked.ladder))
 
     span = None if switching is None else DelayRange(*(tuple(map(int, end)) for end in switching))
-    return design(loop.switching(span), asked, progress=heard)
+    return design(loop.switching(span), asked, progress=reached)
 
 
 def design(
@@ -143,7 +143,7 @@ def design(
             continue
         try:
             with within(max(options.seconds - climb.elapsed, 0.0) if rungs else np.inf, "a larger basis"):
-                least = _SETTLED_DB if taps >= _FEWEST_TAPS[climb.simply] else -np.inf
+                least = _SETTLED_DB if taps > _LARGE else -np.inf
                 found, rung = climb.rung(taps, poles, best, floor, least)
         except TooLong:
             hurried = True
@@ -152,10 +152,10 @@ def design(
         if best and found.g < floor and rung.proved:
             rung = replace(rung, left=f"it renders {found.g:.3f} of the stiffness, less than half of another's")
         elif gained <= 0 or rung.reason == _SETTLED:
-            rung = replace(rung, left=_SETTLED)
+            rung = replace(rung, left=f"{_SETTLED}, the stiffness counted")
         rungs.append(rung)
         progress(rung)
-        settled = rung.reason == _SETTLED
+        settled = rung.reason == _SETTLED or (gained < _SETTLED_DB and taps >= _FEWEST_TAPS[climb.simply])
         if rung.taken:
             best, floor = found, max(floor if best else 0.0, _felt(_KEPT_STIFFNESS * found.g))
             better.append(found)

@@ -4,12 +4,12 @@ from design import certify, design_coupling, guarantee, transparency_of
 from sim import load
 
 LOOP = load("omega-pair").loop("I")
-WISHES = [("spring-damper", "any-environment"), ("spring-damper", "this-environment"), ("optimal", "this-environment")]
+DESIGNS = [("spring-damper", "any-environment"), ("spring-damper", "this-environment"), ("optimal", "this-environment")]
 
 
 def main() -> None:
     print(f"{'coupling':28} {'needs N s/m':>12} {'worst dB':>9} {'rms dB':>7}  certified for")
-    for kind, condition in WISHES:
+    for kind, condition in DESIGNS:
         design = design_coupling(LOOP, kind, condition)
         figures = transparency_of(LOOP, design)
         needed = max(design.requirement.required)

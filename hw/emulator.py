@@ -43,7 +43,7 @@ from sim.run import outside_forces
 from sim.scenario import InputError, Scenario
 
 _FOREVER = 1e9  # [s]
-_STRETCH = 1000  # ticks of outside forces that are computed at once
+_BLOCK = 1000  # ticks of outside forces that are computed at once
 _SUBSTEPS = 8  # per tick where there is Coulomb friction
 _SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
 _FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
@@ -236,7 +236,7 @@ class _EmulatedPlant:
         row = self.tick - self._first
         if not row < len(self._outside):
             self._first, row = self.tick, 0
-            self._outside = outside_forces(self.scenario, self.scene, self._first, _STRETCH)
+            self._outside = outside_forces(self.scenario, self.scene, self._first, _BLOCK)
         self.tick += 1
         return self._outside[row]
 

@@ -67,7 +67,7 @@ class Rehearsal:
     latency_us: float = _LATENCY_US
     clock: float = 1.0  # how long a tick of the device lasts, in T
     keep: bool = True  # every tick of the device in `moments`
-    glance: Callable[[Session], None] = lambda session: None  # called at every turn
+    watch: Callable[[Session], None] = lambda session: None  # called at every turn
     moments: list[_Moment] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -124,7 +124,7 @@ class Rehearsal:
             self._driver.do(self.operator.decide(session, now))
         elif session.stage == Stage.DISARMED and self.arm and session.program is session.programs[0]:
             self._driver.do(session.arm(now))
-        self.glance(session)
+        self.watch(session)
         if session.stage not in ENDED:
             self._ended = self._now
 

@@ -283,7 +283,7 @@ class Session:
                 self._enter(Stage.STOPPED, cause)  # whatever it was to end in, it has not finished
             else:
                 self._log(cause)
-        return self._shutdown.heard(state)
+        return self._shutdown.answer(state)
 
     def _on_driving(self, state: wire.State, ticks: int) -> Said:
         assert self.drive
@@ -386,20 +386,20 @@ class _Shutdown:
         """`acted`: forces have acted, so that a device which says nothing is told again, every T seconds."""
         self._stop, self._latch = (wire.Stop(reason),), reason == wire.Reason.ESTOP
         self._repeat, self._every = acted or self._latch, 1e6 * T
-        self._began = self._told = now
+        self._began = self._sent = now
         self._rests, self._obeys = False, True
 
-    def heard(self, state: wire.State) -> Said:
+    def answer(self, state: wire.State) -> Said:
         """The answer to a STATE that came after the end."""
         self._rests = not state.drives and (not self._latch or state.phase == wire.Phase.ESTOP)
         return () if self._rests else self._stop
 
     def again(self, now: int) -> Said:
         """Repeat STOP where no STATE has confirmed it for a tick: the last STOP, or the STATEs, may be lost."""
-        due = now - self._told >= self._every and now - self._began < _STOPPING_US
+        due = now - self._sent >= self._every and now - self._began < _STOPPING_US
         if self._rests or not due or not self._repeat:
             return ()
-        self._told = now
+        self._sent = now
         return self._stop
 
     def disobeyed(self, state: wire.State, now: int) -> str | None:

@@ -38,18 +38,18 @@ class IncidentLog:
             self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
         except OSError as error:
             raise InputError(f"cannot write {path}: {error.strerror}") from None
-        self._told = 0  # [us]
+        self._written = 0  # [us]
 
     def attach(self, session: Session) -> None:
         """Record from now on."""
         self._write({"at": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "scenario": session.scenario.name, "pid": os.getpid()})
         session.listen = lambda event: self._write({"t_us": event.t_us, "stage": event.stage, "cause": event.cause})
 
-    def glance(self, session: Session) -> None:
+    def update(self, session: Session) -> None:
         """Write the session's state, once a second."""
-        if session.now - self._told < 1_000_000:
+        if session.now - self._written < 1_000_000:
             return
-        self._told, drive = session.now, session.drive
+        self._written, drive = session.now, session.drive
         force, x = (list(drive.force), list(drive.x or ())) if drive else ([], [])
         standing = {"t_us": session.now, "stage": session.stage, "gain": session.gain, "x_m": x, "f_n": force}
         self._write(standing | {"counters": asdict(session.counters)})
@@ -143,11 +143,10 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     """The report of a session that has ended."""
     begin = session.log[0].t_us if session.log else 0
     log = [_Event(1e-6 * (e.t_us - begin), str(e.stage), e.cause) for e in session.log]
-    program = ProgramFigures()
-    steady, ticks, T = list[list[int]](), len(recorder), session.scenario.T
-    if coupled := isinstance(session.program, CertifiedCoupling):
-        program = session.program.figures(session.limits.cap)
-        steady = recorder.steady_ticks(session.units.force_step, session.limits.cap) if ticks else []
+    ticks, T = len(recorder), session.scenario.T
+    coupled = session.program if isinstance(session.program, CertifiedCoupling) else None
+    program = coupled.figures(session.limits.cap) if coupled else ProgramFigures()
+    steady = recorder.steady_ticks(session.units.force_step, session.limits.cap) if coupled and ticks else []
     step = list(session.units.encoder_step) if ticks else None
     ran = _Ran(ticks, ticks * T, T, session.scenario.digest, pace, step, steady)
     trace = recorder.trace(session.units, T, {"run": asdict(ran)}) if coupled and ticks else None

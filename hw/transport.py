@@ -164,14 +164,14 @@ class Live(Driver):
         plan: Callable[[Ages], Sequence[Armable]],
         operator: Operator,
         keyboard: int | None = None,  # a file descriptor with single keys
-        glance: Callable[[Session], None] = lambda session: None,  # called a few times a second
+        watch: Callable[[Session], None] = lambda session: None,  # called a few times a second
         pace: float = 1.0,  # seconds of the session per second; 1 with any real device
     ) -> None:
         super().__init__(session, device, self._designed, lambda: int(time.monotonic_ns() * pace) // 1000)
         self._design, self._operator = plan, operator
-        self._keyboard, self._glance = keyboard, glance
+        self._keyboard, self._watch = keyboard, watch
         self.signals: list[int] = []
-        self._glanced = 0
+        self._watched = 0
 
     def run(self) -> Session:
         """From HELLO to the end. Whatever is raised in between, the device is stopped first."""
@@ -209,13 +209,13 @@ class Live(Driver):
         elif self.signals:
             name = signal.Signals(self.signals[0]).name
             self.do(session.stop(name, now) if len(self.signals) == 1 else session.fail(f"{name} again", now))
-        if now - self._glanced > 100_000:
-            self._glanced = now
-            self._glance(session)
+        if now - self._watched > 100_000:
+            self._watched = now
+            self._watch(session)
 
     def _designed(self, ages: Ages) -> Sequence[Armable]:
         """A design may be interrupted, and what was typed meanwhile is read before its coupling can be armed."""
-        self._glance(self.session)  # for it takes a while
+        self._watch(self.session)  # for it takes a while
         try:
             with _interruptible():
                 programs = self._design(ages)

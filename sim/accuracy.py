@@ -636,6 +636,8 @@ def simulated_growth(
 ) -> float:
     """The growth rate [1/s] of the loop that an engine simulates with these settings; of walls, in the worst state."""
     held = _measured_hold(simulation, engine, integrator, substeps)
+    if not all(np.isfinite(part).all() for part in (held.A, held.B)):
+        raise InputError(f"engine {engine_name(engine)}: a tick from rest leaves the range of numbers")
     return max(float(dominant_mode(close(held, F)).growth) for F in simulation.process.law.frozen().values())
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.coupling import Coupling, ForceFilter
+from controller.coupling import Coupling
 from controller.loop import Loop
 from controller.lti import Array
 from controller.older import CONDITIONS as OLDER
@@ -24,8 +24,8 @@ from sim.scenario import Scenario
 
 def nearby(loop: Loop, coupling: Coupling) -> Nearby:
     """What a coupling needs within ten percent; beside an optimal one what a design for that would cost."""
-    optimal = isinstance(coupling, ForceFilter)
-    return nearby_with_price(loop, coupling) if optimal else Nearby(robustness_nearby(loop, coupling))
+    filters_forces = coupling.in_series(loop.T) is not None
+    return nearby_with_price(loop, coupling) if filters_forces else Nearby(robustness_nearby(loop, coupling))
 
 
 @dataclass(frozen=True, eq=False)

@@ -225,7 +225,12 @@ def _group(
         each = [simulation.held_by(crowd.humans(i), crowd.persons(i)) for i in range(len(crowd))]
         make = validation.engine
         mujoco = np.array([simulated_growth(one, None, None, make) for one in each])
-        other = lambda integrator, timing: OneByOne([make_engine(one, make) for one in each])  # noqa: E731
+
+        def one_by_one(integrator: str, timing: Timing | None) -> Engine:
+            """The user's own, which integrates as it does and has the timing from the simulation."""
+            return OneByOne([make_engine(one, make) for one in each])
+
+        other = one_by_one
     elif validation.engine != "exact":
         maps = (mujoco_loops(held_by, process, nthread=validation.threads, late=late) for process in frozen)
         mujoco = Mode.worst([dominant_mode(loop) for loop in maps]).growth

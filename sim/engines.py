@@ -29,7 +29,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
@@ -65,9 +65,16 @@ class Engine(Protocol):
         """Whether the engine itself has reported numbers that it cannot go on with."""
         ...
 
-    # One that can may also have, from `start` on:
-    #   run_block(ticks) the linear law and `advance` for so many ticks from row 0 on, in fewer calls; or None
-    #   back(k)          after it the plant goes back to the state of row k
+
+@runtime_checkable
+class RunsBlocks(Protocol):
+    """What an engine may have beside: many ticks of a linear law in fewer calls than one by one."""
+
+    run_block: RunBlock | None  # from `start` on: law and `advance` for so many ticks from row 0 on, where it can
+
+    def back(self, k: int) -> None:
+        """After a `run_block`, take the plant back to the state of row k."""
+        ...
 
 
 class _Exact:
@@ -338,16 +345,16 @@ class MujocoEngine:
         self._access = _Access(
             T,
             substeps,
-            self.data.ctrl,
+            ctrl=self.data.ctrl,
             # one view of both, wherever MuJoCo has put them: one copy reads them
-            as_strided(q, (2, q.size), (v.ctypes.data - q.ctypes.data, q.itemsize)),
-            len(scene.plant.A),
-            self.data.qacc,
-            partial(mujoco.mj_forward, *both),
-            partial(mujoco.mj_step, *both),
-            partial(setattr, self.model.opt, "timestep"),
-            (lambda h: moves(h).dot) if integrator == EXPONENTIAL else None,
-            _kicks(stacked),
+            state=as_strided(q, (2, q.size), (v.ctypes.data - q.ctypes.data, q.itemsize)),
+            size=len(scene.plant.A),
+            qacc=self.data.qacc,
+            forward=partial(mujoco.mj_forward, *both),
+            step=partial(mujoco.mj_step, *both),
+            pace=partial(setattr, self.model.opt, "timestep"),
+            move=(lambda h: moves(h).dot) if integrator == EXPONENTIAL else None,
+            kick=_kicks(stacked),
         )
         # what rubs is solved from the solution before, which nothing takes back
         self._rubs = default_integrator(scene) != EXPONENTIAL
@@ -454,15 +461,15 @@ class MujocoBatchEngine:
         self._access = _Access(
             T,
             substeps,
-            batch.bind("ctrl").T,
-            batch.state[:, time:motion].T,  # position and velocity lie side by side in a state row
-            plants.A.shape[-1],
-            batch.bind("qacc").T,
-            batch.forward,
-            lambda count: batch.step(nstep=count),
-            batch.expand("opt.timestep").fill if timing else float,
-            cache(move) if integrator == EXPONENTIAL else None,
-            _kicks(plants),
+            ctrl=batch.bind("ctrl").T,
+            state=batch.state[:, time:motion].T,  # position and velocity lie side by side in a state row
+            size=plants.A.shape[-1],
+            qacc=batch.bind("qacc").T,
+            forward=batch.forward,
+            step=lambda count: batch.step(nstep=count),
+            pace=batch.expand("opt.timestep").fill if timing else float,
+            move=cache(move) if integrator == EXPONENTIAL else None,
+            kick=_kicks(plants),
         )
 
     def start(self, buffer: StepBuffer) -> None:

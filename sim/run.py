@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -36,6 +36,7 @@ from sim.engines import (
     ExactEngine,
     ExactTimedEngine,
     MujocoEngine,
+    RunsBlocks,
     default_integrator,
     profiler_off,
     quiet_warnings,
@@ -271,13 +272,13 @@ def run_blocks(
 
 def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
     """Close the loop for the first `ticks` rows of the buffer."""
-    done, fast = 0, cast(Any, engine)
-    if buffer.calm and getattr(engine, "run_block", None):
-        fast.run_block(ticks)  # the same by the linear law, whose forces are looked at afterwards
+    done = 0
+    if buffer.calm and isinstance(engine, RunsBlocks) and engine.run_block:
+        engine.run_block(ticks)  # the same by the linear law, whose forces are looked at afterwards
         done = buffer.linear_until(ticks)
         if done == ticks:
             return
-        fast.back(done)
+        engine.back(done)
         buffer.calm = False
     tick, advance = buffer.ticking(), engine.advance
     for k in range(done, ticks):

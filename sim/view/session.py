@@ -225,7 +225,7 @@ def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> Prep
 
 
 HISTORY = 4.0  # [s] of forces that are kept for the picture
-_STRETCH = 64  # ticks between two looks at what is due
+_BLOCK = 64  # ticks between two looks at what is due
 LONGEST_LAG = 0.1  # [s] what a window may make up in one go; more is dropped and counted
 _STIFFNESS, _DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand: as firm as the hands of the default scenario
 
@@ -414,7 +414,7 @@ class LiveLoop:
                     self._latest = prepared
                     self._switch(event, prepared)
             until = min(end, self._script[0][0]) if self._script else end
-            self._advance(min(_STRETCH, until - self._tick))
+            self._advance(min(_BLOCK, until - self._tick))
 
     def _advance(self, count: int) -> None:
         buffer, scene = self._buffer, self.prepared.simulation.scene
@@ -452,7 +452,7 @@ class LiveLoop:
         """Continue with another process from the plant state s."""
         process = prepared.simulation.process
         outside = prepared.simulation.plant.B.shape[1] - process.channels
-        buffer = StepBuffer(process, _STRETCH, s.size, outside)
+        buffer = StepBuffer(process, _BLOCK, s.size, outside)
         buffer.s[0, :, 0] = s
         buffer.z[0, :, 0] = process.ticked.at_rest(s[: process.channels])
         self.prepared, self._buffer = prepared, buffer

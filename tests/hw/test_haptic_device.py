@@ -118,7 +118,7 @@ class StandIn:
         return "no device found"
 
 
-def held_session(scenario, sdk, seconds=0.5, cap=12.0, glance=lambda session: None):
+def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: None):
     """A session of Live with the stand-in, from the handshake to the end."""
     session = Session(scenario, SafetyLimits((cap,) * 2), LinkSettings(measure=150))
     session.record = recorder = Recorder(2)
@@ -130,7 +130,7 @@ def held_session(scenario, sdk, seconds=0.5, cap=12.0, glance=lambda session: No
             made.extend(certified_couplings(judged, "I", None, None, link, spare=0))
             return made
 
-        live = Live(session, device, plan, Operator(True, seconds), glance=glance)
+        live = Live(session, device, plan, Operator(True, seconds), watch=watch)
         live.clock = lambda: round(1e6 * sdk.now)
         live.run()
     return session, recorder, made
@@ -210,11 +210,11 @@ def test_forces_later_than_certified_end_in_a_ramp(scenario):
     """0.4 ms in place of 0.1, still within the tick: late, for the certificate is for less."""
     sdk = StandIn(scenario)
 
-    def glance(session):
+    def watch(session):
         if session.stage == Stage.ARMED:
             sdk.write = 0.4e-3
 
-    session, *_ = held_session(scenario, sdk, seconds=3.0, glance=glance)
+    session, *_ = held_session(scenario, sdk, seconds=3.0, watch=watch)
     assert session.stage == Stage.STOPPED
     assert "answers were late, and nothing softer is left" in session.cause
     assert session.counters.late > 20
@@ -224,11 +224,11 @@ def test_forces_later_than_certified_end_in_a_ramp(scenario):
 def test_a_host_that_cannot_keep_the_period_stops(scenario):
     sdk = StandIn(scenario)
 
-    def glance(session):
+    def watch(session):
         if session.stage == Stage.ARMED:
             sdk.read = 1.6e-3
 
-    session, *_ = held_session(scenario, sdk, seconds=3.0, glance=glance)
+    session, *_ = held_session(scenario, sdk, seconds=3.0, watch=watch)
     assert session.stage == Stage.STOPPED
     assert "no answer in time" in session.cause or "by its own clock" in session.cause
     assert sdk.force.tolist() == [0.0, 0.0]
@@ -237,10 +237,10 @@ def test_a_host_that_cannot_keep_the_period_stops(scenario):
 def test_a_device_that_is_unplugged_is_lost(scenario):
     sdk = StandIn(scenario)
 
-    def glance(session):
+    def watch(session):
         sdk.broken |= session.stage == Stage.ARMED
 
-    session, *_ = held_session(scenario, sdk, glance=glance)
+    session, *_ = held_session(scenario, sdk, watch=watch)
     assert (session.stage, session.cause) == (Stage.LOST, "the device is gone: no device found")
     assert sdk.force.tolist() == [0.0, 0.0]
 
@@ -249,10 +249,10 @@ def test_motors_that_saturate_are_a_fault_of_the_device(scenario):
     """What they then push is not what was certified."""
     sdk = StandIn(scenario)
 
-    def glance(session):
+    def watch(session):
         sdk.saturated |= session.stage == Stage.ARMED
 
-    session, *_ = held_session(scenario, sdk, glance=glance)
+    session, *_ = held_session(scenario, sdk, watch=watch)
     assert session.stage == Stage.STOPPED
     assert session.cause == "the device is in ramp, cause device"
 
@@ -262,7 +262,7 @@ def test_the_emergency_stop_is_at_once(scenario):
     sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * t)
     held = []
 
-    def glance(session):
+    def watch(session):
         if session.stage == Stage.ARMED and np.abs(sdk.force).max() > 0.2:
             held.append(np.abs(sdk.force).max())
             live.do(session.estop("asked to", session.now))
@@ -274,7 +274,7 @@ def test_the_emergency_stop_is_at_once(scenario):
         def plan(ages):
             return certified_couplings(timed(scenario, ages, 0.99, 50.0, True)[0], "I", None, None, 0, spare=0)
 
-        live = Live(session, device, plan, Operator(True, 3.0), glance=glance)
+        live = Live(session, device, plan, Operator(True, 3.0), watch=watch)
         live.clock = lambda: round(1e6 * sdk.now)
         live.run()
     assert (session.stage, session.cause) == (Stage.ESTOP, "asked to")

@@ -73,11 +73,11 @@ def emulator():
     assert emulator.end()["phase"] in AT_REST
 
 
-def run(emulator, scenario, plan, glance=lambda session: None, pace=PACE):
+def run(emulator, scenario, plan, watch=lambda session: None, pace=PACE):
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=150))
     with SerialPort(emulator.path, 921_600) as port:
         device = SerialDevice(port, lambda: pace * time.monotonic())
-        live = Live(session, device, plan, Operator(True, 60.0), glance=glance, pace=pace)
+        live = Live(session, device, plan, Operator(True, 60.0), watch=watch, pace=pace)
         live.run()
     return session, live
 
@@ -106,15 +106,15 @@ def test_an_interrupt_while_forces_act_is_130_after_a_ramp(tmp_path, capsys, mon
     """The whole command: the gain comes down to zero in 100 ms, and the exit code tells of the interrupt."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    look = IncidentLog.glance
+    look = IncidentLog.update
 
-    def glance(incidents, session):
+    def update(incidents, session):
         look(incidents, session)
         if session.stage == Stage.ARMED and session.gain == 1.0 and not sent:
             sent.append(session.stage)
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(IncidentLog, "glance", glance)
+    monkeypatch.setattr(IncidentLog, "update", update)
     for pace in PACES:
         sent = []
         options = ["--emulate", "--case", "I", "--duration", "20", "--measure", "60", "--pace", str(pace)]
@@ -139,7 +139,7 @@ def test_an_interrupt_while_forces_act_is_130_after_a_ramp(tmp_path, capsys, mon
 def test_a_signal_while_forces_act(scenario, name, stage):
     """At slow pace: SIGINT and SIGTERM end in a ramp of 100 ms, SIGUSR1 in an emergency stop, at once and latched."""
 
-    def glance(session):
+    def watch(session):
         if session.stage == Stage.ARMED and not sent:
             sent.append(name)
             signal.raise_signal(getattr(signal, name))
@@ -147,7 +147,7 @@ def test_a_signal_while_forces_act(scenario, name, stage):
     for pace in PACES:
         emulator, sent = EmulatorProcess(f"--pace={pace}"), []
         session, _ = run(
-            emulator, scenario, lambda ages: [certified_coupling(scenario, "I", None, None, 2)], glance, pace
+            emulator, scenario, lambda ages: [certified_coupling(scenario, "I", None, None, 2)], watch, pace
         )
         ended = emulator.end()
         assert ended["phase"] in AT_REST
@@ -168,13 +168,13 @@ def test_a_signal_while_forces_act(scenario, name, stage):
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGQUIT"])
 def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, rungs, name):
-    def glance(session):
+    def watch(session):
         if session.stage == Stage.MEASURING and not sent:
             sent.append(name)
             signal.raise_signal(getattr(signal, name))
 
     sent = []
-    session, live = run(emulator, scenario, lambda ages: rungs, glance=glance)
+    session, live = run(emulator, scenario, lambda ages: rungs, watch=watch)
     assert (session.stage, session.cause) == (Stage.FINISHED, name)
     assert live.signals == [getattr(signal, name)]
 

@@ -153,7 +153,7 @@ def test_the_incident_log_survives_sigkill(tmp_path):
         "from hw.limits import SafetyLimits; from hw.session import Session\n"
         "from sim.scenario import load\n"
         f"session, log = Session(load(), SafetyLimits((2.0, 2.0))), IncidentLog(Path({str(tmp_path / 'log')!r}))\n"
-        "log.attach(session); session.start(0); session.now = 1_500_000; log.glance(session)\n"
+        "log.attach(session); session.start(0); session.now = 1_500_000; log.update(session)\n"
         "print('written', flush=True); time.sleep(600)"
     )
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -173,7 +173,7 @@ def test_the_incident_log_tells_every_stage_and_every_second(scenario, rungs, tm
     rehearsal = rehearsal_of(scenario, rungs, Operator(True, 2.0))
     log.attach(rehearsal.session)
     steer = rehearsal.operator.decide
-    rehearsal.operator.decide = lambda session, now: (log.glance(session), steer(session, now))[1]
+    rehearsal.operator.decide = lambda session, now: (log.update(session), steer(session, now))[1]
     session = rehearsal.run_until_armed(3.0)
     log.close()
     lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
