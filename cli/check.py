@@ -15,7 +15,7 @@ from design.certificate import NotProved, Verdict, lag, named, prove, required_d
 from design.conditions import Condition
 from design.coupling_file import Stored, SwitchingProof
 from design.coverage import SearchFigures
-from design.files import unseen
+from design.files import off_table
 from design.guarantees import HERE, RANGES
 from design.result import CONDITIONS, listed, switching_guarantee
 from design.worst_member import Searched, search, search_ranges
@@ -51,8 +51,8 @@ class _Checked:
     limited_forces: str | None = render.figure("forces")
     wall_s: float = render.figure("seconds", "{:.6g}")
     switching: _Switching | None = field(default=None)
-    claim: str | None = render.figure("claim", default=None, json="given")  # of a condition of the user's own
-    anew: bool = unseen(default=False)  # by another condition than the file's, whose certificate says nothing here
+    claim: str | None = render.figure("claim", default=None, json="if given")  # of a condition of the user's own
+    anew: bool = off_table(default=False)  # by another condition than the file's, whose certificate says nothing here
 
 
 def main(argv: list[str]) -> int:

@@ -271,16 +271,16 @@ class _Report:
     wall_s: float
     certificate: Requirement
     price: list[coverage.OverRanges] | None
-    judged: Judged = render.several(_judged_rows, "beside")
+    judged: Judged = render.several(_judged_rows, "inlined")
     switching: coverage.Switching | None = render.figure("damping, any switching", _switching_words)
-    delays: str | None = render.figure("guarantee, delays", json="table")
+    delays: str | None = render.figure("guarantee, delays", json="left out")
     objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
     transparency: Transparency = render.figure("transparency error", render.transparency_error)
-    nearby: Nearby = render.several(render.robustness_rows, "beside")
-    best: _Best | None = render.several(_Best.rows, "beside")
+    nearby: Nearby = render.several(render.robustness_rows, "inlined")
+    best: _Best | None = render.several(_Best.rows, "inlined")
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
     stored: Filed = render.several(_stored_rows)
-    claim: str | None = render.figure("claim", default=None, json="given")  # of a condition of the user's own
+    claim: str | None = render.figure("claim", default=None, json="if given")  # of a condition of the user's own
 
     @property
     def aim(self) -> str:
