@@ -19,7 +19,7 @@ from design.audit import LONGEST_DELAY, Audit, ConditionAudit, Help, audit
 from design.certificate import check_ranges, named
 from design.coverage import Switching
 from design.designs import KINDS, name_and_own
-from design.files import unseen
+from design.files import off_table
 from design.guarantees import EncoderSteps
 from design.result import listed
 from models.device import CATALOGUE, Listed, listed_device
@@ -39,7 +39,7 @@ class _CatalogueDevice:
     """A device of the catalogue, by its name."""
 
     name: str
-    listed: Listed = unseen("beside")
+    listed: Listed = off_table("inlined")
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +50,10 @@ class _Report:
     scenario: str | None
     device: _CatalogueDevice | None
     gains: str | None  # the source of a device's gains
-    audit: Audit = unseen("beside")
-    encoder: EncoderSteps | None = unseen()
-    notes: tuple[str, ...] = unseen()
-    wall_s: float = unseen()
+    audit: Audit = off_table("inlined")
+    encoder: EncoderSteps | None = off_table()
+    notes: tuple[str, ...] = off_table()
+    wall_s: float = off_table()
 
 
 def main(argv: list[str]) -> int:

@@ -15,7 +15,7 @@ from design.certificate import NotProved, Verdict, lag, named, prove, required_d
 from design.conditions import Condition
 from design.coupling_file import Stored, SwitchingProof
 from design.coverage import SearchFigures
-from design.files import unseen
+from design.files import off_table
 from design.guarantees import HERE, RANGES
 from design.result import CONDITIONS, listed, switching_guarantee
 from design.worst_member import Searched, search, search_ranges
@@ -51,8 +51,8 @@ class _Checked:
     limited_forces: str | None = render.figure("forces")
     wall_s: float = render.figure("seconds", "{:.6g}")
     switching: _Switching | None = field(default=None)
-    claim: str | None = render.figure("claim", default=None, json="given")  # of a condition of the user's own
-    anew: bool = unseen(default=False)  # by another condition than the file's, whose certificate says nothing here
+    claim: str | None = render.figure("claim", default=None, json="if given")  # of a condition of the user's own
+    anew: bool = off_table(default=False)  # by another condition than the file's, whose certificate says nothing here
 
 
 def main(argv: list[str]) -> int:
@@ -67,7 +67,7 @@ def main(argv: list[str]) -> int:
     searched = _searched(stored, own) if verdict.proved else None
     if searched and not searched.worst[0].ratio < 1:
         verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
-    checked = _checked(stored, verdict, searched, time.perf_counter() - begin)
+    checked = _checked(stored, own, verdict, searched, time.perf_counter() - begin)
     if own and verdict.proved and own.name not in CONDITIONS:
         checked = replace(checked, claim=own.claim)
     checked = replace(checked, anew=anew)
@@ -107,7 +107,9 @@ def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
         return search(regions(loop.network, loop.ranges), lambda m: need(loop.at(m.network)).ratio, move)
 
 
-def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, seconds: float) -> _Checked:
+def _checked(
+    stored: Stored, condition: Condition | None, verdict: Verdict, searched: Searched | None, seconds: float
+) -> _Checked:
     loop, claim, proved = stored.loop, stored.certificate, verdict.proved
     span, switching = loop.varying_delay, None
     if span and claim and isinstance(delays := claim.switching, SwitchingProof):
@@ -118,7 +120,7 @@ def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, second
         proved,
         verdict.reason,
         claim and claim.condition,
-        claim.guarantee if claim and proved else None,
+        (condition or named(claim.condition)).words(loop) if claim and proved else None,
         claim.proof if claim and proved else None,
         len(loop.members()) - 1 if loop.ranges else None,
         searched and SearchFigures.of(searched),

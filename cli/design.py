@@ -238,10 +238,15 @@ class _Best:
         yield "bound", self.bound and self.bound.words
         share = finite(self.rendered_stiffness)  # a free mass has no static stiffness to render
         yield "rendered stiffness", None if share is None else f"{share:.3f} of the environment's"
-        rungs = (f"{rung.mismatch_db:.2f}{'' if rung.proved else ' (not proved)'}" for rung in self.ladder)
+        rungs = (f"{rung.mismatch_db:.2f}{_why_left(rung)}" for rung in self.ladder)
         yield "ladder [dB]", ", ".join(rungs) or None
-        if missed := [rung.reason for rung in self.ladder if not rung.proved]:
+        yield "last not taken", next((rung.left for rung in reversed(self.ladder) if rung.left), None)
+        if missed := [rung.reason for rung in self.ladder if not (rung.proved or rung.left)]:
             yield "last not proved", missed[-1]
+
+
+def _why_left(rung: Any) -> str:
+    return "" if rung.taken else " (not taken)" if rung.left else " (not proved)"
 
 
 def _switching_words(proof: coverage.Switching) -> str:
@@ -266,16 +271,16 @@ class _Report:
     wall_s: float
     certificate: Requirement
     price: list[coverage.OverRanges] | None
-    judged: Judged = render.several(_judged_rows, "beside")
+    judged: Judged = render.several(_judged_rows, "inlined")
     switching: coverage.Switching | None = render.figure("damping, any switching", _switching_words)
-    delays: str | None = render.figure("guarantee, delays", json="table")
+    delays: str | None = render.figure("guarantee, delays", json="left out")
     objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
     transparency: Transparency = render.figure("transparency error", render.transparency_error)
-    nearby: Nearby = render.several(render.robustness_rows, "beside")
-    best: _Best | None = render.several(_Best.rows, "beside")
+    nearby: Nearby = render.several(render.robustness_rows, "inlined")
+    best: _Best | None = render.several(_Best.rows, "inlined")
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
     stored: Filed = render.several(_stored_rows)
-    claim: str | None = render.figure("claim", default=None, json="given")  # of a condition of the user's own
+    claim: str | None = render.figure("claim", default=None, json="if given")  # of a condition of the user's own
 
     @property
     def aim(self) -> str:

@@ -27,7 +27,7 @@ from design.export import (
     trial,
     with_origin,
 )
-from design.files import out_file, unseen, write
+from design.files import off_table, out_file, write
 from design.result import listed
 from sim.couplings import read_coupling
 from sim.scenario import InputError
@@ -56,10 +56,10 @@ class _Exported:
     channels: int = render.figure("block", "{} channels, {r.states} states, T = {r.T_s:g} s")
     certificate: _Proof = render.figure("certificate")
     multiplications: int = render.figure("one tick", "{} multiplications")
-    force_limit: Array | None = unseen()
+    force_limit: Array | None = off_table()
     forces: str | None = render.figure("forces")
     test: dict[str, Any] = render.figure("test vector", "{[ticks]} ticks, in the file")
-    claim: str | None = render.figure("claim", json="given")  # of a condition of the user's own
+    claim: str | None = render.figure("claim", json="if given")  # of a condition of the user's own
 
 
 def main(argv: list[str]) -> int:

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from cli import options, render
 from cli.session_cli import add_link_options, check_link, hold_session, steady_scenario
-from design.files import plain, unseen, write
+from design.files import off_table, plain, write
 from hw.emulator import nobody
 from hw.identify import Estimate, Excitation, capped, chirp, estimate, held, settled
 from hw.limits import Stage
@@ -45,23 +45,23 @@ class _Sitting:
 
     axes: list[Estimate]  # none where there is a reason
     reason: str | None
-    report: SessionReport = unseen("no")
-    session: Session = unseen("no")
-    trace: Path | None = unseen("no")
-    signals: Sequence[int] = unseen("no")
+    report: SessionReport = off_table("left out")
+    session: Session = off_table("left out")
+    trace: Path | None = off_table("left out")
+    signals: Sequence[int] = off_table("left out")
 
 
 @dataclass(frozen=True, eq=False)
 class _Report:
     """The last session, one estimate per axis from all sittings, and whether each has a bound above zero."""
 
-    session: SessionReport = unseen("beside")
-    axes: list[Estimate] = unseen()
-    sittings: list[_Sitting] = unseen()
-    bounded: bool = unseen()
-    warnings: list[str] = unseen()
-    reason: str | None = unseen("given")
-    limits: str = unseen(default=_LIMITS)
+    session: SessionReport = off_table("inlined")
+    axes: list[Estimate] = off_table()
+    sittings: list[_Sitting] = off_table()
+    bounded: bool = off_table()
+    warnings: list[str] = off_table()
+    reason: str | None = off_table("if given")
+    limits: str = off_table(default=_LIMITS)
 
     def lines(self) -> list[str]:
         """What stands below the table."""

@@ -23,7 +23,7 @@ from rich.table import Table
 from rich.text import Text
 
 from controller.loop import Loop
-from design.files import nobody_reads, plain, printable, write_json
+from design.files import InJson, nobody_reads, plain, printable, write_json
 from design.result import DesignFailed, Requirement, listed
 
 if TYPE_CHECKING:  # the reports' parts, which no command without them loads
@@ -206,19 +206,18 @@ def figure(
     name: str,
     form: _Form = "{}",
     default: Any = MISSING,
-    json: str = "key",
+    json: InJson = "always",
     absent: str | None = None,
     older: str | None = None,
 ) -> Any:
     """A field that a report's table shows under this name, in this format: of the value, and of the whole report `r`.
 
-    None is shown as `absent`, or not at all. In JSON it is a `key`, a key only where it is `given`, keys `beside` the
-    report's own, or in the `table` alone; `older` is the name that the key had before.
+    None is shown as `absent`, or not at all. `json` and `older` are as in `off_table` of design/files.py.
     """
     return field(default=default, metadata={"name": name, "form": form, "json": json, "absent": absent, "older": older})
 
 
-def several(rows: Callable[[Any], Rows], json: str = "key") -> Any:
+def several(rows: Callable[[Any], Rows], json: InJson = "always") -> Any:
     """A field that a report's table shows as these rows."""
     return field(metadata={"rows": rows, "json": json})
 

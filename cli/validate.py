@@ -15,7 +15,7 @@ from cli.judged import chosen_by, judge
 from controller.ranges import Member
 from design.certificate import RangesCheck
 from design.conditions import this_environment
-from design.files import unseen
+from design.files import off_table
 from design.guarantees import ANY
 from design.result import Chosen
 from models.human import Human, Population
@@ -200,8 +200,8 @@ class _Own:
     """What the exact loop does in the hands of the scenario, or of --human FILE."""
 
     from_: str
-    exact: Eigenvalues = unseen("beside")
-    holds: bool = unseen()
+    exact: Eigenvalues = off_table("inlined")
+    holds: bool = off_table()
 
     def rows(self) -> render.Rows:
         growth = f"{self.exact.exact_growth_rate_per_s:+.4g} 1/s at {self.exact.exact_frequency_hz:.2f} Hz"
@@ -233,23 +233,23 @@ class _Report:
     own_humans: _Own = render.several(_Own.rows)
     largest_difference_per_s: float | None = render.figure("growth rates apart", "{:.1e} 1/s at most")
     traces: verdicts.Traces | None = render.several(verdicts.Traces.rows)
-    judged: Judged = render.several(_judged_rows, "beside")
-    settled: str | None = render.figure("handles come to rest", json="table")
-    energy_audit: verdicts.EnergyAudit | None = render.figure("energy audit W >= 0", json="given")
+    judged: Judged = render.several(_judged_rows, "inlined")
+    settled: str | None = render.figure("handles come to rest", json="left out")
+    energy_audit: verdicts.EnergyAudit | None = render.figure("energy audit W >= 0", json="if given")
     switching: verdicts.Growing[VaryingDelays] | None = render.several(
-        lambda grow: [*render.delay_rows(grow.met), grow.row("delays")], "given"
+        lambda grow: [*render.delay_rows(grow.met), grow.row("delays")], "if given"
     )
     timing: verdicts.Growing[UnevenTicks] | None = render.several(
-        lambda grow: [render.timing_row(grow.met), grow.row("ticks")], "given"
+        lambda grow: [render.timing_row(grow.met), grow.row("ticks")], "if given"
     )
-    adversary: verdicts.Attacked | None = render.figure("adversary", json="given")
-    adversary_population: verdicts.Attacked | None = render.figure("adversary, own population", json="given")
+    adversary: verdicts.Attacked | None = render.figure("adversary", json="if given")
+    adversary_population: verdicts.Attacked | None = render.figure("adversary, own population", json="if given")
     certified: bool = render.figure("certified", lambda yes: "yes" if yes else "no")
     holds: bool | None = render.figure("holds", lambda yes: "[green]yes[/]" if yes else "[red]no[/]", absent=_NOTHING)
-    reason: str | None = unseen("given")
+    reason: str | None = off_table("if given")
     interrupted: bool
-    kept: str = unseen("table")
-    ended: str | None = render.figure("interrupted", "{r.kept}", json="table")
+    kept: str = off_table("left out")
+    ended: str | None = render.figure("interrupted", "{r.kept}", json="left out")
     unfinished: str | None = render.figure("unfinished", "{}; {r.kept}")
     wall_s: float = render.figure("time", "{:.1f} s, {r.simulated_s_per_s:.0f} simulated seconds per second")
     simulated_s_per_s: float

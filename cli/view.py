@@ -11,7 +11,7 @@ from pathlib import Path
 
 from cli import options, render
 from design.coverage import Limits
-from design.files import unseen, write_json
+from design.files import off_table, write_json
 from design.result import Requirement
 from sim.scenario import InputError, require_even_ticks
 from sim.view.session import (
@@ -76,8 +76,8 @@ class _Event:
     exact_growth_rate_per_s: float  # null in JSON where there is none
     exact_frequency_hz: float
     certificates: Mapping[str, Requirement]
-    guarantee: str | None = unseen(older="promise")
-    limiter: Limits = unseen()
+    guarantee: str | None = off_table(older="promise")
+    limiter: Limits = off_table()
 
     @classmethod
     def of(cls, t: float, what: str, prepared: PreparedLoop) -> _Event:
@@ -116,8 +116,8 @@ class _Ended:
     """How the session was shown, and whether the keyboard ended it."""
 
     interrupted: bool
-    video: _Film | None = unseen("given", None)
-    clock: _Clock | None = unseen("given", None)
+    video: _Film | None = off_table("if given", None)
+    clock: _Clock | None = off_table("if given", None)
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class _Report:
     simulated_s: float
     clipped_ticks: int
     events: list[_Event]
-    ended: _Ended = unseen("beside")
+    ended: _Ended = off_table("inlined")
 
     def lines(self) -> Iterator[str]:
         """One line per event, and where the film is."""

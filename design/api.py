@@ -18,7 +18,7 @@ from design.conditions import Condition
 from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save, sealed
 from design.designs import KINDS, design_by_kind, name_and_own, usual_condition
 from design.environments import SWITCHING
-from design.files import unseen
+from design.files import off_table
 from design.guarantees import ANY, HERE, RANGES, guarantee_of
 from design.result import ConditionName, Design, NotProved, Requirement, switching_guarantee
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
@@ -163,9 +163,9 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
 class _SwitchingFiled:
     """The guarantee for delays that vary, with its proof or why there is none."""
 
-    guarantee: str = unseen(older="promise")
-    proof: str | None = unseen()
-    reason: str | None = unseen()
+    guarantee: str = off_table(older="promise")
+    proof: str | None = off_table()
+    reason: str | None = off_table()
 
 
 @dataclass(frozen=True)

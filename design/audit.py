@@ -25,9 +25,10 @@ from design.certificate import RangesCheck, named
 from design.conditions import Condition
 from design.coverage import RangesFigures, Switching
 from design.environments import THIS_ENVIRONMENT
-from design.files import unseen
+from design.files import InputError, off_table
 from design.frequency import sweeping, too_long
 from design.guarantees import ANY, CAVEATS, guarantee_of
+from design.own import place_of
 from design.result import CONDITIONS, ConditionName, Requirement, listed, refusal
 
 # ----------------------------------------------------------------------------------------------------
@@ -46,9 +47,11 @@ def requirement(loop: Loop, coupling: Coupling, condition: _Asked) -> Requiremen
     asked = named(condition)
     try:
         return asked.judge(loop, coupling)
-    except TooLong:
+    except (TooLong, InputError):
         raise
     except ValueError as error:  # no solution of the algebraic loop
+        if place_of(error):  # in a class of the user's own
+            raise
         return refusal(asked.name, loop.delta, str(error))
 
 
@@ -100,7 +103,7 @@ class _Stiffest:
     """The largest certified stiffness of each channel beside its B [N/m]; None where the reason says why."""
 
     K: tuple[float | None, ...]
-    reason: str | None = unseen("given", None)
+    reason: str | None = off_table("if given", None)
 
 
 @dataclass(frozen=True)
@@ -115,7 +118,7 @@ class _Sensitivity:
     largest_T_s: float | None = None  # gains and delays in samples kept
     T_error: float | None = None
     extra_samples: int | None = None  # of delay, on all channels at once
-    reason: str | None = unseen("given", None)
+    reason: str | None = off_table("if given", None)
 
 
 def stiffest(loop: Loop, coupling: Coupling, condition: _Asked) -> _Stiffest:
@@ -320,9 +323,9 @@ class _Loop:
 class ConditionAudit:
     """What one condition says, and how far the coupling is from its edge."""
 
-    requirement: Requirement = unseen("beside")
-    stiffest: _Stiffest = unseen()
-    sensitivity: _Sensitivity = unseen()
+    requirement: Requirement = off_table("inlined")
+    stiffest: _Stiffest = off_table()
+    sensitivity: _Sensitivity = off_table()
 
 
 @dataclass(frozen=True)
@@ -341,12 +344,12 @@ class Audit:
 
     coupling: _Coupling
     loop: _Loop
-    conditions: dict[str, ConditionAudit] = unseen("beside")  # also under the names that they had before
-    switching: Switching | None = unseen(older="jitter-proof")
-    ranges: RangesFigures | None = unseen(older="set")
-    certified: bool = unseen()
-    guarantee: str | None = unseen(older="promise")
-    helps: list[Help] = unseen()
+    conditions: dict[str, ConditionAudit] = off_table("inlined")  # also under the names that they had before
+    switching: Switching | None = off_table(older="jitter-proof")
+    ranges: RangesFigures | None = off_table(older="set")
+    certified: bool = off_table()
+    guarantee: str | None = off_table(older="promise")
+    helps: list[Help] = off_table()
     not_covered: str = CAVEATS
 
     @property

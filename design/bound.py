@@ -29,7 +29,7 @@ from controller.loop import Loop
 from controller.lti import Array, Complex, Lti
 from design.barrier import EntryInequality, Program, centre, packed, towards
 from design.conditions import even_damping
-from design.files import unseen
+from design.files import off_table
 from design.frequency import frequencies, hermitian, on_circle
 from design.program import Options
 from design.result import Design
@@ -316,10 +316,10 @@ class BoundBeside:
     """
 
     rms_mismatch_db: float | None = None
-    gap_db: float | None = unseen("given", None)
-    reason: str | None = unseen("given", None)
+    gap_db: float | None = off_table("if given", None)
+    reason: str | None = off_table("if given", None)
     even_without: tuple[str, ...] = ()  # what was asked and the bound does not know
-    relative_mismatch_db: float | None = unseen("given", None)  # of the supremum, where that was minimised
+    relative_mismatch_db: float | None = off_table("if given", None)  # of the supremum, where that was minimised
 
     @classmethod
     def of(

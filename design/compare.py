@@ -22,7 +22,7 @@ from design.certificate import named, prove
 from design.conditions import Condition
 from design.coupling_file import digest
 from design.designs import design_by_kind
-from design.files import unseen
+from design.files import off_table
 from design.frequency import Response, frequencies, on_circle
 from design.program import LADDER, Options
 from design.result import CONDITIONS, ConditionName, Design, DesignFailed, NotProved, Requirement, finite
@@ -64,7 +64,7 @@ class Curves:
     sigma_F: Array  # (k, m) singular values of F [N/m], largest first
     sigma_M: Array  # (k, m) of the mismatch F - Lambda E [N/m]
     perceived: Perceived
-    demands: dict[str, Array | None] = field(metadata={"json": "table"})  # (k,) required over available damping
+    demands: dict[str, Array | None] = field(metadata={"json": "left out"})  # (k,) required over available damping
 
 
 def judge(loop: Loop, coupling: Coupling, own: Sequence[Condition] = ()) -> Demands:
@@ -294,7 +294,7 @@ class Sweep:
     label: str
     unit: str
     values: list[float]
-    curves: dict[str, list[Limit]] = field(metadata={"json": "beside"})  # by design
+    curves: dict[str, list[Limit]] = field(metadata={"json": "inlined"})  # by design
 
 
 def limits(
@@ -389,7 +389,7 @@ class LadderRow:
     wall_s: float  # of the design, with its check
     proof_s: float
     reason: str | None = None
-    nearby: Nearby = unseen("beside", Nearby())  # within ten percent of every spring and mass
+    nearby: Nearby = off_table("inlined", Nearby())  # within ten percent of every spring and mass
 
 
 SHORT = (

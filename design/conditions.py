@@ -33,6 +33,8 @@ from controller.delay import delay, moving_sum
 from controller.loop import Loop
 from controller.lti import Array, Block, Complex, Lti, Sampled, as_like, constant_like, hstack, vstack
 from controller.ranges import Member
+from design.arguments import shown
+from design.files import InputError
 from design.frequency import (
     Response,
     frequencies,
@@ -59,6 +61,16 @@ class Demand(Generic[Block]):
     gain: Block
     static: Mapping[str, Array] = field(default_factory=dict)
     semidefinite: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, part in (("free", self.free), ("gain", self.gain)):
+            if not isinstance(part, Lti | Sampled):
+                raise ValueError(f"{name} of a demand is {shown(part)}, expected an Lti")
+        if isinstance(self.free, Lti) and isinstance(self.gain, Lti):
+            (rows, columns), other = (self.free.outputs, self.free.inputs), (self.gain.outputs, self.gain.inputs)
+            if not rows == columns == other[0] == other[1]:
+                sizes = f"free is {rows} x {columns}, gain is {other[0]} x {other[1]}"
+                raise ValueError(f"{sizes} in a demand, expected square blocks of one size")
 
 
 def even_damping(loop: Loop, T: Number | None = None) -> Any:
@@ -274,7 +286,7 @@ class Condition(ABC):
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """The damping that it asks of the devices, from a refined sweep. Raises SingularLoop."""
-        demands = [self.demand(each, coupling) for each in self._loops(loop)]
+        demands = [self.is_demand(self.demand(each, coupling)) for each in self._loops(loop)]
         found = [_least_damping(self.name, demand.free, lambda d=demand: d, loop.delta) for demand in demands]
         return max(found, key=lambda requirement: requirement.ratio)
 
@@ -304,7 +316,13 @@ class Condition(ABC):
         """What is to be proved over the rationals, by the name of the matrix that proves it. Raises NotProved."""
         more = {} if multiplier is None else {"multiplier": multiplier}
         loops = enumerate(self._loops(loop))
-        return {f"P{i or ''}": self.demand(each, coupling, exact=True, **more) for i, each in loops}
+        return {f"P{i or ''}": self.is_demand(self.demand(each, coupling, exact=True, **more)) for i, each in loops}
+
+    def is_demand(self, found: Demand[Block]) -> Demand[Block]:
+        """What a user's own code has made, if it is one. Raises InputError."""
+        if not isinstance(found, Demand):
+            raise InputError(f"the demand of condition {self.name} is {shown(found)}, expected a Demand")
+        return found
 
     def _loops(self, loop: Loop) -> list[Loop]:
         return [loop.at(member.network) for member in self.members(loop)] or [loop]

@@ -15,7 +15,7 @@ from design.certificate import RangesCheck, check_limiter, judged, prove_limiter
 from design.conditions import this_environment
 from design.coupling_file import Certificate, LimiterCertificate
 from design.environments import BETA, LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, worst
-from design.files import unseen
+from design.files import off_table
 from design.guarantees import ANY
 from design.result import Design, DesignFailed, NotProved, Requirement
 from design.transparency import decibels, transparency
@@ -132,12 +132,12 @@ class _Playout:
 class Switching:
     """What any switching within a loop's range of delays asks; only the requirement where its reason says why."""
 
-    requirement: Requirement = unseen("beside")
-    lo: tuple[int, ...] = unseen()
-    hi: tuple[int, ...] = unseen()
-    alpha: tuple[float, ...] | None = unseen("given", None)
-    playout: _Playout | None = unseen("given", None)
-    not_covered: str | None = unseen("given", None)
+    requirement: Requirement = off_table("inlined")
+    lo: tuple[int, ...] = off_table()
+    hi: tuple[int, ...] = off_table()
+    alpha: tuple[float, ...] | None = off_table("if given", None)
+    playout: _Playout | None = off_table("if given", None)
+    not_covered: str | None = off_table("if given", None)
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling) -> Switching:
@@ -270,7 +270,7 @@ class RangesFigures:
     certified: bool
     search: SearchFigures
     inside: _Inside
-    reason: str | None = unseen("given")
+    reason: str | None = off_table("if given")
     what: str = _WHAT_IS_PROVED
 
     @classmethod

@@ -21,7 +21,7 @@ from contextvars import ContextVar
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from math import prod
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 from zipfile import ZipFile, ZipInfo
 
 import msgspec
@@ -312,10 +312,14 @@ def _fill(file: BinaryIO, content: Callable[[BinaryIO], None] | bytes | str) -> 
         file.write(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
 
 
-def unseen(json: str = "key", default: Any = MISSING, older: str | None = None) -> Any:
-    """A field of a report that no table shows; in JSON as `figure` in cli/render.py has it, or `no` key.
+InJson = Literal["always", "if given", "inlined", "left out"]
 
-    `older` is the name that the key had before: the value stands under both.
+
+def off_table(json: InJson = "always", default: Any = MISSING, older: str | None = None) -> Any:
+    """A field of a report that no table shows; `older` is the name that its JSON key had before, which is kept beside.
+
+    In JSON it is a key `always`, or only `if given`, where it is not None; or `left out`; or it is a report of its own
+    whose keys are `inlined` among the others.
     """
     return field(default=default, metadata={"json": json, "older": older})
 
@@ -341,10 +345,10 @@ def plain(report: Any) -> Any:
 def _part(report: Any) -> dict[str, Any]:
     part: dict[str, Any] = {}
     for one in fields(report):
-        value, how = getattr(report, one.name), one.metadata.get("json", "key")
-        if how == "beside":
+        value, how = getattr(report, one.name), one.metadata.get("json", "always")
+        if how == "inlined":
             part |= plain(value) or {}
-        elif how == "key" or (how == "given" and value is not None):
+        elif how == "always" or (how == "if given" and value is not None):
             key = one.name.removesuffix("_")  # from_, for Python has its own `from`
             part |= dict.fromkeys((key, one.metadata.get("older") or key), plain(value))
     return part

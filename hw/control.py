@@ -26,7 +26,7 @@ from controller.lti import Array
 from design.certificate import assess
 from design.conditions import Condition
 from design.coverage import Limits
-from design.files import unseen
+from design.files import off_table
 from design.guarantees import guarantee_of
 from design.result import Chosen, Design, DesignFailed, Requirement
 from hw import monitor
@@ -305,7 +305,7 @@ class ProgramFigures:
     coupling: CouplingFigures | None = None
     certificate: Requirement | None = None
     certificates: Mapping[str, Requirement] | None = None
-    guarantee: str | None = unseen(default=None, older="promise")
+    guarantee: str | None = off_table(default=None, older="promise")
     link_delay: int | None = None
     latency_s: tuple[tuple[float, float], ...] | None = None
     T_max_s: float | None = None

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from controller.budget import BudgetFigures
-from design.files import plain, unseen, write_json
+from design.files import off_table, plain, write_json
 from hw.control import CertifiedCoupling, ProgramFigures
 from hw.protocol import NO_MARGIN
 from hw.recording import Recipe, Recorder
@@ -131,12 +131,12 @@ class SessionReport:
 
     case: str
     scenario: str
-    program: ProgramFigures = unseen("beside")
-    session: _Ended = unseen()
-    link: _Link = unseen()
-    run: _Ran = unseen()
-    growth: list[Growth] = unseen()
-    energy_budget: list[BudgetFigures] | None = unseen()  # arming by arming
+    program: ProgramFigures = off_table("inlined")
+    session: _Ended = off_table()
+    link: _Link = off_table()
+    run: _Ran = off_table()
+    growth: list[Growth] = off_table()
+    energy_budget: list[BudgetFigures] | None = off_table()  # arming by arming
 
 
 def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:

@@ -16,7 +16,7 @@ import numpy as np
 from controller.delay import delay
 from controller.lti import Array, Lti
 from controller.tick import StepBuffer
-from design.files import unseen
+from design.files import off_table
 from models.hold import HeldPlant
 from sim.engines import EXPONENTIAL, default_integrator, pace, quiet_warnings
 from sim.run import AnyEngine, EngineSettings, Progress, Simulation, engine_name, make_engine, run
@@ -33,7 +33,7 @@ class PositionError:
 
     position_relative_rms: float | None = None
     position_max_m: float | None = None
-    reason: str | None = unseen("given", None)
+    reason: str | None = off_table("if given", None)
 
 
 def position_error(
@@ -228,7 +228,7 @@ class Credible:
     motor_speed_m_per_s: list[float]
     credible_force_n: list[float | None]
     credible_speed_m_per_s: list[float]
-    reason: str | None = unseen("given", None)
+    reason: str | None = off_table("if given", None)
 
 
 def credible(simulation: Simulation, trace: Trace) -> Credible:
@@ -280,12 +280,12 @@ def _not_credible(found: Credible, until: float) -> str:
 class ForceError:
     """Two answers to the same displacements, from rest at t = 0 and over the whole run, before any force limit."""
 
-    asked: Array = unseen("no")  # (N, m) what the coupled loop asks of the motors, F x [N]
-    ideal: Array = unseen("no")  # (N, m) what the delay-matched environment itself would ask, Lambda E x [N]
-    error_percent: float | None = unseen()  # rms(asked - ideal)/rms(ideal), over all ticks and channels
-    asked_rms_n: float | None = unseen()
-    ideal_rms_n: float | None = unseen()
-    reason: str | None = unseen("given")  # why the two cannot be compared
+    asked: Array = off_table("left out")  # (N, m) what the coupled loop asks of the motors, F x [N]
+    ideal: Array = off_table("left out")  # (N, m) what the delay-matched environment itself would ask, Lambda E x [N]
+    error_percent: float | None = off_table()  # rms(asked - ideal)/rms(ideal), over all ticks and channels
+    asked_rms_n: float | None = off_table()
+    ideal_rms_n: float | None = off_table()
+    reason: str | None = off_table("if given")  # why the two cannot be compared
 
     @classmethod
     def of(cls, asked: Array, ideal: Array, reason: str | None = None) -> ForceError:
@@ -636,6 +636,8 @@ def simulated_growth(
 ) -> float:
     """The growth rate [1/s] of the loop that an engine simulates with these settings; of walls, in the worst state."""
     held = _measured_hold(simulation, engine, integrator, substeps)
+    if not all(np.isfinite(part).all() for part in (held.A, held.B)):
+        raise InputError(f"engine {engine_name(engine)}: a tick from rest leaves the range of numbers")
     return max(float(dominant_mode(close(held, F)).growth) for F in simulation.process.law.frozen().values())
 
 

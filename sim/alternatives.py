@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from controller.lti import Array
 from design.certificate import assess, named
 from design.conditions import Condition
-from design.files import unseen
+from design.files import off_table
 from design.guarantees import guarantee_of
 from design.result import Chosen, Requirement, finite
 from design.transparency import decibels, transparency
@@ -43,17 +43,17 @@ class Alternative:
 
     coupling: str  # its kind
     condition: str | None
-    guarantee: str | None = unseen(default=None, older="promise")
+    guarantee: str | None = off_table(default=None, older="promise")
     dc_ratio: float | None = None  # share of the static stiffness that is felt
     rms_mismatch_db: float | None = None
     growth_rate_per_s: float | None = None  # of the exact loop
     force_error_percent: float | None = None  # as in a run's report; None where the loop grows or has walls
     required_damping: dict[str, tuple[float, ...]] = field(default_factory=dict)  # [N s/m], by condition
-    reason: str | None = unseen("given", None)  # why there is no such coupling
-    requirements: dict[str, Requirement] | None = unseen("no", None)
-    trace: Trace | None = unseen("no", None)  # of the exact engine
-    ideal: Array | None = unseen("no", None)  # (N, m) forces of the ideal environment at its displacements [N]
-    until_s: float | None = unseen("no", None)  # from here on the trace is not credible
+    reason: str | None = off_table("if given", None)  # why there is no such coupling
+    requirements: dict[str, Requirement] | None = off_table("left out", None)
+    trace: Trace | None = off_table("left out", None)  # of the exact engine
+    ideal: Array | None = off_table("left out", None)  # (N, m) forces of the ideal environment at its displacements [N]
+    until_s: float | None = off_table("left out", None)  # from here on the trace is not credible
 
     @property
     def name(self) -> str:

@@ -12,7 +12,7 @@ from controller.lti import Array
 from controller.older import CONDITIONS as OLDER
 from controller.older import with_older
 from design import compare
-from design.files import unseen
+from design.files import off_table
 from design.optimal import nearby as nearby_with_price
 from design.program import Options
 from design.result import CONDITIONS, Chosen, Requirement
@@ -32,10 +32,10 @@ def nearby(loop: Loop, coupling: Coupling) -> Nearby:
 class ConditionCurve:
     """What one condition asks of a coupling, over frequency."""
 
-    requirement: Requirement = unseen("beside")
-    ratio: float = unseen()
-    demand: Array | None = unseen()  # required over available damping at each frequency
-    reason: str | None = unseen("given")
+    requirement: Requirement = off_table("inlined")
+    ratio: float = off_table()
+    demand: Array | None = off_table()  # required over available damping at each frequency
+    reason: str | None = off_table("if given")
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +45,10 @@ class ComparedCoupling:
     name: str
     states: int
     transparency: Transparency
-    nearby: Nearby = unseen("beside")
-    curves: compare.Curves = unseen("beside")
-    coupling: CouplingFigures = unseen("beside")
-    conditions: dict[str, ConditionCurve] = unseen("beside")  # also under the names that they had before
+    nearby: Nearby = off_table("inlined")
+    curves: compare.Curves = off_table("inlined")
+    coupling: CouplingFigures = off_table("inlined")
+    conditions: dict[str, ConditionCurve] = off_table("inlined")  # also under the names that they had before
 
     @classmethod
     def of(cls, loop: Loop, name: str, chosen: Chosen, judged: compare.Demands, hz: Array) -> ComparedCoupling:
@@ -88,12 +88,12 @@ class LimitCurves:
     case: str
     objective: str
     delays_kept_in: str
-    options: Options = unseen(older="wish")
-    here: Here = unseen()
-    sweeps: dict[str, compare.Sweep] = unseen()
-    gains: list[str] = unseen()
-    wall_s: float = unseen()
-    interrupted: bool = unseen()
+    options: Options = off_table(older="wish")
+    here: Here = off_table()
+    sweeps: dict[str, compare.Sweep] = off_table()
+    gains: list[str] = off_table()
+    wall_s: float = off_table()
+    interrupted: bool = off_table()
 
 
 @dataclass(frozen=True, eq=False)

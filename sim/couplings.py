@@ -18,7 +18,7 @@ from design.coupling_file import Stored, load
 from design.coverage import Limits, RangesFigures, covered_limits
 from design.designs import KINDS, design_by_kind, name_and_own, own_coupling, usual_condition
 from design.environments import THIS_ENVIRONMENT
-from design.files import unseen
+from design.files import off_table
 from design.guarantees import guarantee_of
 from design.lmi import ANY_ENVIRONMENT
 from design.own import called, place_of
@@ -211,7 +211,7 @@ class CouplingFigures:
     order: int
     K: list[float] | None = None  # (m,) [N/m]
     B: list[float] | None = None  # (m,) [N s/m]
-    stiffness: list[float] | None = unseen("given", None)  # (m,) [N/m], static, of a moving average
+    stiffness: list[float] | None = off_table("if given", None)  # (m,) [N/m], static, of a moving average
 
     @classmethod
     def of(cls, kind: str, coupling: Coupling, T: float) -> CouplingFigures:
@@ -226,13 +226,13 @@ class CouplingFigures:
 class Judged:
     """The parts that every report of a coupling begins with."""
 
-    chosen: Chosen = unseen("no")
-    whole: RangesCheck | None = unseen("no")
-    coupling: CouplingFigures = unseen()
-    certificates: dict[str, Requirement] = unseen()  # by condition, also under the names that they had before
-    guarantee: str | None = unseen(older="promise")
-    ranges: RangesFigures | None = unseen(older="set")
-    limiter: Limits = unseen()
+    chosen: Chosen = off_table("left out")
+    whole: RangesCheck | None = off_table("left out")
+    coupling: CouplingFigures = off_table()
+    certificates: dict[str, Requirement] = off_table()  # by condition, also under the names that they had before
+    guarantee: str | None = off_table(older="promise")
+    ranges: RangesFigures | None = off_table(older="set")
+    limiter: Limits = off_table()
 
     @classmethod
     def of(

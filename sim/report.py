@@ -10,7 +10,7 @@ import numpy as np
 from controller.coupling import PUBLISHED, Coupling
 from controller.delay import LOST, Timing, VaryingDelay, ages
 from design.certificate import assess
-from design.files import unseen
+from design.files import off_table
 from design.guarantees import EncoderSteps
 from design.result import Chosen, finite, listed
 from sim.couplings import CouplingFigures
@@ -190,9 +190,9 @@ def _verdict(growth: float) -> str:
 class VaryingDelays:
     """All that a report says of delays that vary; `met` is of a run, where they switch."""
 
-    span: DelaySpan = unseen("beside")
-    met: _DelaysMet | None = unseen("beside")
-    certified: DelaysCovered = unseen("beside")
+    span: DelaySpan = off_table("inlined")
+    met: _DelaysMet | None = off_table("inlined")
+    certified: DelaysCovered = off_table("inlined")
 
     @classmethod
     def of(cls, simulation: Simulation, chosen: Chosen, period: Period | None, ticks: int, certified: bool) -> Self:

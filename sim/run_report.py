@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from controller.budget import BudgetFigures
 from controller.lti import Array
 from design.certificate import named
-from design.files import unseen
+from design.files import off_table
 from design.guarantees import ANY, CAVEATS, MAKING, EncoderSteps
 from design.result import Requirement, listed
 from design.robustness import Nearby
@@ -63,18 +63,18 @@ class RunReport:
     case: str
     scenario: str
     certificate: Requirement
-    judged: Judged = unseen("beside")
+    judged: Judged = off_table("inlined")
     encoder: EncoderSteps | None
     transparency: Transparency
     stability: Stability
-    varying_delay: VaryingDelays | None = unseen(older="jitter")
+    varying_delay: VaryingDelays | None = off_table(older="jitter")
     run: Ran
     error: accuracy.PositionError
     credible: accuracy.Credible
     ideal_force: accuracy.ForceError
     energy_budget: BudgetFigures | None
     baseline: BaselineFigures | None
-    nearby: Nearby = unseen("beside", default=Nearby())
+    nearby: Nearby = off_table("inlined", default=Nearby())
     alternatives: list[Alternative] = field(default_factory=list)
     reproducibility: tuple[PaperRow, ...]
     remarks: tuple[str, ...]

@@ -18,7 +18,7 @@ from controller.law import State
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
-from design.files import unseen
+from design.files import off_table
 from models.hold import HeldPlant, at_the_latch, hold
 from models.scene import Scene, Variants
 from sim.engines import Engine, MujocoBatchEngine, profiler_off, quiet_warnings
@@ -263,8 +263,8 @@ class Stability(Eigenvalues):
     clipped_ticks: int
     growth_rate_per_s: float | None
     frequency_hz: float | None
-    contact: _Contact | None = unseen("given", None)
-    reason: str | None = unseen("given", None)
+    contact: _Contact | None = off_table("if given", None)
+    reason: str | None = off_table("if given", None)
 
 
 def eigenvalues(mode: Mode) -> Eigenvalues:

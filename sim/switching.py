@@ -25,7 +25,7 @@ from controller.loop import DelayRange
 from controller.lti import Array, Lti
 from controller.tick import Process, StepBuffer
 from design.coverage import Switching
-from design.files import unseen
+from design.files import off_table
 from design.result import Chosen, switching_guarantee
 from models.hold import HeldPlant, hold
 from models.scene import Scene, Variants
@@ -257,7 +257,7 @@ class DelaysCovered:
 
     covered: bool
     covers: str  # which delays, in words
-    switching: Switching | None = unseen(default=None, older="jitter_proof")
+    switching: Switching | None = off_table(default=None, older="jitter_proof")
     on_file: DelayRange | None = None
 
     @classmethod

@@ -10,7 +10,7 @@ import numpy as np
 
 from controller.environment import Network
 from controller.lti import Array
-from design.files import unseen
+from design.files import off_table
 from design.result import finite
 from models.human import Hand, Human, Link, Person
 from sim.adversary import Worst
@@ -28,8 +28,8 @@ class Unstable:
 
     exact: int
     mujoco: int | None
-    own: int | None = unseen("given", None)  # by an engine of the user's own
-    others: str = unseen("no", "")
+    own: int | None = off_table("if given", None)  # by an engine of the user's own
+    others: str = off_table("left out", "")
 
     @classmethod
     def of(cls, question: Validation, exact: int, other: int | None) -> Unstable:
@@ -50,8 +50,8 @@ class EnvironmentsMet:
 
     of: str
     count: int
-    names: list[str] | None = unseen("given", None)
-    unstable_in: list[str] | None = unseen("given", None)
+    names: list[str] | None = off_table("if given", None)
+    unstable_in: list[str] | None = off_table("if given", None)
 
     @classmethod
     def met(cls, question: Validation, findings: Findings) -> EnvironmentsMet:
@@ -71,12 +71,12 @@ class EnvironmentsMet:
 class _Held:
     """A channel's human: links, or of a user's own class what the handle feels of it."""
 
-    links: tuple[Link, ...] | None = unseen("given", None)
-    class_: str | None = unseen("given", None)
-    mass: Array | None = unseen("given", None)
-    across: Array | None = unseen("given", None)
-    damping: Array | None = unseen("given", None)
-    stiffness: Array | None = unseen("given", None)
+    links: tuple[Link, ...] | None = off_table("if given", None)
+    class_: str | None = off_table("if given", None)
+    mass: Array | None = off_table("if given", None)
+    across: Array | None = off_table("if given", None)
+    damping: Array | None = off_table("if given", None)
+    stiffness: Array | None = off_table("if given", None)
 
     @classmethod
     def of(cls, human: Hand) -> _Held:
@@ -94,8 +94,8 @@ class DrawnHumans:
     index: int
     human: list[_Held]
     person: tuple[Person, ...]
-    environment: str | None = unseen("given", None)
-    network: Network | None = unseen("given", None)
+    environment: str | None = off_table("if given", None)
+    network: Network | None = off_table("if given", None)
 
     @classmethod
     def of(cls, question: Validation, index: int) -> DrawnHumans:
@@ -111,7 +111,7 @@ class WorstDrawn:
     spectral_radius: float
     growth_rate_per_s: float
     frequency_hz: float
-    who: DrawnHumans = unseen("beside")
+    who: DrawnHumans = off_table("inlined")
 
     @classmethod
     def of(cls, question: Validation, findings: Findings) -> WorstDrawn:
@@ -138,7 +138,7 @@ class Traces:
     slowest_settling: float | None
     slowest_decay_s: float | None
     settling_decides: bool
-    reason: str | None = unseen("given", None)
+    reason: str | None = off_table("if given", None)
 
     @classmethod
     def of(cls, question: Validation, findings: Findings) -> Traces:
@@ -198,14 +198,14 @@ _Met = TypeVar("_Met")  # which delays, or which ticks
 class Growing(Generic[_Met]):
     """How many humans grow while delays or ticks vary; it holds unless certificates cover these and one grows."""
 
-    met: _Met = unseen("beside")
-    covered: bool = unseen()  # by certificates
-    unstable: Unstable = unseen()
-    humans: int = unseen()
-    mujoco_unclipped: int = unseen()
-    largest_growth_per_s: float | None = unseen()
-    worst_index: int | None = unseen()
-    holds: bool = unseen()
+    met: _Met = off_table("inlined")
+    covered: bool = off_table()  # by certificates
+    unstable: Unstable = off_table()
+    humans: int = off_table()
+    mujoco_unclipped: int = off_table()
+    largest_growth_per_s: float | None = off_table()
+    worst_index: int | None = off_table()
+    holds: bool = off_table()
 
     @classmethod
     def of(cls, question: Validation, findings: Findings, met: _Met, covered: bool) -> Growing[_Met]:

@@ -13,7 +13,7 @@ import numpy as np
 from controller.environment import RIGID_WALL, Network
 from controller.lti import Array
 from design.coverage import Limits, RangesFigures
-from design.files import unseen, write
+from design.files import off_table, write
 from design.guarantees import CAVEATS
 from design.result import Requirement
 from sim.couplings import CouplingFigures, Judged
@@ -32,8 +32,8 @@ class _Ratio:
 
     required_over_available: Array  # (rows, columns)
     certified_cells: int
-    contradicted_cells: int | None = unseen("given")  # by the population, where it meets this condition's loop
-    reason: str | None = unseen("given")
+    contradicted_cells: int | None = off_table("if given")  # by the population, where it meets this condition's loop
+    reason: str | None = off_table("if given")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class _Population:
     unstable_humans_at_least: Array  # (rows, columns)
     stable_cells: int
     decided_cells: int
-    reason: str | None = unseen("given")
+    reason: str | None = off_table("if given")
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,10 @@ class _Marked:
 
     K: float
     B: float
-    requirements: dict[str, Requirement] = unseen("beside")
-    growth_rate_per_s: float = unseen()
-    unstable_humans: int = unseen()
-    stiffest_K_at_this_B: dict[str, float | str | None] = unseen()
+    requirements: dict[str, Requirement] = off_table("inlined")
+    growth_rate_per_s: float = off_table()
+    unstable_humans: int = off_table()
+    stiffest_K_at_this_B: dict[str, float | str | None] = off_table()
 
     @classmethod
     def of(cls, mark: Mark) -> _Marked:
@@ -106,8 +106,8 @@ class _DesignedFor:
 
     contact_springs: list[_ContactSpring]
     certificates: dict[str, Requirement]
-    guarantee: str | None = unseen(older="promise")
-    ranges: RangesFigures | None = unseen(older="set")
+    guarantee: str | None = off_table(older="promise")
+    ranges: RangesFigures | None = off_table(older="set")
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,11 +207,11 @@ class MapReport:
     wall_s: dict[str, float]
     axes: str  # coupling or environment: whose K and B they are
     coupling: CouplingFigures | None
-    ratios: dict[str, _Ratio] = unseen("beside")
-    fixed: FixedCoupling | None = unseen("beside")  # of a map over environments
-    error: dict[str, MapError | None] | None = unseen("given")
-    marks: list[_Marked] | None = unseen("given")
-    claim: str | None = unseen("given")  # of a condition of the user's own that certifies a cell
+    ratios: dict[str, _Ratio] = off_table("inlined")
+    fixed: FixedCoupling | None = off_table("inlined")  # of a map over environments
+    error: dict[str, MapError | None] | None = off_table("if given")
+    marks: list[_Marked] | None = off_table("if given")
+    claim: str | None = off_table("if given")  # of a condition of the user's own that certifies a cell
     not_covered: str = CAVEATS
 
     @classmethod

@@ -9,10 +9,14 @@ from worlds import PAIR, SOFT, STIFF
 
 from cli import check
 from controller.coupling import SpringDamper
+from controller.environment import GROUND, Network, Spring, Wall
+from controller.loop import Loop
+from controller.lti import constant_like
 from design.certificate import assess, prove, required_damping, verify
 from design.conditions import Condition, this_environment_demand
-from design.coupling_file import Stored, save
+from design.coupling_file import Stored, save, sealed
 from design.environments import LimitedForces, Multiplied, Unknowns
+from design.result import MAKING
 
 change = msgspec.structs.replace
 
@@ -85,3 +89,64 @@ def test_check_does_not_replace_what_is_on_file(tmp_path, capsys):
     assert "digest differs" in " ".join(capsys.readouterr().out.split())
     assert check.main([str(tmp_path / "right.json"), "--condition", "any-environment"]) == 0
     assert "proved anew, not from the file" in " ".join(capsys.readouterr().out.split())
+
+
+class Seven(Scaled):
+    name = "seven"
+
+    def demand(self, loop, coupling, exact=False):
+        return 7
+
+
+class Tuple(Scaled):
+    name = "tuple"
+
+    def demand(self, loop, coupling, exact=False):
+        linear = super().demand(loop, coupling, exact)
+        return linear.free, linear.gain
+
+
+class Wide(Scaled):
+    name = "wide"
+
+    def demand(self, loop, coupling, exact=False):
+        linear = super().demand(loop, coupling, exact)
+        return replace(linear, gain=constant_like(linear.free, np.eye(3)))
+
+
+class Empty(PerWall):
+    name = "empty"
+
+    def block(self, G, loop, multiplier=None):
+        return None
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        (Seven(), r"the demand of condition seven is 7 \(int\), expected a Demand"),
+        (Tuple(), "the demand of condition tuple is a tuple, expected a Demand"),
+        (Wide(), "free is 2 x 2, gain is 3 x 3 in a demand, expected square blocks of one size"),
+        (Empty(), "the demand of condition empty is None, expected a Demand"),
+    ],
+)
+def test_a_demand_that_is_none_is_refused_by_name(own, message):
+    for ask in (required_damping, prove):
+        with pytest.raises(ValueError, match=message):
+            ask(PAIR, SOFT, own)
+
+
+def test_the_right_multiplier_must_be_all_that_is_on_file(tmp_path, capsys):
+    wall = Wall(("tip", GROUND), 3000.0, gap=0.0)
+    network = Network(("tip",), (Spring(("tip", GROUND), 20.0, 0.3),), {"tip": 0.05}, (wall,))
+    loop, coupling = Loop(1e-3, (1,), (0,), (1,), (1.3,), network), SpringDamper([1000.0], [0.5])
+    stored = Stored.of(loop, coupling, prove(loop, coupling, "this-environment"))
+    held = stored.certificate
+    assert held
+    save(stored, path := tmp_path / "wall.json")
+    assert check.main([str(path), "--condition", "this-environment"]) == 0
+    assert MAKING in " ".join(capsys.readouterr().out.replace("│", " ").split())
+    (g,) = held.matrices["g"]
+    for rows in ((("1" + 400 * "0",),), (g, ("1",)), ()):
+        forged = change(stored, certificate=sealed(change(held, matrices={**held.matrices, "g": rows})))
+        assert "g is no row of rational numbers" in (verify(forged).reason or "")

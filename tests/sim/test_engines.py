@@ -15,6 +15,7 @@ from controller.coupling import PUBLISHED, NoCoupling
 from models.scene import plant
 from sim import engines as mujoco_engine
 from sim import run as loop
+from sim.accuracy import simulated_growth
 from sim.engines import MujocoBatchEngine, MujocoEngine, profiler_off
 from sim.run import assemble, make_engine, outside_forces, run
 from sim.scenario import InputError, load
@@ -179,3 +180,24 @@ def test_a_long_trace_lies_on_the_disk(simulation, monkeypatch, tmp_path):
     monkeypatch.setattr(loop.shutil, "disk_usage", lambda place: SimpleNamespace(free=1000))
     with pytest.raises(InputError, match=r"duration: .* GiB of .* are free: allowed are"):
         run(simulation, "exact")
+
+
+class Lost:
+    """An engine whose tick ends outside the range of numbers."""
+
+    def __init__(self, simulation):
+        pass
+
+    def start(self, buffer):
+        self.states = buffer.plant_state
+
+    def advance(self, k):
+        self.states[k + 1][...] = np.nan
+
+    def troubled(self):
+        return False
+
+
+def test_an_engine_that_leaves_the_range_of_numbers_is_named(simulation):
+    with pytest.raises(InputError, match=r"engine .*:Lost: a tick from rest leaves the range of numbers"):
+        simulated_growth(simulation, None, None, Lost)
