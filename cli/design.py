@@ -238,10 +238,15 @@ class _Best:
         yield "bound", self.bound and self.bound.words
         share = finite(self.rendered_stiffness)  # a free mass has no static stiffness to render
         yield "rendered stiffness", None if share is None else f"{share:.3f} of the environment's"
-        rungs = (f"{rung.mismatch_db:.2f}{'' if rung.proved else ' (not proved)'}" for rung in self.ladder)
+        rungs = (f"{rung.mismatch_db:.2f}{_why_left(rung)}" for rung in self.ladder)
         yield "ladder [dB]", ", ".join(rungs) or None
-        if missed := [rung.reason for rung in self.ladder if not rung.proved]:
+        yield "last not taken", next((rung.left for rung in reversed(self.ladder) if rung.left), None)
+        if missed := [rung.reason for rung in self.ladder if not (rung.proved or rung.left)]:
             yield "last not proved", missed[-1]
+
+
+def _why_left(rung: Any) -> str:
+    return "" if rung.taken else " (not taken)" if rung.left else " (not proved)"
 
 
 def _switching_words(proof: coverage.Switching) -> str:

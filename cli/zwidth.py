@@ -46,7 +46,9 @@ def main(argv: list[str]) -> int:
     chosen = chosen_by(args, scenario) if args.coupling else None  # over the whole map the same
     sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
-        fixed = FixedCoupling.of(judge(args, scenario, chosen), scenario.loop(args.case).network, chosen.notes)
+        judged = judge(args, scenario, chosen)
+        notes = chosen.remarks(judged.requirements) if chosen.fails(judged.requirements) else chosen.notes
+        fixed = FixedCoupling.of(judged, scenario.loop(args.case).network, notes)
         sweep = replace(sweep, lag=fixed.limiter.rho)
     marks = tuple(args.mark)
     grid = zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, marks)

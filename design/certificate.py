@@ -392,13 +392,16 @@ _NAMED: dict[str, Condition] = {each.name: each for each in (ANY_ENVIRONMENT, TH
 _PARTS = SwitchingDelays, LimitedForces  # of a certificate, beside its condition
 
 
+def _is_ours(condition: Condition) -> bool:
+    return condition in _NAMED.values() or type(condition) in _PARTS
+
+
 def named(condition: str | Condition) -> Condition:
     """The condition of that name; one that comes itself is itself. Raises ValueError for an unknown or a taken name."""
     if not isinstance(condition, str):
         name, taken = getattr(condition, "name", None), {*_NAMED, *OLDER, *(each.name for each in _PARTS)}
-        if not (condition in _NAMED.values() or type(condition) in _PARTS) and (
-            not isinstance(name, str) or not name.strip() or name in taken
-        ):
+        free = isinstance(name, str) and name.strip() and name not in taken
+        if not (free or _is_ours(condition)):
             own = f"condition {type(condition).__name__}: its name is {name!r}"
             raise ValueError(f"{own}, expected one of its own, not {', '.join(sorted(taken))}")
         return condition

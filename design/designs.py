@@ -123,7 +123,7 @@ def design_by_kind(
     made_for = able[asked]
     if chosen.model and loop.environment.walls:
         reason = f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls"
-        raise ValueError(f"{reason}{_instead(loop, '--coupling spring-damper', 'spring-damper')}")
+        raise ValueError(f"{reason}{_before_walls(loop)}")
     if chosen.model and options.get("limiter") and (reason := LIMITER.beyond(loop)):
         with_less = {**options, "limiter": False, "ladder": ((4, 3),)}
         raise ValueError(f"{reason}{_instead(loop, 'without --limiter', kind, **with_less)}")
@@ -145,8 +145,21 @@ def _instead(loop: Loop, words: str, kind: str, **options: Any) -> str:
     with suppress(ValueError, DesignFailed):
         found = design_by_kind(loop, kind, **options)
         if found.requirement.certified:
-            return f"; {words} gives one that needs {found.requirement.ratio:.3g} of the damping"
+            return f"; {words} gives one that needs {found.requirement.ratio:.4g} of the damping"
     return ""
+
+
+def _before_walls(loop: Loop) -> str:
+    """The first coupling that is certified before walls, as `_instead` has it, or which were tried."""
+    others = {
+        f"--coupling {kind} --condition {ANY_ENVIRONMENT.name}": kind for kind in ("spring-damper", "moving-average")
+    }
+    for words, kind in others.items():
+        if found := _instead(loop, words, kind, condition=ANY_ENVIRONMENT.name):
+            return found
+    words = "--coupling spring-damper --condition this-environment"
+    tried = f"; tried and not certified either: {', '.join((*others, words))}"
+    return _instead(loop, words, "spring-damper", condition=THIS_ENVIRONMENT.name) or tried
 
 
 def own_coupling(name: str, loop: Loop) -> Any:

@@ -153,6 +153,8 @@ class _Search:
         self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # what was swept last
         self._grid = np.concatenate([[0.0], frequencies(system)])
         self._spare = np.diag(np.broadcast_to(unknowns.spare, system.outputs))
+        self._plain: list[Demand[Lti]] = []  # the blocks of no multiplier, and of each unknown alone
+        self._root = np.ones(system.outputs)  # what makes the rows of an inequality about one
         self.pays = system.outputs <= _MOST_ROWS and self._searched.size > 0
 
     def swept(self, values: Sequence[float]) -> tuple[float, float]:
@@ -204,13 +206,12 @@ class _Search:
 
         w = peaks(needed, self._grid, -np.inf, near=_NEAR)
         at = needed(w)
-        if (top := float(at.max(initial=-np.inf))) <= bound + _SETTLED * max(bound, 1.0):
-            top, between = found = supremum(needed, self._grid)
-            if not self._spare.any():
-                self._last = tuple(values), found
-            w = np.array([between] if top > bound + 2 * _SETTLED * max(bound, 1.0) else [])
-            return top, w
-        return top, w[np.argsort(-at)[:_MOST_PEAKS]]
+        if (top := float(at.max(initial=-np.inf))) > bound + _SETTLED * max(bound, 1.0):
+            return top, w[np.argsort(-at)[:_MOST_PEAKS]]
+        most, between = found = supremum(needed, self._grid)
+        if not self._spare.any():
+            self._last = tuple(values), found
+        return most, np.array([between] if most > bound + 2 * _SETTLED * max(bound, 1.0) else [])
 
     def _parts(self, w: Array) -> tuple[Any, Any]:
         """The Hermitian parts of the constant, and of what each unknown and s multiply, at w (k,)."""

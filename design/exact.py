@@ -313,7 +313,8 @@ def _whitening(W: Floats) -> Floats | None:
 # Kalman-Yakubovich-Popov: if P > 0 and
 #     [[P - A'PA, C' - A'PB], [C - B'PA, D + D' - B'PB]] > 0                                      (KYP)
 # then A is stable (x'Px falls along x+ = Ax, by the first block) and He G > 0 on the whole unit circle,
-# because [(zI - A)^-1 B; I] maps the matrix of (KYP) to G + G* there. Both inequalities are tested exactly.
+# because [(zI - A)^-1 B; I] maps the matrix of (KYP) to G + G* there. Both inequalities
+# are tested exactly for P rounded to some bits, a P as good as any other; what else is rounded is bounded and paid.
 
 
 LARGEST = 800  # states of a model that a proof is tried for: .3 s at 100, 1 s at 200, 5 s at 400, 30 s at 800
@@ -334,9 +335,10 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[Floats, float
 
     In states and channels that are scaled by powers of two, in which P and D + D' have diagonals near one. P is taken
     rounded to multiples of 2^-bits: a matrix as good as any other, and exactly known. The rest is rounded to multiples
-    of u, which changes C by u/2, D + D' by u and J = [A B] by E, |E_ij| <= u/2; digits below u, which are dropped, are
-    less than u. |E'PJ + J'PE + E'PE| <= (2 |J| + |E|) |E| |P| in the norm of Frobenius, which floating point gives to
-    better than a hundredth.
+    of u, which changes C by u/2, D + D' by u and J = [A B] by E, |E_ij| <= u/2. Digits below u are dropped: balanced,
+    |d_k| <= 2^15, they weigh half a u and a little. So every entry is off by less than 2 u, and all by less than
+    2 (n + m) u as a norm, but for what E makes: |E'PJ + J'PE + E'PE| <= (2 |J| + |E|) |E| |P| in the norm of Frobenius,
+    which floating point gives to better than a hundredth.
     """
     n, m = G.B.shape
     state, channel = _halves(P), _halves(Matrix.of(G.D + G.D.T))
@@ -366,7 +368,8 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[Floats, float
         for part, unit in ((whole, bits), (J, finer))
     )
     e = 0.5 * math.sqrt(n * (n + m))
-    return _carried(sums)[at:], 2.0 * (n + m) + 1.02 * e * p * (2 * j + e * 2.0**-finer)
+    kept = _carried(sums)[at:]
+    return kept if len(kept) else np.zeros((1, n + m, n + m)), 2.0 * (n + m) + 1.02 * e * p * (2 * j + e * 2.0**-finer)
 
 
 def too_large(states: int) -> str | None:

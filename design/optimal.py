@@ -38,9 +38,10 @@ _FIRST = 3  # of the environments: those that the nominal design misses most are
 _SETTLED_DB = 0.05  # a rung that gains less ends the climb
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
 _LARGE, _PROMISING_DB = 26, 0.1  # taps: one of more is tried after one that gains so much, proved if it is worth it
-_FEWEST_RUNGS = 3
+_FEWEST_TAPS = {True: 22, False: 14}  # of a rung that may end the climb; whether this-environment alone is asked
 _MOST_REFUSED = 2  # rungs without a proof, one after the other, after which a larger one has none either
 _KEPT_STIFFNESS = 0.5  # of the most static stiffness of a rung that was best: one that renders less is not taken
+_FELT_STIFFNESS = 0.02  # of the environment's: where a rung renders less than this, merit alone decides
 _LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # (beta, c) of a limiter to begin with: without psi the first alone
 _HOPELESS = 0.9  # relative mismatch from which on the climb is compared with other couplings
 _TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
@@ -63,10 +64,15 @@ class _Rung:
     g: float  # rendered share of the static stiffness
     reason: str | None  # why it is not certified and proved
     seconds: float  # since the design began
+    left: str | None = None  # why it is not taken, though it is certified
 
     @property
     def proved(self) -> bool:
         return self.reason is None
+
+    @property
+    def taken(self) -> bool:
+        return self.proved and self.left is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +135,7 @@ def design(
     best: Optimal | None = None
     better: list[Optimal] = []  # each than the one before
     rungs: list[_Rung] = []
-    hurried, floor, gained = False, min(climb.simple, 1.0), np.inf
+    hurried, floor, gained = False, _felt(min(climb.simple, 1.0)), np.inf
     for taps, poles in options.ladder:
         if taps > _LARGE and gained < _PROMISING_DB:
             break
@@ -142,12 +148,16 @@ def design(
         except TooLong:
             hurried = True
             break
+        gained = np.inf if rung.reason else climb.gained(best, found)
+        if best and found.g < floor and rung.proved:
+            rung = replace(rung, left=f"it renders {found.g:.3f} of the stiffness, less than half of another's")
+        elif gained <= 0 or rung.reason == _SETTLED:
+            rung = replace(rung, left=f"{_SETTLED}, the stiffness counted")
         rungs.append(rung)
         progress(rung)
-        gained = np.inf if rung.reason else climb.gained(best, found)
-        settled = rung.reason == _SETTLED or (gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS)
-        if rung.reason is None and (best is None or (found.g >= floor and gained > 0)):
-            best, floor = found, max(floor if best else 0.0, _KEPT_STIFFNESS * found.g)
+        settled = rung.reason == _SETTLED or (gained < _SETTLED_DB and taps >= _FEWEST_TAPS[climb.simply])
+        if rung.taken:
+            best, floor = found, max(floor if best else 0.0, _felt(_KEPT_STIFFNESS * found.g))
             better.append(found)
         hurried = not settled and climb.elapsed > options.seconds
         hopeless = len(rungs) >= _MOST_REFUSED and not any(each.proved for each in rungs[-_MOST_REFUSED:])
@@ -222,6 +232,15 @@ class _Search:
             assert isinstance(proof, LimiterCertificate)
             return (program.Slip(proof.beta, proof.c),)
         return tuple(program.Slip.even(self.loop, *some) for some in (_LAGS if any(self.loop.psi) else _LAGS[:1]))
+
+    def slip_of(self, coupling: Coupling) -> program.Slip | None:
+        """The limiter with which this coupling needs the least damping, with its best multiplier."""
+        if not self.options.limiter:
+            return None
+        slips = [slip for slip in self.slips(None) if slip]
+        needs = [required_damping(self.loop, coupling, slip.condition) for slip in slips]
+        slip, need = min(zip(slips, needs, strict=True), key=lambda pair: pair[1].ratio)
+        return replace(slip, c=slip.condition.rows(self.loop, need.multiplier)) if need.multiplier else slip
 
     def asked(self, slip: program.Slip | None) -> tuple[program.Case, ...]:
         """The environments with all that holds in each."""
@@ -448,6 +467,11 @@ class _Search:
         return replace(found, requirement=requirement, certificate=certificate, wall_s=self.elapsed, reason=None)
 
 
+def _felt(g: float) -> float:
+    """The least share of the static stiffness that is asked, or 0 where that would be nothing to feel."""
+    return g if g >= _FELT_STIFFNESS else 0.0
+
+
 def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
     """The filter times a number, in decimals for which R(1) = g I holds exactly."""
     every = np.ones((len(coupling.R) - 1, *coupling.R.shape[1:]), dtype=bool)
@@ -480,7 +504,7 @@ def spread(
     before = climb.decibels(climb._assessed(nominal, nominal.g))
     others = [at(loop, network) for network in vertices(loop.network, percent).values()]
     more = tuple(program.Case(there, there.E(), (program.this_environment(there),), 0.0) for there in others)
-    climb, slip = replace(climb, cases=climb.cases + more), climb.slips(None)[0]
+    climb, slip = replace(climb, cases=climb.cases + more), climb.slip_of(nominal)
     taps, poles = next(basis for most, basis in _PRICED_BY.items() if loop.channels <= most)
     problem = program.Problem(
         climb.span(taps, poles), climb.asked(slip), options, program.SOFT[0] * program.SOFT[1], sparse=True

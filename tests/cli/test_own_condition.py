@@ -161,6 +161,7 @@ class Never(Condition):
         ("run", ["--duration", ".1", "--no-plot", "--no-alternatives"], 0),
         ("validate", ["--humans", "2", "--duration", "0", "--no-plot"], 1),
         ("compare", ["--no-plot"], 0),
+        ("zwidth", ["--grid", "4", "--points", "0", "--humans", "2", "--no-plot", "--K-range", "9e3,1e4"], 0),
     ],
 )
 def test_a_condition_that_fails_is_nowhere_claimed(command, words, code, folder, monkeypatch):

@@ -186,6 +186,8 @@ def test_a_wrong_storage_matrix_proves_nothing():
     for D, reason in ((Fraction(1, 2) + Fraction(1, 10**30), None), (Fraction(1, 2), "the KYP matrix is not positive")):
         told = prove_positive_real(Lti(*([[v]] for v in (0.5, 1, 0.5, D)), Fraction(1)), Matrix.of([[1]]))
         assert told is reason or told.startswith(reason)
+    zero = Lti(*([[v]] for v in (1, 1, 1, Fraction(1, 2))), Fraction(1))  # P = 1 makes all of its matrix exactly zero
+    assert prove_positive_real(zero, Matrix.of([[1]])).startswith("the KYP matrix is not positive")
     # unstable: P < 0 may satisfy the second inequality alone, and only P > 0 refuses it
     unstable = Lti(*([[v]] for v in (2, 1, 0, 5)), Fraction(1))
     assert prove_positive_real(unstable, Matrix.of([[-1]])) == (

@@ -27,7 +27,7 @@ from design.conditions import ratio_in
 from design.coupling_file import Stored, save
 from design.coupling_file import load as load_file
 from design.frequency import hermitian, on_circle
-from design.optimal import design, spread
+from design.optimal import _SETTLED, _Rung, design, spread
 from design.program import MARGIN, Options, Problem, Span, span_of, static_weight
 from design.robustness import ranges_around, robustness, vertices
 from design.transparency import transparency
@@ -172,6 +172,33 @@ def test_every_rung_is_reported_as_it_is_finished():
     assert [rung.taps for rung in heard] == [4, 8]
     assert all(rung.proved for rung in heard)
     assert heard[0].seconds < heard[1].seconds <= found.wall_s
+
+
+@pytest.mark.parametrize(
+    ("script", "taken"),
+    [
+        ([(0.875, 2e-4), (0.874, 2e-4), (0.873, 2e-4), (0.83, 1e-5), (0.82, 1e-5)], 4),  # stiffness that nobody feels
+        ([(0.8, 0.5), (0.7, 0.6), (0.6, 0.2), (0.71, 0.6)], 1),  # a quarter of what is felt: not taken
+        ([(0.8, 0.5), (0.7, 0.6), (0.699, 0.6), (0.6, 0.6), (0.58, 0.6), (0.578, 0.6)], 4),
+    ],
+)
+def test_a_climb_goes_on_over_small_steps_and_says_what_it_leaves(monkeypatch, script, taken):
+    one, steps = best("n3"), iter(script)
+
+    def rung(climb, taps, poles, before, floor, least):
+        error, g = next(steps)
+        found = replace(one, g=g, figures=replace(one.figures, rms_mismatch=error))
+        reason = _SETTLED if climb.gained(before, found) < least else None
+        return found, _Rung(taps, poles, taps, climb.decibels(found), g, reason, 0.0)
+
+    monkeypatch.setattr("design.optimal._Search.rung", rung)
+    found = design(loop_of("n3"), Options(ladder=program.LADDER[: len(script)]))
+    assert (found.figures.rms_mismatch, found.g) == script[taken]
+    assert [i for i, each in enumerate(found.ladder) if each.taken][-1] == taken
+    for each in found.ladder[taken + 1 :]:
+        assert each.left
+    if taken == 1:
+        assert "renders 0.200 of the stiffness" in found.ladder[2].left
 
 
 def test_sixteen_samples_of_delay_beside_slow_poles_are_proved_and_keep_some_stiffness():
@@ -366,6 +393,17 @@ def test_the_price_of_a_range_is_at_most_that_of_the_nominal_design_scaled_down(
     worst = robustness(loop, nominal.coupling).required_over_available
     assert found.g == pytest.approx(nominal.g / worst, rel=0.01)
     assert found.proved == found.environments
+
+
+def test_the_price_of_a_range_is_that_of_the_limiter_that_covers_the_nominal_design(monkeypatch):
+    """A tenth of the environment: with a lag of .01 or .1 of the damping no multiplier covers it, with .5 one does."""
+    monkeypatch.setattr(Problem, "solve", lambda self, start, *args, **how: 1e-3 * start)
+    springs = [Spring(("a", "m"), 300.0, 0.1), Spring(("m", "b"), 500.0, 0.2), Spring(("m", "ground"), 30.0)]
+    network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.2})
+    loop = Loop(0.002, (1, 2), (1, 1), (0, 0), (0.3, 0.6), network)
+    found = spread(loop, ForceFilter([], [], [(0.1 * np.eye(2)).tolist()]), Options(limiter=True), seconds=0.1)
+    assert (found.g, found.price_db, found.reason) == (0.1, 0.0, None)
+    assert found.proved >= 1
 
 
 def test_a_part_of_what_delays_forbid_leaves_a_bound(monkeypatch):
