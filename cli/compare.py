@@ -242,7 +242,10 @@ class _Ladder:
 
 def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
     out, begin = options.out_folder(args, "compare"), time.perf_counter()
-    loops = {case: scenario.loop(case) for case in ("I", "II")}
+    called = {case: f"case {case}" for case in ("I", "II")}
+    if scenario.lam is not None:  # both cases are the same loop then
+        called = {"I": f"lam {', '.join(map(str, scenario.lam))}"}
+    loops = {case: scenario.loop(case) for case in called}
     with render.progress("designing") as move:
         rows, interrupted = options.until_interrupted(
             compare.compare_designs(loops, LADDERS[args.ladder], move, nearby)
@@ -251,9 +254,9 @@ def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
     shown = []
     for case in loops:
         some = [row for row in rows if row.case == case]
-        shown.append(render.columns(f"the ladder · {scenario.name}, case {case}", _LADDER, some, left=(0, 5)))
-    lines = [f"{row.design}, case {row.case}: {row.reason}" for row in rows if row.reason]
-    lines += [line for row in rows for line in _price(f"{row.design}, case {row.case}", row.nearby)]
+        shown.append(render.columns(f"the ladder · {scenario.name}, {called[case]}", _LADDER, some, left=(0, 5)))
+    lines = [f"{row.design}, {called[row.case]}: {row.reason}" for row in rows if row.reason]
+    lines += [line for row in rows for line in _price(f"{row.design}, {called[row.case]}", row.nearby)]
     render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out)
     return options.exit_code(True, interrupted)
 

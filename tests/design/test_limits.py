@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -276,3 +277,13 @@ def test_a_point_says_what_is_proved_of_it(monkeypatch, impossible):
     row = {"optimal": replace(limit, proof="rational"), "any-environment": limit, "this-environment": None}
     assert command._proofs(row) == "sampled: any-environment"
     assert command._proofs({"optimal": replace(limit, proof=None)}) == "-"
+
+
+def test_a_scenario_that_fixes_the_reference_delays_has_one_ladder(monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(LADDERS, "short", SHORT[:1])
+    five = Path(__file__).parents[1] / "loops" / "o09-five.toml"
+    main(["--ladder", "--scenario", str(five), "--out", str(tmp_path)])
+    told = capsys.readouterr().out
+    assert told.count("the ladder") == 1
+    assert "lam 0, 0, 0, 0, 0" in told
+    assert "case I" not in told
