@@ -159,11 +159,11 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
 
 def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Judged:
     """What each condition asks of the coupling, by a sweep and an exact proof, and the limiter that it may have."""
-    held, searched = design.certificate, design.searched if isinstance(design, Optimal) else None
+    held = design.certificate
     requirements = assess(loop, design.coupling, held, own=design.own)
     samples = SAMPLES if args.samples is None else args.samples
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
-        whole = check_ranges(loop, design.coupling, args.seed, samples, move, searched, held)
+        whole = check_ranges(loop, design.coupling, args.seed, samples, move, design.searched, held)
     limits = coverage.Limits(None, "as asked")
     if args.limiter is not False:
         limits = coverage.covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None, held)

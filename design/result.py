@@ -181,4 +181,5 @@ class Design(Chosen):
     sdps: int = 0  # convex problems solved (local searches count their runs)
     wall_s: float = 0.0
     c: Sequence[Sequence[float]] | None = field(kw_only=True, default=None)  # of the limiter, where its search is long
+    searched: Any = field(kw_only=True, default=None)  # design.worst_member.Searched, between the vertices of ranges
     hurried: bool = field(kw_only=True, default=False)  # its clock ended it: more time may find a better
