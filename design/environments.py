@@ -117,7 +117,7 @@ class Multiplied(Condition):
             bound, values = search.best(values)
         ratio, w = search.swept(values)
         if np.isinf(ratio):
-            reason = f"no multiplier {unknowns.name} was found with which any damping is enough"
+            reason = f"no multiplier {unknowns.name} that was found proves it, whatever the damping"
             return replace(refusal(self.name, delta, reason), multiplier=values)
         found = from_ratio(self.name, max(ratio, 0.0), tuple(delta), w / (2 * np.pi * loop.T))
         return replace(found, multiplier=values, bound=bound and min(bound, ratio))
