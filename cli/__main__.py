@@ -1,6 +1,6 @@
 """python -m cli: the same as haptic-loop."""
 
-from cli.main import main
+from haptic_loop.cli.main import main
 
 if __name__ == "__main__":
     main()

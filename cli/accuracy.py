@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from cli import options, render
-from cli.judged import chosen_by
-from controller.coupling import NoCoupling
-from sim.accuracy import Row, default_substeps, measure_all
-from sim.couplings import NAMES, limits_of
-from sim.engines import EXPONENTIAL
-from sim.run import assemble
-from sim.scenario import InputError, require_even_ticks, require_linear
+from haptic_loop.cli import options, render
+from haptic_loop.cli.judged import chosen_by
+from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.sim.accuracy import Row, default_substeps, measure_all
+from haptic_loop.sim.couplings import NAMES, limits_of
+from haptic_loop.sim.engines import EXPONENTIAL
+from haptic_loop.sim.run import assemble
+from haptic_loop.sim.scenario import InputError, require_even_ticks, require_linear
 
 _MOST_STEPS = 3_000_000  # of a row: a minute or two
 _LEGEND = (

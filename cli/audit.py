@@ -10,22 +10,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from haptic_loop.cli import options, render
+from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.design.audit import LONGEST_DELAY, Audit, ConditionAudit, Help, audit
+from haptic_loop.design.certificate import check_ranges, named
+from haptic_loop.design.coverage import Switching
+from haptic_loop.design.designs import KINDS, name_and_own
+from haptic_loop.design.files import off_table
+from haptic_loop.design.guarantees import EncoderSteps
+from haptic_loop.design.result import listed
+from haptic_loop.models.device import CATALOGUE, Listed, listed_device
+from haptic_loop.sim.couplings import check_stored, fitted, own_of, read_coupling
+from haptic_loop.sim.report import encoder_steps
+from haptic_loop.sim.scenario import InputError, Scenario
 from rich.table import Table
-
-from cli import options, render
-from controller.coupling import Coupling, NoCoupling, SpringDamper
-from controller.loop import DelayRange, Loop
-from design.audit import LONGEST_DELAY, Audit, ConditionAudit, Help, audit
-from design.certificate import check_ranges, named
-from design.coverage import Switching
-from design.designs import KINDS, name_and_own
-from design.files import off_table
-from design.guarantees import EncoderSteps
-from design.result import listed
-from models.device import CATALOGUE, Listed, listed_device
-from sim.couplings import check_stored, fitted, own_of, read_coupling
-from sim.report import encoder_steps
-from sim.scenario import InputError, Scenario
 
 _EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
   python -m design.audit --rigid --K 5000 --B 0 --T 1e-3 --theta 0 --delta 1.37

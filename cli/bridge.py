@@ -14,21 +14,20 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
+from haptic_loop.cli import options, render, session_cli
+from haptic_loop.design.certificate import named
+from haptic_loop.design.files import plain, write_json
+from haptic_loop.design.guarantees import CAVEATS
+from haptic_loop.design.result import listed
+from haptic_loop.hw.control import CertifiedCoupling, certified_couplings, timed
+from haptic_loop.hw.limits import Stage
+from haptic_loop.hw.monitor import Ages
+from haptic_loop.hw.recording import Recorder
+from haptic_loop.hw.session import session_for
+from haptic_loop.hw.session_report import SessionReport, outcome, save
+from haptic_loop.sim.couplings import NAMES
+from haptic_loop.sim.scenario import InputError, Scenario
 from rich.console import Console
-
-from cli import options, render, session_cli
-from design.certificate import named
-from design.files import plain, write_json
-from design.guarantees import CAVEATS
-from design.result import listed
-from hw.control import CertifiedCoupling, certified_couplings, timed
-from hw.limits import Stage
-from hw.monitor import Ages
-from hw.recording import Recorder
-from hw.session import session_for
-from hw.session_report import SessionReport, outcome, save
-from sim.couplings import NAMES
-from sim.scenario import InputError, Scenario
 
 _LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
 

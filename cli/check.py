@@ -7,19 +7,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+from haptic_loop.cli import options, render
+from haptic_loop.controller.ranges import regions
+from haptic_loop.design.certificate import (
+    NotProved,
+    Verdict,
+    lag,
+    named,
+    prove,
+    required_damping,
+    verify,
+    violated_between,
+)
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.coupling_file import Stored, SwitchingProof
+from haptic_loop.design.coverage import SearchFigures
+from haptic_loop.design.files import off_table
+from haptic_loop.design.guarantees import HERE, RANGES
+from haptic_loop.design.result import CONDITIONS, listed, switching_guarantee
+from haptic_loop.design.worst_member import Searched, search, search_ranges
+from haptic_loop.sim.couplings import read_coupling
 from rich.table import Table
-
-from cli import options, render
-from controller.ranges import regions
-from design.certificate import NotProved, Verdict, lag, named, prove, required_damping, verify, violated_between
-from design.conditions import Condition
-from design.coupling_file import Stored, SwitchingProof
-from design.coverage import SearchFigures
-from design.files import off_table
-from design.guarantees import HERE, RANGES
-from design.result import CONDITIONS, listed, switching_guarantee
-from design.worst_member import Searched, search, search_ranges
-from sim.couplings import read_coupling
 
 
 @dataclass(frozen=True)

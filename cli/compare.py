@@ -13,22 +13,21 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from haptic_loop.cli import options, render
+from haptic_loop.cli.design import add_optimal_options, asked_of
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array
+from haptic_loop.design import compare
+from haptic_loop.design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.program import Options
+from haptic_loop.design.result import CONDITIONS, Chosen, DesignFailed, finite
+from haptic_loop.design.robustness import Nearby, Robustness
+from haptic_loop.sim import baselines
+from haptic_loop.sim.compare_report import ComparedCoupling, Comparison, ConditionCurve, Here, LimitCurves, nearby
+from haptic_loop.sim.couplings import NAMES, choose
+from haptic_loop.sim.scenario import InputError, Scenario
 from rich.table import Table
-
-from cli import options, render
-from cli.design import add_optimal_options, asked_of
-from controller.loop import Loop
-from controller.lti import Array
-from design import compare
-from design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
-from design.conditions import Condition
-from design.program import Options
-from design.result import CONDITIONS, Chosen, DesignFailed, finite
-from design.robustness import Nearby, Robustness
-from sim import baselines
-from sim.compare_report import ComparedCoupling, Comparison, ConditionCurve, Here, LimitCurves, nearby
-from sim.couplings import NAMES, choose
-from sim.scenario import InputError, Scenario
 
 _MOST = 6  # curves that can be told apart in one panel
 

@@ -9,27 +9,26 @@ from functools import partial
 from typing import Any
 
 import msgspec
+from haptic_loop.cli import options, render
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design import coverage
+from haptic_loop.design.api import Filed, proved, store
+from haptic_loop.design.audit import LONGEST_DELAY
+from haptic_loop.design.bound import BoundBeside
+from haptic_loop.design.certificate import SAMPLES, assess, check_ranges, named
+from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_condition
+from haptic_loop.design.files import out_file
+from haptic_loop.design.gain_search import STIFFEST
+from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.optimal import Optimal
+from haptic_loop.design.optimal import nearby as nearby_of
+from haptic_loop.design.program import DEFAULT, OBJECTIVES, Options
+from haptic_loop.design.result import Design, Requirement, finite, listed
+from haptic_loop.design.robustness import Nearby, ranges_around
+from haptic_loop.design.transparency import BAND_HZ, Transparency, transparency
+from haptic_loop.sim.couplings import Judged
+from haptic_loop.sim.scenario import InputError, Scenario
 from rich.table import Table
-
-from cli import options, render
-from controller.loop import Loop
-from design import coverage
-from design.api import Filed, proved, store
-from design.audit import LONGEST_DELAY
-from design.bound import BoundBeside
-from design.certificate import SAMPLES, assess, check_ranges, named
-from design.designs import KINDS, design_by_kind, kind_of, usual_condition
-from design.files import out_file
-from design.gain_search import STIFFEST
-from design.guarantees import ANY
-from design.optimal import Optimal
-from design.optimal import nearby as nearby_of
-from design.program import DEFAULT, OBJECTIVES, Options
-from design.result import Design, Requirement, finite, listed
-from design.robustness import Nearby, ranges_around
-from design.transparency import BAND_HZ, Transparency, transparency
-from sim.couplings import Judged
-from sim.scenario import InputError, Scenario
 
 
 def main(argv: list[str]) -> int:

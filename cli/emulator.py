@@ -10,10 +10,10 @@ import signal
 import sys
 from typing import Any
 
-from cli import options
-from cli.session_cli import add_pace_option, steady_scenario
-from hw.emulator import KINDS, Emulator, FaultInjection, Line, RealTimeEmulator, Terminal, nobody
-from sim.scenario import InputError
+from haptic_loop.cli import options
+from haptic_loop.cli.session_cli import add_pace_option, steady_scenario
+from haptic_loop.hw.emulator import KINDS, Emulator, FaultInjection, Line, RealTimeEmulator, Terminal, nobody
+from haptic_loop.sim.scenario import InputError
 
 
 def main(argv: list[str]) -> int:

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from cli import options, render
-from controller.lti import Array
-from design.certificate import Verdict, named, verify
-from design.coupling_file import Stored
-from design.designs import name_and_own
-from design.export import (
+from haptic_loop.cli import options, render
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.certificate import Verdict, named, verify
+from haptic_loop.design.coupling_file import Stored
+from haptic_loop.design.designs import name_and_own
+from haptic_loop.design.export import (
     SUFFIXES,
     ExportedBlock,
     NothingToExport,
@@ -27,10 +26,10 @@ from design.export import (
     trial,
     with_origin,
 )
-from design.files import off_table, out_file, write
-from design.result import listed
-from sim.couplings import read_coupling
-from sim.scenario import InputError
+from haptic_loop.design.files import off_table, out_file, write
+from haptic_loop.design.result import listed
+from haptic_loop.sim.couplings import read_coupling
+from haptic_loop.sim.scenario import InputError
 
 
 @dataclass(frozen=True)

@@ -13,20 +13,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from haptic_loop.cli import options, render
+from haptic_loop.cli.session_cli import add_link_options, check_link, hold_session, steady_scenario
+from haptic_loop.design.files import off_table, plain, write
+from haptic_loop.hw.emulator import nobody
+from haptic_loop.hw.identify import Estimate, Excitation, capped, chirp, estimate, held, settled
+from haptic_loop.hw.limits import Stage
+from haptic_loop.hw.monitor import Ages, LinkSettings
+from haptic_loop.hw.recording import Recorder
+from haptic_loop.hw.session import Session, session_for
+from haptic_loop.hw.session_report import SessionReport, outcome
+from haptic_loop.models.device import RigidDevice
+from haptic_loop.sim.scenario import InputError, Scenario
 from rich.table import Table
-
-from cli import options, render
-from cli.session_cli import add_link_options, check_link, hold_session, steady_scenario
-from design.files import off_table, plain, write
-from hw.emulator import nobody
-from hw.identify import Estimate, Excitation, capped, chirp, estimate, held, settled
-from hw.limits import Stage
-from hw.monitor import Ages, LinkSettings
-from hw.recording import Recorder
-from hw.session import Session, session_for
-from hw.session_report import SessionReport, outcome
-from models.device import RigidDevice
-from sim.scenario import InputError, Scenario
 
 _LIMITS = (
     "The bound is a statement about these records: the least viscous friction of all laws that fit, less its scatter "

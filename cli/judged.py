@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from cli import render
-from design.result import Chosen
-from sim import couplings
-from sim.couplings import Judged, choose
-from sim.scenario import Scenario
+from haptic_loop.cli import render
+from haptic_loop.design.result import Chosen
+from haptic_loop.sim import couplings
+from haptic_loop.sim.couplings import Judged, choose
+from haptic_loop.sim.scenario import Scenario
 
 
 def chosen_by(args: argparse.Namespace, scenario: Scenario) -> Chosen:

@@ -14,14 +14,13 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any, NoReturn
 
+from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, UNFINISHED
+from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.design.files import nobody_reads, one_command, one_line
+from haptic_loop.design.own import is_refusal, place_of
+from haptic_loop.design.result import DesignFailed
+from haptic_loop.sim.scenario import InputError
 from threadpoolctl import threadpool_limits
-
-from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, UNFINISHED
-from controller.arithmetic import SingularLoop
-from design.files import nobody_reads, one_command, one_line
-from design.own import is_refusal, place_of
-from design.result import DesignFailed
-from sim.scenario import InputError
 
 #: command -> what python -m calls it, and what it is for; it lives in the file of its name in this folder
 COMMANDS = {
@@ -46,7 +45,7 @@ COMMANDS = {
 
 def door(command: str) -> NoReturn:
     """Run the command of this name with the words of the command line."""
-    execute(lambda argv: import_module(f"cli.{command}").main(argv))
+    execute(lambda argv: import_module(f"haptic_loop.cli.{command}").main(argv))
 
 
 def main() -> NoReturn:
@@ -63,7 +62,7 @@ def main() -> NoReturn:
 def _command(name: str) -> ModuleType:
     if name not in COMMANDS:
         raise InputError(f"unknown command {name!r}, allowed are {', '.join(COMMANDS)}")
-    return import_module(f"cli.{name}")
+    return import_module(f"haptic_loop.cli.{name}")
 
 
 # ----------------------------------------------------------------------------------------------------

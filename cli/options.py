@@ -17,18 +17,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import msgspec
-
-from controller import older
-from controller.delay import LOST, Periods, VaryingDelay
-from controller.loop import DelayRange, Loop
-from design.files import check_file, folder, read_text
-from design.own import called, named, place_of
-from design.result import CONDITIONS, DesignFailed
-from models.device import MOST_DAMPING
-from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
+from haptic_loop.controller import older
+from haptic_loop.controller.delay import LOST, Periods, VaryingDelay
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.design.files import check_file, folder, read_text
+from haptic_loop.design.own import called, named, place_of
+from haptic_loop.design.result import CONDITIONS, DesignFailed
+from haptic_loop.models.device import MOST_DAMPING
+from haptic_loop.sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
 
 if TYPE_CHECKING:
-    from design.conditions import Condition
+    from haptic_loop.design.conditions import Condition
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -274,8 +273,8 @@ def condition(text: str) -> str:
 
 def own_condition(text: str) -> Condition:
     """The user's own condition that `package.module:Name` or `FILE.py:NAME` names. Raises InputError."""
-    from design.certificate import named as checked
-    from design.conditions import Condition
+    from haptic_loop.design.certificate import named as checked
+    from haptic_loop.design.conditions import Condition
 
     found = named("--condition", text)
     made = called(f"--condition {text}", found) if isinstance(found, type) else found

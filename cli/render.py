@@ -16,20 +16,19 @@ from dataclasses import MISSING, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.files import InJson, nobody_reads, plain, printable, write_json
+from haptic_loop.design.result import DesignFailed, Requirement, listed
 from rich.console import Console
 from rich.errors import MarkupError
 from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from controller.loop import Loop
-from design.files import InJson, nobody_reads, plain, printable, write_json
-from design.result import DesignFailed, Requirement, listed
-
 if TYPE_CHECKING:  # the reports' parts, which no command without them loads
-    from design.robustness import Nearby, Spread
-    from design.transparency import Transparency
-    from sim.report import UnevenTicks, VaryingDelays
+    from haptic_loop.design.robustness import Nearby, Spread
+    from haptic_loop.design.transparency import Transparency
+    from haptic_loop.sim.report import UnevenTicks, VaryingDelays
 
 # ----------------------------------------------------------------------------------------------------
 # The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
@@ -115,7 +114,7 @@ def designing(loop: Loop | None = None, kind: str | None = None, condition: str 
         try:
             yield lambda what, done, total: move(done, total, what)
         except DesignFailed as error:
-            from design.api import instead  # for a failure only
+            from haptic_loop.design.api import instead  # for a failure only
 
             move(0, 1, "trying other designs")
             if loop is None or not (others := instead(loop, kind or "spring-damper", condition)):
@@ -159,7 +158,7 @@ def pictures(args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping
     """Pictures of a report, by file what of sim.plots draws it; with --no-plot none, and matplotlib is not loaded."""
     if args.no_plot:
         return []
-    from sim import plots
+    from haptic_loop.sim import plots
 
     return [getattr(plots, name)(report, folder / file) for file, name in drawn.items()]
 

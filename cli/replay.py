@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-from cli import options, render
-from hw.recording import load, replay
+from haptic_loop.cli import options, render
+from haptic_loop.hw.recording import load, replay
 
 
 @dataclass(frozen=True)

@@ -8,31 +8,31 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cli import options, render
-from cli.judged import chosen_by, judge
-from cli.judged import rows as judged_rows
-from controller.budget import BudgetFigures
-from controller.environment import GROUND
-from controller.loop import Loop
-from design.certificate import named
-from design.files import write
-from design.guarantees import ANY
-from design.optimal import nearby
-from design.result import CONDITIONS, Chosen, finite, listed
-from design.robustness import Nearby
-from design.transparency import BAND_HZ
-from sim import accuracy
-from sim import passivity_layer as layer
-from sim.accuracy import MOST
-from sim.alternatives import Alternative, alternatives
-from sim.api import ScenarioRun, run_scenario
-from sim.couplings import NAMES, Judged, choose
-from sim.engines import INTEGRATORS
-from sim.passivity_layer import BaselineFigures
-from sim.run import ENGINES, AnyEngine, EngineSettings
-from sim.run_report import Ran, RunReport, run_report
-from sim.scenario import InputError, Scenario
-from sim.stability import MARGINAL, ExactVerdict
+from haptic_loop.cli import options, render
+from haptic_loop.cli.judged import chosen_by, judge
+from haptic_loop.cli.judged import rows as judged_rows
+from haptic_loop.controller.budget import BudgetFigures
+from haptic_loop.controller.environment import GROUND
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.certificate import named
+from haptic_loop.design.files import write
+from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.optimal import nearby
+from haptic_loop.design.result import CONDITIONS, Chosen, finite, listed
+from haptic_loop.design.robustness import Nearby
+from haptic_loop.design.transparency import BAND_HZ
+from haptic_loop.sim import accuracy
+from haptic_loop.sim import passivity_layer as layer
+from haptic_loop.sim.accuracy import MOST
+from haptic_loop.sim.alternatives import Alternative, alternatives
+from haptic_loop.sim.api import ScenarioRun, run_scenario
+from haptic_loop.sim.couplings import NAMES, Judged, choose
+from haptic_loop.sim.engines import INTEGRATORS
+from haptic_loop.sim.passivity_layer import BaselineFigures
+from haptic_loop.sim.run import ENGINES, AnyEngine, EngineSettings
+from haptic_loop.sim.run_report import Ran, RunReport, run_report
+from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.stability import MARGINAL, ExactVerdict
 
 
 def main(argv: list[str]) -> int:
@@ -146,7 +146,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun
 
 
 def _side_by_side(others: list[Alternative], path: Path, names: tuple[str, ...]) -> Path:
-    from sim.plots import Panel, plot_side_by_side
+    from haptic_loop.sim.plots import Panel, plot_side_by_side
 
     panels = [
         Panel(_panel_title(other), other.trace, other.ideal, other.until_s)
@@ -179,7 +179,7 @@ def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunRepo
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", run.simulation.scene.xml))
     if not args.no_plot and result.t.size:
-        from sim.plots import Contacts, Onset, plot_run
+        from haptic_loop.sim.plots import Contacts, Onset, plot_run
 
         apart = report.ideal_force.error_percent
         ideal = None if apart is None else (report.ideal_force.ideal, apart)

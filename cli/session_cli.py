@@ -16,19 +16,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cli import options
-from cli.render import console, progress
-from hw.control import Armable
-from hw.emulator import Emulator, FaultInjection, spawned
-from hw.force_dimension import FORCE_DIMENSION, ForceDimension
-from hw.haptic_device import HapticDevice, SerialDevice
-from hw.limits import Stage
-from hw.monitor import Ages, LinkSettings
-from hw.rehearsal import Rehearsal
-from hw.session import Operator, Session
-from hw.session_report import IncidentLog
-from hw.transport import Live, SerialPort, preflight
-from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
+from haptic_loop.cli import options
+from haptic_loop.cli.render import console, progress
+from haptic_loop.hw.control import Armable
+from haptic_loop.hw.emulator import Emulator, FaultInjection, spawned
+from haptic_loop.hw.force_dimension import FORCE_DIMENSION, ForceDimension
+from haptic_loop.hw.haptic_device import HapticDevice, SerialDevice
+from haptic_loop.hw.limits import Stage
+from haptic_loop.hw.monitor import Ages, LinkSettings
+from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.session import Operator, Session
+from haptic_loop.hw.session_report import IncidentLog
+from haptic_loop.hw.transport import Live, SerialPort, preflight
+from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 _USUAL_BAUD = 921_600
 _SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself

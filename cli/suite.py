@@ -24,11 +24,11 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from cli import options, render
-from controller.arithmetic import SingularLoop
-from design.files import folder, write, write_json
-from design.result import CONDITIONS, DesignFailed
-from sim.scenario import InputError
+from haptic_loop.cli import options, render
+from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.design.files import folder, write, write_json
+from haptic_loop.design.result import CONDITIONS, DesignFailed
+from haptic_loop.sim.scenario import InputError
 
 # ----------------------------------------------------------------------------------------------------
 # The checks, and how their answers read: the gist of what a command prints, a table of rows of our own.
@@ -208,7 +208,7 @@ def _called(command: str, place: Path, printed: StringIO) -> int:
     """Another command, as `python -m` runs it."""
     module, *words = shlex.split(command)
     with redirect_stdout(printed):
-        return import_module(f"cli.{module.rpartition('.')[2]}").main([*words, "--out", str(place)])
+        return import_module(f"haptic_loop.cli.{module.rpartition('.')[2]}").main([*words, "--out", str(place)])
 
 
 def _measured(check: Check, place: Path, seed: int) -> int:

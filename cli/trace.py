@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from cli import options, render
-from design.files import check_file
-from sim.scenario import InputError
-from sim.trace import Growth, Trace, growths
+from haptic_loop.cli import options, render
+from haptic_loop.design.files import check_file
+from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.trace import Growth, Trace, growths
 
 _ZOOM_HZ = 10.0  # the picture shows six periods of it where nothing oscillates
 
@@ -33,7 +33,7 @@ def main(argv: list[str]) -> int:
     if not result.t.size:
         raise InputError(f"{args.trace}: it has no ticks")
     if args.plot:
-        from sim.plots import plot_run
+        from haptic_loop.sim.plots import plot_run
 
         strongest = next((one.frequency_hz for one in found if one.frequency_hz), _ZOOM_HZ)
         plot_run(result, Path(args.plot), args.trace, strongest)

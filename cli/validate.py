@@ -9,26 +9,25 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-from cli import options, render
-from cli.judged import chosen_by, judge
-from controller.ranges import Member
-from design.certificate import RangesCheck
-from design.conditions import this_environment
-from design.files import off_table
-from design.guarantees import ANY
-from design.result import Chosen
-from models.human import Human, Population
-from models.scene import MIXED
-from sim import verdicts
-from sim.adversary import Worst, search, search_population
-from sim.couplings import NAMES, Judged
-from sim.crowds import ENGINES, Findings, Table, Validation, validate, validate_on_cluster
-from sim.report import DelaySpan, UnevenTicks, VaryingDelays
-from sim.run import assemble, engine_name
-from sim.scenario import InputError, Scenario, require_linear, save_humans
-from sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
-from sim.switching import DelaysCovered
+from haptic_loop.cli import options, render
+from haptic_loop.cli.judged import chosen_by, judge
+from haptic_loop.controller.ranges import Member
+from haptic_loop.design.certificate import RangesCheck
+from haptic_loop.design.conditions import this_environment
+from haptic_loop.design.files import off_table
+from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.result import Chosen
+from haptic_loop.models.human import Human, Population
+from haptic_loop.models.scene import MIXED
+from haptic_loop.sim import verdicts
+from haptic_loop.sim.adversary import Worst, search, search_population
+from haptic_loop.sim.couplings import NAMES, Judged
+from haptic_loop.sim.crowds import ENGINES, Findings, Table, Validation, validate, validate_on_cluster
+from haptic_loop.sim.report import DelaySpan, UnevenTicks, VaryingDelays
+from haptic_loop.sim.run import assemble, engine_name
+from haptic_loop.sim.scenario import InputError, Scenario, require_linear, save_humans
+from haptic_loop.sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
+from haptic_loop.sim.switching import DelaysCovered
 
 _ENVIRONMENTS = ("nominal", "ranges", "box")  # the last is the older name of the second
 _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
@@ -179,7 +178,7 @@ def _save(
         remark = f"found by the adversary, seed {question.seed}: growth {worst.growth:+.6g} 1/s"
         files.append(save_humans(out / "adversary.toml", worst.humans, remark, worst.persons))
     if not args.no_plot and findings.index.size:
-        from sim.plots import plot_population
+        from haptic_loop.sim.plots import plot_population
 
         coupling = "no coupling" if args.case == "none" else f"{kind} coupling"
         what = scenario.title(args.case).removesuffix(", no coupling")

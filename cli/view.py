@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from math import inf, isfinite
 from pathlib import Path
 
-from cli import options, render
-from design.coverage import Limits
-from design.files import off_table, write_json
-from design.result import Requirement
-from sim.scenario import InputError, require_even_ticks
-from sim.view.session import (
+from haptic_loop.cli import options, render
+from haptic_loop.design.coverage import Limits
+from haptic_loop.design.files import off_table, write_json
+from haptic_loop.design.result import Requirement
+from haptic_loop.sim.scenario import InputError, require_even_ticks
+from haptic_loop.sim.view.session import (
     COUPLINGS,
     GIVEN,
     LABELS,
@@ -27,7 +27,16 @@ from sim.view.session import (
     first_loop,
     parse_script,
 )
-from sim.view.stage import FlatPictures, NoWindow, Picture, ShownScene, check_film, keys_help, save_film, show
+from haptic_loop.sim.view.stage import (
+    FlatPictures,
+    NoWindow,
+    Picture,
+    ShownScene,
+    check_film,
+    keys_help,
+    save_film,
+    show,
+)
 
 _EXAMPLE = "python -m sim.view --video out.gif --script '0:none 1:theta+1 6:designed'"
 _SCRIPT = "0:none 1:theta+1 6:designed"  # of a video: an oscillation starts and dies

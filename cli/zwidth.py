@@ -10,19 +10,18 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import msgspec
-
-from cli import options, render
-from cli.judged import chosen_by, judge
-from controller.lti import Array
-from controller.older import CONDITIONS as OLDER
-from design.designs import name_and_own
-from design.result import Chosen, Requirement
-from sim import zwidth
-from sim.couplings import NAMES
-from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
-from sim.scenario import InputError, Scenario, require_constant_delay
-from sim.trace import SUSTAINED
-from sim.zwidth_report import FixedCoupling, MapReport, Shown, save_csv
+from haptic_loop.cli import options, render
+from haptic_loop.cli.judged import chosen_by, judge
+from haptic_loop.controller.lti import Array
+from haptic_loop.controller.older import CONDITIONS as OLDER
+from haptic_loop.design.designs import name_and_own
+from haptic_loop.design.result import Chosen, Requirement
+from haptic_loop.sim import zwidth
+from haptic_loop.sim.couplings import NAMES
+from haptic_loop.sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
+from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay
+from haptic_loop.sim.trace import SUSTAINED
+from haptic_loop.sim.zwidth_report import FixedCoupling, MapReport, Shown, save_csv
 
 _EXAMPLE = """python -m sim.zwidth --theta 1 --grid 30
   python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0
@@ -63,7 +62,7 @@ def main(argv: list[str]) -> int:
     report = MapReport.of(scenario, sweep, drawn, plan, fixed, found, args.humans, args.seed)
     files = [save_csv(drawn, out / "map.csv")]
     if not args.no_plot:
-        from sim.map_plot import plot_zwidth
+        from haptic_loop.sim.map_plot import plot_zwidth
 
         files.append(plot_zwidth(drawn, report, out / "zwidth.png"))
     title = f"{_span(grid.K)} N/m, B {_span(grid.B)} N s/m, {report.cells} couplings"

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-
-from controller.arithmetic import SingularLoop
-from controller.lti import Array, ReadOnly, frozen
+from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.controller.lti import Array, ReadOnly, frozen
 
 _LEAST_MINOR = 1e-12  # of a matrix whose diagonal is one: what is smaller counts as singular
 _MOST_CANDIDATES = 27  # three channels, or two with a wall: beyond, the sets are not listed but pivoted through

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import msgspec
 import numpy as np
+from haptic_loop.controller.arithmetic import Number, numbers
+from haptic_loop.controller.lti import Array, Block, Complex, Lti, ReadOnly, Sampled, as_like, frozen, taps
 from numpy.typing import ArrayLike, NDArray
-
-from controller.arithmetic import Number, numbers
-from controller.lti import Array, Block, Complex, Lti, ReadOnly, Sampled, as_like, frozen, taps
 
 _LARGEST_COEFFICIENT = 1e12  # of a stored coupling, SI units
 _MOST_TERMS = 2000  # of a moving average; every one is a state

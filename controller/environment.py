@@ -15,12 +15,11 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from haptic_loop.controller.arithmetic import Number, inverse, numbers, rational, times
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.lti import Array, Complex, Lti, Sampled, as_like
 from numpy.typing import NDArray
-
-from controller.arithmetic import Number, inverse, numbers, rational, times
-from controller.coupling import Coupling
-from controller.delay import delay
-from controller.lti import Array, Complex, Lti, Sampled, as_like
 
 GROUND = "ground"
 

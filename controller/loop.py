@@ -14,15 +14,14 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from haptic_loop.controller.arithmetic import Number, rational
+from haptic_loop.controller.coupling import Coupling, Strict
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_environment
+from haptic_loop.controller.law import Law, Limiter
+from haptic_loop.controller.lti import Block, Complex, Lti, Sampled, as_like
+from haptic_loop.controller.ranges import Member, Ranges, members
 from numpy.typing import ArrayLike
-
-from controller.arithmetic import Number, rational
-from controller.coupling import Coupling, Strict
-from controller.delay import delay
-from controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_environment
-from controller.law import Law, Limiter
-from controller.lti import Block, Complex, Lti, Sampled, as_like
-from controller.ranges import Member, Ranges, members
 
 MOST_SAMPLES = 1000  # of delay on a channel; every one is a state
 _Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=MOST_SAMPLES)], ...]

@@ -20,9 +20,19 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 import scipy  # its parts load when they are used
+from haptic_loop.controller.arithmetic import (
+    Array,
+    Number,
+    SingularLoop,
+    eye,
+    fractions,
+    inverse,
+    numbers,
+    on_time,
+    solve,
+    times,
+)
 from numpy.typing import ArrayLike, NDArray
-
-from controller.arithmetic import Array, Number, SingularLoop, eye, fractions, inverse, numbers, on_time, solve, times
 
 Complex = NDArray[np.complex128]
 

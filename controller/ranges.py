@@ -14,9 +14,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
-
-from controller.environment import GROUND, MOST_AMOUNT, Network, Spring
-from controller.lti import Array
+from haptic_loop.controller.environment import GROUND, MOST_AMOUNT, Network, Spring
+from haptic_loop.controller.lti import Array
 
 _Range = tuple[float, float]
 

@@ -23,12 +23,11 @@ from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
-
-from controller.budget import NetFigures
-from controller.delay import HeldLine, Ticks, packet_delays
-from controller.environment import Wall
-from controller.law import Law, Transition
-from controller.lti import Array, Lti, ReadOnly, frozen
+from haptic_loop.controller.budget import NetFigures
+from haptic_loop.controller.delay import HeldLine, Ticks, packet_delays
+from haptic_loop.controller.environment import Wall
+from haptic_loop.controller.law import Law, Transition
+from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen
 
 RunBlock = Callable[[int], None]  # so many ticks from row 0 on
 

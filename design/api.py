@@ -8,20 +8,19 @@ from pathlib import Path
 from typing import Literal, TypedDict, Unpack
 
 import msgspec
-
-from controller.coupling import Coupling
-from controller.loop import Loop
-from controller.lti import Lti
-from design.arguments import known, of_kind, one_of, shown
-from design.certificate import RangesCheck, assess, check_ranges, judged, lag, named, prove, prove_limiter
-from design.conditions import Condition
-from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save, sealed
-from design.designs import KINDS, design_by_kind, name_and_own, usual_condition
-from design.environments import SWITCHING
-from design.files import off_table
-from design.guarantees import ANY, HERE, RANGES, guarantee_of
-from design.result import ConditionName, Design, NotProved, Requirement, switching_guarantee
-from design.transparency import BAND_HZ, Transparency, decibels, transparency
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Lti
+from haptic_loop.design.arguments import known, of_kind, one_of, shown
+from haptic_loop.design.certificate import RangesCheck, assess, check_ranges, judged, lag, named, prove, prove_limiter
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save, sealed
+from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, usual_condition
+from haptic_loop.design.environments import SWITCHING
+from haptic_loop.design.files import off_table
+from haptic_loop.design.guarantees import ANY, HERE, RANGES, guarantee_of
+from haptic_loop.design.result import ConditionName, Design, NotProved, Requirement, switching_guarantee
+from haptic_loop.design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 _Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
 

@@ -11,25 +11,24 @@ from typing import Any, TypeVar, cast
 
 import msgspec
 import numpy as np
-
-from controller.arithmetic import TooLong
-from controller.coupling import (
+from haptic_loop.controller.arithmetic import TooLong
+from haptic_loop.controller.coupling import (
     Coupling,
     SpringDamper,
 )
-from controller.environment import RIGID_WALL
-from controller.loop import DelayRange, Loop
-from controller.older import CONDITIONS as OLDER
-from controller.older import with_older
-from design.certificate import RangesCheck, named
-from design.conditions import Condition
-from design.coverage import RangesFigures, Switching
-from design.environments import THIS_ENVIRONMENT
-from design.files import InputError, off_table
-from design.frequency import sweeping, too_long
-from design.guarantees import ANY, CAVEATS, guarantee_of
-from design.own import place_of
-from design.result import CONDITIONS, ConditionName, Requirement, listed, refusal
+from haptic_loop.controller.environment import RIGID_WALL
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.older import CONDITIONS as OLDER
+from haptic_loop.controller.older import with_older
+from haptic_loop.design.certificate import RangesCheck, named
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.coverage import RangesFigures, Switching
+from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.design.files import InputError, off_table
+from haptic_loop.design.frequency import sweeping, too_long
+from haptic_loop.design.guarantees import ANY, CAVEATS, guarantee_of
+from haptic_loop.design.own import place_of
+from haptic_loop.design.result import CONDITIONS, ConditionName, Requirement, listed, refusal
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling in its loop, judged by either condition.
@@ -433,6 +432,6 @@ def _helps(loop: Loop, coupling: Coupling, condition: Condition) -> list[Help]:
 
 
 if __name__ == "__main__":
-    from cli.main import door
+    from haptic_loop.cli.main import door
 
     door("audit")

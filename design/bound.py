@@ -23,17 +23,16 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 import scipy  # its parts load when they are used
-
-from controller.delay import delay
-from controller.loop import Loop
-from controller.lti import Array, Complex, Lti
-from design.barrier import EntryInequality, Program, centre, packed, towards
-from design.conditions import even_damping
-from design.files import off_table
-from design.frequency import frequencies, hermitian, on_circle
-from design.program import Options
-from design.result import Design
-from design.transparency import BAND_HZ, decibels
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Complex, Lti
+from haptic_loop.design.barrier import EntryInequality, Program, centre, packed, towards
+from haptic_loop.design.conditions import even_damping
+from haptic_loop.design.files import off_table
+from haptic_loop.design.frequency import frequencies, hermitian, on_circle
+from haptic_loop.design.program import Options
+from haptic_loop.design.result import Design
+from haptic_loop.design.transparency import BAND_HZ, decibels
 
 _GRID = 250  # points, even and even in the logarithm, on which H is given
 _KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # of h, by channels

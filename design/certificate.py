@@ -12,15 +12,14 @@ from typing import Any
 import msgspec
 import numpy as np
 import scipy
-
-from controller.arithmetic import SingularLoop, TooLong, rational, within
-from controller.coupling import Coupling
-from controller.loop import Loop
-from controller.lti import Lti
-from controller.older import AUDITS as OLDER
-from controller.ranges import Member, inside, number_of_vertices
-from design.conditions import Condition, Demand
-from design.coupling_file import (
+from haptic_loop.controller.arithmetic import SingularLoop, TooLong, rational, within
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Lti
+from haptic_loop.controller.older import AUDITS as OLDER
+from haptic_loop.controller.ranges import Member, inside, number_of_vertices
+from haptic_loop.design.conditions import Condition, Demand
+from haptic_loop.design.coupling_file import (
     Certificate,
     LimiterCertificate,
     Rows,
@@ -31,12 +30,29 @@ from design.coupling_file import (
     own_fields,
     sealed,
 )
-from design.environments import BETA, SWITCHING, THIS_ENVIRONMENT, LimitedForces, SwitchingDelays, in_each, worst
-from design.exact import LARGEST, Matrix, Violated, definiteness, find_storage, refuted_rows, require_size, rows_of
-from design.frequency import frequencies, on_circle, rounding
-from design.lmi import ANY_ENVIRONMENT
-from design.result import NotProved, Requirement, refusal
-from design.worst_member import Progress, Searched, search_ranges
+from haptic_loop.design.environments import (
+    BETA,
+    SWITCHING,
+    THIS_ENVIRONMENT,
+    LimitedForces,
+    SwitchingDelays,
+    in_each,
+    worst,
+)
+from haptic_loop.design.exact import (
+    LARGEST,
+    Matrix,
+    Violated,
+    definiteness,
+    find_storage,
+    refuted_rows,
+    require_size,
+    rows_of,
+)
+from haptic_loop.design.frequency import frequencies, on_circle, rounding
+from haptic_loop.design.lmi import ANY_ENVIRONMENT
+from haptic_loop.design.result import NotProved, Requirement, refusal
+from haptic_loop.design.worst_member import Progress, Searched, search_ranges
 
 _CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 _LONGEST = 60.0  # [s] of exact arithmetic for one coupling: what fits into the limits on states takes less

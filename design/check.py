@@ -1,6 +1,6 @@
 """python -m design.check: prove a stored coupling again (design.certificate.verify); the command is cli/check.py."""
 
 if __name__ == "__main__":
-    from cli.main import door
+    from haptic_loop.cli.main import door
 
     door("check")

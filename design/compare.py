@@ -10,24 +10,23 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
+from haptic_loop.controller.coupling import PUBLISHED, Coupling, NoCoupling
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.design import conditions
+from haptic_loop.design.bound import MOST, NO_BOUND, bound
+from haptic_loop.design.certificate import named, prove
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.coupling_file import digest
+from haptic_loop.design.designs import design_by_kind
+from haptic_loop.design.files import off_table
+from haptic_loop.design.frequency import Response, frequencies, on_circle
+from haptic_loop.design.program import LADDER, Options
+from haptic_loop.design.result import CONDITIONS, ConditionName, Design, DesignFailed, NotProved, Requirement, finite
+from haptic_loop.design.robustness import Nearby
+from haptic_loop.design.transparency import decibels, transparency
 from numpy.typing import NDArray
-
-from controller.coupling import PUBLISHED, Coupling, NoCoupling
-from controller.delay import delay
-from controller.loop import Loop
-from controller.lti import Array, Lti
-from design import conditions
-from design.bound import MOST, NO_BOUND, bound
-from design.certificate import named, prove
-from design.conditions import Condition
-from design.coupling_file import digest
-from design.designs import design_by_kind
-from design.files import off_table
-from design.frequency import Response, frequencies, on_circle
-from design.program import LADDER, Options
-from design.result import CONDITIONS, ConditionName, Design, DesignFailed, NotProved, Requirement, finite
-from design.robustness import Nearby
-from design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling over frequency: singular values, the demand for damping, and what a hand perceives.
@@ -523,6 +522,6 @@ def printed_decibels(value: float) -> str:
 
 
 if __name__ == "__main__":
-    from cli.main import door
+    from haptic_loop.cli.main import door
 
     door("compare")

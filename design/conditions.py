@@ -26,16 +26,15 @@ from typing import Any, Generic
 
 import numpy as np
 import scipy  # its parts load when they are used
-
-from controller.arithmetic import Number, SingularLoop, numbers
-from controller.coupling import Coupling
-from controller.delay import delay, moving_sum
-from controller.loop import Loop
-from controller.lti import Array, Block, Complex, Lti, Sampled, as_like, constant_like, hstack, vstack
-from controller.ranges import Member
-from design.arguments import shown
-from design.files import InputError
-from design.frequency import (
+from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.delay import delay, moving_sum
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Block, Complex, Lti, Sampled, as_like, constant_like, hstack, vstack
+from haptic_loop.controller.ranges import Member
+from haptic_loop.design.arguments import shown
+from haptic_loop.design.files import InputError
+from haptic_loop.design.frequency import (
     Response,
     frequencies,
     frequencies_of_many,
@@ -47,7 +46,7 @@ from design.frequency import (
     supremum,
     too_long,
 )
-from design.result import Guarantee, Requirement, from_ratio, refusal
+from haptic_loop.design.result import Guarantee, Requirement, from_ratio, refusal
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
-
-from controller.lti import Array, Complex
-from design.result import DesignFailed, Infeasible
+from haptic_loop.controller.lti import Array, Complex
+from haptic_loop.design.result import DesignFailed, Infeasible
 
 #: Largest negative eigenvalue that is taken for rounding; problems are posed in units where 1 is large.
 _TOLERANCE = 1e-4

@@ -14,14 +14,13 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
-
-from controller.coupling import Coupling, Form, Strict, require_channels
-from controller.environment import Network
-from controller.loop import Loop
-from controller.older import CONDITIONS, GUARANTEES, named_first, named_today
-from design.files import InputError, counted, read, write
-from design.frequency import frequencies, on_circle, rounding
-from design.result import Guarantee
+from haptic_loop.controller.coupling import Coupling, Form, Strict, require_channels
+from haptic_loop.controller.environment import Network
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.older import CONDITIONS, GUARANTEES, named_first, named_today
+from haptic_loop.design.files import InputError, counted, read, write
+from haptic_loop.design.frequency import frequencies, on_circle, rounding
+from haptic_loop.design.result import Guarantee
 
 _Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
 Rows = tuple[tuple[_Rational, ...], ...]  # of a matrix, rationals "p/q"

@@ -8,18 +8,18 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from controller.coupling import Coupling
-from controller.loop import Loop
-from controller.ranges import Member
-from design.certificate import RangesCheck, check_limiter, judged, prove_limiter, required_damping
-from design.conditions import this_environment
-from design.coupling_file import Certificate, LimiterCertificate
-from design.environments import BETA, LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, worst
-from design.files import off_table
-from design.guarantees import ANY
-from design.result import Design, DesignFailed, NotProved, Requirement
-from design.transparency import decibels, transparency
-from design.worst_member import SEARCH, Searched
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.ranges import Member
+from haptic_loop.design.certificate import RangesCheck, check_limiter, judged, prove_limiter, required_damping
+from haptic_loop.design.conditions import this_environment
+from haptic_loop.design.coupling_file import Certificate, LimiterCertificate
+from haptic_loop.design.environments import BETA, LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, worst
+from haptic_loop.design.files import off_table
+from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.result import Design, DesignFailed, NotProved, Requirement
+from haptic_loop.design.transparency import decibels, transparency
+from haptic_loop.design.worst_member import SEARCH, Searched
 
 _OWN_PROOF = "by a proof of its own, for this environment"
 

@@ -11,21 +11,20 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-
-from controller.loop import Loop
-from design.conditions import Condition
-from design.environments import LIMITER, THIS_ENVIRONMENT
-from design.guarantees import ANY
-from design.lmi import ANY_ENVIRONMENT
-from design.own import called, named
-from design.result import Design, DesignFailed
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT
+from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.lmi import ANY_ENVIRONMENT
+from haptic_loop.design.own import called, named
+from haptic_loop.design.result import Design, DesignFailed
 
 
 class Kind(NamedTuple):
     """One design: what it promises, where it is made, and what can be asked of it."""
 
     conditions: tuple[Condition, ...]  # that it can be made for, its own first
-    module: str  # loaded when it is asked for
+    module: str  # of design/, imported on first use
     function: str  # from a loop to a Design
     takes: tuple[str, ...] = ()  # besides the loop and its options: condition, progress
     options: tuple[str, ...] = ()  # in words of design.api.DesignOptions
@@ -37,18 +36,18 @@ class Kind(NamedTuple):
 KINDS = {
     "spring-damper": Kind(
         (THIS_ENVIRONMENT, ANY_ENVIRONMENT),
-        "design.spring_damper",
+        "spring_damper",
         "design_with",
         ("condition",),
         ("switching", "limiter", "band_hz"),
         limited=True,
         softened=True,
     ),
-    "moving-average": Kind((ANY_ENVIRONMENT,), "design.spring_damper", "moving_average", softened=True),
-    "ccl": Kind((ANY_ENVIRONMENT,), "design.fixed_order", "design", options=("order", "method", "diagonal")),
+    "moving-average": Kind((ANY_ENVIRONMENT,), "spring_damper", "moving_average", softened=True),
+    "ccl": Kind((ANY_ENVIRONMENT,), "fixed_order", "design", options=("order", "method", "diagonal")),
     "optimal": Kind(
         (THIS_ENVIRONMENT,),
-        "design.optimal",
+        "optimal",
         "design_with",
         ("progress",),
         ("objective", "band_hz", "high_gain", "limiter", "seconds", "switching"),
@@ -129,7 +128,7 @@ def design_by_kind(
         raise ValueError(f"{reason}{_instead(loop, 'without --limiter', kind, **with_less)}")
     further = {"condition": made_for.name, "progress": progress}
     further = {name: value for name, value in further.items() if name in chosen.takes}
-    made = partial(getattr(import_module(chosen.module), chosen.function), **further, **options)
+    made = partial(getattr(import_module(f"haptic_loop.design.{chosen.module}"), chosen.function), **further, **options)
 
     if loop.latency and "latency" not in made_for.covers:
         raise ValueError(f"latency: {made_for.beyond(loop)}, or design for this-environment")

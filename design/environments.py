@@ -13,13 +13,12 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-
-from controller.arithmetic import Number, SingularLoop, numbers
-from controller.coupling import Coupling
-from controller.loop import Loop
-from controller.lti import Array, Block, Lti, as_like, constant_like, hstack, taps, vstack
-from controller.ranges import Member
-from design.conditions import (
+from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Block, Lti, as_like, constant_like, hstack, taps, vstack
+from haptic_loop.controller.ranges import Member
+from haptic_loop.design.conditions import (
     BEYOND,
     Condition,
     Demand,
@@ -32,11 +31,11 @@ from design.conditions import (
     unsound,
     unsound_static,
 )
-from design.cone import ConeProgram, Inequality
-from design.exact import require_size
-from design.files import InputError
-from design.frequency import frequencies, hermitian, on_circle, peaks, supremum, sweeping
-from design.result import MAKING, DesignFailed, Requirement, from_ratio, refusal, switching_guarantee
+from haptic_loop.design.cone import ConeProgram, Inequality
+from haptic_loop.design.exact import require_size
+from haptic_loop.design.files import InputError
+from haptic_loop.design.frequency import frequencies, hermitian, on_circle, peaks, supremum, sweeping
+from haptic_loop.design.result import MAKING, DesignFailed, Requirement, from_ratio, refusal, switching_guarantee
 
 # ----------------------------------------------------------------------------------------------------
 # The best multiplier. The block is affine in (s, multiplier), so the least s over all multipliers at some frequencies

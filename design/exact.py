@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
+from haptic_loop.controller.arithmetic import on_time, rational
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.design.frequency import frequencies, hermitian, on_circle, supremum
+from haptic_loop.design.result import NotProved, Requirement
 from numpy.typing import NDArray
-
-from controller.arithmetic import on_time, rational
-from controller.lti import Array, Lti
-from design.frequency import frequencies, hermitian, on_circle, supremum
-from design.result import NotProved, Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # Matrices over the rationals: integers over one common denominator, and exact tests of definiteness.

@@ -10,15 +10,14 @@ from string import Template
 from typing import Any, BinaryIO
 
 import numpy as np
-
-from controller.complementarity import GROUNDED, PIVOT_ROUNDING
-from controller.law import Limiter
-from controller.loop import Loop
-from controller.lti import Array, Lti
-from design.certificate import Verdict, lag
-from design.coupling_file import Stored
-from design.guarantees import HERE, RANGES
-from design.result import listed, switching_guarantee
+from haptic_loop.controller.complementarity import GROUNDED, PIVOT_ROUNDING
+from haptic_loop.controller.law import Limiter
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.design.certificate import Verdict, lag
+from haptic_loop.design.coupling_file import Stored
+from haptic_loop.design.guarantees import HERE, RANGES
+from haptic_loop.design.result import listed, switching_guarantee
 
 # ----------------------------------------------------------------------------------------------------
 # What is exported: one state-space block, the order in which its sums are taken, and a test vector in that order.
@@ -645,6 +644,6 @@ def content(kind: str, block: ExportedBlock, test: _Trial, file: str) -> Any:
 
 
 if __name__ == "__main__":
-    from cli.main import door
+    from haptic_loop.cli.main import door
 
     door("export")

@@ -16,19 +16,18 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from haptic_loop.controller.coupling import Compliance, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.design import lmi, spring_damper
+from haptic_loop.design.arguments import of_kind, one_of, whole
+from haptic_loop.design.conditions import any_environment, any_environment_demand
+from haptic_loop.design.cone import ConeProgram, Inequality
+from haptic_loop.design.frequency import on_circle
+from haptic_loop.design.result import Design, DesignFailed, Requirement
 from scipy.linalg import block_diag
 from scipy.optimize import minimize
-
-from controller.coupling import Compliance, SpringDamper
-from controller.environment import GROUND, Network, Spring
-from controller.loop import Loop
-from controller.lti import Array, Lti
-from design import lmi, spring_damper
-from design.arguments import of_kind, one_of, whole
-from design.conditions import any_environment, any_environment_demand
-from design.cone import ConeProgram, Inequality
-from design.frequency import on_circle
-from design.result import Design, DesignFailed, Requirement
 
 #: How such a coupling may be sought.
 _METHODS = ("complementarity", "inner", "fixed-poles")

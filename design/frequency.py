@@ -6,10 +6,9 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 
 import numpy as np
+from haptic_loop.controller.arithmetic import within
+from haptic_loop.controller.lti import Array, Lti
 from numpy.typing import NDArray
-
-from controller.arithmetic import within
-from controller.lti import Array, Lti
 
 # ----------------------------------------------------------------------------------------------------
 # Integrals over frequency, by Gauss's rule on intervals that are halved until it no longer matters.

@@ -15,18 +15,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.lti import Array, Complex, Sampled
+from haptic_loop.design.conditions import Demand, even_damping, this_environment, this_environment_demand
+from haptic_loop.design.environments import LIMITER, SWITCHING
+from haptic_loop.design.frequency import frequencies, hermitian, on_circle
+from haptic_loop.design.lmi import RESERVE
+from haptic_loop.design.result import Requirement
+from haptic_loop.design.transparency import BAND_HZ, transparency
 from numpy.typing import NDArray
-
-from controller.coupling import SpringDamper
-from controller.delay import delay
-from controller.loop import DelayRange, Loop
-from controller.lti import Array, Complex, Sampled
-from design.conditions import Demand, even_damping, this_environment, this_environment_demand
-from design.environments import LIMITER, SWITCHING
-from design.frequency import frequencies, hermitian, on_circle
-from design.lmi import RESERVE
-from design.result import Requirement
-from design.transparency import BAND_HZ, transparency
 
 if TYPE_CHECKING:  # slow to load
     from scipy.optimize import OptimizeResult

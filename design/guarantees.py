@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-
-from controller.coupling import Coupling
-from controller.loop import Loop
-from design.conditions import encoder_friction
-from design.result import MAKING, Requirement
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.conditions import encoder_friction
+from haptic_loop.design.result import MAKING, Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # What may be said of a coupling: required against available damping, for which environments, and what is left out.

@@ -20,19 +20,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # its parts load when they are used
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.controller.ranges import Member
+from haptic_loop.design import conditions
+from haptic_loop.design.conditions import Condition, Demand, delayed_environment_demand, even_damping, uncovered
+from haptic_loop.design.cone import ConeProgram, Inequality
+from haptic_loop.design.exact import require_size
+from haptic_loop.design.frequency import Response, frequencies, on_circle, supremum
+from haptic_loop.design.result import DesignFailed, Guarantee, Infeasible, NotProved, Requirement, refusal
 from numpy.typing import NDArray
-
-from controller.coupling import Coupling
-from controller.delay import delay
-from controller.loop import Loop
-from controller.lti import Array, Lti
-from controller.ranges import Member
-from design import conditions
-from design.conditions import Condition, Demand, delayed_environment_demand, even_damping, uncovered
-from design.cone import ConeProgram, Inequality
-from design.exact import require_size
-from design.frequency import Response, frequencies, on_circle, supremum
-from design.result import DesignFailed, Guarantee, Infeasible, NotProved, Requirement, refusal
 
 #: Designs ask for (1 - RESERVE) of the available damping, so that they are certified as stored.
 RESERVE = 1e-4

@@ -13,23 +13,22 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-
-from controller.arithmetic import TooLong, within
-from controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
-from controller.loop import DelayRange, Loop
-from controller.lti import Array
-from design import program
-from design.certificate import prove, prove_limiter, required_damping
-from design.conditions import Condition, ratio_in
-from design.conditions import this_environment as requirement_of
-from design.coupling_file import Certificate, LimiterCertificate
-from design.environments import BETA, LIMITER, THIS_ENVIRONMENT, LimitedForces, in_each, worst
-from design.guarantees import ANY
-from design.result import Design, DesignFailed, NotProved, from_ratio
-from design.robustness import Nearby, Spread, at, robustness_nearby, vertices
-from design.spring_damper import design as design_spring_damper
-from design.transparency import Transparency, decibels, transparency
-from design.worst_member import Searched, search_ranges
+from haptic_loop.controller.arithmetic import TooLong, within
+from haptic_loop.controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.lti import Array
+from haptic_loop.design import program
+from haptic_loop.design.certificate import prove, prove_limiter, required_damping
+from haptic_loop.design.conditions import Condition, ratio_in
+from haptic_loop.design.conditions import this_environment as requirement_of
+from haptic_loop.design.coupling_file import Certificate, LimiterCertificate
+from haptic_loop.design.environments import BETA, LIMITER, THIS_ENVIRONMENT, LimitedForces, in_each, worst
+from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.result import Design, DesignFailed, NotProved, from_ratio
+from haptic_loop.design.robustness import Nearby, Spread, at, robustness_nearby, vertices
+from haptic_loop.design.spring_damper import design as design_spring_damper
+from haptic_loop.design.transparency import Transparency, decibels, transparency
+from haptic_loop.design.worst_member import Searched, search_ranges
 
 #: [s] of the processor, up to so many devices: what the price of a range may take, a third of it for proofs
 _PRICED = {2: 3.0, 4: 6.0, 10**3: 12.0}

@@ -10,10 +10,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
-from design.files import InputError
+from haptic_loop.design.files import InputError
 
 _Made = TypeVar("_Made")
-_HOME, _WORLDS = Path(__file__).parents[1], ("models", "controller", "design", "sim", "hw", "cli")
+_HOME, _WORLDS = Path(__file__).parents[1], ("haptic_loop", "models", "controller", "design", "sim", "hw", "cli")
 _OURS = tuple(f"{_HOME / world}{os.sep}" for world in _WORLDS)
 _OTHERS = ("<", f"{sys.prefix}{os.sep}", f"{sys.base_prefix}{os.sep}", *_OURS)
 

@@ -16,18 +16,17 @@ from typing import Any, Literal
 
 import numpy as np
 import scipy  # its parts load when they are used
+from haptic_loop.controller.coupling import ForceFilter, basis
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.lti import Array, Complex, Lti, Sampled, as_like
+from haptic_loop.design.arguments import number, one_of
+from haptic_loop.design.barrier import EntryInequality, MatrixInequality, Program, centre, joined, packed, towards
+from haptic_loop.design.conditions import Demand, even_damping, this_environment_demand
+from haptic_loop.design.environments import SWITCHING, LimitedForces
+from haptic_loop.design.frequency import frequencies, hermitian, on_circle, peaks
+from haptic_loop.design.transparency import BAND_HZ
 from numpy.typing import NDArray
-
-from controller.coupling import ForceFilter, basis
-from controller.delay import delay
-from controller.loop import DelayRange, Loop
-from controller.lti import Array, Complex, Lti, Sampled, as_like
-from design.arguments import number, one_of
-from design.barrier import EntryInequality, MatrixInequality, Program, centre, joined, packed, towards
-from design.conditions import Demand, even_damping, this_environment_demand
-from design.environments import SWITCHING, LimitedForces
-from design.frequency import frequencies, hermitian, on_circle, peaks
-from design.transparency import BAND_HZ
 
 OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # share of the damping that stays unused: what an exact proof always finds room in

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
-
-from controller.coupling import Coupling
-from controller.loop import DelayRange
-from controller.lti import Array
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.loop import DelayRange
+from haptic_loop.controller.lti import Array
 
 ConditionName = Literal["this-environment", "any-environment"]
 #: for which environments a certificate holds

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-
-from controller.coupling import Coupling
-from controller.environment import Network
-from controller.loop import Loop
-from controller.ranges import Ranges, UncertainSpring
-from design.conditions import Condition
-from design.environments import THIS_ENVIRONMENT
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.environment import Network
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.ranges import Ranges, UncertainSpring
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.environments import THIS_ENVIRONMENT
 
 #: Of more environments than _FEW every _THIN-th frequency is looked at; only those that ask for the most there, or for
 #: next to it, are swept whole.

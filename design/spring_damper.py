@@ -14,17 +14,24 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-
-from controller.coupling import Coupling, MovingAverage, SpringDamper
-from controller.loop import Loop
-from controller.lti import Array, Lti, hstack, taps, vstack
-from design.certificate import named
-from design.conditions import even_damping, theta_hat, this_environment
-from design.cone import ConeProgram, Inequality
-from design.environments import LIMITER
-from design.frequency import on_circle, peaks, too_long
-from design.gain_search import FEW, LimiterLoop, SampledLoop, SwitchingLoop, damper_rate, least_rms, likeliest_first
-from design.lmi import (
+from haptic_loop.controller.coupling import Coupling, MovingAverage, SpringDamper
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Lti, hstack, taps, vstack
+from haptic_loop.design.certificate import named
+from haptic_loop.design.conditions import even_damping, theta_hat, this_environment
+from haptic_loop.design.cone import ConeProgram, Inequality
+from haptic_loop.design.environments import LIMITER
+from haptic_loop.design.frequency import on_circle, peaks, too_long
+from haptic_loop.design.gain_search import (
+    FEW,
+    LimiterLoop,
+    SampledLoop,
+    SwitchingLoop,
+    damper_rate,
+    least_rms,
+    likeliest_first,
+)
+from haptic_loop.design.lmi import (
     ANY_ENVIRONMENT,
     RESERVE,
     Ports,
@@ -36,8 +43,8 @@ from design.lmi import (
     symmetric_from,
     usable,
 )
-from design.result import Design, DesignFailed, Infeasible
-from design.transparency import BAND_HZ, transparency
+from haptic_loop.design.result import Design, DesignFailed, Infeasible
+from haptic_loop.design.transparency import BAND_HZ, transparency
 
 # ----------------------------------------------------------------------------------------------------
 # The convex set of spring-damper gains that satisfy Theorem 4, channel by channel.

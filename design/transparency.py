@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.design.frequency import frequencies, integral, on_circle, supremum
 from numpy.typing import NDArray
-
-from controller.delay import delay
-from controller.lti import Array, Lti
-from design.frequency import frequencies, integral, on_circle, supremum
 
 BAND_HZ = (0.5, 80.0)
 _ROUNDING = 1e-10  # of the environment: two responses that differ by less are one

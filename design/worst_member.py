@@ -14,13 +14,12 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-
-from controller.coupling import Coupling
-from controller.loop import Loop
-from controller.lti import Array
-from controller.ranges import Member, Region, regions
-from design.conditions import ratio_in
-from design.frequency import MOST_SECONDS
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array
+from haptic_loop.controller.ranges import Member, Region, regions
+from haptic_loop.design.conditions import ratio_in
+from haptic_loop.design.frequency import MOST_SECONDS
 
 _Ratio = Callable[[Member], float]  # required over available damping
 

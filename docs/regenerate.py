@@ -37,13 +37,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from controller.lti import Lti
-from design.coupling_file import Stored, save
-from design.coupling_file import load as read_stored
-from design.designs import design_by_kind
-from design.frequency import frequencies, on_circle
-from sim import load
-from sim.design_cache import proved, shipped
+from haptic_loop.controller.lti import Lti
+from haptic_loop.design.coupling_file import Stored, save
+from haptic_loop.design.coupling_file import load as read_stored
+from haptic_loop.design.designs import design_by_kind
+from haptic_loop.design.frequency import frequencies, on_circle
+from haptic_loop.sim.design_cache import proved, shipped
+
+from haptic_loop import load
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

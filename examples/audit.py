@@ -3,9 +3,7 @@
 The loop is the paper's: two devices of 1.37 N s/m, T = 1.2 ms, delays of 1 and 2 samples.
 """
 
-from controller.coupling import SpringDamper
-from design import certify
-from sim import load
+from haptic_loop import SpringDamper, certify, load
 
 LOOP = load("omega-pair").loop("I")
 K, B = (2870.0, 2320.0), (5.47, 5.55)  # the paper's gains (27) [N/m], [N s/m]

@@ -1,7 +1,6 @@
 """Design three couplings for one loop and compare what each guarantees, what it costs and how transparent it is."""
 
-from design import certify, design_coupling, guarantee, transparency_of
-from sim import load
+from haptic_loop import certify, design_coupling, guarantee, load, transparency_of
 
 LOOP = load("omega-pair").loop("I")
 DESIGNS = [("spring-damper", "any-environment"), ("spring-damper", "this-environment"), ("optimal", "this-environment")]

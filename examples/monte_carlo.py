@@ -3,8 +3,7 @@
 import numpy as np
 from scipy.special import betaincinv
 
-from design import Design, design_coupling
-from sim import Scenario, load, validate
+from haptic_loop import Design, Scenario, design_coupling, load, validate
 
 HANDS = 500
 

@@ -8,8 +8,7 @@ import sys
 
 import numpy as np
 
-from design import certify, design_coupling, guarantee
-from sim import InputError, load, simulate
+from haptic_loop import InputError, certify, design_coupling, guarantee, load, simulate
 
 BUDGET, SECONDS, NEURONS = 0.01, 6.0, 32  # [J], [s]
 

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from design import design_coupling
-from sim import Trace, load, plot_run, simulate
+from haptic_loop import Trace, design_coupling, load, plot_run, simulate
 
 SECONDS = 8.0
 

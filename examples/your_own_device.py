@@ -7,12 +7,7 @@ import sys
 
 import numpy as np
 
-from controller.coupling import SpringDamper
-from controller.environment import RIGID_WALL
-from design import Loop, certify
-from hw import rehearse
-from models.device import RigidDevice
-from sim import InputError, load
+from haptic_loop import RIGID_WALL, InputError, Loop, RigidDevice, SpringDamper, certify, load, rehearse
 
 # put your numbers here: [kg], [N s/m], [N], [m]
 MINE = {"mass": 0.18, "damping": 0.9, "force_limit": 6.0, "encoder_step": 2e-6}

@@ -1,6 +1,6 @@
 """python -m hw.bridge: a session with a device over a serial port; the command is cli/bridge.py."""
 
 if __name__ == "__main__":
-    from cli.main import door
+    from haptic_loop.cli.main import door
 
     door("bridge")

@@ -17,24 +17,23 @@ from operator import sub
 from typing import NamedTuple, Protocol
 
 import numpy as np
-
-from controller.budget import BudgetFigures, EnergyBudget, Packets
-from controller.coupling import Coupling
-from controller.law import Law
-from controller.loop import Loop
-from controller.lti import Array
-from design.certificate import assess
-from design.conditions import Condition
-from design.coverage import Limits
-from design.files import off_table
-from design.guarantees import guarantee_of
-from design.result import Chosen, Design, DesignFailed, Requirement
-from hw import monitor
-from hw.limits import Gain, Heat, SafetyLimits, Units
-from hw.protocol import MAX_THETA, Config, SafetyStop, State
-from sim.couplings import choose, given, limits_of
-from sim.report import CouplingFigures
-from sim.scenario import InputError, Scenario
+from haptic_loop.controller.budget import BudgetFigures, EnergyBudget, Packets
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.law import Law
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.certificate import assess
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.coverage import Limits
+from haptic_loop.design.files import off_table
+from haptic_loop.design.guarantees import guarantee_of
+from haptic_loop.design.result import Chosen, Design, DesignFailed, Requirement
+from haptic_loop.hw import monitor
+from haptic_loop.hw.limits import Gain, Heat, SafetyLimits, Units
+from haptic_loop.hw.protocol import MAX_THETA, Config, SafetyStop, State
+from haptic_loop.sim.couplings import choose, given, limits_of
+from haptic_loop.sim.report import CouplingFigures
+from haptic_loop.sim.scenario import InputError, Scenario
 
 _SPEED_SECONDS = 0.01  # over which a speed is taken: one count of the coarsest encoder is 0.03 m/s
 _FALLBACK = ("spring-damper", "any-environment")  # what softer couplings are where the one asked for cannot be had

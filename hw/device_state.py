@@ -6,7 +6,7 @@ The same machine as hw/firmware/haptic_link.h, integer for integer and byte for 
 rules are in docs/protocol.md. Forces are in steps, per axis, as tuples.
 """
 
-from hw import protocol as wire
+from haptic_loop.hw import protocol as wire
 
 _SLOTS = 16  # forces that wait for their tick: a power of two above MAX_THETA
 RUNNING = (wire.Phase.ARMED, wire.Phase.HOLDING, wire.Phase.RAMP)  # the motors may carry a force

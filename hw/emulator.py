@@ -31,16 +31,15 @@ from itertools import count
 from typing import Self
 
 import numpy as np
-
-from controller.lti import Array
-from hw.device_state import RUNNING, Device
-from hw.protocol import PROTOCOL, Force, Info, Phase, distance
-from models.device import require
-from models.hold import hold
-from models.human import Human, Link
-from models.scene import build
-from sim.run import outside_forces
-from sim.scenario import InputError, Scenario
+from haptic_loop.controller.lti import Array
+from haptic_loop.hw.device_state import RUNNING, Device
+from haptic_loop.hw.protocol import PROTOCOL, Force, Info, Phase, distance
+from haptic_loop.models.device import require
+from haptic_loop.models.hold import hold
+from haptic_loop.models.human import Human, Link
+from haptic_loop.models.scene import build
+from haptic_loop.sim.run import outside_forces
+from haptic_loop.sim.scenario import InputError, Scenario
 
 _FOREVER = 1e9  # [s]
 _BLOCK = 1000  # ticks of outside forces that are computed at once
@@ -545,6 +544,6 @@ def spawned(options: Sequence[str]) -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    from cli.main import door
+    from haptic_loop.cli.main import door
 
     door("emulator")

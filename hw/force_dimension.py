@@ -13,11 +13,11 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Self
 
-from hw.device_state import Device
-from hw.emulator import info_of
-from hw.haptic_device import PortLost
-from hw.protocol import NO_MARGIN, Ack, Config, Decoder, Force, Info, Phase, Reason, State, Stop, encode
-from sim.scenario import InputError, Scenario
+from haptic_loop.hw.device_state import Device
+from haptic_loop.hw.emulator import info_of
+from haptic_loop.hw.haptic_device import PortLost
+from haptic_loop.hw.protocol import NO_MARGIN, Ack, Config, Decoder, Force, Info, Phase, Reason, State, Stop, encode
+from haptic_loop.sim.scenario import InputError, Scenario
 
 FORCE_DIMENSION = "force-dimension"  # in place of a port
 _BINDINGS = "forcedimension_core.dhd"

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from hw import protocol as wire
+from haptic_loop.hw import protocol as wire
 
 _RESEND = 0.1  # [s] after which a question is asked again
 _STOPPING = 0.05  # [s] in which a device that was told to stop must rest

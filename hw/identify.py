@@ -14,14 +14,13 @@ from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
+from haptic_loop.controller.lti import Array, frozen
+from haptic_loop.hw.control import Controller
+from haptic_loop.hw.friction import Friction, friction
+from haptic_loop.hw.recording import Recorder
+from haptic_loop.hw.session import Session
+from haptic_loop.sim.scenario import Scenario
 from numpy.typing import NDArray
-
-from controller.lti import Array, frozen
-from hw.control import Controller
-from hw.friction import Friction, friction
-from hw.recording import Recorder
-from hw.session import Session
-from sim.scenario import Scenario
 
 _SLOW_SPAN = 4.0  # of the slow sweeps' frequencies
 _LEAD = 0.3  # [s] of zero force, in which the gain comes up
@@ -306,6 +305,6 @@ def estimate(
 
 
 if __name__ == "__main__":
-    from cli.main import door
+    from haptic_loop.cli.main import door
 
     door("identify")

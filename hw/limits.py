@@ -12,9 +12,19 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from hw.protocol import MAX_RELEASE_NS, MAX_THETA, PROTOCOL, Config, Force, Info, SafetyStop, State, wire_bytes
-from models.device import require
-from sim.scenario import Scenario
+from haptic_loop.hw.protocol import (
+    MAX_RELEASE_NS,
+    MAX_THETA,
+    PROTOCOL,
+    Config,
+    Force,
+    Info,
+    SafetyStop,
+    State,
+    wire_bytes,
+)
+from haptic_loop.models.device import require
+from haptic_loop.sim.scenario import Scenario
 
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _FEWEST_STEPS = 16  # of force up to the cap: coarser, and the certificate's linear loop is another one

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from hw.protocol import NO_MARGIN, Config, Phase, SafetyStop, State, distance
+from haptic_loop.hw.protocol import NO_MARGIN, Config, Phase, SafetyStop, State, distance
 
 _STATES_PER_ANSWER = 8  # at most: a USB frame of 1 ms may bring several FORCEs, of which one margin is told
 _MEASURED_TOLERANCE = 0.01  # of the device's clock against T, over the measurement

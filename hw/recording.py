@@ -16,17 +16,16 @@ from typing import Annotated, Any, BinaryIO
 
 import msgspec
 import numpy as np
+from haptic_loop.controller.coupling import Form
+from haptic_loop.controller.lti import Array
+from haptic_loop.controller.older import named_today
+from haptic_loop.design.files import counted, read_arrays, write
+from haptic_loop.hw.control import Arming, BudgetPlan, CertifiedCoupling, SentBudget, TraceRow, host_controller
+from haptic_loop.hw.limits import SafetyLimits, Units
+from haptic_loop.hw.protocol import NO_MARGIN, SafetyStop
+from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.trace import Trace
 from numpy.typing import NDArray
-
-from controller.coupling import Form
-from controller.lti import Array
-from controller.older import named_today
-from design.files import counted, read_arrays, write
-from hw.control import Arming, BudgetPlan, CertifiedCoupling, SentBudget, TraceRow, host_controller
-from hw.limits import SafetyLimits, Units
-from hw.protocol import NO_MARGIN, SafetyStop
-from sim.scenario import InputError, Scenario
-from sim.trace import Trace
 
 #: what the link adds, one entry per tick and name
 _LINK = ("tick", "arming", "received", "asked", "test", "gain", "sent", "margin_us", "status")

@@ -13,23 +13,22 @@ from itertools import count
 from typing import NamedTuple
 
 import numpy as np
-
-from controller.coupling import Coupling
-from controller.lti import Array
-from design.api import COUPLING, bare
-from design.arguments import number, of_kind, whole
-from design.guarantees import guarantee_of
-from design.result import Design, Requirement
-from hw.control import Armable, CertifiedCoupling, certified_coupling, certified_couplings, timed
-from hw.emulator import Emulator, FaultInjection, Line
-from hw.haptic_device import PortLost, SerialDevice
-from hw.limits import ENDED, Stage
-from hw.monitor import Ages, LinkSettings
-from hw.protocol import Phase
-from hw.recording import Recorder
-from hw.session import Driver, Operator, Said, Session, session_for
-from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
-from sim.trace import Trace
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.api import COUPLING, bare
+from haptic_loop.design.arguments import number, of_kind, whole
+from haptic_loop.design.guarantees import guarantee_of
+from haptic_loop.design.result import Design, Requirement
+from haptic_loop.hw.control import Armable, CertifiedCoupling, certified_coupling, certified_couplings, timed
+from haptic_loop.hw.emulator import Emulator, FaultInjection, Line
+from haptic_loop.hw.haptic_device import PortLost, SerialDevice
+from haptic_loop.hw.limits import ENDED, Stage
+from haptic_loop.hw.monitor import Ages, LinkSettings
+from haptic_loop.hw.protocol import Phase
+from haptic_loop.hw.recording import Recorder
+from haptic_loop.hw.session import Driver, Operator, Said, Session, session_for
+from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
+from haptic_loop.sim.trace import Trace
 
 _MEASURE = 200  # answers that are timed: virtual time does not scatter
 _QUANTILE, _GUARD_US = 0.99, 100.0  # of the ages that the delay covers, and what is added [us]; as hw.bridge has it

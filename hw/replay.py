@@ -1,6 +1,6 @@
 """python -m hw.replay: a recorded session through the controller again, bit by bit; the command is cli/replay.py."""
 
 if __name__ == "__main__":
-    from cli.main import door
+    from haptic_loop.cli.main import door
 
     door("replay")

@@ -13,10 +13,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from hw import protocol as wire
-from hw.control import Armable, Arming, BudgetPlan, Drive, SentBudget, TraceRow
-from hw.haptic_device import HapticDevice, PortLost
-from hw.limits import (
+from haptic_loop.hw import protocol as wire
+from haptic_loop.hw.control import Armable, Arming, BudgetPlan, Drive, SentBudget, TraceRow
+from haptic_loop.hw.haptic_device import HapticDevice, PortLost
+from haptic_loop.hw.limits import (
     DRIVING,
     ENDED,
     SafetyLimits,
@@ -25,8 +25,8 @@ from hw.limits import (
     probe_delay,
     watchdog_for,
 )
-from hw.monitor import Ages, Counters, LinkMonitor, LinkSettings, Measurement
-from sim.scenario import InputError, Scenario
+from haptic_loop.hw.monitor import Ages, Counters, LinkMonitor, LinkSettings, Measurement
+from haptic_loop.sim.scenario import InputError, Scenario
 
 _PATIENCE_US = 2_000_000  # after which a question is given up
 _ARMING_US = 500_000  # in which a device must follow ARM

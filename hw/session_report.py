@@ -11,15 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from controller.budget import BudgetFigures
-from design.files import off_table, plain, write_json
-from hw.control import CertifiedCoupling, ProgramFigures
-from hw.protocol import NO_MARGIN
-from hw.recording import Recipe, Recorder
-from hw.session import Session
-from sim.scenario import InputError
-from sim.trace import Growth, growths
+from haptic_loop.controller.budget import BudgetFigures
+from haptic_loop.design.files import off_table, plain, write_json
+from haptic_loop.hw.control import CertifiedCoupling, ProgramFigures
+from haptic_loop.hw.protocol import NO_MARGIN
+from haptic_loop.hw.recording import Recipe, Recorder
+from haptic_loop.hw.session import Session
+from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.trace import Growth, growths
 
 _PERCENTILES = (50, 90, 99, 100)
 
@@ -174,7 +173,7 @@ def save(out: Path, session: Session, recorder: Recorder, report: SessionReport,
         result = recorder.trace(session.units, session.scenario.T, plain(report) | {"replay": replay})
         files += [recorder.save(out / "trace.npz", result), result.save_csv(out / "trace.csv")]
         if plot:
-            from sim.plots import plot_run
+            from haptic_loop.sim.plots import plot_run
 
             title = f"{report.scenario}, case {report.case}: a session that ended {session.stage}"
             files.append(plot_run(result, out / "figure.png", title, 10.0))

@@ -16,13 +16,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Self
 
-from hw.control import Armable
-from hw.haptic_device import HapticDevice, PortLost
-from hw.limits import ENDED, Stage
-from hw.monitor import Ages
-from hw.protocol import SafetyStop
-from hw.session import Driver, Operator, Session
-from sim.scenario import InputError
+from haptic_loop.hw.control import Armable
+from haptic_loop.hw.haptic_device import HapticDevice, PortLost
+from haptic_loop.hw.limits import ENDED, Stage
+from haptic_loop.hw.monitor import Ages
+from haptic_loop.hw.protocol import SafetyStop
+from haptic_loop.hw.session import Driver, Operator, Session
+from haptic_loop.sim.scenario import InputError
 
 _CHUNK = 4096  # bytes read at once; a tick brings a few dozen
 _UNUSED = 9600  # baud that a port without UART is told: it does nothing, but 1200 resets many boards

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
+from haptic_loop.models.scene import Plant
 from numpy.typing import NDArray
-
-from models.scene import Plant
 
 _Array = NDArray[np.floating[Any]]
 

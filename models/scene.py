@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-
-from models.device import Device
-from models.human import (
+from haptic_loop.models.device import Device
+from haptic_loop.models.human import (
     Cross,
     Hand,
     Human,
@@ -25,6 +23,7 @@ from models.human import (
     Port,
     check_holds,
 )
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # a third of a second: loaded where it is used
     import mujoco

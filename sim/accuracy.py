@@ -12,17 +12,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-
-from controller.delay import delay
-from controller.lti import Array, Lti
-from controller.tick import StepBuffer
-from design.files import off_table
-from models.hold import HeldPlant
-from sim.engines import EXPONENTIAL, default_integrator, pace, quiet_warnings
-from sim.run import AnyEngine, EngineSettings, Progress, Simulation, engine_name, make_engine, run
-from sim.scenario import InputError
-from sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode
-from sim.trace import Trace
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.controller.tick import StepBuffer
+from haptic_loop.design.files import off_table
+from haptic_loop.models.hold import HeldPlant
+from haptic_loop.sim.engines import EXPONENTIAL, default_integrator, pace, quiet_warnings
+from haptic_loop.sim.run import AnyEngine, EngineSettings, Progress, Simulation, engine_name, make_engine, run
+from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode
+from haptic_loop.sim.trace import Trace
 
 # ---- beside the exact engine
 
@@ -642,6 +641,6 @@ def simulated_growth(
 
 
 if __name__ == "__main__":
-    from cli.main import door
+    from haptic_loop.cli.main import door
 
     door("accuracy")

@@ -18,13 +18,12 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-
-from controller.lti import Array, Lti
-from models.human import Hand, Person
-from models.scene import Crowd, HumanSets, variants
-from sim.run import Progress
-from sim.scenario import Scenario
-from sim.stability import ClosedLoop, dominant_mode, exact_loops
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.models.human import Hand, Person
+from haptic_loop.models.scene import Crowd, HumanSets, variants
+from haptic_loop.sim.run import Progress
+from haptic_loop.sim.scenario import Scenario
+from haptic_loop.sim.stability import ClosedLoop, dominant_mode, exact_loops
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult

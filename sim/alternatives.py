@@ -12,19 +12,19 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from controller.lti import Array
-from design.certificate import assess, named
-from design.conditions import Condition
-from design.files import off_table
-from design.guarantees import guarantee_of
-from design.result import Chosen, Requirement, finite
-from design.transparency import decibels, transparency
-from sim.accuracy import credible, force_error
-from sim.couplings import Judged, choose, limits_of
-from sim.run import assemble, run
-from sim.scenario import Scenario, load
-from sim.stability import exact_growth, unstable
-from sim.trace import Trace
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.certificate import assess, named
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.files import off_table
+from haptic_loop.design.guarantees import guarantee_of
+from haptic_loop.design.result import Chosen, Requirement, finite
+from haptic_loop.design.transparency import decibels, transparency
+from haptic_loop.sim.accuracy import credible, force_error
+from haptic_loop.sim.couplings import Judged, choose, limits_of
+from haptic_loop.sim.run import assemble, run
+from haptic_loop.sim.scenario import Scenario, load
+from haptic_loop.sim.stability import exact_growth, unstable
+from haptic_loop.sim.trace import Trace
 
 #: (kind, condition) in the order of a table, and the samples of delay in all beyond which a design takes long
 _ROWS: dict[tuple[str, str | None], float] = {

@@ -8,23 +8,33 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from controller.coupling import Coupling
-from controller.lti import Array
-from design.arguments import number, of_kind, one_of, whole
-from design.files import plain
-from design.result import Design
-from sim.accuracy import MOST, EngineChoice, compare_engines, pick, settle
-from sim.couplings import given, limits_of
-from sim.engines import INTEGRATORS, Engine
-from sim.passivity_layer import EnergyNet, Plugged, Wanted, netted
-from sim.run import ENGINES, AnyEngine, EngineSettings, Progress, Simulation, assemble, engine_name, make_engine, run
-from sim.scenario import InputError, Scenario, require_linear
-from sim.stability import stability_of
-from sim.switching import Period, switching
-from sim.trace import Trace
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.arguments import number, of_kind, one_of, whole
+from haptic_loop.design.files import plain
+from haptic_loop.design.result import Design
+from haptic_loop.sim.accuracy import MOST, EngineChoice, compare_engines, pick, settle
+from haptic_loop.sim.couplings import given, limits_of
+from haptic_loop.sim.engines import INTEGRATORS, Engine
+from haptic_loop.sim.passivity_layer import EnergyNet, Plugged, Wanted, netted
+from haptic_loop.sim.run import (
+    ENGINES,
+    AnyEngine,
+    EngineSettings,
+    Progress,
+    Simulation,
+    assemble,
+    engine_name,
+    make_engine,
+    run,
+)
+from haptic_loop.sim.scenario import InputError, Scenario, require_linear
+from haptic_loop.sim.stability import stability_of
+from haptic_loop.sim.switching import Period, switching
+from haptic_loop.sim.trace import Trace
 
 if TYPE_CHECKING:
-    from sim import crowds
+    from haptic_loop.sim import crowds
 
 _MOST_HUMANS = 1_000_000
 _USUAL = EngineSettings()
@@ -177,8 +187,8 @@ def validate(
     Raises InputError for Coulomb friction (verdicts are of linear loops), ValueError for numbers out of range,
     TypeError for an argument of another type.
     """
-    from sim import crowds  # its workers are loaded where they are used
-    from sim.crowds import validate as validate_all
+    from haptic_loop.sim import crowds  # its workers are loaded where they are used
+    from haptic_loop.sim.crowds import validate as validate_all
 
     of_kind("scenario", scenario, Scenario, _SCENARIO)
     chosen = given(coupling)

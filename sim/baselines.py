@@ -12,19 +12,18 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-
-from controller.coupling import NoCoupling
-from controller.lti import Array
-from controller.tick import StepBuffer
-from design.result import CONDITIONS, Chosen, DesignFailed
-from models.hold import hold
-from models.scene import Crowd, variants
-from sim.accuracy import ForceError, force_error
-from sim.couplings import choose, limits_of
-from sim.engines import ExactEngine
-from sim.passivity_layer import BASELINES, Classic, EnergyNet, netted
-from sim.run import Simulation, assemble, run, run_blocks
-from sim.scenario import InputError, Scenario, require_even_ticks
+from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.controller.lti import Array
+from haptic_loop.controller.tick import StepBuffer
+from haptic_loop.design.result import CONDITIONS, Chosen, DesignFailed
+from haptic_loop.models.hold import hold
+from haptic_loop.models.scene import Crowd, variants
+from haptic_loop.sim.accuracy import ForceError, force_error
+from haptic_loop.sim.couplings import choose, limits_of
+from haptic_loop.sim.engines import ExactEngine
+from haptic_loop.sim.passivity_layer import BASELINES, Classic, EnergyNet, netted
+from haptic_loop.sim.run import Simulation, assemble, run, run_blocks
+from haptic_loop.sim.scenario import InputError, Scenario, require_even_ticks
 
 PAIRS, SECONDS, SLOW = 100, 10.0, 0.1  # of lossless hands, their time [s], their speed at the start [m/s]
 _AUDIBLE = 40.0  # [Hz] above which a force is felt as buzzing

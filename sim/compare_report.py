@@ -6,20 +6,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.coupling import Coupling
-from controller.loop import Loop
-from controller.lti import Array
-from controller.older import CONDITIONS as OLDER
-from controller.older import with_older
-from design import compare
-from design.files import off_table
-from design.optimal import nearby as nearby_with_price
-from design.program import Options
-from design.result import CONDITIONS, Chosen, Requirement
-from design.robustness import Nearby, robustness_nearby
-from design.transparency import Transparency, transparency
-from sim.couplings import CouplingFigures
-from sim.scenario import Scenario
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array
+from haptic_loop.controller.older import CONDITIONS as OLDER
+from haptic_loop.controller.older import with_older
+from haptic_loop.design import compare
+from haptic_loop.design.files import off_table
+from haptic_loop.design.optimal import nearby as nearby_with_price
+from haptic_loop.design.program import Options
+from haptic_loop.design.result import CONDITIONS, Chosen, Requirement
+from haptic_loop.design.robustness import Nearby, robustness_nearby
+from haptic_loop.design.transparency import Transparency, transparency
+from haptic_loop.sim.couplings import CouplingFigures
+from haptic_loop.sim.scenario import Scenario
 
 
 def nearby(loop: Loop, coupling: Coupling) -> Nearby:

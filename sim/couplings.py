@@ -7,24 +7,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from controller.coupling import PUBLISHED, Coupling, NoCoupling
-from controller.loop import DelayRange, Loop
-from controller.older import CONDITIONS as OLDER
-from controller.older import with_older
-from design.api import COUPLING, bare, fitting
-from design.certificate import RangesCheck, assess, check_ranges, verify
-from design.conditions import Condition
-from design.coupling_file import Stored, load
-from design.coverage import Limits, RangesFigures, covered_limits
-from design.designs import KINDS, design_by_kind, name_and_own, own_coupling, usual_condition
-from design.environments import THIS_ENVIRONMENT
-from design.files import off_table
-from design.guarantees import guarantee_of
-from design.lmi import ANY_ENVIRONMENT
-from design.own import called, place_of
-from design.result import CONDITIONS, Chosen, Design, DesignFailed, Requirement, switching_guarantee
-from sim import design_cache
-from sim.scenario import InputError, Scenario
+from haptic_loop.controller.coupling import PUBLISHED, Coupling, NoCoupling
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.older import CONDITIONS as OLDER
+from haptic_loop.controller.older import with_older
+from haptic_loop.design.api import COUPLING, bare, fitting
+from haptic_loop.design.certificate import RangesCheck, assess, check_ranges, verify
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.coupling_file import Stored, load
+from haptic_loop.design.coverage import Limits, RangesFigures, covered_limits
+from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, own_coupling, usual_condition
+from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.design.files import off_table
+from haptic_loop.design.guarantees import guarantee_of
+from haptic_loop.design.lmi import ANY_ENVIRONMENT
+from haptic_loop.design.own import called, place_of
+from haptic_loop.design.result import CONDITIONS, Chosen, Design, DesignFailed, Requirement, switching_guarantee
+from haptic_loop.sim import design_cache
+from haptic_loop.sim.scenario import InputError, Scenario
 
 NAMES = ("none", "published", *KINDS)
 

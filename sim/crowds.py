@@ -32,23 +32,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
-
-from controller.coupling import Coupling
-from controller.delay import Timing
-from controller.law import Law
-from controller.lti import Array
-from controller.ranges import Member
-from design.files import InputError
-from models.hold import hold
-from models.human import Population
-from models.scene import Crowd, HumanSets, Variants, crowds, variants
-from sim.accuracy import simulated_growth
-from sim.engines import EXPONENTIAL, LEAST, Engine, ExactEngine, MujocoBatchEngine, OneByOne
-from sim.run import Progress, Simulation, assemble, engine_name, make_engine
-from sim.scenario import Scenario
-from sim.stability import (
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.delay import Timing
+from haptic_loop.controller.law import Law
+from haptic_loop.controller.lti import Array
+from haptic_loop.controller.ranges import Member
+from haptic_loop.design.files import InputError
+from haptic_loop.models.hold import hold
+from haptic_loop.models.human import Population
+from haptic_loop.models.scene import Crowd, HumanSets, Variants, crowds, variants
+from haptic_loop.sim.accuracy import simulated_growth
+from haptic_loop.sim.engines import EXPONENTIAL, LEAST, Engine, ExactEngine, MujocoBatchEngine, OneByOne
+from haptic_loop.sim.run import Progress, Simulation, assemble, engine_name, make_engine
+from haptic_loop.sim.scenario import Scenario
+from haptic_loop.sim.stability import (
     Balance,
     ClosedLoop,
     ImpulseTest,
@@ -59,7 +56,9 @@ from sim.stability import (
     impulse_test,
     mujoco_loops,
 )
-from sim.switching import Switched, switched_crowd
+from haptic_loop.sim.switching import Switched, switched_crowd
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 if TYPE_CHECKING:
     from distributed import Client

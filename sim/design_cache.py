@@ -16,14 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.certificate import named, prove, prove_limiter, verify
+from haptic_loop.design.coupling_file import Certificate, Stored, digest, load, save, sealed
+from haptic_loop.design.files import one_command
+from haptic_loop.design.result import Design, NotProved
 
-import controller
-import design
-from controller.loop import Loop
-from design.certificate import named, prove, prove_limiter, verify
-from design.coupling_file import Certificate, Stored, digest, load, save, sealed
-from design.files import one_command
-from design.result import Design, NotProved
+from haptic_loop import controller, design
 
 _SHIPPED = Path(__file__).with_name("designs")
 _MOST = 200  # entries; the oldest go

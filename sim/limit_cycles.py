@@ -12,19 +12,18 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+from haptic_loop.controller.delay import Timing
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.models.device import Device
+from haptic_loop.models.hold import HeldPlant, hold
+from haptic_loop.models.human import Population
+from haptic_loop.models.scene import Crowd, Scene, crowds, variants
+from haptic_loop.sim.engines import MujocoBatchEngine, pace, profiler_off, quiet_warnings
+from haptic_loop.sim.run import Progress, run_block
+from haptic_loop.sim.stability import close
+from haptic_loop.sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen
 from numpy.typing import NDArray
-
-from controller.delay import Timing
-from controller.lti import Array, Lti
-from controller.tick import Process, StepBuffer
-from models.device import Device
-from models.hold import HeldPlant, hold
-from models.human import Population
-from models.scene import Crowd, Scene, crowds, variants
-from sim.engines import MujocoBatchEngine, pace, profiler_off, quiet_warnings
-from sim.run import Progress, run_block
-from sim.stability import close
-from sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen
 
 Cells = NDArray[np.intp]
 

@@ -15,8 +15,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-
-from controller.budget import (
+from haptic_loop.controller.budget import (
     EPS,
     BudgetFigures,
     EnergyBounding,
@@ -27,13 +26,13 @@ from controller.budget import (
     Shell,
     ShellFigures,
 )
-from controller.delay import LOST, Ticks, ages
-from controller.lti import Array
-from controller.tick import Net, Process
-from design.guarantees import ANY
-from design.result import Requirement
-from sim.run import Simulation
-from sim.scenario import InputError
+from haptic_loop.controller.delay import LOST, Ticks, ages
+from haptic_loop.controller.lti import Array
+from haptic_loop.controller.tick import Net, Process
+from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.result import Requirement
+from haptic_loop.sim.run import Simulation
+from haptic_loop.sim.scenario import InputError
 
 _HELD = 4  # ticks for which a device goes on holding a force, beyond the largest delay, where packets are lost
 

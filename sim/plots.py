@@ -12,6 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.files import printable, write
+from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.result import CONDITIONS
+from haptic_loop.sim.trace import Trace
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
@@ -20,17 +25,11 @@ from matplotlib.text import Text
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from controller.lti import Array
-from design.files import printable, write
-from design.guarantees import ANY
-from design.result import CONDITIONS
-from sim.trace import Trace
-
 if TYPE_CHECKING:  # whose figures are drawn
-    from design.compare import Limit, Sweep
-    from sim.accuracy import Row
-    from sim.baselines import Baselines
-    from sim.compare_report import Comparison, LimitCurves
+    from haptic_loop.design.compare import Limit, Sweep
+    from haptic_loop.sim.accuracy import Row
+    from haptic_loop.sim.baselines import Baselines
+    from haptic_loop.sim.compare_report import Comparison, LimitCurves
 
 # ----------------------------------------------------------------------------------------------------
 # The style.

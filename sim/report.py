@@ -6,19 +6,18 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-
-from controller.coupling import PUBLISHED, Coupling
-from controller.delay import LOST, Timing, VaryingDelay, ages
-from design.certificate import assess
-from design.files import off_table
-from design.guarantees import EncoderSteps
-from design.result import Chosen, finite, listed
-from sim.couplings import CouplingFigures
-from sim.run import Simulation
-from sim.scenario import Scenario, load
-from sim.stability import Stability, close, dominant_mode, eigenvalues, linear_growth
-from sim.switching import DelaysCovered, Period
-from sim.trace import Trace
+from haptic_loop.controller.coupling import PUBLISHED, Coupling
+from haptic_loop.controller.delay import LOST, Timing, VaryingDelay, ages
+from haptic_loop.design.certificate import assess
+from haptic_loop.design.files import off_table
+from haptic_loop.design.guarantees import EncoderSteps
+from haptic_loop.design.result import Chosen, finite, listed
+from haptic_loop.sim.couplings import CouplingFigures
+from haptic_loop.sim.run import Simulation
+from haptic_loop.sim.scenario import Scenario, load
+from haptic_loop.sim.stability import Stability, close, dominant_mode, eigenvalues, linear_growth
+from haptic_loop.sim.switching import DelaysCovered, Period
+from haptic_loop.sim.trace import Trace
 
 # ----------------------------------------------------------------------------------------------------
 # Couplings and encoders.

@@ -19,17 +19,16 @@ from typing import Any
 
 import msgspec
 import numpy as np
-
-from controller.coupling import Coupling
-from controller.delay import Timing
-from controller.loop import Loop
-from controller.lti import Array, Lti
-from controller.tick import Net, Process, StepBuffer
-from design.own import called
-from models.hold import HeldPlant, hold
-from models.human import Hand, Person
-from models.scene import Scene, build
-from sim.engines import (
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.delay import Timing
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.controller.tick import Net, Process, StepBuffer
+from haptic_loop.design.own import called
+from haptic_loop.models.hold import HeldPlant, hold
+from haptic_loop.models.human import Hand, Person
+from haptic_loop.models.scene import Scene, build
+from haptic_loop.sim.engines import (
     EXPONENTIAL,
     LEAST,
     Engine,
@@ -41,8 +40,8 @@ from sim.engines import (
     profiler_off,
     quiet_warnings,
 )
-from sim.scenario import InputError, Scenario
-from sim.trace import Trace
+from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.trace import Trace
 
 ENGINES = ("mujoco", "exact")
 AnyEngine = str | Engine | Callable[["Simulation"], Engine]  # a name, one of a user's own, or what makes it
@@ -363,12 +362,12 @@ def _own_engine(simulation: Simulation, engine: Engine | Callable[[Simulation], 
     if lacking := [part for part in ("start", "troubled") if not callable(getattr(made, part, None))]:
         has = "expected what has start(buffer), advance(k) and troubled() (sim.engines.Engine)"
         raise InputError(f"{name} has no {' and no '.join(lacking)}: {has}")
-    if simulation.timing and not type(made).__module__.startswith("sim."):
+    if simulation.timing and not type(made).__module__.startswith("haptic_loop."):
         raise InputError(f"{name}: uneven ticks (period, latency) run in {' and '.join(ENGINES)}")
     return made
 
 
 if __name__ == "__main__":
-    from cli.main import door
+    from haptic_loop.cli.main import door
 
     door("run")

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from controller.budget import BudgetFigures
-from controller.lti import Array
-from design.certificate import named
-from design.files import off_table
-from design.guarantees import ANY, CAVEATS, MAKING, EncoderSteps
-from design.result import Requirement, listed
-from design.robustness import Nearby
-from design.transparency import Transparency, transparency
-from sim import accuracy
-from sim.alternatives import Alternative
-from sim.api import ScenarioRun
-from sim.couplings import Judged
-from sim.passivity_layer import BaselineFigures, idle
-from sim.report import (
+from haptic_loop.controller.budget import BudgetFigures
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.certificate import named
+from haptic_loop.design.files import off_table
+from haptic_loop.design.guarantees import ANY, CAVEATS, MAKING, EncoderSteps
+from haptic_loop.design.result import Requirement, listed
+from haptic_loop.design.robustness import Nearby
+from haptic_loop.design.transparency import Transparency, transparency
+from haptic_loop.sim import accuracy
+from haptic_loop.sim.alternatives import Alternative
+from haptic_loop.sim.api import ScenarioRun
+from haptic_loop.sim.couplings import Judged
+from haptic_loop.sim.passivity_layer import BaselineFigures, idle
+from haptic_loop.sim.report import (
     PaperRow,
     UnevenTicks,
     VaryingDelays,
@@ -25,9 +25,9 @@ from sim.report import (
     encoder_steps,
     switched_stability,
 )
-from sim.run import beginnings, engine_name
-from sim.scenario import Scenario
-from sim.stability import Stability, stability_of
+from haptic_loop.sim.run import beginnings, engine_name
+from haptic_loop.sim.scenario import Scenario
+from haptic_loop.sim.stability import Stability, stability_of
 
 
 @dataclass(frozen=True, kw_only=True)

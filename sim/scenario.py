@@ -19,18 +19,26 @@ from typing import Any, Self, get_args
 
 import msgspec
 import numpy as np
-
-from controller.delay import Periods, Timing, VaryingDelay, drawn
-from controller.environment import RIGID_WALL, Block, Environment, Network, Spring, Wall, environment, parts_of
-from controller.loop import MOST_SAMPLES, DelayRange, Loop
-from controller.lti import Lti
-from controller.older import SCENARIOS as OLDER_SCENARIOS
-from controller.older import named_first, named_today
-from controller.ranges import Ranges, UncertainSpring
-from design.files import InputError, counted, printable, read_text, toml, write
-from design.own import called, named, place_of, reach_working_directory
-from models.device import MOST_DAMPING, Device, fields_of, require
-from models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
+from haptic_loop.controller.delay import Periods, Timing, VaryingDelay, drawn
+from haptic_loop.controller.environment import (
+    RIGID_WALL,
+    Block,
+    Environment,
+    Network,
+    Spring,
+    Wall,
+    environment,
+    parts_of,
+)
+from haptic_loop.controller.loop import MOST_SAMPLES, DelayRange, Loop
+from haptic_loop.controller.lti import Lti
+from haptic_loop.controller.older import SCENARIOS as OLDER_SCENARIOS
+from haptic_loop.controller.older import named_first, named_today
+from haptic_loop.controller.ranges import Ranges, UncertainSpring
+from haptic_loop.design.files import InputError, counted, printable, read_text, toml, write
+from haptic_loop.design.own import called, named, place_of, reach_working_directory
+from haptic_loop.models.device import MOST_DAMPING, Device, fields_of, require
+from haptic_loop.models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
 CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"

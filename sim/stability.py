@@ -11,19 +11,18 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from haptic_loop.controller.delay import Timing
+from haptic_loop.controller.law import State
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.design.files import off_table
+from haptic_loop.models.hold import HeldPlant, at_the_latch, hold
+from haptic_loop.models.scene import Scene, Variants
+from haptic_loop.sim.engines import Engine, MujocoBatchEngine, profiler_off, quiet_warnings
+from haptic_loop.sim.run import Simulation, beginnings, make_engine, run_blocks
+from haptic_loop.sim.trace import Trace
 from numpy.typing import ArrayLike, NDArray
-
-from controller.delay import Timing
-from controller.law import State
-from controller.loop import Loop
-from controller.lti import Array, Lti
-from controller.tick import Process, StepBuffer
-from design.files import off_table
-from models.hold import HeldPlant, at_the_latch, hold
-from models.scene import Scene, Variants
-from sim.engines import Engine, MujocoBatchEngine, profiler_off, quiet_warnings
-from sim.run import Simulation, beginnings, make_engine, run_blocks
-from sim.trace import Trace
 
 #: growth rates up to this [1/s] count as stable: eigenvalues at 1 (a free loop that drifts) come out at 1e-12
 MARGINAL = 1e-9

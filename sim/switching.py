@@ -18,21 +18,20 @@ from functools import cache
 from itertools import product
 
 import numpy as np
+from haptic_loop.controller.delay import LOST, Ticks, Timing, VaryingDelay, realising
+from haptic_loop.controller.loop import DelayRange
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.design.coverage import Switching
+from haptic_loop.design.files import off_table
+from haptic_loop.design.result import Chosen, switching_guarantee
+from haptic_loop.models.hold import HeldPlant, hold
+from haptic_loop.models.scene import Scene, Variants
+from haptic_loop.sim.engines import Engine, ExactEngine, ExactTimedEngine
+from haptic_loop.sim.run import Simulation
+from haptic_loop.sim.scenario import Scenario
+from haptic_loop.sim.stability import impulse_forces, impulse_growth
 from numpy.typing import NDArray
-
-from controller.delay import LOST, Ticks, Timing, VaryingDelay, realising
-from controller.loop import DelayRange
-from controller.lti import Array, Lti
-from controller.tick import Process, StepBuffer
-from design.coverage import Switching
-from design.files import off_table
-from design.result import Chosen, switching_guarantee
-from models.hold import HeldPlant, hold
-from models.scene import Scene, Variants
-from sim.engines import Engine, ExactEngine, ExactTimedEngine
-from sim.run import Simulation
-from sim.scenario import Scenario
-from sim.stability import impulse_forces, impulse_growth
 
 _SEARCHED = 1600  # ticks of greedy switching in which the worst period is sought
 _LONGEST_PERIOD = 250  # [ticks]

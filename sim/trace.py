@@ -23,11 +23,10 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
 
 import numpy as np
+from haptic_loop.controller.lti import Array, ReadOnly, frozen
+from haptic_loop.controller.tick import Net
+from haptic_loop.design.files import InputError, read_arrays, write
 from numpy.typing import NDArray
-
-from controller.lti import Array, ReadOnly, frozen
-from controller.tick import Net
-from design.files import InputError, read_arrays, write
 
 _MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep
 _STATES = {"z": 2, "s": 2}
@@ -332,6 +331,6 @@ def growths(trace: Trace) -> list[Growth]:
 
 
 if __name__ == "__main__":
-    from cli.main import door
+    from haptic_loop.cli.main import door
 
     door("trace")

@@ -7,16 +7,15 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-
-from controller.environment import Network
-from controller.lti import Array
-from design.files import off_table
-from design.result import finite
-from models.human import Hand, Human, Link, Person
-from sim.adversary import Worst
-from sim.crowds import Findings, Validation
-from sim.run import engine_name
-from sim.stability import unstable
+from haptic_loop.controller.environment import Network
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.files import off_table
+from haptic_loop.design.result import finite
+from haptic_loop.models.human import Hand, Human, Link, Person
+from haptic_loop.sim.adversary import Worst
+from haptic_loop.sim.crowds import Findings, Validation
+from haptic_loop.sim.run import engine_name
+from haptic_loop.sim.stability import unstable
 
 _SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be slower in its last quarter than before
 _ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up

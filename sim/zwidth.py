@@ -20,27 +20,26 @@ from typing import TypeVar
 
 import msgspec
 import numpy as np
+from haptic_loop.controller import environment
+from haptic_loop.controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
+from haptic_loop.controller.law import Law, Limiter
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.controller.tick import Process
+from haptic_loop.design.audit import check_loop, edge
+from haptic_loop.design.certificate import named
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.coverage import covered_limits
+from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.result import CONDITIONS, Requirement, refusal
+from haptic_loop.models.device import Device
+from haptic_loop.models.human import Population
+from haptic_loop.sim import limit_cycles
+from haptic_loop.sim.run import Progress
+from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.stability import MARGINAL
 from numpy.typing import NDArray
-
-from controller import environment
-from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
-from controller.law import Law, Limiter
-from controller.loop import Loop
-from controller.lti import Array, Lti
-from controller.tick import Process
-from design.audit import check_loop, edge
-from design.certificate import named
-from design.conditions import Condition
-from design.coverage import covered_limits
-from design.environments import THIS_ENVIRONMENT
-from design.guarantees import ANY
-from design.result import CONDITIONS, Requirement, refusal
-from models.device import Device
-from models.human import Population
-from sim import limit_cycles
-from sim.run import Progress
-from sim.scenario import InputError
-from sim.stability import MARGINAL
 
 # ----------------------------------------------------------------------------------------------------
 # What K and B are, and what is asked of the loop with them.
@@ -624,6 +623,6 @@ def _last(tried: Array, safe: NDArray[np.bool_], between: Callable[[float, float
 
 
 if __name__ == "__main__":
-    from cli.main import door
+    from haptic_loop.cli.main import door
 
     door("zwidth")

@@ -9,19 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-from controller.environment import RIGID_WALL, Network
-from controller.lti import Array
-from design.coverage import Limits, RangesFigures
-from design.files import off_table, write
-from design.guarantees import CAVEATS
-from design.result import Requirement
-from sim.couplings import CouplingFigures, Judged
-from sim.limit_cycles import UNDECIDED, Plan
-from sim.scenario import Scenario
-from sim.stability import MARGINAL
-from sim.trace import slowest_seen
-from sim.zwidth import MODEL_KEPT, Map, MapError, Mark, Sweep, contact_springs, map_error
+from haptic_loop.controller.environment import RIGID_WALL, Network
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.coverage import Limits, RangesFigures
+from haptic_loop.design.files import off_table, write
+from haptic_loop.design.guarantees import CAVEATS
+from haptic_loop.design.result import Requirement
+from haptic_loop.sim.couplings import CouplingFigures, Judged
+from haptic_loop.sim.limit_cycles import UNDECIDED, Plan
+from haptic_loop.sim.scenario import Scenario
+from haptic_loop.sim.stability import MARGINAL
+from haptic_loop.sim.trace import slowest_seen
+from haptic_loop.sim.zwidth import MODEL_KEPT, Map, MapError, Mark, Sweep, contact_springs, map_error
 
 _NOT_REACHED = "not reached before the interruption"
 

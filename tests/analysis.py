@@ -8,11 +8,10 @@ from dataclasses import dataclass
 
 import cvxpy as cp
 import numpy as np
-
-from controller.delay import delay
-from controller.lti import Array, Lti, taps
-from design.conditions import dampings, regular_part
-from design.lmi import (
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.lti import Array, Lti, taps
+from haptic_loop.design.conditions import dampings, regular_part
+from haptic_loop.design.lmi import (
     Ports,
     balanced,
     check_passive,

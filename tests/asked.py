@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from controller.environment import GROUND, Network, Spring, Wall
-from controller.loop import DelayRange, Loop
-from design import conditions, environments
+from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.design import conditions, environments
 
 
 def loop(T, delta, theta=None, walls=(), psi=None, environment=None, **further) -> Loop:

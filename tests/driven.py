@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-
-from controller.tick import Process, StepBuffer
-from models.scene import Scene, Variants
-from sim.engines import Engine
-from sim.run import _Outside, run_blocks
+from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.models.scene import Scene, Variants
+from haptic_loop.sim.engines import Engine
+from haptic_loop.sim.run import _Outside, run_blocks
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,12 +31,12 @@ def share_designs(folder: Path, patch=setattr) -> None:
     That is: designs, bounds, the price of a wrong model, what limited forces ask, and how the couplings beside a run's
     own are judged. What makes them, design.designs and the modules behind it, is as it was.
     """
-    import cli.design
-    from design import api, bound, compare, coverage, designs, optimal
-    from sim import alternatives, couplings
+    import haptic_loop.cli.design
+    from haptic_loop.design import api, bound, compare, coverage, designs, optimal
+    from haptic_loop.sim import alternatives, couplings
 
     for made, modules in (
-        (designs.design_by_kind, (cli.design, api, compare, couplings)),
+        (designs.design_by_kind, (haptic_loop.cli.design, api, compare, couplings)),
         (bound.bound, (bound, compare)),
         (optimal.spread, (optimal,)),
         (coverage.required_damping, (coverage,)),
@@ -49,7 +49,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
 
 def _remembering(folder: Path, make):
     """The same function, with its results kept in the folder; failures and loops without a digest are not."""
-    from design.coupling_file import digest
+    from haptic_loop.design.coupling_file import digest
 
     @functools.wraps(make)
     def remembered(loop, *asked, **options):
@@ -72,10 +72,10 @@ def _remembering(folder: Path, make):
 
 def _asked(make, loop, *asked, **options) -> list[tuple[str, str]]:
     """What a call asks of the loop, defaults by their values, in words that two equal calls share."""
-    from design.conditions import Condition
-    from design.coupling_file import digest
-    from design.designs import usual_condition
-    from design.program import DEFAULT
+    from haptic_loop.design.conditions import Condition
+    from haptic_loop.design.coupling_file import digest
+    from haptic_loop.design.designs import usual_condition
+    from haptic_loop.design.program import DEFAULT
 
     call = inspect.signature(make).bind(loop, *asked, **options)
     call.apply_defaults()
@@ -114,7 +114,7 @@ def run(command: str | list[str], folder: Path, **environment: str) -> subproces
 
 def _command(words: list[str]) -> None:
     """In the child: the command by its door, or the file; the code that it leaves with."""
-    from cli.main import COMMANDS, door
+    from haptic_loop.cli.main import COMMANDS, door
 
     if words[0] != "-m":
         sys.argv = words
@@ -157,7 +157,7 @@ def _serve() -> None:
     import matplotlib as mpl
 
     mpl.use("Agg")
-    from cli.main import COMMANDS
+    from haptic_loop.cli.main import COMMANDS
 
     for name in ["matplotlib.pyplot", "clarabel", *(f"cli.{command}" for command in COMMANDS)]:
         import_module(name)

@@ -1,10 +1,10 @@
 """Sessions in virtual time: what the tests of hw/ rehearse with."""
 
-from hw.emulator import Emulator, FaultInjection
-from hw.limits import SafetyLimits
-from hw.monitor import LinkSettings
-from hw.rehearsal import Rehearsal
-from hw.session import Session
+from haptic_loop.hw.emulator import Emulator, FaultInjection
+from haptic_loop.hw.limits import SafetyLimits
+from haptic_loop.hw.monitor import LinkSettings
+from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.session import Session
 
 FAST = LinkSettings(measure=100)
 AT_REST = LinkSettings(measure=100, test_encoders=False)  # nothing moves the handles before the person does

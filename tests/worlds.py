@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-
-from controller.coupling import ForceFilter, InternalModel, SpringDamper
-from controller.delay import delay
-from controller.environment import Network, Spring
-from controller.loop import Loop
+from haptic_loop.controller.coupling import ForceFilter, InternalModel, SpringDamper
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.environment import Network, Spring
+from haptic_loop.controller.loop import Loop
 
 #: Figure 4 as we read it: contact 1 -(K1, B1)- M -(K2, B2)- contact 2, the mass free.
 FIGURE_4 = Network(

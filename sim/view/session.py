@@ -20,24 +20,23 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 
 import numpy as np
-
-from controller.arithmetic import SingularLoop
-from controller.coupling import Coupling
-from controller.lti import Array
-from controller.tick import StepBuffer
-from design.certificate import assess
-from design.conditions import Condition
-from design.coverage import Limits
-from design.designs import KINDS, name_and_own
-from design.guarantees import guarantee_of
-from design.result import Chosen, DesignFailed, Requirement
-from models.hold import HeldPlant, hold
-from models.scene import Plant, Scene
-from sim.couplings import NAMES, choose, limits_of
-from sim.engines import ExactEngine
-from sim.run import Simulation, assemble, outside_forces, run_block
-from sim.scenario import LONGEST_DELAY, InputError, Scenario
-from sim.stability import Mode, worst_mode
+from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.lti import Array
+from haptic_loop.controller.tick import StepBuffer
+from haptic_loop.design.certificate import assess
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.coverage import Limits
+from haptic_loop.design.designs import KINDS, name_and_own
+from haptic_loop.design.guarantees import guarantee_of
+from haptic_loop.design.result import Chosen, DesignFailed, Requirement
+from haptic_loop.models.hold import HeldPlant, hold
+from haptic_loop.models.scene import Plant, Scene
+from haptic_loop.sim.couplings import NAMES, choose, limits_of
+from haptic_loop.sim.engines import ExactEngine
+from haptic_loop.sim.run import Simulation, assemble, outside_forces, run_block
+from haptic_loop.sim.scenario import LONGEST_DELAY, InputError, Scenario
+from haptic_loop.sim.stability import Mode, worst_mode
 
 # ----------------------------------------------------------------------------------------------------
 # What may happen to a running loop, by a key or by a script.

@@ -21,14 +21,13 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import mujoco
 import numpy as np
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.files import InputError, check_file, write
+from haptic_loop.design.result import Requirement
+from haptic_loop.models.scene import APART, DRAWN, STEP, Scene
+from haptic_loop.sim.view.session import GIVEN, HISTORY, KEYS, Couple, Frame, Grip, LiveLoop, PreparedLoop, words
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
-
-from controller.lti import Array
-from design.files import InputError, check_file, write
-from design.result import Requirement
-from models.scene import APART, DRAWN, STEP, Scene
-from sim.view.session import GIVEN, HISTORY, KEYS, Couple, Frame, Grip, LiveLoop, PreparedLoop, words
 
 if TYPE_CHECKING:
     from mujoco import viewer

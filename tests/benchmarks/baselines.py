@@ -20,17 +20,17 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 import numpy as np
+from haptic_loop.controller.budget import EnergyBounding, EnergyBudget, Packets, PassivityControl, Shell
+from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.environment import Networks, environment
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.models.hold import HeldPlant, hold
+from haptic_loop.models.scene import Crowd, variants
+from haptic_loop.sim.run import assemble, outside_forces
+from haptic_loop.sim.scenario import Scenario, load
 
-from controller.budget import EnergyBounding, EnergyBudget, Packets, PassivityControl, Shell
-from controller.coupling import Coupling, NoCoupling, SpringDamper
-from controller.delay import delay
-from controller.environment import Networks, environment
-from controller.lti import Array, Lti
-from design import design_coupling
-from models.hold import HeldPlant, hold
-from models.scene import Crowd, variants
-from sim.run import assemble, outside_forces
-from sim.scenario import Scenario, load
+from haptic_loop import design_coupling
 
 STEP = 1e-5  # [m] of the encoders
 SLOW = 0.1  # [m/s] with which hands are started

@@ -17,11 +17,10 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-
-from hw.emulator import _EmulatedPlant, nobody
-from hw.identify import Estimate, chirp, identify
-from models.device import RigidDevice
-from sim.scenario import load
+from haptic_loop.hw.emulator import _EmulatedPlant, nobody
+from haptic_loop.hw.identify import Estimate, chirp, identify
+from haptic_loop.models.device import RigidDevice
+from haptic_loop.sim.scenario import load
 
 FORCE_STEP = 4e-4  # [N] of the wire
 NOISE = (0.0, 0.0, 0.2, 0.4)  # [encoder steps]

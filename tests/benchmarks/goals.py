@@ -21,13 +21,12 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from haptic_loop.sim.accuracy import position_error, simulated_growth
+from haptic_loop.sim.couplings import choose, limits_of
+from haptic_loop.sim.engines import EXPONENTIAL
+from haptic_loop.sim.run import assemble
+from haptic_loop.sim.stability import exact_growth
 from test_engine_cost import SCENES, cpu_seconds, looped, raw
-
-from sim.accuracy import position_error, simulated_growth
-from sim.couplings import choose, limits_of
-from sim.engines import EXPONENTIAL
-from sim.run import assemble
-from sim.stability import exact_growth
 
 ROOT = Path(__file__).parents[2]
 PAGES = {"engines": "docs/accuracy-engine.md", "cold": "docs/accuracy.md"}

@@ -14,11 +14,10 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
-
-from controller.environment import GROUND, Network, Spring
-from controller.loop import Loop
-from design.bound import bound
-from design.optimal import design
+from haptic_loop.controller.environment import GROUND, Network, Spring
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.bound import bound
+from haptic_loop.design.optimal import design
 
 
 def hostile(rng: np.random.Generator) -> Loop:

@@ -14,10 +14,9 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-
-from controller.lti import Array
-from hw.friction import Friction
-from hw.identify import chirp, identify
+from haptic_loop.controller.lti import Array
+from haptic_loop.hw.friction import Friction
+from haptic_loop.hw.identify import chirp, identify
 
 #: what the fit of before, one mass and Coulomb friction by output error, made of these; "none" of all others
 EARLIER = {"coulomb 0.05, slip 0.02": "3.5 % above", "hand (0.01, 0.1, 20.0)": "7 to 17 % above"}

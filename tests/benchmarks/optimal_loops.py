@@ -17,13 +17,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
+from haptic_loop.design.bound import MOST, bound
+from haptic_loop.design.optimal import design
+from haptic_loop.design.program import Options
+from haptic_loop.design.robustness import robustness
+from haptic_loop.sim.scenario import load
 from threadpoolctl import threadpool_limits
-
-from design.bound import MOST, bound
-from design.optimal import design
-from design.program import Options
-from design.robustness import robustness
-from sim.scenario import load
 
 T = TypeVar("T")
 PATIENT = Options(seconds=600)  # so that a busy machine climbs as far as an idle one

@@ -18,15 +18,14 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-
-from controller.coupling import PUBLISHED
-from controller.lti import Array
-from models.scene import _actuation, _tendon_jacobian
-from sim.engines import EXPONENTIAL
-from sim.run import Simulation, assemble, make_engine, outside_forces, run
-from sim.scenario import load
-from sim.stability import MARGINAL, _measured_growth, close, dominant_mode
-from sim.trace import Trace
+from haptic_loop.controller.coupling import PUBLISHED
+from haptic_loop.controller.lti import Array
+from haptic_loop.models.scene import _actuation, _tendon_jacobian
+from haptic_loop.sim.engines import EXPONENTIAL
+from haptic_loop.sim.run import Simulation, assemble, make_engine, outside_forces, run
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.stability import MARGINAL, _measured_growth, close, dominant_mode
+from haptic_loop.sim.trace import Trace
 
 States = tuple[Array, Array, Array]  # process states (N, order), plant states (N, 2n), forces (N, m)
 Peer = Callable[[Simulation, Array], States]  # from rest, under outside forces (N, outside)

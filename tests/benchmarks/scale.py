@@ -15,16 +15,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from controller.coupling import PUBLISHED, SpringDamper
-from controller.loop import Loop
-from design import certify, design_coupling
-from design.certificate import prove_limiter
-from design.result import Design, NotProved
-from models.scene import MIXED
-from sim.crowds import Validation, validate
-from sim.run import assemble, run
-from sim.scenario import load, parse
-from sim.stability import exact_growth
+from haptic_loop.controller.coupling import PUBLISHED, SpringDamper
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.certificate import prove_limiter
+from haptic_loop.design.result import Design, NotProved
+from haptic_loop.models.scene import MIXED
+from haptic_loop.sim.crowds import Validation, validate
+from haptic_loop.sim.run import assemble, run
+from haptic_loop.sim.scenario import load, parse
+from haptic_loop.sim.stability import exact_growth
+
+from haptic_loop import certify, design_coupling
 
 
 def star(n: int) -> str:

@@ -9,9 +9,8 @@ a step) and the force of a partner whom the hand resists: up to 6 N, at 0.3 to 8
 import sys
 
 import numpy as np
-
-from hw.monitor import EncoderMonitor
-from hw.protocol import SafetyStop
+from haptic_loop.hw.monitor import EncoderMonitor
+from haptic_loop.hw.protocol import SafetyStop
 
 T, TICKS, SUBSTEPS = 1.2e-3, 1000, 8
 FORCE_STEP = 4e-4  # [N]

@@ -4,16 +4,15 @@ make bench
 """
 
 import pytest
-
-from controller.coupling import PUBLISHED
-from design import fixed_order as ccl
-from design import optimal, spring_damper
-from design.audit import audit
-from design.certificate import assess, prove, verify
-from design.coupling_file import Stored
-from design.program import LADDER, Options
-from design.transparency import decibels
-from sim.scenario import load
+from haptic_loop.controller.coupling import PUBLISHED
+from haptic_loop.design import fixed_order as ccl
+from haptic_loop.design import optimal, spring_damper
+from haptic_loop.design.audit import audit
+from haptic_loop.design.certificate import assess, prove, verify
+from haptic_loop.design.coupling_file import Stored
+from haptic_loop.design.program import LADDER, Options
+from haptic_loop.design.transparency import decibels
+from haptic_loop.sim.scenario import load
 
 pytestmark = pytest.mark.benchmark(group="design")
 LOOP = load().loop("I")

@@ -13,17 +13,16 @@ import time
 import mujoco
 import numpy as np
 import pytest
-
-from controller.coupling import PUBLISHED
-from controller.tick import StepBuffer
-from models.device import CompliantDevice
-from models.hold import hold
-from models.scene import crowds, plant, variants
-from sim.accuracy import _measured_hold, default_substeps, pace, simulated_growth
-from sim.engines import EXPONENTIAL, ExactEngine, MujocoBatchEngine, _discretised, profiler_off
-from sim.run import assemble, make_engine, run, run_block
-from sim.scenario import load
-from sim.stability import exact_growth
+from haptic_loop.controller.coupling import PUBLISHED
+from haptic_loop.controller.tick import StepBuffer
+from haptic_loop.models.device import CompliantDevice
+from haptic_loop.models.hold import hold
+from haptic_loop.models.scene import crowds, plant, variants
+from haptic_loop.sim.accuracy import _measured_hold, default_substeps, pace, simulated_growth
+from haptic_loop.sim.engines import EXPONENTIAL, ExactEngine, MujocoBatchEngine, _discretised, profiler_off
+from haptic_loop.sim.run import assemble, make_engine, run, run_block
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.stability import exact_growth
 
 pytestmark = pytest.mark.benchmark(group="engines")
 ROUNDS = 9

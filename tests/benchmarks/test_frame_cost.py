@@ -7,9 +7,8 @@ import random
 import time
 
 import pytest
-
-from hw.device_state import Device
-from hw.protocol import Config, Decoder, Force, Info, State, encode
+from haptic_loop.hw.device_state import Device
+from haptic_loop.hw.protocol import Config, Decoder, Force, Info, State, encode
 
 pytestmark = pytest.mark.benchmark(group="frame", timer=time.process_time)  # CPU time: others may use the machine
 

@@ -8,12 +8,11 @@ from functools import partial
 
 import numpy as np
 import pytest
+from haptic_loop.controller.complementarity import BoxProblem
+from haptic_loop.controller.coupling import PUBLISHED, SpringDamper
+from haptic_loop.sim.run import assemble, run
+from haptic_loop.sim.scenario import load
 from msgspec.structs import replace
-
-from controller.complementarity import BoxProblem
-from controller.coupling import PUBLISHED, SpringDamper
-from sim.run import assemble, run
-from sim.scenario import load
 
 pytestmark = pytest.mark.benchmark(group="loop")
 

@@ -8,15 +8,15 @@ import time
 import numpy as np
 import pytest
 from asked import this_environment
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
+from haptic_loop.controller.tick import StepBuffer
+from haptic_loop.models.hold import hold
+from haptic_loop.models.scene import Variants, crowds, variants
+from haptic_loop.sim.engines import ExactEngine, MujocoBatchEngine, profiler_off
+from haptic_loop.sim.run import assemble, run_block
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
 
-from controller.coupling import PUBLISHED, NoCoupling
-from controller.tick import StepBuffer
-from models.hold import hold
-from models.scene import Variants, crowds, variants
-from sim.engines import ExactEngine, MujocoBatchEngine, profiler_off
-from sim.run import assemble, run_block
-from sim.scenario import load
-from sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
 from tests.checks.tightness import attempts
 
 pytestmark = pytest.mark.benchmark(group="validation")

@@ -17,16 +17,17 @@ import sys
 import time
 from collections import defaultdict
 
-from hw.control import certified_couplings
-from hw.emulator import Emulator, Terminal
-from hw.haptic_device import SerialDevice
-from hw.limits import ENDED, Stage
-from hw.monitor import LinkSettings
-from hw.protocol import Command, Decoder, Force, State, encode
-from hw.recording import Recorder
-from hw.session import Operator, session_for
-from hw.transport import Live, SerialPort
-from sim.scenario import load
+from haptic_loop.hw.control import certified_couplings
+from haptic_loop.hw.emulator import Emulator, Terminal
+from haptic_loop.hw.haptic_device import SerialDevice
+from haptic_loop.hw.limits import ENDED, Stage
+from haptic_loop.hw.monitor import LinkSettings
+from haptic_loop.hw.protocol import Command, Decoder, Force, State, encode
+from haptic_loop.hw.recording import Recorder
+from haptic_loop.hw.session import Operator, session_for
+from haptic_loop.hw.transport import Live, SerialPort
+from haptic_loop.sim.scenario import load
+
 from tests.checks.faults import _lively
 
 BLOCK = 200

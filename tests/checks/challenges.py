@@ -16,22 +16,21 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-
-from controller.coupling import SpringDamper
-from controller.environment import GROUND, Network, Spring, Wall
-from controller.loop import Loop
-from controller.lti import Array
-from controller.tick import Process, StepBuffer
-from design.conditions import any_environment, encoder_friction, this_environment
-from design.environments import LIMITER, THIS_ENVIRONMENT
-from models.device import RigidDevice
-from models.hold import HeldPlant, hold
-from models.human import Human, Link
-from models.scene import Crowd, variants
-from sim.engines import ExactEngine
-from sim.passivity_layer import EnergyNet, netted
-from sim.run import assemble, run_blocks
-from sim.scenario import Scenario
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array
+from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.design.conditions import any_environment, encoder_friction, this_environment
+from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT
+from haptic_loop.models.device import RigidDevice
+from haptic_loop.models.hold import HeldPlant, hold
+from haptic_loop.models.human import Human, Link
+from haptic_loop.models.scene import Crowd, variants
+from haptic_loop.sim.engines import ExactEngine
+from haptic_loop.sim.passivity_layer import EnergyNet, netted
+from haptic_loop.sim.run import assemble, run_blocks
+from haptic_loop.sim.scenario import Scenario
 
 ENOUGH = 1.02  # times what a guarantee asks for
 _GIVEN = 0.005  # [J] of the budget

@@ -11,17 +11,17 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
+from haptic_loop.hw.control import certified_couplings
+from haptic_loop.hw.emulator import Emulator
+from haptic_loop.hw.limits import Stage
+from haptic_loop.hw.monitor import LinkSettings
+from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.session import session_for
+from haptic_loop.sim.couplings import choose
+from haptic_loop.sim.crowds import Validation, _as_worker, validate
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.stability import unstable
 
-from hw.control import certified_couplings
-from hw.emulator import Emulator
-from hw.limits import Stage
-from hw.monitor import LinkSettings
-from hw.rehearsal import Rehearsal
-from hw.session import session_for
-from sim.couplings import choose
-from sim.crowds import Validation, _as_worker, validate
-from sim.scenario import load
-from sim.stability import unstable
 from tests.checks.faults import person
 
 

@@ -13,15 +13,14 @@ from typing import Any
 
 import msgspec
 import numpy as np
-
-from hw.control import CertifiedCoupling, certified_couplings
-from hw.emulator import Emulator, FaultInjection, info_of
-from hw.limits import ENDED, SafetyLimits, Stage
-from hw.monitor import Ages, LinkSettings
-from hw.protocol import Info
-from hw.rehearsal import Plan, Rehearsal
-from hw.session import Said, Session
-from sim.scenario import Scenario, load
+from haptic_loop.hw.control import CertifiedCoupling, certified_couplings
+from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of
+from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage
+from haptic_loop.hw.monitor import Ages, LinkSettings
+from haptic_loop.hw.protocol import Info
+from haptic_loop.hw.rehearsal import Plan, Rehearsal
+from haptic_loop.hw.session import Said, Session
+from haptic_loop.sim.scenario import Scenario, load
 
 _WHEN = 0.45  # [s] after arming: the gain is 1 after 0.25 s, the person moves after 0.31 s
 _LASTS = 0.75  # [s] after arming that a case is watched

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-
-from controller.coupling import PUBLISHED, Coupling, SpringDamper
-from models.device import CompliantDevice
-from models.human import Human, Link
-from sim.accuracy import _check_substeps, default_substeps, position_error, simulated_growth
-from sim.run import Simulation, assemble, make_engine, run
-from sim.scenario import InputError, Scenario, load
-from sim.stability import exact_growth
+from haptic_loop.controller.coupling import PUBLISHED, Coupling, SpringDamper
+from haptic_loop.models.device import CompliantDevice
+from haptic_loop.models.human import Human, Link
+from haptic_loop.sim.accuracy import _check_substeps, default_substeps, position_error, simulated_growth
+from haptic_loop.sim.run import Simulation, assemble, make_engine, run
+from haptic_loop.sim.scenario import InputError, Scenario, load
+from haptic_loop.sim.stability import exact_growth
 
 CLOSE = 1e-2  # [1/s] what the growth rate of the rule's own choice may be off
 #: a setting holds if it is stable, has the exact verdict, and errs by less than both of these

@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from cli import render
-from cli.suite import Check, Part, Row, table
-from sim.stability import unstable
+from haptic_loop.cli import render
+from haptic_loop.cli.suite import Check, Part, Row, table
+from haptic_loop.sim.stability import unstable
+
 from tests.checks.challenges import challenges
 from tests.checks.endurance import endurance
 from tests.checks.faults import rehearse_faults

@@ -12,18 +12,17 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-
-from controller.coupling import Coupling, NoCoupling, SpringDamper
-from controller.environment import Network, Spring
-from controller.loop import Loop
-from design.certificate import prove, required_damping
-from design.result import NotProved
-from models.device import CompliantDevice, RigidDevice
-from models.human import Human, Population, Voluntary
-from sim.accuracy import settle
-from sim.run import assemble, make_engine, run
-from sim.scenario import InputError, Scenario
-from sim.stability import _NOT_EXCITED, disagree, stability_of
+from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
+from haptic_loop.controller.environment import Network, Spring
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.certificate import prove, required_damping
+from haptic_loop.design.result import NotProved
+from haptic_loop.models.device import CompliantDevice, RigidDevice
+from haptic_loop.models.human import Human, Population, Voluntary
+from haptic_loop.sim.accuracy import settle
+from haptic_loop.sim.run import assemble, make_engine, run
+from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.stability import _NOT_EXCITED, disagree, stability_of
 
 _TOO_CLOSE = 1e-4  # of the damping: a proof needs some room
 _HANDS = Population()

@@ -11,14 +11,13 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-
-from controller.coupling import Coupling, NoCoupling
-from controller.lti import Array
-from design.environments import THIS_ENVIRONMENT
-from sim import plots
-from sim.adversary import Worst, search
-from sim.couplings import choose
-from sim.scenario import Scenario, load
+from haptic_loop.controller.coupling import Coupling, NoCoupling
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.sim import plots
+from haptic_loop.sim.adversary import Worst, search
+from haptic_loop.sim.couplings import choose
+from haptic_loop.sim.scenario import Scenario, load
 
 
 @dataclass(frozen=True)

@@ -15,16 +15,15 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-
-from controller.arithmetic import SingularLoop
-from controller.coupling import SpringDamper
-from controller.environment import GROUND, Network, Spring
-from controller.loop import Loop
-from controller.lti import Array
-from design.environments import THIS_ENVIRONMENT
-from models.hold import at_the_latch, hold
-from models.scene import Plant
-from sim.stability import close
+from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.models.hold import at_the_latch, hold
+from haptic_loop.models.scene import Plant
+from haptic_loop.sim.stability import close
 
 T, _LONG = 1e-3, 1.6e-3  # [s]
 HANDS, _TICKS = 40, 4000

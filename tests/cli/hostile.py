@@ -30,10 +30,9 @@ import hostile_files
 import hostile_words
 import matplotlib.figure  # noqa: F401 - once, before the forks
 import numpy as np
+from haptic_loop.cli import options
+from haptic_loop.cli.main import COMMANDS, execute
 from hostile_cases import BUT, Case, furnish, npz, put
-
-from cli import options
-from cli.main import COMMANDS, execute
 
 SECONDS = 20  # of processor time that a case may take
 
@@ -77,7 +76,7 @@ def streams() -> Iterator[Case]:
     def backend() -> None:
         os.environ["MPLBACKEND"] = "nonsense"
         script = f"import sys; sys.path.insert(0, {str(Path(options.__file__).parents[1])!r}); "
-        script += "from cli.main import door; door('trace')"
+        script += "from haptic_loop.cli.main import door; door('trace')"
         os.execv(sys.executable, [sys.executable, "-c", script, "t.npz", "--plot", "a.png"])
 
     yield Case("MPLBACKEND=nonsense", ("trace",), (0,), before=backend)
@@ -165,7 +164,7 @@ def run(case: Case, place: Path) -> int:
             after = {str(path.relative_to(files)): content(path) for path in files.rglob("*")}
             put(place / "changed", json.dumps({name: one for name, one in after.items() if before.get(name) != one}))
         command, *words = case.words
-        execute(lambda argv: put(place / "begun", "") or import_module(f"cli.{command}").main(argv), words)
+        execute(lambda argv: put(place / "begun", "") or import_module(f"haptic_loop.cli.{command}").main(argv), words)
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 0
     except BaseException:
@@ -237,7 +236,7 @@ def main() -> int:
     """Run every case whose name holds the word of the command line."""
     word = sys.argv[1] if len(sys.argv) > 1 else ""
     for command in COMMANDS:
-        import_module(f"cli.{command}")
+        import_module(f"haptic_loop.cli.{command}")
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.environ["HAPTIC_LOOP_CACHE"] = "off"  # every case takes as long as the first
     if shared := os.environ.get("SHARED_DESIGNS"):

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-from controller.coupling import SpringDamper
-from design.certificate import prove
-from design.coupling_file import Stored, save
-from sim.scenario import SCENARIOS, load
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.design.certificate import prove
+from haptic_loop.design.coupling_file import Stored, save
+from haptic_loop.sim.scenario import SCENARIOS, load
 
 BUT = 2  # exit code of bad input
 

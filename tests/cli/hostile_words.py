@@ -296,10 +296,10 @@ REFUSED = {
         --mark 1 | --mark 1,2,3 | --points -1 | --velocity-filter 0""",
     "emulator": "--fault axis9:jump | --fault drop=-1 | --coulomb -1 | --pace 0 | --parent 1 | --duration -1",
 }
-HUMANS = """from models.human import Human, Link
+HUMANS = """from haptic_loop.models.human import Human, Link
 humans = [Human((Link(0.3, 3.0, 200.0),))] * 2
 """
-_PORT = """from models.human import *
+_PORT = """from haptic_loop.models.human import *
 class Hand:
     def port(self): {}
     def voluntary_force(self, t): {}

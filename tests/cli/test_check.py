@@ -5,12 +5,11 @@ import subprocess
 import sys
 
 import pytest
+from haptic_loop.cli.check import main
+from haptic_loop.cli.main import execute
+from haptic_loop.design.certificate import prove
+from haptic_loop.design.coupling_file import Stored, save
 from worlds import PAIR, SOFT
-
-from cli.check import main
-from cli.main import execute
-from design.certificate import prove
-from design.coupling_file import Stored, save
 
 
 def leave(monkeypatch, *argv: str) -> int:
@@ -75,5 +74,5 @@ def test_an_interruption_exits_with_130(path, monkeypatch):
     def interrupted(*given):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("cli.check.verify", interrupted)
+    monkeypatch.setattr("haptic_loop.cli.check.verify", interrupted)
     assert leave(monkeypatch, str(path)) == 130

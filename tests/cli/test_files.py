@@ -7,9 +7,8 @@ import threading
 from pathlib import Path
 
 import pytest
-
-from design.files import check_file, write
-from sim.scenario import InputError
+from haptic_loop.design.files import check_file, write
+from haptic_loop.sim.scenario import InputError
 
 
 def test_a_link_stays_a_link(tmp_path):

@@ -9,9 +9,8 @@ import sys
 from pathlib import Path
 
 import pytest
-
-from cli.main import COMMANDS
-from cli.options import Parser
+from haptic_loop.cli.main import COMMANDS
+from haptic_loop.cli.options import Parser
 
 ROOT = Path(__file__).parents[2]
 DOOR = re.compile(r"    door\(\"(\w+)\"\)")  # how a file says that it is a command
@@ -36,7 +35,7 @@ def main_of(module):
     text = (path / "__main__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
     if found := DOOR.search(text):
         assert COMMANDS[found.group(1)][0] == module
-        return importlib.import_module(f"cli.{found.group(1)}").main
+        return importlib.import_module(f"haptic_loop.cli.{found.group(1)}").main
     package = f"{module}.__main__" if path.is_dir() else module
     return getattr(importlib.import_module(package), LAUNCH.search(text).group(1))
 
@@ -90,7 +89,8 @@ def test_help_says_what_every_option_is(module, capsys, monkeypatch):
 def test_commands_compute_with_one_blas_thread():
     """The last digits of a result depend on how a sum is shared; an environment that asks for two changes nothing."""
     script = (
-        "import sys, scipy.linalg; from threadpoolctl import threadpool_info; from cli.main import execute\n"
+        "import sys, scipy.linalg; from threadpoolctl import threadpool_info\n"
+        "from haptic_loop.cli.main import execute\n"
         "count = lambda: {lib['num_threads'] for lib in threadpool_info() if lib['user_api'] == 'blas'}\n"
         "print(count()); execute(lambda words: print(count()) or 0)"
     )

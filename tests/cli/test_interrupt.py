@@ -7,12 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
-
-from cli.main import execute
-from controller.coupling import SpringDamper
-from design.coupling_file import Stored, save
-from design.files import check_file, out_file
-from sim.scenario import InputError, load
+from haptic_loop.cli.main import execute
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.design.coupling_file import Stored, save
+from haptic_loop.design.files import check_file, out_file
+from haptic_loop.sim.scenario import InputError, load
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
@@ -92,8 +91,8 @@ def test_the_folder_of_a_file_that_is_named_must_exist(tmp_path):
 
 @pytest.mark.parametrize("command", [["design"], ["design.export", "coupling.json"]])
 def test_no_command_makes_the_folder_of_a_file(command, tmp_path, monkeypatch, capsys):
-    from cli.design import main as design
-    from cli.export import main as export
+    from haptic_loop.cli.design import main as design
+    from haptic_loop.cli.export import main as export
 
     monkeypatch.chdir(tmp_path)
     save(Stored.of(load().loop("I"), SpringDamper((878.7, 551.8), (0.3864, 0.5219))), "coupling.json")

@@ -5,15 +5,14 @@ import json
 from dataclasses import dataclass
 
 import pytest
-
-from cli import compare as cli_compare
-from cli import design as cli_design
-from cli import options, render
-from cli.audit import main as audit
-from cli.run import main as run
-from controller.loop import DelayRange
-from design.files import one_line
-from sim.scenario import InputError
+from haptic_loop.cli import compare as cli_compare
+from haptic_loop.cli import design as cli_design
+from haptic_loop.cli import options, render
+from haptic_loop.cli.audit import main as audit
+from haptic_loop.cli.run import main as run
+from haptic_loop.controller.loop import DelayRange
+from haptic_loop.design.files import one_line
+from haptic_loop.sim.scenario import InputError
 
 
 def parser():

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from haptic_loop.design.files import InputError
+from haptic_loop.hw.control import SafetyStop, certified_coupling
 
-from design import certify, design_coupling
-from design.files import InputError
-from hw.control import SafetyStop, certified_coupling
-from sim import load
+from haptic_loop import certify, design_coupling, load
 
 PAGE = (Path(__file__).parents[2] / "docs/architecture.md").read_text()
 NAME, OWN = "joined-devices", "joined_devices.py:JoinedDevices"
@@ -32,7 +31,7 @@ def folder(tmp_path_factory):
 
 
 def run(command: str, *words: str) -> int:
-    return import_module(f"cli.{command}").main([*words, "--condition", OWN])
+    return import_module(f"haptic_loop.cli.{command}").main([*words, "--condition", OWN])
 
 
 def test_a_design_for_it_is_proved_and_uses_nearly_all_that_it_allows(folder):
@@ -78,16 +77,19 @@ def test_every_command_judges_by_it(command, words, folder, monkeypatch, capsys)
 
 def test_an_audit_is_decided_by_the_condition_that_is_asked_for(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
-    assert import_module("cli.audit").main(["--coupling", "joined.json", "--condition", "any-environment"]) == 1
+    assert (
+        import_module("haptic_loop.cli.audit").main(["--coupling", "joined.json", "--condition", "any-environment"])
+        == 1
+    )
     assert "not certified, only for this environment" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_file_says_so_where_its_condition_is_not_given(folder, monkeypatch):
     monkeypatch.chdir(folder)
-    assert import_module("cli.check").main(["joined.json", *JSON]) == 1
+    assert import_module("haptic_loop.cli.check").main(["joined.json", *JSON]) == 1
     assert "condition is 'joined-devices', allowed are" in Path("report.json").read_text()
     words = ["--coupling", "joined.json", "--duration", ".1", "--no-plot", "--no-alternatives", *JSON]
-    assert import_module("cli.run").main(words) == 0
+    assert import_module("haptic_loop.cli.run").main(words) == 0
     report = json.loads(Path("report.json").read_text())
     assert report["certificate"]["condition"] == "this-environment"
     assert any("condition is 'joined-devices'" in remark for remark in report["remarks"])
@@ -124,7 +126,7 @@ def test_what_cannot_be_designed_for_it_is_said_in_a_line(words, message, folder
 def test_a_condition_that_is_none_is_refused(named, message, folder, monkeypatch):
     monkeypatch.chdir(folder)
     with pytest.raises(InputError, match=message):
-        import_module("cli.design").main(["--condition", named])
+        import_module("haptic_loop.cli.design").main(["--condition", named])
 
 
 def test_in_python_it_is_the_class(folder, monkeypatch):
@@ -144,7 +146,7 @@ def test_in_python_it_is_the_class(folder, monkeypatch):
 
 NEVER = """
 from dataclasses import replace
-from design.conditions import Condition, this_environment_demand
+from haptic_loop.design.conditions import Condition, this_environment_demand
 
 class Never(Condition):
     name = "never"
@@ -168,7 +170,7 @@ def test_a_condition_that_fails_is_nowhere_claimed(command, words, code, folder,
     monkeypatch.chdir(folder)
     (folder / "never.py").write_text(NEVER)
     asked = ["--coupling", "joined.json", "--condition", "never.py:Never"]
-    assert import_module(f"cli.{command}").main([*asked, *words, *JSON]) == code
+    assert import_module(f"haptic_loop.cli.{command}").main([*asked, *words, *JSON]) == code
     text = Path("report.json").read_text()
     assert "fails the condition never: needs 2." in text
     assert "yours to show" not in text

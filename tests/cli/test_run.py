@@ -9,16 +9,15 @@ import forked
 import msgspec
 import numpy as np
 import pytest
-
-from cli.run import main
-from controller.coupling import SpringDamper
-from design.certificate import prove
-from design.coupling_file import Stored, save
-from design.designs import design_by_kind
-from sim import couplings
-from sim import run as loop
-from sim.scenario import InputError, load
-from sim.trace import Trace
+from haptic_loop.cli.run import main
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.design.certificate import prove
+from haptic_loop.design.coupling_file import Stored, save
+from haptic_loop.design.designs import design_by_kind
+from haptic_loop.sim import couplings
+from haptic_loop.sim import run as loop
+from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.trace import Trace
 
 SECTIONS = {"case", "scenario", "coupling", "certificate", "certificates", "promise", "transparency", "stability"}
 SECTIONS |= {"run", "error", "files"}

@@ -11,11 +11,11 @@ from functools import partial
 from importlib import import_module
 
 import pytest
+from haptic_loop.cli import suite
+from haptic_loop.cli.options import Parser
+from haptic_loop.cli.suite import CHECKS, Check, main
+from haptic_loop.sim.scenario import InputError
 
-from cli import suite
-from cli.options import Parser
-from cli.suite import CHECKS, Check, main
-from sim.scenario import InputError
 from tests.checks import endurance, ours
 
 HARD = next(check for check in ours.CHECKS if check.name == "hard")
@@ -47,7 +47,7 @@ def test_every_check_is_a_command_with_its_options(check, monkeypatch):
 
     monkeypatch.setattr(Parser, "parse_args", understood)
     with pytest.raises(Parsed, match="x"):
-        import_module(f"cli.{module.removeprefix('sim.')}").main([*options, "--out", "x"])
+        import_module(f"haptic_loop.cli.{module.removeprefix('sim.')}").main([*options, "--out", "x"])
 
 
 def test_names_of_checks_are_folders_of_their_own():
@@ -57,7 +57,7 @@ def test_names_of_checks_are_folders_of_their_own():
 def test_from_another_folder_with_tests_of_its_own_all_checks_are_there(tmp_path):
     (tmp_path / "tests").mkdir()
     (tmp_path / "tests" / "__init__.py").write_text("raise SystemExit('not these')")
-    code = "from cli import suite; print(*suite._checks())"
+    code = "from haptic_loop.cli import suite; print(*suite._checks())"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.split()) == (0, list(suite._checks())), done.stderr
 

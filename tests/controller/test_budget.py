@@ -3,17 +3,17 @@
 import msgspec
 import numpy as np
 import pytest
+from haptic_loop.controller.budget import EnergyBounding, EnergyBudget, Packets, PassivityControl, Shell
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.environment import Network, Networks, Spring, environment
+from haptic_loop.controller.lti import Lti
+from haptic_loop.models.hold import hold as hold_input
+from haptic_loop.models.scene import Crowd, variants
+from haptic_loop.sim.scenario import load
 from scipy.linalg import expm
 from worlds import FIGURE_4
 
-from controller.budget import EnergyBounding, EnergyBudget, Packets, PassivityControl, Shell
-from controller.coupling import SpringDamper
-from controller.environment import Network, Networks, Spring, environment
-from controller.lti import Lti
-from design import design_coupling
-from models.hold import hold as hold_input
-from models.scene import Crowd, variants
-from sim.scenario import load
+from haptic_loop import design_coupling
 
 T = 1.2e-3
 DELTA = np.array([1.37, 0.9])

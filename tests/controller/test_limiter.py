@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 from driven import drive, wander
+from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.controller.complementarity import BoxProblem
+from haptic_loop.controller.coupling import NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
+from haptic_loop.controller.law import Limiter
+from haptic_loop.controller.lti import Lti
+from haptic_loop.controller.tick import Process, StepBuffer
 from worlds import FIGURE_4, STIFF, T, loop_of
-
-from controller.arithmetic import SingularLoop
-from controller.complementarity import BoxProblem
-from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import GROUND, Network, Spring, Wall
-from controller.law import Limiter
-from controller.lti import Lti
-from controller.tick import Process, StepBuffer
 
 LIMITS = (12.0, 5.657)
 

@@ -5,10 +5,9 @@ from fractions import Fraction
 import control
 import numpy as np
 import pytest
-
-from controller.arithmetic import SingularLoop, times
-from controller.delay import delay
-from controller.lti import Lti, Sampled, hstack, taps
+from haptic_loop.controller.arithmetic import SingularLoop, times
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.lti import Lti, Sampled, hstack, taps
 
 Z = np.exp(1j * np.linspace(0.01, 3.1, 60))
 

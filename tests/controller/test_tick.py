@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
+from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring, Wall, environment
+from haptic_loop.controller.law import Law
+from haptic_loop.controller.lti import Lti
+from haptic_loop.controller.tick import Process, StepBuffer
 from worlds import FIGURE_4, force_map, loop_of
-
-from controller.coupling import Compliance, NoCoupling, SpringDamper
-from controller.environment import GROUND, Network, Spring, Wall, environment
-from controller.law import Law
-from controller.lti import Lti
-from controller.tick import Process, StepBuffer
 
 T = 1e-3
 NONE = np.zeros(1)

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.delay import LOST, HeldLine, VaryingDelay, _newest, ages, packet_delays, realising
+from haptic_loop.controller.environment import environment
+from haptic_loop.controller.law import Law
+from haptic_loop.controller.tick import Process, StepBuffer
 from worlds import FIGURE_4, force_map
-
-from controller.coupling import SpringDamper
-from controller.delay import LOST, HeldLine, VaryingDelay, _newest, ages, packet_delays, realising
-from controller.environment import environment
-from controller.law import Law
-from controller.tick import Process, StepBuffer
 
 T = 1.2e-3
 COUPLING = SpringDamper([7806, 3137], [0.105, 1.68])

@@ -7,28 +7,27 @@ import numpy as np
 import pytest
 from asked import this_environment
 from driven import drive, wander
+from haptic_loop.cli.accuracy import main as accuracy
+from haptic_loop.cli.run import main
+from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.controller.complementarity import Complementarity
+from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Wall, environment, held
+from haptic_loop.controller.law import Law
+from haptic_loop.controller.lti import Lti, taps
+from haptic_loop.controller.tick import Process
+from haptic_loop.design.audit import audit, requirement
+from haptic_loop.design.certificate import assess, prove
+from haptic_loop.design.guarantees import MAKING
+from haptic_loop.models.device import CompliantDevice
+from haptic_loop.models.hold import hold
+from haptic_loop.models.human import Population
+from haptic_loop.models.scene import crowds, variants
+from haptic_loop.sim.engines import ExactEngine, MujocoBatchEngine
+from haptic_loop.sim.run import assemble, run, run_blocks
+from haptic_loop.sim.scenario import SCENARIOS, InputError, load, parse
 from scipy.optimize import brentq
 from worlds import FIGURE_4, SOFT, force_map, loop_of
-
-from cli.accuracy import main as accuracy
-from cli.run import main
-from controller.arithmetic import SingularLoop
-from controller.complementarity import Complementarity
-from controller.coupling import Coupling, NoCoupling, SpringDamper
-from controller.environment import GROUND, Network, Wall, environment, held
-from controller.law import Law
-from controller.lti import Lti, taps
-from controller.tick import Process
-from design.audit import audit, requirement
-from design.certificate import assess, prove
-from design.guarantees import MAKING
-from models.device import CompliantDevice
-from models.hold import hold
-from models.human import Population
-from models.scene import crowds, variants
-from sim.engines import ExactEngine, MujocoBatchEngine
-from sim.run import assemble, run, run_blocks
-from sim.scenario import SCENARIOS, InputError, load, parse
 
 T = 1e-3
 WALL = ("tip", GROUND)

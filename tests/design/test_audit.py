@@ -7,20 +7,19 @@ import sys
 import msgspec
 import numpy as np
 import pytest
+from haptic_loop.cli.audit import main
+from haptic_loop.cli.main import execute
+from haptic_loop.controller.coupling import PUBLISHED, Compliance, Coupling, NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Lti
+from haptic_loop.controller.ranges import Ranges
+from haptic_loop.design import certificate, coupling_file, frequency
+from haptic_loop.design.api import certify
+from haptic_loop.design.audit import MOST_EXTRA_SAMPLES, audit, edge, remedies, requirement, sensitivity, stiffest
+from haptic_loop.design.files import plain
+from haptic_loop.design.guarantees import ANY, CAVEATS, guarantee_of
 from worlds import FIGURE_4, PAIR, SOFT
-
-from cli.audit import main
-from cli.main import execute
-from controller.coupling import PUBLISHED, Compliance, Coupling, NoCoupling, SpringDamper
-from controller.environment import GROUND, RIGID_WALL, Network, Spring
-from controller.loop import Loop
-from controller.lti import Lti
-from controller.ranges import Ranges
-from design import certificate, coupling_file, frequency
-from design.api import certify
-from design.audit import MOST_EXTRA_SAMPLES, audit, edge, remedies, requirement, sensitivity, stiffest
-from design.files import plain
-from design.guarantees import ANY, CAVEATS, guarantee_of
 
 CONDITIONS = ("this-environment", "any-environment")
 T = 1.2e-3
@@ -387,7 +386,7 @@ def test_what_would_take_minutes_is_not_begun_and_what_does_is_given_up(monkeypa
     assert part["certified"]
     assert part["stiffest"]["reason"].startswith("not searched: some 60 sweeps over 8 states and 2 channels would take")
     assert part["sensitivity"]["least_delta"] == part["required_damping"]
-    monkeypatch.setattr("design.audit.too_long", lambda *_: None)
+    monkeypatch.setattr("haptic_loop.design.audit.too_long", lambda *_: None)
     monkeypatch.setattr(frequency, "MOST_SECONDS", 1e-3)
     part = report(PAIR, SOFT)["this-environment"]
     assert part["stiffest"] == {

@@ -3,16 +3,15 @@
 import numpy as np
 import pytest
 from asked import any_environment, this_environment
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Lti
+from haptic_loop.design import fixed_order as ccl
+from haptic_loop.design import spring_damper
+from haptic_loop.design.conditions import any_environment_demand
+from haptic_loop.design.fixed_order import FixedOrder, FixedPoles, descend
+from haptic_loop.design.lmi import RESERVE, Shaping
 from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
-
-from controller.coupling import SpringDamper
-from controller.loop import Loop
-from controller.lti import Lti
-from design import fixed_order as ccl
-from design import spring_damper
-from design.conditions import any_environment_demand
-from design.fixed_order import FixedOrder, FixedPoles, descend
-from design.lmi import RESERVE, Shaping
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
 

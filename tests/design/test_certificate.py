@@ -7,11 +7,9 @@ import msgspec
 import numpy as np
 import pytest
 from asked import this_environment
-from worlds import FIGURE_4, PAIR, SOFT, SOFT_NETWORK, STIFF
-
-from controller import coupling as controller_coupling
-from controller.arithmetic import SingularLoop, numbers, rational, solve
-from controller.coupling import (
+from haptic_loop.controller import coupling as controller_coupling
+from haptic_loop.controller.arithmetic import SingularLoop, numbers, rational, solve
+from haptic_loop.controller.coupling import (
     PUBLISHED,
     Compliance,
     ForceFilter,
@@ -20,19 +18,21 @@ from controller.coupling import (
     _ComplianceForm,
     _InternalModelForm,
 )
-from controller.environment import Network, Spring, Wall
-from controller.loop import DelayRange, Loop
-from controller.lti import Lti
-from design import certificate as design_certificate
-from design import environments, exact, spring_damper
-from design.certificate import Verdict, prove, required_damping, verify
-from design.coupling_file import Stored, digest, load, save, sealed
-from design.environments import LIMITER, THIS_ENVIRONMENT
-from design.files import InputError
-from design.frequency import frequencies, on_circle, rounding
-from design.lmi import ANY_ENVIRONMENT
-from design.result import NotProved, from_ratio
-from sim.scenario import load as scenario
+from haptic_loop.controller.environment import Network, Spring, Wall
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.lti import Lti
+from haptic_loop.design import certificate as design_certificate
+from haptic_loop.design import environments, exact, spring_damper
+from haptic_loop.design.certificate import Verdict, prove, required_damping, verify
+from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
+from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT
+from haptic_loop.design.files import InputError
+from haptic_loop.design.frequency import frequencies, on_circle, rounding
+from haptic_loop.design.lmi import ANY_ENVIRONMENT
+from haptic_loop.design.result import NotProved, from_ratio
+from haptic_loop.sim.scenario import load as scenario
+from worlds import FIGURE_4, PAIR, SOFT, SOFT_NETWORK, STIFF
+
 from tests.checks.random_loops import proofs
 
 DEFAULT = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
@@ -444,7 +444,7 @@ def test_any_environment_asks_the_same_of_a_coupling_as_its_state_space_behind_w
 def test_exact_arithmetic_that_takes_too_long_is_given_up_in_one_line(monkeypatch):
     stored = certified(PAIR, STIFF, "this-environment")
     monkeypatch.setattr(design_certificate, "_LONGEST", 0.0)
-    monkeypatch.setattr("controller.loop._exactly", [(None,) * 4, None])  # what an earlier proof has built
+    monkeypatch.setattr("haptic_loop.controller.loop._exactly", [(None,) * 4, None])  # what an earlier proof has built
     words = "exact arithmetic was given up after 0 s: these are too many digits over many states"
     with pytest.raises(NotProved, match=words):
         prove(PAIR, STIFF, "this-environment")

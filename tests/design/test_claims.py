@@ -11,22 +11,21 @@ import numpy as np
 import pytest
 from asked import any_environment, this_environment
 from driven import driven
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring, environment
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Lti
+from haptic_loop.design.environments import LimitedForces
+from haptic_loop.design.lmi import Infeasible, Shaping, least_multiplier
+from haptic_loop.design.spring_damper import GainSet, step
+from haptic_loop.models.device import RigidDevice
+from haptic_loop.models.human import Human, Link, Population
+from haptic_loop.sim.report import _PRINTED_TAU_DB
+from haptic_loop.sim.run import assemble, make_engine, run
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.stability import close, dominant_mode
 from scipy.signal import dlsim, lfilter
 from worlds import FIGURE_4, SOFT, STIFF, force_map
-
-from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
-from controller.environment import GROUND, Network, Spring, environment
-from controller.loop import Loop
-from controller.lti import Lti
-from design.environments import LimitedForces
-from design.lmi import Infeasible, Shaping, least_multiplier
-from design.spring_damper import GainSet, step
-from models.device import RigidDevice
-from models.human import Human, Link, Population
-from sim.report import _PRINTED_TAU_DB
-from sim.run import assemble, make_engine, run
-from sim.scenario import load
-from sim.stability import close, dominant_mode
 
 T, THETA, DELTA = 1.2e-3, (1, 2), 1.37
 W = np.unique(np.concatenate([np.geomspace(1e-5, np.pi, 40_001), np.linspace(1e-4, np.pi, 40_001)]))

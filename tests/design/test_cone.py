@@ -7,11 +7,10 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from analysis import solve
-
-from design import cone
-from design.cone import INTERIOR, LADDER, ConeProgram, Inequality
-from design.lmi import symmetric_from
-from design.result import DesignFailed, Infeasible
+from haptic_loop.design import cone
+from haptic_loop.design.cone import INTERIOR, LADDER, ConeProgram, Inequality
+from haptic_loop.design.lmi import symmetric_from
+from haptic_loop.design.result import DesignFailed, Infeasible
 
 #: the least trace of X >= M is that of M
 M = np.array([[2.0, 1.0], [1.0, 2.0]])

@@ -4,15 +4,14 @@ import json
 
 import numpy as np
 import pytest
+from haptic_loop.cli.compare import main
+from haptic_loop.controller.coupling import PUBLISHED, Compliance, NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.compare import curves, grid, ideal, judge
+from haptic_loop.design.result import DesignFailed
+from haptic_loop.sim.scenario import InputError
 from worlds import FIGURE_4, PAIR, SOFT
-
-from cli.compare import main
-from controller.coupling import PUBLISHED, Compliance, NoCoupling, SpringDamper
-from controller.environment import GROUND, Network, Spring
-from controller.loop import Loop
-from design.compare import curves, grid, ideal, judge
-from design.result import DesignFailed
-from sim.scenario import InputError
 
 T, DELTA = 1.2e-3, 1.37
 

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 from asked import this_environment
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Lti, taps
+from haptic_loop.design.conditions import encoder_friction, l1_gain
 from worlds import FIGURE_4
-
-from controller.coupling import SpringDamper
-from controller.delay import delay
-from controller.loop import Loop
-from controller.lti import Lti, taps
-from design.conditions import encoder_friction, l1_gain
 
 T, STEP = 1.2e-3, 1e-5
 LOOP = Loop(T, (0, 1), (0, 0), (0, 1), (1.37, 1.37), FIGURE_4)

@@ -19,22 +19,21 @@ from asked import (
     this_environment_demand,
     walls_demand,
 )
+from haptic_loop.controller.arithmetic import rational
+from haptic_loop.controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
+from haptic_loop.controller.environment import Network, Spring, Wall
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.lti import Lti
+from haptic_loop.controller.ranges import Ranges, UncertainSpring
+from haptic_loop.design import certificate
+from haptic_loop.design.certificate import prove, verify
+from haptic_loop.design.conditions import delayed_environment_demand
+from haptic_loop.design.coupling_file import Stored, digest, sealed
+from haptic_loop.design.environments import SWITCHING, LimitedForces
+from haptic_loop.design.exact import find_storage, prove_positive_real
+from haptic_loop.design.result import NotProved, from_ratio
 from scipy.optimize import minimize_scalar
 from worlds import FIGURE_4, SOFT, STIFF, T
-
-from controller.arithmetic import rational
-from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
-from controller.environment import Network, Spring, Wall
-from controller.loop import DelayRange, Loop
-from controller.lti import Lti
-from controller.ranges import Ranges, UncertainSpring
-from design import certificate
-from design.certificate import prove, verify
-from design.conditions import delayed_environment_demand
-from design.coupling_file import Stored, digest, sealed
-from design.environments import SWITCHING, LimitedForces
-from design.exact import find_storage, prove_positive_real
-from design.result import NotProved, from_ratio
 
 CLOSE = 1e-6  # relative, on either side of a limit
 change = msgspec.structs.replace

@@ -9,20 +9,19 @@ import sys
 
 import numpy as np
 import pytest
+from haptic_loop.cli.export import main
+from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
+from haptic_loop.controller.coupling import SpringDamper as Gains
+from haptic_loop.controller.environment import GROUND, Network, Spring, environment
+from haptic_loop.controller.law import Law
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Lti
+from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.design.certificate import prove, prove_limiter
+from haptic_loop.design.coupling_file import Stored, save
+from haptic_loop.design.export import process_block, sequential, trial
+from haptic_loop.design.files import InputError, one_command
 from worlds import FIGURE_4, PAIR, SOFT, T, force_map
-
-from cli.export import main
-from controller.coupling import Compliance, NoCoupling, SpringDamper
-from controller.coupling import SpringDamper as Gains
-from controller.environment import GROUND, Network, Spring, environment
-from controller.law import Law
-from controller.loop import Loop
-from controller.lti import Lti
-from controller.tick import Process, StepBuffer
-from design.certificate import prove, prove_limiter
-from design.coupling_file import Stored, save
-from design.export import process_block, sequential, trial
-from design.files import InputError, one_command
 
 SPRINGS = SpringDamper((300.0, 200.0), (0.0, 0.0))  # no state at all
 FULL = Compliance(

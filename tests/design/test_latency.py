@@ -5,23 +5,22 @@ import numpy as np
 import pytest
 from asked import latency_demand, this_environment, this_environment_demand
 from driven import growing
+from haptic_loop.controller.arithmetic import numbers
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.lti import Lti, Sampled, hstack, vstack
+from haptic_loop.design.api import design_coupling, transparency_of
+from haptic_loop.design.certificate import assess, prove, required_damping, verify
+from haptic_loop.design.conditions import Condition, Demand, least_scale
+from haptic_loop.design.coupling_file import Stored, load, save, sealed
+from haptic_loop.design.environments import THIS_ENVIRONMENT, ThisEnvironment
+from haptic_loop.design.frequency import frequencies, hermitian, on_circle
+from haptic_loop.design.lmi import LATE
+from haptic_loop.design.result import NotProved
 from scipy.linalg import expm
 from worlds import FIGURE_4
-
-from controller.arithmetic import numbers
-from controller.coupling import SpringDamper
-from controller.delay import delay
-from controller.environment import GROUND, Network, Spring, Wall
-from controller.loop import DelayRange, Loop
-from controller.lti import Lti, Sampled, hstack, vstack
-from design.api import design_coupling, transparency_of
-from design.certificate import assess, prove, required_damping, verify
-from design.conditions import Condition, Demand, least_scale
-from design.coupling_file import Stored, load, save, sealed
-from design.environments import THIS_ENVIRONMENT, ThisEnvironment
-from design.frequency import frequencies, hermitian, on_circle
-from design.lmi import LATE
-from design.result import NotProved
 
 T, TAU, K = 1.2e-3, 0.13e-3, 1000.0
 SOFT = SpringDamper([879.0, 552.0], [0.39, 0.52])

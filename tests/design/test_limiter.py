@@ -6,26 +6,25 @@ import msgspec
 import numpy as np
 import pytest
 from asked import limiter, limiter_demand, this_environment
+from haptic_loop.cli.design import main as design_main
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from haptic_loop.controller.environment import Network, Wall
+from haptic_loop.controller.loop import DelayRange
+from haptic_loop.controller.lti import Lti, Sampled, taps
+from haptic_loop.controller.ranges import Ranges
+from haptic_loop.design import environments
+from haptic_loop.design.certificate import lag, prove, prove_limiter, required_damping, verify
+from haptic_loop.design.conditions import least_multiple
+from haptic_loop.design.coupling_file import Certificate, LimiterCertificate, Stored, load, save, sealed
+from haptic_loop.design.environments import LIMITER, LimitedForces
+from haptic_loop.design.frequency import hermitian, on_circle
+from haptic_loop.design.gain_search import LimiterLoop
+from haptic_loop.design.lmi import RESERVE
+from haptic_loop.design.result import NotProved
+from haptic_loop.design.spring_damper import design
+from haptic_loop.design.transparency import transparency
+from haptic_loop.sim.scenario import InputError
 from worlds import DELTA, PAIR, STIFF, T
-
-from cli.design import main as design_main
-from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
-from controller.environment import Network, Wall
-from controller.loop import DelayRange
-from controller.lti import Lti, Sampled, taps
-from controller.ranges import Ranges
-from design import environments
-from design.certificate import lag, prove, prove_limiter, required_damping, verify
-from design.conditions import least_multiple
-from design.coupling_file import Certificate, LimiterCertificate, Stored, load, save, sealed
-from design.environments import LIMITER, LimitedForces
-from design.frequency import hermitian, on_circle
-from design.gain_search import LimiterLoop
-from design.lmi import RESERVE
-from design.result import NotProved
-from design.spring_damper import design
-from design.transparency import transparency
-from sim.scenario import InputError
 
 LAG = LIMITER.rho(PAIR)
 BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # designed with the limiter's block

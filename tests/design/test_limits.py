@@ -8,19 +8,29 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from asked import this_environment
+from haptic_loop.cli import compare as command
+from haptic_loop.cli.compare import main
+from haptic_loop.controller.coupling import PUBLISHED
+from haptic_loop.controller.environment import environment
+from haptic_loop.design import compare as limit_curve
+from haptic_loop.design.compare import (
+    AXES,
+    LADDERS,
+    SHORT,
+    Point,
+    Sweep,
+    ladder_row,
+    measured,
+    optimum,
+    points_along,
+    remembered,
+)
+from haptic_loop.design.program import LADDER, Options
+from haptic_loop.design.robustness import Nearby
+from haptic_loop.sim.compare_report import Here, LimitCurves
+from haptic_loop.sim.plots import plot_limits
+from haptic_loop.sim.scenario import InputError, load
 from worlds import force_map
-
-from cli import compare as command
-from cli.compare import main
-from controller.coupling import PUBLISHED
-from controller.environment import environment
-from design import compare as limit_curve
-from design.compare import AXES, LADDERS, SHORT, Point, Sweep, ladder_row, measured, optimum, points_along, remembered
-from design.program import LADDER, Options
-from design.robustness import Nearby
-from sim.compare_report import Here, LimitCurves
-from sim.plots import plot_limits
-from sim.scenario import InputError, load
 
 LOOP = load().loop("I")
 SMALL = Options(ladder=LADDER[:1])

@@ -5,15 +5,13 @@ import numpy as np
 import pytest
 from analysis import analysis, e_hat_regular, solve, theta_hat, unit_coupling, v_hat_ports
 from asked import any_environment
-from worlds import DELTA, FIGURE_4, T
-
-from controller.coupling import SpringDamper
-from controller.delay import delay
-from controller.environment import Network, Spring, environment
-from controller.lti import Lti
-from design.conditions import v_hat
-from design.frequency import frequencies, hermitian, on_circle
-from design.lmi import (
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.environment import Network, Spring, environment
+from haptic_loop.controller.lti import Lti
+from haptic_loop.design.conditions import v_hat
+from haptic_loop.design.frequency import frequencies, hermitian, on_circle
+from haptic_loop.design.lmi import (
     Ports,
     balanced,
     lemma1,
@@ -21,6 +19,7 @@ from design.lmi import (
     lemma3,
     unit_environment,
 )
+from worlds import DELTA, FIGURE_4, T
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
 

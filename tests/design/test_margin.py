@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 from asked import any_environment, any_environment_demand, any_environment_per_channel, this_environment
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring, environment
+from haptic_loop.controller.lti import Lti
+from haptic_loop.design.conditions import least_multiple, least_scale, regular_part
+from haptic_loop.design.frequency import frequencies, hermitian, on_circle, supremum
 from scipy.linalg import eig, eigh
 from worlds import FIGURE_4, STIFF, force_map
-
-from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
-from controller.environment import GROUND, Network, Spring, environment
-from controller.lti import Lti
-from design.conditions import least_multiple, least_scale, regular_part
-from design.frequency import frequencies, hermitian, on_circle, supremum
 
 T, THETA, DELTA = 1.2e-3, (1, 2), (1.37, 1.37)
 E = environment(FIGURE_4, T)
@@ -136,7 +135,7 @@ def test_a_free_mass_is_not_refused_by_rounding(mass):
 
 def test_moving_a_delay_between_force_and_measurement_changes_nothing():
     """Remark 3 of the paper, for stability: only the sum of the two delays of a channel matters."""
-    from controller.delay import delay
+    from haptic_loop.controller.delay import delay
 
     inner = PUBLISHED["I"].around(E)
     split = delay((1, 0), T) @ inner @ delay((0, 2), T)

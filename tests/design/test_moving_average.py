@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 from asked import any_environment
+from haptic_loop.controller.coupling import MovingAverage, SpringDamper
+from haptic_loop.controller.lti import Lti, taps
+from haptic_loop.design.certificate import prove, verify
+from haptic_loop.design.coupling_file import Stored, load, save
+from haptic_loop.design.transparency import decibels
 
-from controller.coupling import MovingAverage, SpringDamper
-from controller.lti import Lti, taps
-from design import certify, design_coupling, transparency_of
-from design.certificate import prove, verify
-from design.coupling_file import Stored, load, save
-from design.transparency import decibels
-from sim import load as scenario_of
-from sim import simulate
+from haptic_loop import certify, design_coupling, simulate, transparency_of
+from haptic_loop import load as scenario_of
 
 T = 1e-3
 

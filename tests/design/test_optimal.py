@@ -11,27 +11,27 @@ import msgspec
 import numpy as np
 import pytest
 from asked import this_environment
+from haptic_loop.cli.compare import main as compare_main
+from haptic_loop.cli.design import main
+from haptic_loop.controller.coupling import ForceFilter, NoCoupling, SpringDamper, basis
+from haptic_loop.controller.environment import Network, Spring
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.lti import Lti, Sampled
+from haptic_loop.design import program
+from haptic_loop.design.barrier import EntryInequality, MatrixInequality, Program, centre
+from haptic_loop.design.bound import BoundBeside, _causal, bound
+from haptic_loop.design.certificate import verify
+from haptic_loop.design.conditions import ratio_in
+from haptic_loop.design.coupling_file import Stored, save
+from haptic_loop.design.coupling_file import load as load_file
+from haptic_loop.design.frequency import hermitian, on_circle
+from haptic_loop.design.optimal import _SETTLED, _Rung, design, spread
+from haptic_loop.design.program import MARGIN, Options, Problem, Span, span_of, static_weight
+from haptic_loop.design.robustness import ranges_around, robustness, vertices
+from haptic_loop.design.transparency import transparency
+from haptic_loop.sim.scenario import load
 from scipy.optimize import minimize_scalar
 
-from cli.compare import main as compare_main
-from cli.design import main
-from controller.coupling import ForceFilter, NoCoupling, SpringDamper, basis
-from controller.environment import Network, Spring
-from controller.loop import DelayRange, Loop
-from controller.lti import Lti, Sampled
-from design import program
-from design.barrier import EntryInequality, MatrixInequality, Program, centre
-from design.bound import BoundBeside, _causal, bound
-from design.certificate import verify
-from design.conditions import ratio_in
-from design.coupling_file import Stored, save
-from design.coupling_file import load as load_file
-from design.frequency import hermitian, on_circle
-from design.optimal import _SETTLED, _Rung, design, spread
-from design.program import MARGIN, Options, Problem, Span, span_of, static_weight
-from design.robustness import ranges_around, robustness, vertices
-from design.transparency import transparency
-from sim.scenario import load
 from tests.benchmarks.hostile_loops import hostile
 
 LOOPS = Path(__file__).parents[1] / "loops"
@@ -191,7 +191,7 @@ def test_a_climb_goes_on_over_small_steps_and_says_what_it_leaves(monkeypatch, s
         reason = _SETTLED if climb.gained(before, found) < least else None
         return found, _Rung(taps, poles, taps, climb.decibels(found), g, reason, 0.0)
 
-    monkeypatch.setattr("design.optimal._Search.rung", rung)
+    monkeypatch.setattr("haptic_loop.design.optimal._Search.rung", rung)
     found = design(loop_of("n3"), Options(ladder=program.LADDER[: len(script)]))
     assert (found.figures.rms_mismatch, found.g) == script[taken]
     assert [i for i, each in enumerate(found.ladder) if each.taken][-1] == taken
@@ -369,7 +369,7 @@ def test_a_thinned_sweep_finds_the_environment_that_asks_the_most(monkeypatch):
     coupling = SpringDamper((9e3, 4e3, 2e3), (0.5, 0.9, 1.2))
     worst = max(this_environment(loop.at(each).F(coupling), loop.delta).ratio for each in vertices(network).values())
     for few in (0, 100):
-        monkeypatch.setattr("design.robustness._FEW", few)
+        monkeypatch.setattr("haptic_loop.design.robustness._FEW", few)
         assert robustness(loop, coupling).required_over_available == pytest.approx(worst, rel=1e-9)
 
 
@@ -409,7 +409,7 @@ def test_the_price_of_a_range_is_that_of_the_limiter_that_covers_the_nominal_des
 def test_a_part_of_what_delays_forbid_leaves_a_bound(monkeypatch):
     loop = loop_of("n3")
     whole = bound(loop, knots=8).rms
-    monkeypatch.setattr("design.bound._MOST_FORBIDDEN", 2)
+    monkeypatch.setattr("haptic_loop.design.bound._MOST_FORBIDDEN", 2)
     assert 0 < bound(loop, knots=8).rms < whole < best("n3").figures.rms_mismatch
 
 
@@ -505,8 +505,8 @@ ORDINARY = {
 @pytest.mark.parametrize("name", ORDINARY)
 def test_the_optimum_over_a_basis_is_the_one_of_a_dense_cone_program(name, monkeypatch):
     """Four taps and three poles, the condition at many frequencies, by cvxpy: the same objective to 0.1 dB."""
-    monkeypatch.setattr("design.program.SOFT", (0.0, 0.3))  # what the cone program does not have
-    monkeypatch.setattr("design.program._EVEN", 0.0)
+    monkeypatch.setattr("haptic_loop.design.program.SOFT", (0.0, 0.3))  # what the cone program does not have
+    monkeypatch.setattr("haptic_loop.design.program._EVEN", 0.0)
     loop = ORDINARY[name]()
     m, E = loop.channels, loop.E()
     span = span_of(E, 4, 3)

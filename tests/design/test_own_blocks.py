@@ -5,18 +5,17 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from haptic_loop.cli import check
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import constant_like
+from haptic_loop.design.certificate import assess, prove, required_damping, verify
+from haptic_loop.design.conditions import Condition, this_environment_demand
+from haptic_loop.design.coupling_file import Stored, save, sealed
+from haptic_loop.design.environments import LimitedForces, Multiplied, Unknowns
+from haptic_loop.design.result import MAKING
 from worlds import PAIR, SOFT, STIFF
-
-from cli import check
-from controller.coupling import SpringDamper
-from controller.environment import GROUND, Network, Spring, Wall
-from controller.loop import Loop
-from controller.lti import constant_like
-from design.certificate import assess, prove, required_damping, verify
-from design.conditions import Condition, this_environment_demand
-from design.coupling_file import Stored, save, sealed
-from design.environments import LimitedForces, Multiplied, Unknowns
-from design.result import MAKING
 
 change = msgspec.structs.replace
 

@@ -6,21 +6,21 @@ from fractions import Fraction
 import msgspec
 import numpy as np
 import pytest
+from haptic_loop.controller.coupling import Compliance, Coupling, SpringDamper
+from haptic_loop.controller.loop import DelayRange
+from haptic_loop.controller.lti import Lti, as_like, constant_like, numbers, taps
+from haptic_loop.design import compare
+from haptic_loop.design.certificate import assess, lag, prove, required_damping, verify
+from haptic_loop.design.conditions import BEYOND, Condition, Demand
+from haptic_loop.design.coupling_file import Stored, filed, sealed
+from haptic_loop.design.coverage import covered_limits
+from haptic_loop.design.environments import SWITCHING, SwitchingDelays
+from haptic_loop.design.files import InputError
+from haptic_loop.design.guarantees import guarantee_of
+from haptic_loop.design.result import NotProved
+from haptic_loop.sim.zwidth import CouplingSweep, EnvironmentSweep
 
-from controller.coupling import Compliance, Coupling, SpringDamper
-from controller.loop import DelayRange
-from controller.lti import Lti, as_like, constant_like, numbers, taps
-from design import compare
-from design.certificate import assess, lag, prove, required_damping, verify
-from design.conditions import BEYOND, Condition, Demand
-from design.coupling_file import Stored, filed, sealed
-from design.coverage import covered_limits
-from design.environments import SWITCHING, SwitchingDelays
-from design.files import InputError
-from design.guarantees import guarantee_of
-from design.result import NotProved
-from sim import load
-from sim.zwidth import CouplingSweep, EnvironmentSweep
+from haptic_loop import load
 
 PAIR = load("omega-pair").loop("I")
 SOFT = SpringDamper([400.0, 300.0], [0.1, 0.1])

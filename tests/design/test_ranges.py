@@ -7,27 +7,26 @@ from itertools import combinations, pairwise, product
 import msgspec
 import numpy as np
 import pytest
+from haptic_loop.cli.audit import main as audit_main
+from haptic_loop.cli.check import main as check_main
+from haptic_loop.cli.design import main as design_main
+from haptic_loop.cli.run import main as run_main
+from haptic_loop.cli.validate import main as validate_main
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.coupling import SpringDamper as StoredSpringDamper
+from haptic_loop.controller.delay import VaryingDelay
+from haptic_loop.controller.environment import Network, Spring, environment
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices
+from haptic_loop.design import optimal
+from haptic_loop.design.certificate import check_ranges, prove, verify
+from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
+from haptic_loop.design.coverage import RangesFigures
+from haptic_loop.design.program import Options
+from haptic_loop.design.result import NotProved
+from haptic_loop.sim import scenario
+from haptic_loop.sim.scenario import SCENARIOS, InputError, parse
 from worlds import FIGURE_4, environment_by_hand, filter_by_hand, force_map
-
-from cli.audit import main as audit_main
-from cli.check import main as check_main
-from cli.design import main as design_main
-from cli.run import main as run_main
-from cli.validate import main as validate_main
-from controller.coupling import SpringDamper
-from controller.coupling import SpringDamper as StoredSpringDamper
-from controller.delay import VaryingDelay
-from controller.environment import Network, Spring, environment
-from controller.loop import Loop
-from controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices
-from design import optimal
-from design.certificate import check_ranges, prove, verify
-from design.coupling_file import Stored, digest, load, save, sealed
-from design.coverage import RangesFigures
-from design.program import Options
-from design.result import NotProved
-from sim import scenario
-from sim.scenario import SCENARIOS, InputError, parse
 
 T, THETA = 1.2e-3, (1, 2)
 #: the first spring softer or stiffer or lost: three vertices beside the environment

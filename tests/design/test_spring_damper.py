@@ -9,24 +9,23 @@ import numpy as np
 import pytest
 from analysis import analysis, solve
 from asked import any_environment, this_environment
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.environment import Network, Spring
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Lti
+from haptic_loop.design import conditions, gain_search, spring_damper
+from haptic_loop.design.api import instead, transparency_of
+from haptic_loop.design.designs import design_by_kind
+from haptic_loop.design.frequency import hermitian
+from haptic_loop.design.gain_search import LimiterLoop, SampledLoop, SwitchingLoop
+from haptic_loop.design.lmi import RESERVE, Shaping, check_passive
+from haptic_loop.design.result import DesignFailed, Infeasible
+from haptic_loop.design.spring_damper import GainSet, design
+from haptic_loop.design.transparency import decibels
+from haptic_loop.sim.scenario import load
 from scipy.optimize import brentq
 from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
-
-from controller.coupling import SpringDamper
-from controller.delay import delay
-from controller.environment import Network, Spring
-from controller.loop import Loop
-from controller.lti import Lti
-from design import conditions, gain_search, spring_damper
-from design.api import instead, transparency_of
-from design.designs import design_by_kind
-from design.frequency import hermitian
-from design.gain_search import LimiterLoop, SampledLoop, SwitchingLoop
-from design.lmi import RESERVE, Shaping, check_passive
-from design.result import DesignFailed, Infeasible
-from design.spring_damper import GainSet, design
-from design.transparency import decibels
-from sim.scenario import load
 
 CASES = {"I": (1, 2), "II": (0, 0)}
 WALL = Network(("c",), (Spring(("c", "ground"), 100.0),))

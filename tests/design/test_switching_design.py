@@ -5,18 +5,17 @@ import json
 import numpy as np
 import pytest
 from asked import switching_sweep
-
-from cli.design import main
-from controller.coupling import SpringDamper
-from controller.delay import VaryingDelay
-from design.coupling_file import load as load_stored
-from design.optimal import design_with
-from design.result import DesignFailed
-from design.spring_damper import design
-from models.scene import Crowd, variants
-from sim.run import assemble
-from sim.scenario import InputError, load
-from sim.switching import switched_crowd
+from haptic_loop.cli.design import main
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.delay import VaryingDelay
+from haptic_loop.design.coupling_file import load as load_stored
+from haptic_loop.design.optimal import design_with
+from haptic_loop.design.result import DesignFailed
+from haptic_loop.design.spring_damper import design
+from haptic_loop.models.scene import Crowd, variants
+from haptic_loop.sim.run import assemble
+from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.switching import switched_crowd
 
 RANGE = ((1, 1), (2, 2))
 

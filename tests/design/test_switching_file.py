@@ -7,31 +7,31 @@ import msgspec
 import numpy as np
 import pytest
 from asked import switching_demand, switching_sweep, this_environment
+from haptic_loop.cli.audit import main as audit_main
+from haptic_loop.cli.check import main as check_main
+from haptic_loop.cli.design import main as design_main
+from haptic_loop.cli.run import main as run_main
+from haptic_loop.cli.validate import main as validate_main
+from haptic_loop.controller import coupling as built
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.delay import LOST, VaryingDelay, ages
+from haptic_loop.controller.environment import environment
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.lti import Lti, Sampled
+from haptic_loop.controller.ranges import Ranges, UncertainSpring
+from haptic_loop.design import exact as positive_real
+from haptic_loop.design.certificate import prove, verify
+from haptic_loop.design.coupling_file import Certificate, Stored, digest, load, save, sealed
+from haptic_loop.design.environments import SWITCHING
+from haptic_loop.design.exact import Matrix
+from haptic_loop.design.files import InputError
+from haptic_loop.design.frequency import hermitian
+from haptic_loop.design.result import NotProved
+from haptic_loop.hw.control import certified_couplings
+from haptic_loop.sim.scenario import load as scenario_of
 from worlds import DELTA, FIGURE_4, PAIR, SOFT, STIFF, T, force_map
 
-from cli.audit import main as audit_main
-from cli.check import main as check_main
-from cli.design import main as design_main
-from cli.run import main as run_main
-from cli.validate import main as validate_main
-from controller import coupling as built
-from controller.coupling import SpringDamper
-from controller.delay import LOST, VaryingDelay, ages
-from controller.environment import environment
-from controller.loop import DelayRange, Loop
-from controller.lti import Lti, Sampled
-from controller.ranges import Ranges, UncertainSpring
-from design import certify
-from design import exact as positive_real
-from design.certificate import prove, verify
-from design.coupling_file import Certificate, Stored, digest, load, save, sealed
-from design.environments import SWITCHING
-from design.exact import Matrix
-from design.files import InputError
-from design.frequency import hermitian
-from design.result import NotProved
-from hw.control import certified_couplings
-from sim.scenario import load as scenario_of
+from haptic_loop import certify
 
 RANGE = DelayRange((1, 1), (2, 2))
 LOOP = PAIR.switching(RANGE)

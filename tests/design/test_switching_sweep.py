@@ -7,21 +7,20 @@ import numpy as np
 import pytest
 from analysis import solve
 from asked import switching_demand, switching_sweep, this_environment
+from haptic_loop.cli.audit import main
+from haptic_loop.controller.coupling import NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring, environment
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.lti import Lti, Sampled
+from haptic_loop.design import environments
+from haptic_loop.design.certificate import judged, prove, required_damping
+from haptic_loop.design.coverage import Switching
+from haptic_loop.design.environments import SWITCHING
+from haptic_loop.design.exact import find_storage
+from haptic_loop.design.frequency import hermitian
+from haptic_loop.design.result import NotProved
+from haptic_loop.sim.scenario import InputError
 from worlds import DELTA, FIGURE_4, SOFT, STIFF, T, force_map
-
-from cli.audit import main
-from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import GROUND, Network, Spring, environment
-from controller.loop import DelayRange, Loop
-from controller.lti import Lti, Sampled
-from design import environments
-from design.certificate import judged, prove, required_damping
-from design.coverage import Switching
-from design.environments import SWITCHING
-from design.exact import find_storage
-from design.frequency import hermitian
-from design.result import NotProved
-from sim.scenario import InputError
 
 
 def sent(coupling=STIFF, T=T) -> Lti:

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring, environment
+from haptic_loop.controller.lti import Lti
+from haptic_loop.design.frequency import integral
+from haptic_loop.design.transparency import decibels, transparency
 from scipy.integrate import quad
 from worlds import FIGURE_4, SOFT, STIFF, force_map
-
-from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
-from controller.environment import GROUND, Network, Spring, environment
-from controller.lti import Lti
-from design.frequency import integral
-from design.transparency import decibels, transparency
 
 T, THETA = 1.2e-3, (1, 2)
 E = environment(FIGURE_4, T)

@@ -6,19 +6,18 @@ import msgspec
 import numpy as np
 import pytest
 from asked import any_environment, this_environment, walls_demand, walls_proof
+from haptic_loop.controller.coupling import Compliance, InternalModel, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Lti
+from haptic_loop.controller.ranges import Ranges
+from haptic_loop.design.certificate import assess, prove, required_damping, verify
+from haptic_loop.design.coupling_file import Stored, sealed
+from haptic_loop.design.designs import design_by_kind
+from haptic_loop.design.exact import find_storage
+from haptic_loop.design.guarantees import MAKING, guarantee_of, making_covered
+from haptic_loop.design.result import NotProved
 from scipy.linalg import expm
-
-from controller.coupling import Compliance, InternalModel, SpringDamper
-from controller.environment import GROUND, Network, Spring, Wall
-from controller.loop import Loop
-from controller.lti import Lti
-from controller.ranges import Ranges
-from design.certificate import assess, prove, required_damping, verify
-from design.coupling_file import Stored, sealed
-from design.designs import design_by_kind
-from design.exact import find_storage
-from design.guarantees import MAKING, guarantee_of, making_covered
-from design.result import NotProved
 
 change = msgspec.structs.replace
 

@@ -6,22 +6,21 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
+from haptic_loop.cli.check import main as check_main
+from haptic_loop.controller.coupling import ForceFilter, InternalModel
+from haptic_loop.controller.environment import Network, Spring
+from haptic_loop.controller.ranges import Member, Ranges, Region, UncertainSpring, members, regions
+from haptic_loop.design import optimal
+from haptic_loop.design.api import certify, store
+from haptic_loop.design.certificate import check_ranges, prove, verify
+from haptic_loop.design.coupling_file import Stored, load, save
+from haptic_loop.design.coverage import RangesFigures
+from haptic_loop.design.program import Options
+from haptic_loop.design.result import Design
+from haptic_loop.design.worst_member import search
+from haptic_loop.sim import scenario
+from haptic_loop.sim.scenario import SCENARIOS
 from worlds import FIGURE_4, VERTICES_ONLY, environment_by_hand, filter_by_hand
-
-from cli.check import main as check_main
-from controller.coupling import ForceFilter, InternalModel
-from controller.environment import Network, Spring
-from controller.ranges import Member, Ranges, Region, UncertainSpring, members, regions
-from design import optimal
-from design.api import certify, store
-from design.certificate import check_ranges, prove, verify
-from design.coupling_file import Stored, load, save
-from design.coverage import RangesFigures
-from design.program import Options
-from design.result import Design
-from design.worst_member import search
-from sim import scenario
-from sim.scenario import SCENARIOS
 
 T, THETA, DELTA = 1.2e-3, (1, 2), 1.37
 RANGED = scenario.load(SCENARIOS / "omega-pair-ranges.toml").loop("I")

@@ -5,15 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worlds import FakePort
-
-from design.files import plain
-from hw.device_state import Device
-from hw.emulator import Emulator, FaultInjection, info_of, nobody
-from hw.haptic_device import SerialDevice
-from hw.identify import chirp
-from hw.limits import SafetyLimits, Stage
-from hw.monitor import (
+from haptic_loop.design.files import plain
+from haptic_loop.hw.device_state import Device
+from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
+from haptic_loop.hw.haptic_device import SerialDevice
+from haptic_loop.hw.identify import chirp
+from haptic_loop.hw.limits import SafetyLimits, Stage
+from haptic_loop.hw.monitor import (
     _BLOCK,
     _PATIENCE,
     Ages,
@@ -23,13 +21,26 @@ from hw.monitor import (
     Measurement,
     _ClockDrift,
 )
-from hw.protocol import NO_MARGIN, Command, Config, Force, Phase, Reason, Refused, SafetyStop, State, Stop, encode
-from hw.recording import Recorder
-from hw.rehearsal import Rehearsal
-from hw.session import Driver, Session, _check_state
-from hw.session_report import outcome
-from sim.scenario import load as scenario_of
-from sim.trace import growths
+from haptic_loop.hw.protocol import (
+    NO_MARGIN,
+    Command,
+    Config,
+    Force,
+    Phase,
+    Reason,
+    Refused,
+    SafetyStop,
+    State,
+    Stop,
+    encode,
+)
+from haptic_loop.hw.recording import Recorder
+from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.session import Driver, Session, _check_state
+from haptic_loop.hw.session_report import outcome
+from haptic_loop.sim.scenario import load as scenario_of
+from haptic_loop.sim.trace import growths
+from worlds import FakePort
 
 T_US = 1200
 CONFIG = Config(2, 4, 5, 50, (20000, 20000), (600, 600))

@@ -5,15 +5,14 @@ from runpy import run_path
 
 import numpy as np
 import pytest
+from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
+from haptic_loop.hw.limits import SafetyLimits, Stage
+from haptic_loop.hw.monitor import EncoderMonitor, EncoderTest, LinkSettings
+from haptic_loop.hw.protocol import SafetyStop
+from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.session import Session
+from haptic_loop.sim.scenario import InputError
 from msgspec.structs import replace
-
-from hw.emulator import Emulator, FaultInjection, nobody
-from hw.limits import SafetyLimits, Stage
-from hw.monitor import EncoderMonitor, EncoderTest, LinkSettings
-from hw.protocol import SafetyStop
-from hw.rehearsal import Rehearsal
-from hw.session import Session
-from sim.scenario import InputError
 
 T = 1.2e-3
 STEP = 4e-4  # [N]

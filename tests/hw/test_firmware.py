@@ -11,9 +11,8 @@ from pathlib import Path
 from zlib import crc32
 
 import pytest
-
-from hw.device_state import Device
-from hw.protocol import (
+from haptic_loop.hw.device_state import Device
+from haptic_loop.hw.protocol import (
     _LAYOUTS,
     _READ,
     Ack,

@@ -5,27 +5,26 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from haptic_loop.cli import bridge, replay
+from haptic_loop.cli.session_cli import check_link
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.hw.control import certified_coupling, certified_couplings, timed
+from haptic_loop.hw.device_state import Device
+from haptic_loop.hw.emulator import info_of
+from haptic_loop.hw.force_dimension import ForceDimension, library
+from haptic_loop.hw.haptic_device import PortLost, SerialDevice
+from haptic_loop.hw.limits import SafetyLimits, Stage
+from haptic_loop.hw.monitor import Ages, LinkSettings
+from haptic_loop.hw.protocol import Command, Config, Decoder, Force, Hello, Phase, Reason, Refused, State, encode
+from haptic_loop.hw.recording import Recorder
+from haptic_loop.hw.session import Operator, Session
+from haptic_loop.hw.session_report import save
+from haptic_loop.hw.transport import Live
+from haptic_loop.models.scene import build, plant
+from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.scenario import load as scenario_of
 from scipy.linalg import expm
 from worlds import FakePort
-
-from cli import bridge, replay
-from cli.session_cli import check_link
-from controller.coupling import SpringDamper
-from hw.control import certified_coupling, certified_couplings, timed
-from hw.device_state import Device
-from hw.emulator import info_of
-from hw.force_dimension import ForceDimension, library
-from hw.haptic_device import PortLost, SerialDevice
-from hw.limits import SafetyLimits, Stage
-from hw.monitor import Ages, LinkSettings
-from hw.protocol import Command, Config, Decoder, Force, Hello, Phase, Reason, Refused, State, encode
-from hw.recording import Recorder
-from hw.session import Operator, Session
-from hw.session_report import save
-from hw.transport import Live
-from models.scene import build, plant
-from sim.scenario import InputError
-from sim.scenario import load as scenario_of
 
 T = 1.2e-3
 

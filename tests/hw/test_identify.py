@@ -10,18 +10,17 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
-
-from cli.identify import main as identify_command
-from hw.emulator import Emulator, FaultInjection, nobody
-from hw.identify import Estimate, capped, chirp, estimate, held, identify, settled
-from hw.limits import SafetyLimits, Stage
-from hw.monitor import LinkSettings
-from hw.recording import Recorder
-from hw.rehearsal import Rehearsal
-from hw.session import Operator, Session
-from models.device import RigidDevice
-from sim.scenario import InputError, load
-from sim.trace import Trace
+from haptic_loop.cli.identify import main as identify_command
+from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
+from haptic_loop.hw.identify import Estimate, capped, chirp, estimate, held, identify, settled
+from haptic_loop.hw.limits import SafetyLimits, Stage
+from haptic_loop.hw.monitor import LinkSettings
+from haptic_loop.hw.recording import Recorder
+from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.session import Operator, Session
+from haptic_loop.models.device import RigidDevice
+from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.trace import Trace
 
 STEP = 5e-6  # [m] a coarse encoder: half of an Omega's 0.01 mm
 
@@ -208,7 +207,7 @@ def test_the_command_takes_two_sittings_and_refuses_what_only_one_of_them_damps(
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_second_sitting_waits_until_every_handle_was_taken_elsewhere(axis, sign, monkeypatch):
     """By 5 mm or more. Where it arms by itself, whoever did so has 5 s (here 0.2) to let go, and again later."""
-    monkeypatch.setattr("hw.session._LET_GO_US", 200_000)
+    monkeypatch.setattr("haptic_loop.hw.session._LET_GO_US", 200_000)
     scenario = nobody(load("omega-pair-rigid"))
     session = Session(scenario, SafetyLimits((1.0, 1.0)), LinkSettings(measure=60, elsewhere=(0, 0)))
     excitation = chirp(2, scenario.T, 1, 1.0, (3.0, 200.0), 0.5)

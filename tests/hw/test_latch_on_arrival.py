@@ -5,23 +5,23 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from haptic_loop.cli.bridge import _overlong_tick
+from haptic_loop.cli.bridge import main as bridge
+from haptic_loop.cli.replay import main as replay
+from haptic_loop.hw.control import certified_couplings, timed
+from haptic_loop.hw.emulator import Emulator
+from haptic_loop.hw.monitor import Ages, LinkSettings
+from haptic_loop.hw.protocol import SafetyStop
+from haptic_loop.hw.recording import Recorder
+from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.session import Stage, session_for
+from haptic_loop.models.scene import plant
+from haptic_loop.sim.couplings import CouplingFigures
+from haptic_loop.sim.run import outside_forces
+from haptic_loop.sim.scenario import InputError
 from scipy.linalg import expm
 
-from cli.bridge import _overlong_tick
-from cli.bridge import main as bridge
-from cli.replay import main as replay
-from hw.control import certified_couplings, timed
-from hw.emulator import Emulator
-from hw.monitor import Ages, LinkSettings
-from hw.protocol import SafetyStop
-from hw.recording import Recorder
-from hw.rehearsal import Rehearsal
-from hw.session import Stage, session_for
-from models.scene import plant
-from sim import load
-from sim.couplings import CouplingFigures
-from sim.run import outside_forces
-from sim.scenario import InputError
+from haptic_loop import load
 
 LAB = load("omega-pair").replace(theta=(0, 0))
 TAU = 130  # [us] of an emulated link

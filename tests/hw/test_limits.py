@@ -3,10 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
-from hw.limits import (
+from haptic_loop.hw.limits import (
     DRIVING,
     ENDED,
     Gain,
@@ -18,10 +15,12 @@ from hw.limits import (
     probe_delay,
     watchdog_for,
 )
-from hw.monitor import CommandMonitor
-from hw.protocol import MAX_RELEASE_NS, PROTOCOL, Config, Force, Info, Phase, SafetyStop, State, encode
-from hw.session import _check_state
-from sim.scenario import load
+from haptic_loop.hw.monitor import CommandMonitor
+from haptic_loop.hw.protocol import MAX_RELEASE_NS, PROTOCOL, Config, Force, Info, Phase, SafetyStop, State, encode
+from haptic_loop.hw.session import _check_state
+from haptic_loop.sim.scenario import load
+from hypothesis import given
+from hypothesis import strategies as st
 
 LIMITS = SafetyLimits((12.0, 6.0))
 T = 1.2e-3

@@ -20,20 +20,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-from cli import bridge, identify, replay
-from cli import emulator as emulator_command
-from cli.options import Parser
-from cli.session_cli import add_link_options, check_link
-from controller.delay import VaryingDelay
-from hw.control import certified_coupling
-from hw.haptic_device import SerialDevice
-from hw.limits import ENDED, SafetyLimits, Stage
-from hw.monitor import LinkSettings
-from hw.session import Operator, Session
-from hw.session_report import IncidentLog
-from hw.transport import Live, SerialPort
-from sim.scenario import InputError
+from haptic_loop.cli import bridge, identify, replay
+from haptic_loop.cli import emulator as emulator_command
+from haptic_loop.cli.options import Parser
+from haptic_loop.cli.session_cli import add_link_options, check_link
+from haptic_loop.controller.delay import VaryingDelay
+from haptic_loop.hw.control import certified_coupling
+from haptic_loop.hw.haptic_device import SerialDevice
+from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage
+from haptic_loop.hw.monitor import LinkSettings
+from haptic_loop.hw.session import Operator, Session
+from haptic_loop.hw.session_report import IncidentLog
+from haptic_loop.hw.transport import Live, SerialPort
+from haptic_loop.sim.scenario import InputError
 
 pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
 ROOT = Path(__file__).parent.parent.parent
@@ -314,7 +313,7 @@ def test_an_exception_stops_the_device_first(emulator, scenario):
 def test_an_emulator_ends_with_the_bridge_that_started_it():
     """However that ended: here by SIGKILL, which nobody can catch. An orphan would keep its terminal for minutes."""
     code = (
-        "import time; from hw.emulator import spawned\n"
+        "import time; from haptic_loop.hw.emulator import spawned\n"
         "with spawned(['--case=I', '--pace=0.2', '--duration=660']) as path: print(path, flush=True); time.sleep(600)"
     )
     environment = os.environ | {"PYTHONPATH": str(ROOT)}

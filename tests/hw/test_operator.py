@@ -1,12 +1,11 @@
 """Who arms a session, and when: the live rule, in virtual time."""
 
 import pytest
-
-from hw.emulator import Emulator, FaultInjection
-from hw.limits import SafetyLimits, Stage
-from hw.monitor import LinkSettings
-from hw.rehearsal import Rehearsal
-from hw.session import Operator, Session
+from haptic_loop.hw.emulator import Emulator, FaultInjection
+from haptic_loop.hw.limits import SafetyLimits, Stage
+from haptic_loop.hw.monitor import LinkSettings
+from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.session import Operator, Session
 
 
 def rehearsal_of(scenario, rungs, operator, *faults):

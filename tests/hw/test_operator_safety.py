@@ -10,20 +10,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from haptic_loop.cli import bridge, replay
+from haptic_loop.cli.bridge import _parser
+from haptic_loop.cli.session_cli import limits_from, touched
+from haptic_loop.hw import transport
+from haptic_loop.hw.emulator import Emulator, FaultInjection
+from haptic_loop.hw.haptic_device import SerialDevice
+from haptic_loop.hw.limits import SafetyLimits, Stage
+from haptic_loop.hw.monitor import LinkSettings
+from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.session import Driver, Operator, Session, session_for
+from haptic_loop.hw.session_report import IncidentLog
+from haptic_loop.sim.scenario import InputError
 from worlds import FakePort
-
-from cli import bridge, replay
-from cli.bridge import _parser
-from cli.session_cli import limits_from, touched
-from hw import transport
-from hw.emulator import Emulator, FaultInjection
-from hw.haptic_device import SerialDevice
-from hw.limits import SafetyLimits, Stage
-from hw.monitor import LinkSettings
-from hw.rehearsal import Rehearsal
-from hw.session import Driver, Operator, Session, session_for
-from hw.session_report import IncidentLog
-from sim.scenario import InputError
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -149,9 +148,9 @@ def test_the_incident_log_survives_sigkill(tmp_path):
     """A session in a process of its own, killed while forces act: every stage up to then is on the disk."""
     code = (
         "import time; from pathlib import Path\n"
-        "from hw.session_report import IncidentLog\n"
-        "from hw.limits import SafetyLimits; from hw.session import Session\n"
-        "from sim.scenario import load\n"
+        "from haptic_loop.hw.session_report import IncidentLog\n"
+        "from haptic_loop.hw.limits import SafetyLimits; from haptic_loop.hw.session import Session\n"
+        "from haptic_loop.sim.scenario import load\n"
         f"session, log = Session(load(), SafetyLimits((2.0, 2.0))), IncidentLog(Path({str(tmp_path / 'log')!r}))\n"
         "log.attach(session); session.start(0); session.now = 1_500_000; log.update(session)\n"
         "print('written', flush=True); time.sleep(600)"
@@ -193,7 +192,7 @@ def test_the_incident_log_tells_every_stage_and_every_second(scenario, rungs, tm
 
 def test_the_preflight_says_what_the_machine_can_do():
     """In a child, since real-time scheduling and locked memory stay with a process."""
-    code = "from hw.transport import preflight; print(preflight('/dev/null'))"
+    code = "from haptic_loop.hw.transport import preflight; print(preflight('/dev/null'))"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     begun = time.monotonic()
     line = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True).stdout

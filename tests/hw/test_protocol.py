@@ -6,11 +6,8 @@ import re
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
-from hw.device_state import Device
-from hw.protocol import (
+from haptic_loop.hw.device_state import Device
+from haptic_loop.hw.protocol import (
     Ack,
     Cause,
     Command,
@@ -27,6 +24,8 @@ from hw.protocol import (
     encode,
     wire_bytes,
 )
+from hypothesis import given
+from hypothesis import strategies as st
 
 DOC = Path(__file__).parent.parent.parent / "docs/protocol.md"
 
@@ -138,7 +137,7 @@ def test_stuffing_and_crc_equal_their_definitions(data):
 
 @pytest.mark.parametrize("message", EVERY, ids=names)
 def test_frames_equal_the_textbook(message):
-    from hw.protocol import pack
+    from haptic_loop.hw.protocol import pack
 
     payload = pack(message)
     assert encode(message) == cobs_textbook(payload + crc_bitwise(payload).to_bytes(4, "little")) + b"\0"

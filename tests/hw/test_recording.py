@@ -6,27 +6,26 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
+from haptic_loop.cli import bridge
+from haptic_loop.cli import replay as replay_command
+from haptic_loop.cli import trace as trace_command
+from haptic_loop.design.certificate import assess
+from haptic_loop.design.files import plain
+from haptic_loop.hw.control import CertifiedCoupling, _fill, certified_coupling
+from haptic_loop.hw.emulator import Emulator
+from haptic_loop.hw.limits import SafetyLimits, Stage, Units
+from haptic_loop.hw.recording import Recorder, _digest, _recipes_of, load, replay
+from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.session import Session
+from haptic_loop.hw.session_report import outcome, save
+from haptic_loop.sim.couplings import choose, limits_of
+from haptic_loop.sim.run import assemble, run
+from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.scenario import load as scenario_of
+from haptic_loop.sim.stability import close, dominant_mode
+from haptic_loop.sim.trace import Trace
 from rich.console import Console
 from sessions import FAST, rehearsal_of
-
-from cli import bridge
-from cli import replay as replay_command
-from cli import trace as trace_command
-from design.certificate import assess
-from design.files import plain
-from hw.control import CertifiedCoupling, _fill, certified_coupling
-from hw.emulator import Emulator
-from hw.limits import SafetyLimits, Stage, Units
-from hw.recording import Recorder, _digest, _recipes_of, load, replay
-from hw.rehearsal import Rehearsal
-from hw.session import Session
-from hw.session_report import outcome, save
-from sim.couplings import choose, limits_of
-from sim.run import assemble, run
-from sim.scenario import InputError
-from sim.scenario import load as scenario_of
-from sim.stability import close, dominant_mode
-from sim.trace import Trace
 
 
 def test_missing_samples_are_filled_by_a_straight_line():

@@ -4,28 +4,28 @@ import re
 
 import numpy as np
 import pytest
+from haptic_loop.cli import bridge
+from haptic_loop.controller.law import Law
+from haptic_loop.design.coupling_file import Stored
+from haptic_loop.design.coupling_file import save as save_coupling
+from haptic_loop.hw.control import _HostController, certified_coupling, certified_couplings
+from haptic_loop.hw.emulator import Emulator, FaultInjection
+from haptic_loop.hw.haptic_device import SerialDevice
+from haptic_loop.hw.limits import SafetyLimits, Stage
+from haptic_loop.hw.monitor import Ages, LinkSettings
+from haptic_loop.hw.protocol import Command, Decoder, Force, Hello, Phase, SafetyStop, State, Stop, encode
+from haptic_loop.hw.recording import Recorder, _recipes_of, load, replay
+from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.session import Driver, Session
+from haptic_loop.hw.session_report import outcome, save
+from haptic_loop.models.hold import hold
+from haptic_loop.models.scene import plant
+from haptic_loop.sim.run import assemble, outside_forces, run
+from haptic_loop.sim.scenario import InputError
 from rich.console import Console
 from sessions import AT_REST, FAST, rehearsal_of, session_with
 from worlds import FakePort
 
-from cli import bridge
-from controller.law import Law
-from design.coupling_file import Stored
-from design.coupling_file import save as save_coupling
-from hw.control import _HostController, certified_coupling, certified_couplings
-from hw.emulator import Emulator, FaultInjection
-from hw.haptic_device import SerialDevice
-from hw.limits import SafetyLimits, Stage
-from hw.monitor import Ages, LinkSettings
-from hw.protocol import Command, Decoder, Force, Hello, Phase, SafetyStop, State, Stop, encode
-from hw.recording import Recorder, _recipes_of, load, replay
-from hw.rehearsal import Rehearsal
-from hw.session import Driver, Session
-from hw.session_report import outcome, save
-from models.hold import hold
-from models.scene import plant
-from sim.run import assemble, outside_forces, run
-from sim.scenario import InputError
 from tests.checks.faults import CASES, Fault, _rehearse_case, at, person
 
 # faults
@@ -400,7 +400,7 @@ def test_a_thief_under_the_bridge_is_limited_and_hands_get_no_more_than_the_budg
 ):
     """And the replay repeats what the budget did, bit by bit."""
     for module in ("control", "recording"):
-        monkeypatch.setattr(f"hw.{module}.host_controller", lambda scenario, *given: _Thief(scenario.T))
+        monkeypatch.setattr(f"haptic_loop.hw.{module}.host_controller", lambda scenario, *given: _Thief(scenario.T))
     taken = {}
     for budget in (0.01, 10.0):
         recorder = Recorder(2)

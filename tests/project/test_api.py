@@ -1,73 +1,70 @@
-"""`from sim import ..` and `from design import ..`: the functions for scripts do what the commands do."""
+"""`from haptic_loop import ..`: the functions for scripts do what the commands do."""
 
 import json
 import pydoc
 import subprocess
 import sys
 from dataclasses import fields
-from inspect import signature
+from inspect import isfunction, signature
 
 import numpy as np
 import pytest
+from haptic_loop.cli.design import main as design_command
+from haptic_loop.cli.run import main as run_command
+from haptic_loop.cli.validate import main as validate_command
+from haptic_loop.controller.coupling import NoCoupling, SpringDamper
+from haptic_loop.controller.environment import Spring
+from haptic_loop.design.designs import KINDS
+from haptic_loop.models.device import RigidDevice
+from haptic_loop.sim.scenario import SCENARIOS
 from msgspec.structs import replace
 from worlds import SOFT
 
-import design
-import hw
-import sim
-from cli.design import main as design_command
-from cli.run import main as run_command
-from cli.validate import main as validate_command
-from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import Spring
-from design import DesignOptions, certify, design_coupling, guarantee, transparency_of
-from design.designs import KINDS
-from hw import rehearse
-from models.device import RigidDevice
-from sim import InputError, Scenario, Trace, load, parse, simulate, validate
-from sim.scenario import SCENARIOS
+import haptic_loop
+from haptic_loop import (
+    DesignOptions,
+    InputError,
+    Scenario,
+    Trace,
+    certify,
+    design_coupling,
+    guarantee,
+    load,
+    parse,
+    rehearse,
+    simulate,
+    transparency_of,
+    validate,
+)
 
 SHORT = load().replace(duration=0.3)
 
 
-def test_every_name_that_is_exported_is_there():
-    for package in (sim, design, hw):
-        assert all(getattr(package, name) is not None for name in package.__all__)
-        with pytest.raises(AttributeError, match="no_such_name"):
-            package.no_such_name  # noqa: B018
+def test_every_exported_name_exists():
+    assert all(getattr(haptic_loop, name) is not None for name in haptic_loop.__all__)
+    with pytest.raises(AttributeError, match="no_such_name"):
+        haptic_loop.no_such_name  # noqa: B018
 
 
-def test_a_file_of_the_same_name_does_not_take_the_functions_place():
-    """In whatever order: this file has imported sim.validate already, a fresh process does so first."""
-    assert callable(validate)
-    assert callable(simulate)
-    code = "import sim.crowds; from sim import simulate, validate; print(simulate.__module__)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "sim.api"
-
-
-def test_importing_the_packages_loads_nothing():
-    code = "import sys, sim, design, hw; print(len({'numpy', 'mujoco', 'cvxpy', 'msgspec'} & set(sys.modules)))"
+def test_importing_the_package_loads_no_library():
+    code = "import sys, haptic_loop; print(len({'numpy', 'mujoco', 'cvxpy', 'msgspec'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "0"
 
 
-@pytest.mark.parametrize("package", [sim, design, hw])
-def test_help_and_completion_show_what_is_for_scripts(package):
-    text = pydoc.render_doc(package, renderer=pydoc.plaintext)
-    public = {name for name in dir(package) if not name.startswith("_")}
-    assert public == set(package.__all__)
-    for name in public:
-        kind = "class " if isinstance(getattr(package, name), type) else f"{name}("
-        assert f"{kind}{name}" in text or f"\n    {kind}" in text, name
-    calls = {name for name in public if not isinstance(getattr(package, name), type)}
-    assert all(f"{name}(" in package.__doc__ for name in calls)  # the docstring lists every function
+def test_help_and_completion_show_the_api():
+    text = pydoc.render_doc(haptic_loop, renderer=pydoc.plaintext)
+    public = {name for name in dir(haptic_loop) if not name.startswith("_")}
+    assert public == set(haptic_loop.__all__)
+    assert all(name in text for name in public)
+    calls = {name for name in public if isfunction(getattr(haptic_loop, name))}
+    assert all(f"{name}(" in haptic_loop.__doc__ for name in calls)  # the docstring lists every function
 
 
 def test_the_options_are_those_that_the_designs_take():
     """One table, the types of the arguments, and the designs' own signatures say the same."""
-    from design import fixed_order as ccl
-    from design import optimal, spring_damper
+    from haptic_loop.design import fixed_order as ccl
+    from haptic_loop.design import optimal, spring_damper
 
     assert set(KINDS["ccl"].options) < set(signature(ccl.design).parameters)
     assert set(KINDS["spring-damper"].options) - {"limiter"} < set(signature(spring_damper.design).parameters)

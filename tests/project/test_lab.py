@@ -5,8 +5,8 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from cli.main import COMMANDS, _command
-from cli.options import DOES_NOT_HOLD, DONE
+from haptic_loop.cli.main import COMMANDS, _command
+from haptic_loop.cli.options import DOES_NOT_HOLD, DONE
 
 LAB = str(Path(__file__).parents[2] / "examples/lab.toml")
 DESIGNS = [

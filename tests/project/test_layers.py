@@ -1,13 +1,10 @@
 """Who may import whom, without circles of files or of folders, and which package lives where."""
 
 import ast
-import re
 from functools import cache
 from pathlib import Path
 
 import pytest
-
-from cli.main import COMMANDS
 
 ROOT = Path(__file__).parents[2]
 WORLDS = ("models", "controller", "design", "sim", "hw", "cli")
@@ -80,15 +77,17 @@ def imported(path: Path) -> set[str]:
     for top in _tree(path).body:
         for node in () if is_door(top) else ast.walk(top):
             if isinstance(node, ast.Import):
-                names |= {alias.name for alias in node.names}
+                names |= {alias.name.removeprefix("haptic_loop.") for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 assert node.level == 0, f"{path}: relative import"
-                inside = {f"{node.module}.{alias.name}" for alias in node.names}
+                inside = {f"{node.module}.{alias.name}".removeprefix("haptic_loop.") for alias in node.names}
                 modules = {name for name in inside if file_of(name)}
-                names |= modules or {node.module or ""}
+                names |= modules or {(node.module or "").removeprefix("haptic_loop.")}
             elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
                 names |= {
-                    arg.value for arg in node.args if isinstance(arg, ast.Constant) and isinstance(arg.value, str)
+                    arg.value.removeprefix("haptic_loop.")
+                    for arg in node.args
+                    if isinstance(arg, ast.Constant) and isinstance(arg.value, str)
                 }
     return names
 
@@ -149,16 +148,6 @@ def test_files_have_no_circle():
     assert circle(between_files()) is None
 
 
-def test_design_stands_on_six_floors():
-    """A file stands one floor above the highest that it imports."""
-    arrows = between_files()
-
-    def floor(path: str) -> int:
-        return 1 + max((floor(one) for one in arrows[path] if one.startswith("design/")), default=0)
-
-    assert max(floor(path) for path in arrows if path.startswith("design/")) <= 6
-
-
 def test_folders_have_no_circle():
     folders: dict[str, set[str]] = {}
     for name, after in between_files().items():
@@ -170,7 +159,9 @@ def test_folders_have_no_circle():
 def test_the_check_sees_forbidden_arrows_and_circles(tmp_path):
     wrong = tmp_path / "wrong.py"
     door = "if __name__ == '__main__':\n    import cli.run\n"
-    wrong.write_text(f"import numpy\nfrom sim.run import run\nimport_module('hw.session')\n{door}")
+    wrong.write_text(
+        f"import numpy\nfrom haptic_loop.sim.run import run\nimport_module('haptic_loop.hw.session')\n{door}"
+    )
     assert imported(wrong) == {"numpy", "sim.run", "hw.session"}
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}}) == ["a", "b", "c", "a"]
     assert circle({"a": {"b"}, "b": {"c"}}) is None
@@ -187,70 +178,4 @@ def test_replaced_fields_exist():
         for keyword in node.keywords
         if keyword.arg and keyword.arg not in fields
     ]
-    assert not wrong
-
-
-def prose(path: Path) -> str:
-    """Comments and docstrings of Python, all of any other file but what pages show as a file or as output."""
-    if path.suffix != ".py":
-        return re.sub(r"^```(?:toml|console|text)\n.*?^```", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
-    return "\n".join(re.findall(r'#.*|"""(?:.|\n)*?"""', path.read_text()))
-
-
-PLACES = (*WORLDS, "docs", "tests", "examples")
-#: whatever speaks of our files; the changelog tells of those that are gone
-SPEAKING = [
-    path
-    for place in PLACES
-    for kind in ("py", "md", "h", "ino", "toml", "xml", "c")
-    for path in ROOT.glob(f"{place}/**/*.{kind}")
-]
-SPEAKING += [
-    ROOT / n for n in ("README.md", "CONTRIBUTING.md", "NOTATION.md", "Makefile", "pyproject.toml", "constraints.txt")
-]
-SPEAKING += [ROOT / n for n in (".pre-commit-config.yaml", ".github/workflows/ci.yml", ".ci/run")]
-#: what a reader makes after a page's example, and a word of Linux
-YOURS = {"h.py", "performance"}
-
-
-def _off_the_map(page: str) -> list[str]:
-    """Files of its table that are not there, a name alone being in the folder before it; ours that the page does not
-    name, but for commands and their doors."""
-    named, gone = set(re.findall(r"`((?:\w+/)+\w+\.py)`", page)), []
-    table = page[page.index("## Where each concept") :]
-    for files, tests in re.findall(r"^\|[^|]*\|([^|]*)\|([^|]*)\|", table, re.MULTILINE):
-        for cell in (files, re.sub(r"`(?=\w+/)", "`tests/", tests)):
-            folder = ""
-            for place, file in re.findall(r"`((?:\w+/)*)(\w+\.py)`", cell):
-                folder = place or folder
-                named.add(folder + file)
-                gone += [] if (ROOT / folder / file).exists() else [folder + file]
-    ours = {str(path.relative_to(ROOT)) for world in WORLDS for path in ROOT.glob(f"{world}/**/[!_]*.py")}
-    doors = {f"{module.replace('.', '/')}.py" for module, _ in COMMANDS.values()} | {f"cli/{n}.py" for n in COMMANDS}
-    return gone + sorted(ours - named - doors)
-
-
-def test_what_is_named_is_there():
-    """In comments, docstrings, headers and pages: files of ours, names by their module, words in backticks on pages."""
-    names = {path.name for place in PLACES for path in ROOT.glob(f"{place}/**/*.*")} | YOURS
-    names |= {name for page in SPEAKING for name in re.findall(r"^# (\w+\.py)$", page.read_text(), re.MULTILINE)}
-    words = {word for path in SPEAKING if path.suffix != ".md" for word in re.findall(r"\w+", path.read_text())} | YOURS
-    wrong = []
-    for path in SPEAKING:
-        text, place = prose(path), path.relative_to(ROOT)
-        said = re.findall(rf"(?<![\w/.])(?:{'|'.join(PLACES)})/[a-z_/]+\.[a-z]+\b", text)
-        gone = [name for name in said if not (ROOT / name).exists() and not (ROOT / "tests" / name).exists()]
-        gone += {*re.findall(r"(?<![\w/.<-])[a-z_]+\.(?:py|h|ino)\b(?!>)", text)} - names
-        for world, module, name in re.findall(
-            rf"(?<!from )(?<![\w/.])({'|'.join(WORLDS)})\.(?!py\b|step\b)([a-z_]+)(?:\.(\w+))?", text
-        ):
-            file, front = ROOT / world / f"{module}.py", ROOT / world / "__init__.py"
-            within = [name] if file.exists() else [] if (ROOT / world / module).is_dir() else [module]
-            known = (file if file.exists() else front).read_text()
-            gone += [f"{world}.{module}" for one in within if one not in YOURS and not re.search(rf"\b{one}\b", known)]
-        if path.name == "architecture.md":
-            gone += _off_the_map(path.read_text())
-        if path.suffix == ".md":
-            gone += {*re.findall(r"`([a-z]{4}\w*)(?:\([^`]*)?`", text)} - words
-        wrong += [f"{place}: {name}" for name in gone]
     assert not wrong

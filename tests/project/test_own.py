@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.coupling import Compliance, Coupling
-from controller.environment import Spring, Wall
-from controller.lti import Lti, numbers, taps
+from haptic_loop.controller.coupling import Compliance, Coupling
+from haptic_loop.controller.environment import Spring, Wall
+from haptic_loop.controller.lti import Lti, numbers, taps
 
 
 class Trapezoidal:
@@ -170,7 +170,7 @@ def test_what_is_wrong_with_them_is_said_in_a_line(environment, message, place):
 )
 def test_a_hand_that_fails_after_a_while(force, message, place):
     """In a module that the file of hands imports."""
-    hand = "import numpy as np\nfrom models.human import Port\n\n\nclass Hand:\n    def port(self):\n"
+    hand = "import numpy as np\nfrom haptic_loop.models.human import Port\n\n\nclass Hand:\n    def port(self):\n"
     hand += "        return Port([0.3], [[-1, 1]], [4.0], [500.0])\n\n"
     hand += f"    def voluntary_force(self, t):\n        return {force}\n"
     (place / "friends.py").write_text(hand)

@@ -5,14 +5,13 @@ import json
 import msgspec
 import numpy as np
 import pytest
-
-from cli.accuracy import main
-from controller.coupling import NoCoupling
-from models.device import RigidDevice
-from sim import accuracy as yardstick
-from sim.accuracy import Row, _with_front, credible
-from sim.run import assemble, run
-from sim.scenario import InputError, load
+from haptic_loop.cli.accuracy import main
+from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.models.device import RigidDevice
+from haptic_loop.sim import accuracy as yardstick
+from haptic_loop.sim.accuracy import Row, _with_front, credible
+from haptic_loop.sim.run import assemble, run
+from haptic_loop.sim.scenario import InputError, load
 
 
 @pytest.fixture(scope="module")

@@ -6,21 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from haptic_loop.cli import run as run_command
+from haptic_loop.cli.suite import Check
+from haptic_loop.cli.suite import main as suite
+from haptic_loop.cli.validate import main
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from haptic_loop.design.environments import ThisEnvironment
+from haptic_loop.models.device import RigidDevice
+from haptic_loop.models.hold import hold
+from haptic_loop.models.scene import build, plant
+from haptic_loop.sim import adversary
+from haptic_loop.sim.adversary import _DESTABILISED, search
+from haptic_loop.sim.run import assemble
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.stability import close, dominant_mode
 
-from cli import run as run_command
-from cli.suite import Check
-from cli.suite import main as suite
-from cli.validate import main
-from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
-from design.environments import ThisEnvironment
-from models.device import RigidDevice
-from models.hold import hold
-from models.scene import build, plant
-from sim import adversary
-from sim.adversary import _DESTABILISED, search
-from sim.run import assemble
-from sim.scenario import load
-from sim.stability import close, dominant_mode
 from tests.checks.ours import tightness
 from tests.checks.tightness import attempts, plot_tightness, shortages
 
@@ -150,8 +150,8 @@ def test_a_human_who_destabilises_a_loop_with_enough_damping_fails_the_check(tmp
     monkeypatch.setattr("tests.checks.tightness.THIS_ENVIRONMENT", Third())
     rows = lambda seed: shortages(seed, ("none",), (0,), 5)  # noqa: E731
     check = Check("tightness", "How tight?", rows, tightness, plot_tightness)
-    monkeypatch.setattr("cli.suite.CHECKS", (check,))
-    monkeypatch.setattr("cli.suite._measuring", lambda: ())
+    monkeypatch.setattr("haptic_loop.cli.suite.CHECKS", (check,))
+    monkeypatch.setattr("haptic_loop.cli.suite._measuring", lambda: ())
     assert suite(["--out", str(tmp_path)]) == 1
     assert (tmp_path / "tightness" / "tightness.png").stat().st_size > 10_000
     assert "| no coupling | 0.0% |" in (tmp_path / "report.md").read_text()

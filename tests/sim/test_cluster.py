@@ -15,11 +15,11 @@ import pytest
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra `dask`)")
 
-from controller.coupling import PUBLISHED  # noqa: E402
-from models.scene import MIXED  # noqa: E402
-from sim import crowds as shards  # noqa: E402
-from sim.crowds import _BATCH, Findings, Table, Validation, validate, validate_on_cluster  # noqa: E402
-from sim.scenario import (  # noqa: E402
+from haptic_loop.controller.coupling import PUBLISHED  # noqa: E402
+from haptic_loop.models.scene import MIXED  # noqa: E402
+from haptic_loop.sim import crowds as shards  # noqa: E402
+from haptic_loop.sim.crowds import _BATCH, Findings, Table, Validation, validate, validate_on_cluster  # noqa: E402
+from haptic_loop.sim.scenario import (  # noqa: E402
     InputError,
     load,
 )

@@ -13,13 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from cli.validate import main
-from controller.coupling import PUBLISHED
-from models.scene import MIXED
-from sim import crowds as shards
-from sim.crowds import _BATCH, Findings, Table, Validation, validate
-from sim.scenario import InputError, load
+from haptic_loop.cli.validate import main
+from haptic_loop.controller.coupling import PUBLISHED
+from haptic_loop.models.scene import MIXED
+from haptic_loop.sim import crowds as shards
+from haptic_loop.sim.crowds import _BATCH, Findings, Table, Validation, validate
+from haptic_loop.sim.scenario import InputError, load
 
 ROOT = Path(__file__).parents[2]
 QUESTION = Validation(load(), PUBLISHED["I"], 0, 3 * _BATCH + 10, MIXED, "exact", 0.0)

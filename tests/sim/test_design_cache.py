@@ -5,13 +5,12 @@ from functools import partial
 
 import numpy as np
 import pytest
-
-from controller.coupling import SpringDamper
-from design.certificate import assess
-from design.result import Chosen
-from sim import couplings, design_cache
-from sim.couplings import choose
-from sim.scenario import load
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.design.certificate import assess
+from haptic_loop.design.result import Chosen
+from haptic_loop.sim import couplings, design_cache
+from haptic_loop.sim.couplings import choose
+from haptic_loop.sim.scenario import load
 
 
 @pytest.fixture

@@ -10,16 +10,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from driven import alike, driven
-
-from controller.coupling import PUBLISHED, NoCoupling
-from models.scene import plant
-from sim import engines as mujoco_engine
-from sim import run as loop
-from sim.accuracy import simulated_growth
-from sim.engines import MujocoBatchEngine, MujocoEngine, profiler_off
-from sim.run import assemble, make_engine, outside_forces, run
-from sim.scenario import InputError, load
-from sim.stability import close, dominant_mode
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
+from haptic_loop.models.scene import plant
+from haptic_loop.sim import engines as mujoco_engine
+from haptic_loop.sim import run as loop
+from haptic_loop.sim.accuracy import simulated_growth
+from haptic_loop.sim.engines import MujocoBatchEngine, MujocoEngine, profiler_off
+from haptic_loop.sim.run import assemble, make_engine, outside_forces, run
+from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.stability import close, dominant_mode
 
 SHORT = load().replace(duration=0.6)
 
@@ -150,7 +149,7 @@ def test_profiler_clock_is_put_back_and_changes_no_result(simulation, monkeypatc
         assert found
         assert pointer.value is None
     assert pointer.value == before
-    monkeypatch.setattr("sim.run.profiler_off", nullcontext)
+    monkeypatch.setattr("haptic_loop.sim.run.profiler_off", nullcontext)
     with_clock = run(simulation)
     monkeypatch.undo()
     np.testing.assert_array_equal(with_clock.s, run(simulation).s)

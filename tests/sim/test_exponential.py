@@ -8,16 +8,14 @@ import mujoco
 import numpy as np
 import pytest
 from driven import Driven, alike, driven, tick_by_tick
-from scipy.linalg import expm
-
-from controller.coupling import PUBLISHED, NoCoupling
-from controller.tick import Process, StepBuffer
-from models.device import CompliantDevice
-from models.hold import expm_each, exponential_step, hold
-from models.human import Human, Link
-from models.scene import Crowd, Plant, plant, variants
-from sim import engines
-from sim.accuracy import (
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
+from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.models.device import CompliantDevice
+from haptic_loop.models.hold import expm_each, exponential_step, hold
+from haptic_loop.models.human import Human, Link
+from haptic_loop.models.scene import Crowd, Plant, plant, variants
+from haptic_loop.sim import engines
+from haptic_loop.sim.accuracy import (
     _check_substeps,
     _measured_hold,
     _missed,
@@ -28,8 +26,8 @@ from sim.accuracy import (
     pick,
     simulated_growth,
 )
-from sim.api import run_scenario
-from sim.engines import (
+from haptic_loop.sim.api import run_scenario
+from haptic_loop.sim.engines import (
     EXPONENTIAL,
     INTEGRATORS,
     Engine,
@@ -38,10 +36,11 @@ from sim.engines import (
     MujocoEngine,
     default_integrator,
 )
-from sim.passivity_layer import EnergyNet
-from sim.run import EngineSettings, assemble, make_engine, run
-from sim.scenario import InputError, VaryingDelay, load
-from sim.stability import exact_growth
+from haptic_loop.sim.passivity_layer import EnergyNet
+from haptic_loop.sim.run import EngineSettings, assemble, make_engine, run
+from haptic_loop.sim.scenario import InputError, VaryingDelay, load
+from haptic_loop.sim.stability import exact_growth
+from scipy.linalg import expm
 
 SCENARIO = load()
 RUBBING = SCENARIO.replace(device=(CompliantDevice(friction=0.5),) * 2)
@@ -351,7 +350,7 @@ def test_errors_that_nothing_keeps(scenario, error, message):
 def test_what_would_take_minutes_is_refused_after_two_runs(monkeypatch):
     """The third would be one of the many that the first two foretell; seconds are those of a clock that is made up."""
     clock = iter(np.cumsum([0.0, 2.0, 0.0, 3.0]))  # so that a run takes 1 s, and 1 s for each substep
-    monkeypatch.setattr("sim.accuracy.time.process_time", lambda: float(next(clock)))
+    monkeypatch.setattr("haptic_loop.sim.accuracy.time.process_time", lambda: float(next(clock)))
     moved = []
     with pytest.raises(InputError, match="asks for RK4 with about 256 substeps, 512 CPU s; allowed are 120"):
         compare_engines(assemble(RUBBING, PUBLISHED["I"]), 1e-12, 100, lambda done, ticks: moved.append((done, ticks)))

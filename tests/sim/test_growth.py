@@ -4,15 +4,15 @@ import json
 
 import numpy as np
 import pytest
+from haptic_loop.cli import run as command
+from haptic_loop.cli import trace
+from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.sim.accuracy import settle
+from haptic_loop.sim.run import assemble, make_engine, run
+from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.stability import close, dominant_mode, stability_of
+from haptic_loop.sim.trace import Trace, growth, growths
 
-from cli import run as command
-from cli import trace
-from controller.coupling import NoCoupling
-from sim.accuracy import settle
-from sim.run import assemble, make_engine, run
-from sim.scenario import InputError, load
-from sim.stability import close, dominant_mode, stability_of
-from sim.trace import Trace, growth, growths
 from tests.checks.random_loops import traces
 
 T, STEP = 1.2e-3, np.full(2, 1e-6)

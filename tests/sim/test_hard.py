@@ -6,17 +6,17 @@ from functools import partial
 import numpy as np
 import pytest
 from driven import driven
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
+from haptic_loop.design.certificate import assess
+from haptic_loop.models.device import CompliantDevice
+from haptic_loop.models.human import Human, Link
+from haptic_loop.sim.accuracy import _limit_cycle, default_substeps, simulated_growth
+from haptic_loop.sim.engines import EXPONENTIAL
+from haptic_loop.sim.run import assemble, make_engine, outside_forces, run, run_blocks
+from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.stability import exact_growth
 from worlds import STIFF
 
-from controller.coupling import PUBLISHED, NoCoupling
-from design.certificate import assess
-from models.device import CompliantDevice
-from models.human import Human, Link
-from sim.accuracy import _limit_cycle, default_substeps, simulated_growth
-from sim.engines import EXPONENTIAL
-from sim.run import assemble, make_engine, outside_forces, run, run_blocks
-from sim.scenario import InputError, load
-from sim.stability import exact_growth
 from tests.checks.hard import cases, devices, measure, nominal
 
 

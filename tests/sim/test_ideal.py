@@ -4,14 +4,13 @@ import json
 
 import numpy as np
 import pytest
-
-from cli.run import main
-from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
-from design.files import plain
-from sim.accuracy import ForceError, force_error, response
-from sim.run import Simulation, assemble, run
-from sim.scenario import load
-from sim.trace import Trace
+from haptic_loop.cli.run import main
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from haptic_loop.design.files import plain
+from haptic_loop.sim.accuracy import ForceError, force_error, response
+from haptic_loop.sim.run import Simulation, assemble, run
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.trace import Trace
 
 SCENARIO = load()
 

@@ -6,17 +6,16 @@ import msgspec
 import numpy as np
 import pytest
 from driven import tick_by_tick
+from haptic_loop.cli.run import main
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.design.certificate import assess, prove, prove_limiter
+from haptic_loop.design.coupling_file import Stored, save
+from haptic_loop.design.coverage import covered_limits
+from haptic_loop.sim.api import simulate
+from haptic_loop.sim.couplings import choose, limits_of
+from haptic_loop.sim.run import assemble, make_engine, run
+from haptic_loop.sim.scenario import load
 from worlds import SOFT, STIFF
-
-from cli.run import main
-from controller.coupling import SpringDamper
-from design.certificate import assess, prove, prove_limiter
-from design.coupling_file import Stored, save
-from design.coverage import covered_limits
-from sim.api import simulate
-from sim.couplings import choose, limits_of
-from sim.run import assemble, make_engine, run
-from sim.scenario import load
 
 BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # covered with limited forces in this environment
 

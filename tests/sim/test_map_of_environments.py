@@ -6,22 +6,21 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from haptic_loop.cli import zwidth
+from haptic_loop.cli.options import DONE
+from haptic_loop.controller.coupling import NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring
+from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.design.frequency import on_circle
+from haptic_loop.design.optimal import design
+from haptic_loop.design.program import Options
+from haptic_loop.models.scene import crowds, variants
+from haptic_loop.sim.couplings import choose
+from haptic_loop.sim.limit_cycles import HeldDevices
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.stability import dominant_mode, exact_loops
+from haptic_loop.sim.zwidth import EnvironmentSweep
 from worlds import VERTICES_ONLY
-
-from cli import zwidth
-from cli.options import DONE
-from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import GROUND, Network, Spring
-from controller.tick import Process, StepBuffer
-from design.frequency import on_circle
-from design.optimal import design
-from design.program import Options
-from models.scene import crowds, variants
-from sim.couplings import choose
-from sim.limit_cycles import HeldDevices
-from sim.scenario import load
-from sim.stability import dominant_mode, exact_loops
-from sim.zwidth import EnvironmentSweep
 
 PAIR, STAR = load("omega-pair"), load("three-rigid")
 WALL = Network(("tip",), (Spring(("tip", GROUND), 2000.0, 0.2),))

@@ -10,29 +10,28 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from haptic_loop.cli import export, run, validate
+from haptic_loop.controller.coupling import ForceFilter, InternalModel
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.lti import Sampled
+from haptic_loop.design.certificate import prove, verify
+from haptic_loop.design.coupling_file import Stored, save
+from haptic_loop.design.coupling_file import load as load_file
+from haptic_loop.design.optimal import design
+from haptic_loop.design.program import Options
+from haptic_loop.hw.control import certified_couplings
+from haptic_loop.hw.emulator import Emulator
+from haptic_loop.hw.limits import SafetyLimits, Stage
+from haptic_loop.hw.monitor import LinkSettings
+from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.session import Session
+from haptic_loop.sim.couplings import choose, limits_of
+from haptic_loop.sim.run import assemble
+from haptic_loop.sim.run import run as close_loop
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.view import session as live
+from haptic_loop.sim.view.session import GIVEN, Menu, first_loop
 from worlds import VERTICES_ONLY
-
-from cli import export, run, validate
-from controller.coupling import ForceFilter, InternalModel
-from controller.delay import delay
-from controller.lti import Sampled
-from design.certificate import prove, verify
-from design.coupling_file import Stored, save
-from design.coupling_file import load as load_file
-from design.optimal import design
-from design.program import Options
-from hw.control import certified_couplings
-from hw.emulator import Emulator
-from hw.limits import SafetyLimits, Stage
-from hw.monitor import LinkSettings
-from hw.rehearsal import Rehearsal
-from hw.session import Session
-from sim.couplings import choose, limits_of
-from sim.run import assemble
-from sim.run import run as close_loop
-from sim.scenario import load
-from sim.view import session as live
-from sim.view.session import GIVEN, Menu, first_loop
 
 FREE_MASS = next((Path(__file__).parents[1] / "loops").glob("n4*.toml"))
 SMALL = ((4, 3),)

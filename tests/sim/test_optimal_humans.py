@@ -4,14 +4,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-
-from controller.coupling import Coupling, NoCoupling
-from models.scene import Crowd, Variants, draw, variants
-from sim.adversary import _DESTABILISED, search
-from sim.couplings import choose
-from sim.run import assemble
-from sim.scenario import load
-from sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
+from haptic_loop.controller.coupling import Coupling, NoCoupling
+from haptic_loop.models.scene import Crowd, Variants, draw, variants
+from haptic_loop.sim.adversary import _DESTABILISED, search
+from haptic_loop.sim.couplings import choose
+from haptic_loop.sim.run import assemble
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
 
 DEVICES = ("omega-pair", "omega-pair-rigid")
 HUMANS = 200

@@ -6,21 +6,20 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 import pytest
+from haptic_loop.cli.run import main
+from haptic_loop.cli.validate import main as validate_command
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
+from haptic_loop.controller.delay import Periods
+from haptic_loop.models.hold import hold
+from haptic_loop.models.human import Human, Link, Person, Port, state_space
+from haptic_loop.models.scene import variants
+from haptic_loop.sim.adversary import search_population
+from haptic_loop.sim.crowds import Validation
+from haptic_loop.sim.run import assemble, make_engine, run
+from haptic_loop.sim.scenario import InputError, _load_humans
+from haptic_loop.sim.stability import close, dominant_mode
 
-from cli.run import main
-from cli.validate import main as validate_command
-from controller.coupling import PUBLISHED, NoCoupling
-from controller.delay import Periods
-from design import design_coupling
-from models.hold import hold
-from models.human import Human, Link, Person, Port, state_space
-from models.scene import variants
-from sim import load, simulate, validate
-from sim.adversary import search_population
-from sim.crowds import Validation
-from sim.run import assemble, make_engine, run
-from sim.scenario import InputError, _load_humans
-from sim.stability import close, dominant_mode
+from haptic_loop import design_coupling, load, simulate, validate
 
 AGREE = 1e-6  # RK4 at 0.2 rad of the fastest mode in a step: 0.2^5/120 in each, of which most decays
 SCENARIO = load().replace(duration=1.5)
@@ -195,7 +194,7 @@ def test_the_adversary_finds_nobody_where_there_is_enough_damping():
 def test_the_command_s_adversary_takes_a_population_from_a_file(tmp_path):
     file, report = tmp_path / "who.py", tmp_path / "r.json"
     file.write_text(
-        "import numpy as np\nfrom models.human import Port\n"
+        "import numpy as np\nfrom haptic_loop.models.human import Port\n"
         "class Grip:\n"
         "    def __init__(self, m, k): self.m, self.k = m, k\n"
         "    def port(self): return Port([self.m], [[-1, 1]], [0.2], [self.k])\n"
@@ -258,7 +257,7 @@ def test_a_scenario_keeps_it_and_says_what_is_none():
 def test_the_command_takes_hands_from_a_python_file(tmp_path, capsys):
     hands = tmp_path / "hands.py"
     hands.write_text(
-        "from models.human import Port\n"
+        "from haptic_loop.models.human import Port\n"
         "class Soft:\n"
         "    def port(self): return Port([0.2], [[-1, 1]], [2.0], [90.0])\n"
         "    def voluntary_force(self, t): return 0 * t\n"
@@ -292,7 +291,8 @@ def test_a_measured_hand_and_a_population_from_files(tmp_path):
             _load_humans(file, 2)
         assert message in str(caught.value)
     python = tmp_path / "who.py"
-    drawn = "from models.human import Human, Link\nclass Draw:\n    def draw(self, rng, n):\n        return {}\n"
+    drawn = "from haptic_loop.models.human import Human, Link\n"
+    drawn += "class Draw:\n    def draw(self, rng, n):\n        return {}\n"
     python.write_text(drawn.format("[Human((Link(0.3, 3.0, 200.0),))] * n") + "population = Draw()\n")
     assert len(_load_humans(python, 2).population.draw(None, 3)) == 3
     for text, message in [

@@ -6,15 +6,14 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from haptic_loop.cli.compare import main as compare
+from haptic_loop.cli.run import main as run_command
+from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.controller.delay import packet_delays
+from haptic_loop.sim.passivity_layer import BASELINES, Classic, EnergyNet, Plugged, netted
+from haptic_loop.sim.run import assemble, run
 
-from cli.compare import main as compare
-from cli.run import main as run_command
-from controller.coupling import NoCoupling
-from controller.delay import packet_delays
-from design import design_coupling
-from sim import load, simulate
-from sim.passivity_layer import BASELINES, Classic, EnergyNet, Plugged, netted
-from sim.run import assemble, run
+from haptic_loop import design_coupling, load, simulate
 
 SHORT = load().replace(duration=1.5)
 
@@ -165,9 +164,9 @@ def test_the_report_of_a_run_says_what_the_budget_did(tmp_path):
 
 
 def test_baselines_are_compared_in_one_table_and_one_picture(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("sim.baselines.SECONDS", 3.0)
-    monkeypatch.setattr("sim.baselines.PAIRS", 20)
-    monkeypatch.setattr("cli.compare.options.scenario_from", lambda args: load().replace(duration=3.0))
+    monkeypatch.setattr("haptic_loop.sim.baselines.SECONDS", 3.0)
+    monkeypatch.setattr("haptic_loop.sim.baselines.PAIRS", 20)
+    monkeypatch.setattr("haptic_loop.cli.compare.options.scenario_from", lambda args: load().replace(duration=3.0))
     assert compare(["--baselines", "--out", str(tmp_path / "out"), "--json", str(tmp_path / "r.json")]) == 0
     rows = {row["name"]: row for row in json.loads((tmp_path / "r.json").read_text())["rows"]}
     assert [name for name, row in rows.items() if row["baseline"]] == list(BASELINES)

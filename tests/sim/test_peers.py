@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from controller.coupling import PUBLISHED
-from sim.run import assemble, outside_forces
-from sim.scenario import load
+from haptic_loop.controller.coupling import PUBLISHED
+from haptic_loop.sim.run import assemble, outside_forces
+from haptic_loop.sim.scenario import load
 
 _path = Path(__file__).parents[1] / "benchmarks/peers.py"
 _spec = importlib.util.spec_from_file_location("peers", _path)

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from haptic_loop.design.result import CONDITIONS
+from haptic_loop.sim import map_plot, plots
+from haptic_loop.sim.trace import Trace
 
-from design.result import CONDITIONS
-from sim import map_plot, plots
-from sim.trace import Trace
 from tests.checks.tightness import plot_tightness
 
 

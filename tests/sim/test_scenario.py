@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
+from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.sim.run import assemble, run
+from haptic_loop.sim.scenario import SCENARIOS, InputError, built_in, load, parse
 from worlds import FIGURE_4
-
-from controller.coupling import NoCoupling
-from sim.run import assemble, run
-from sim.scenario import SCENARIOS, InputError, built_in, load, parse
 
 TEXT = (SCENARIOS / "omega-pair.toml").read_text()
 

@@ -2,11 +2,18 @@
 
 import numpy as np
 import pytest
-
-from controller.coupling import PUBLISHED, NoCoupling
-from sim.run import assemble, run
-from sim.scenario import load
-from sim.stability import _NOT_EXCITED, Mode, _left_eigenvector, _measured_growth, close, dominant_mode, verdict
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
+from haptic_loop.sim.run import assemble, run
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.stability import (
+    _NOT_EXCITED,
+    Mode,
+    _left_eigenvector,
+    _measured_growth,
+    close,
+    dominant_mode,
+    verdict,
+)
 
 
 @pytest.mark.parametrize(

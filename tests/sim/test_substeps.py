@@ -4,13 +4,12 @@ import json
 
 import numpy as np
 import pytest
-
-from cli.run import main
-from controller.coupling import PUBLISHED, NoCoupling
-from models.device import CompliantDevice
-from models.human import Human, Link, Person
-from models.scene import plant
-from sim.accuracy import (
+from haptic_loop.cli.run import main
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
+from haptic_loop.models.device import CompliantDevice
+from haptic_loop.models.human import Human, Link, Person
+from haptic_loop.models.scene import plant
+from haptic_loop.sim.accuracy import (
     _check_substeps,
     _measured_hold,
     _step_radius,
@@ -18,10 +17,10 @@ from sim.accuracy import (
     pace,
     simulated_growth,
 )
-from sim.engines import INTEGRATORS, _PlantSpeed
-from sim.run import assemble, make_engine, run
-from sim.scenario import SCENARIOS, InputError, load
-from sim.stability import exact_growth
+from haptic_loop.sim.engines import INTEGRATORS, _PlantSpeed
+from haptic_loop.sim.run import assemble, make_engine, run
+from haptic_loop.sim.scenario import SCENARIOS, InputError, load
+from haptic_loop.sim.stability import exact_growth
 
 SCENARIO = load()
 STIFF = SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=1e6),) * 2)

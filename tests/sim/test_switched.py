@@ -6,29 +6,28 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
-from worlds import STIFF
-
-from cli.run import main
-from cli.validate import main as validate
-from controller.delay import VaryingDelay, ages, realising
-from controller.tick import StepBuffer
-from design import coupling_file
-from models.hold import HeldPlant
-from models.scene import Crowd, draw, plant, variants
-from sim.crowds import _batch
-from sim.engines import ExactEngine
-from sim.run import assemble
-from sim.run import run as close_loop
-from sim.scenario import SCENARIOS, InputError, load, parse
-from sim.stability import impulse_growth
-from sim.switching import (
+from haptic_loop.cli.run import main
+from haptic_loop.cli.validate import main as validate
+from haptic_loop.controller.delay import VaryingDelay, ages, realising
+from haptic_loop.controller.tick import StepBuffer
+from haptic_loop.design import coupling_file
+from haptic_loop.models.hold import HeldPlant
+from haptic_loop.models.scene import Crowd, draw, plant, variants
+from haptic_loop.sim.crowds import _batch
+from haptic_loop.sim.engines import ExactEngine
+from haptic_loop.sim.run import assemble
+from haptic_loop.sim.run import run as close_loop
+from haptic_loop.sim.scenario import SCENARIOS, InputError, load, parse
+from haptic_loop.sim.stability import impulse_growth
+from haptic_loop.sim.switching import (
     _greedy_ages,
     _mode_matrix,
     _worst_switching,
     switched_crowd,
     switching,
 )
+from scipy.linalg import expm
+from worlds import STIFF
 
 ASSEMBLY = assemble(load(), STIFF)
 

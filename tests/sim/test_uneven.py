@@ -7,20 +7,20 @@ import weakref
 import numpy as np
 import pytest
 from driven import alike
+from haptic_loop.cli.run import main
+from haptic_loop.cli.validate import main as validate
+from haptic_loop.controller.coupling import NoCoupling, SpringDamper
+from haptic_loop.controller.delay import Periods, Timing, VaryingDelay
+from haptic_loop.design.files import InputError
+from haptic_loop.models.hold import at_the_latch, hold
+from haptic_loop.models.scene import Plant, plant
+from haptic_loop.sim.crowds import Validation, _examine
+from haptic_loop.sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
+from haptic_loop.sim.run import assemble, make_engine, run
+from haptic_loop.sim.stability import close, dominant_mode
 from scipy.linalg import expm
 
-from cli.run import main
-from cli.validate import main as validate
-from controller.coupling import NoCoupling, SpringDamper
-from controller.delay import Periods, Timing, VaryingDelay
-from design.files import InputError
-from models.hold import at_the_latch, hold
-from models.scene import Plant, plant
-from sim import load
-from sim.crowds import Validation, _examine
-from sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
-from sim.run import assemble, make_engine, run
-from sim.stability import close, dominant_mode
+from haptic_loop import load
 from tests.checks import uneven
 
 SOFT = SpringDamper([879.0, 552.0], [0.39, 0.52])

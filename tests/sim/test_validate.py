@@ -11,23 +11,30 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from driven import driven
-
-from cli import run as run_command
-from cli.validate import main
-from controller.coupling import PUBLISHED, NoCoupling, SpringDamper
-from controller.delay import VaryingDelay
-from models.device import RigidDevice
-from models.hold import hold
-from models.human import Person
-from models.scene import MIXED, Crowd, build, crowds, draw, plant, variants
-from sim import crowds as examine_module
-from sim.couplings import choose
-from sim.crowds import _BATCH, Findings, Validation, validate
-from sim.engines import ExactEngine
-from sim.run import assemble, run
-from sim.scenario import InputError, load
-from sim.stability import close, disagree, dominant_mode, exact_loops, impulse_forces, mujoco_loops, unstable
-from sim.verdicts import Traces
+from haptic_loop.cli import run as run_command
+from haptic_loop.cli.validate import main
+from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from haptic_loop.controller.delay import VaryingDelay
+from haptic_loop.models.device import RigidDevice
+from haptic_loop.models.hold import hold
+from haptic_loop.models.human import Person
+from haptic_loop.models.scene import MIXED, Crowd, build, crowds, draw, plant, variants
+from haptic_loop.sim import crowds as examine_module
+from haptic_loop.sim.couplings import choose
+from haptic_loop.sim.crowds import _BATCH, Findings, Validation, validate
+from haptic_loop.sim.engines import ExactEngine
+from haptic_loop.sim.run import assemble, run
+from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.stability import (
+    close,
+    disagree,
+    dominant_mode,
+    exact_loops,
+    impulse_forces,
+    mujoco_loops,
+    unstable,
+)
+from haptic_loop.sim.verdicts import Traces
 
 SCENARIO = load()
 TWO = "[[human]]\nlinks = [{mass = 1.0, damping = 0, stiffness = 0}]\n" * 2

@@ -10,21 +10,17 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from PIL import Image
-
-from cli import view as command
-from controller.coupling import SpringDamper
-from design.result import Chosen
-from models.hold import hold
-from models.human import Human, Link, Person
-from models.scene import build, plant
-from sim.run import run as close_loop
-from sim.scenario import InputError, load
-from sim.stability import close, dominant_mode
-from sim.view import stage as drawing
-from sim.view.session import (
+from haptic_loop.cli import view as command
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.design.result import Chosen
+from haptic_loop.models.hold import hold
+from haptic_loop.models.human import Human, Link, Person
+from haptic_loop.models.scene import build, plant
+from haptic_loop.sim.run import run as close_loop
+from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.stability import close, dominant_mode
+from haptic_loop.sim.view import stage as drawing
+from haptic_loop.sim.view.session import (
     _DAMPING,
     _STIFFNESS,
     GIVEN,
@@ -42,7 +38,7 @@ from sim.view.session import (
     parse_script,
     words,
 )
-from sim.view.stage import (
+from haptic_loop.sim.view.stage import (
     _COLUMNS,
     FlatPictures,
     ShownScene,
@@ -57,6 +53,9 @@ from sim.view.stage import (
     _typed,
     keys_help,
 )
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
 
 SCENARIO = load()
 

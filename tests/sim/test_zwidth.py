@@ -7,27 +7,26 @@ import msgspec
 import mujoco
 import numpy as np
 import pytest
+from haptic_loop.cli import zwidth
+from haptic_loop.cli.main import execute
+from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED
+from haptic_loop.controller.coupling import NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall, environment
+from haptic_loop.controller.law import Law
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.design.frequency import on_circle, suprema
+from haptic_loop.models.device import CompliantDevice, RigidDevice
+from haptic_loop.models.human import Human, Link
+from haptic_loop.models.scene import build, crowds, variants
+from haptic_loop.sim import zwidth as zwidth_map
+from haptic_loop.sim.engines import _discretised
+from haptic_loop.sim.limit_cycles import Effects, HeldDevices, Plan
+from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.stability import dominant_mode, exact_loops
+from haptic_loop.sim.trace import oscillation, slowest_seen
+from haptic_loop.sim.zwidth import CouplingSweep, Grid, draw_map, make_grid, one_sided
 from worlds import force_map, loop_of
-
-from cli import zwidth
-from cli.main import execute
-from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED
-from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall, environment
-from controller.law import Law
-from controller.loop import Loop
-from controller.tick import Process, StepBuffer
-from design.frequency import on_circle, suprema
-from models.device import CompliantDevice, RigidDevice
-from models.human import Human, Link
-from models.scene import build, crowds, variants
-from sim import zwidth as zwidth_map
-from sim.engines import _discretised
-from sim.limit_cycles import Effects, HeldDevices, Plan
-from sim.scenario import InputError, load
-from sim.stability import dominant_mode, exact_loops
-from sim.trace import oscillation, slowest_seen
-from sim.zwidth import CouplingSweep, Grid, draw_map, make_grid, one_sided
 
 DELTA, T = 1.37, 1e-3
 PAIR, STAR = load("omega-pair"), load("three-rigid")

@@ -1,0 +1,107 @@
+"""Couplings for force-feedback devices with delays: design, proof, simulation in MuJoCo, and a bridge to a device.
+
+    from haptic_loop import load, simulate, validate, design_coupling, certify
+
+load("omega-pair"), parse(text)     Return a Scenario, from a TOML file, a packaged name, or a text.
+Scenario.loop("I")                  Return the Loop of a scenario: all that a design may know of it.
+design_coupling(loop, kind)         Return a Design: the best coupling of a kind. DesignOptions lists the options.
+certify(loop, coupling)             Return a Requirement per condition: the damping that the coupling needs.
+guarantee(loop, requirements)       Return the environments for which the coupling is safe for every passive human.
+transparency_of(loop, coupling)     Return a Transparency: how close the felt force is to the environment's.
+simulate(scenario, coupling)        Return a Trace: a run with the people of the scenario, tick by tick.
+validate(scenario, coupling)        Return Findings: the growth of the loop with many random people.
+rehearse(scenario)                  Return a Rehearsed: a whole session with an emulated device, in virtual time.
+plot_run(trace, path)               Write a picture of a Trace.
+
+Couplings: SpringDamper, NoCoupling. Devices: RigidDevice, CompliantDevice. Environments: Network, with Spring
+and Wall, and RIGID_WALL. InputError and DesignFailed are ValueErrors. Names are imported on first use, so that no
+command waits for a library that it does not need.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from haptic_loop.controller.coupling import NoCoupling, SpringDamper
+    from haptic_loop.controller.environment import RIGID_WALL, Network, Spring, Wall
+    from haptic_loop.controller.loop import Loop
+    from haptic_loop.design.api import DesignOptions, certify, design_coupling, guarantee, transparency_of
+    from haptic_loop.design.result import Design, DesignFailed, Requirement
+    from haptic_loop.design.transparency import Transparency
+    from haptic_loop.hw.rehearsal import Rehearsed, rehearse
+    from haptic_loop.models.device import CompliantDevice, RigidDevice
+    from haptic_loop.sim.api import simulate, validate
+    from haptic_loop.sim.crowds import Findings
+    from haptic_loop.sim.plots import plot_run
+    from haptic_loop.sim.scenario import InputError, Scenario, load, parse
+    from haptic_loop.sim.trace import Trace
+
+_HOMES = {
+    "RIGID_WALL": "controller.environment",
+    "CompliantDevice": "models.device",
+    "Design": "design.result",
+    "DesignFailed": "design.result",
+    "DesignOptions": "design.api",
+    "Findings": "sim.crowds",
+    "InputError": "sim.scenario",
+    "Loop": "controller.loop",
+    "Network": "controller.environment",
+    "NoCoupling": "controller.coupling",
+    "Rehearsed": "hw.rehearsal",
+    "Requirement": "design.result",
+    "RigidDevice": "models.device",
+    "Scenario": "sim.scenario",
+    "Spring": "controller.environment",
+    "SpringDamper": "controller.coupling",
+    "Trace": "sim.trace",
+    "Transparency": "design.transparency",
+    "Wall": "controller.environment",
+    "certify": "design.api",
+    "design_coupling": "design.api",
+    "guarantee": "design.api",
+    "load": "sim.scenario",
+    "parse": "sim.scenario",
+    "plot_run": "sim.plots",
+    "rehearse": "hw.rehearsal",
+    "simulate": "sim.api",
+    "transparency_of": "design.api",
+    "validate": "sim.api",
+}
+
+__all__ = [*_HOMES]  # pyright: ignore[reportUnsupportedDunderAll]
+
+_ROOT = Path(__file__).parents[1]
+if (_ROOT / "pyproject.toml").is_file() and (_ROOT / "controller").is_dir():
+    __path__.append(str(_ROOT))  # in a checkout, haptic_loop.sim is the top-level folder sim
+
+
+def _command_starts() -> bool:
+    """Return whether this process runs one of our commands, which Python may still be looking up."""
+    words, started = sys.orig_argv, sys.argv[0] if sys.argv else ""
+    module = words[words.index("-m") + 1] if "-m" in words[:-1] else ""
+    files = (os.path.join(*module.split("."), "__main__.py"), os.path.join(*module.split(".")) + ".py")
+    if module.removeprefix("haptic_loop.").split(".")[0] in ("design", "sim", "hw", "cli"):
+        return started == "-m" or started.endswith(files)
+    return os.path.basename(started) == "haptic-loop" or started.endswith(os.path.join("cli", "__main__.py"))
+
+
+# MuJoCo's import fails where MUJOCO_GL names a backend that is not installed, and no command renders through it. A
+# user's script keeps its setting.
+if _command_starts():
+    os.environ.pop("MUJOCO_GL", None)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'haptic_loop' has no attribute {name!r}")
+    return getattr(import_module(f"haptic_loop.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """List the names for scripts, and what every package has."""
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]
