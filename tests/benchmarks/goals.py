@@ -29,7 +29,7 @@ from haptic_loop.sim.stability import exact_growth
 from test_engine_cost import SCENES, cpu_seconds, looped, raw
 
 ROOT = Path(__file__).parents[2]
-PAGES = {"engines": "docs/accuracy-engine.md", "cold": "docs/accuracy.md"}
+PAGES = {"engines": "docs/accuracy.md", "cold": "docs/accuracy.md"}
 ROUNDS = 9
 COMMANDS = {
     "sim.run --help": 0.3,
