@@ -36,7 +36,7 @@ class _Switching:
 
     lo: Sequence[int]
     hi: Sequence[int]
-    guarantee: str | None = render.figure("switching, guarantee", older="promise")
+    guarantee: str | None = render.figure("switching, guarantee")
     proof: str | None = render.figure("switching, proof")
     required_damping: Sequence[float] | None = render.figure("switching, required damping [N s/m]", listed)
     margin: float | None = render.figure("switching, margin", "{:.6g}")
@@ -49,7 +49,7 @@ class _Checked:
     proved: bool
     reason: str | None = render.figure("reason")
     condition: str | None = render.figure("condition")
-    guarantee: str | None = render.figure("guarantee", older="promise")
+    guarantee: str | None = render.figure("guarantee")
     proof: str | None = render.figure("proof")
     vertices: int | None = render.figure("vertices")
     between: SearchFigures | None = render.figure("between")

@@ -90,7 +90,6 @@ def add_optimal_options(parser: options.Parser, title: str) -> None:
     limit = "bounds the growth of the basis [s] (default 60), not its first, proofs, the bound or the price of 10 %%; "
     limit += "ranges are searched for what is left, a fifth of it at least, for each of up to three bases"
     group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
-    parser.add_older_optimal(to=group)
 
 
 def _percent(text: str) -> float:
@@ -196,7 +195,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         best=best and _Best(limit, best.g, best.ladder),
         sdps=design.sdps,
         stored=stored,
-        claim=design.own and design.own.said(judged.requirements[design.condition]),
+        claim=design.own and design.own.said(judged.certificates[design.condition]),
     )
 
 
@@ -211,7 +210,7 @@ def _judged_rows(judged: Judged) -> render.Rows:
         yield "", end if max(coupling.K) > 0.999 * STIFFEST else None
         yield "B [N s/m]", listed(coupling.B)
     yield "stiffness, static [N/m]", listed(coupling.stiffness) if coupling.stiffness else None
-    yield from render.certificate_rows(judged.requirements, proof=False)
+    yield from render.certificate_rows(judged.certificates, proof=False)
     yield from judged.ranges.rows() if judged.ranges else ()
     yield "guarantee", judged.guarantee or "none"
     yield "guarantee, forces", judged.limiter.words

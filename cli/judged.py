@@ -26,6 +26,6 @@ def judge(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, met: Sce
 
 def rows(part: Judged) -> render.Rows:
     """What a table says first."""
-    yield from render.certificate_rows(part.requirements, 5)
+    yield from render.certificate_rows(part.certificates, 5)
     yield from part.ranges.rows() if part.ranges else ()
     yield "guarantee", f"holds for {part.guarantee}" if part.guarantee else "none"

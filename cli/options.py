@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import math
 import re
-import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -17,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import msgspec
-from haptic_loop.controller import older
 from haptic_loop.controller.delay import LOST, Periods, VaryingDelay
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.design.files import check_file, folder, read_text
@@ -57,10 +55,6 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
         """As argparse's; an empty word is refused for every option, and a --json file that cannot be written."""
         found, rest = super().parse_known_args(*args, **how)
-        if gone := getattr(found, "gone", None):
-            has = "has" if len(gone) == 1 else "have"
-            why = f"{has} no effect any more: the basis of an optimal coupling grows by itself"
-            print(", ".join(gone), why, file=sys.stderr)
         if ":" in (getattr(found, "condition", None) or ""):
             found.condition = own_condition(found.condition)
         for action in self._actions:
@@ -135,9 +129,8 @@ class Parser(argparse.ArgumentParser):
         (to or self).add_argument("--band", dest="band_hz", type=_band_of, metavar="LOW,HIGH", help=band)
 
     def add_varying_delay(self, what: str, to: _Group | None = None) -> None:
-        """--varying-delay, and --jitter, as it was called."""
+        """--varying-delay."""
         (to or self).add_argument("--varying-delay", type=_delay_ranges, metavar="LO,HI", help=what)
-        (to or self).add_argument("--jitter", dest="varying_delay", type=_delay_ranges, help=argparse.SUPPRESS)
 
     def add_varying_delays(self) -> None:
         """--period, --varying-delay, --pattern, --loss and --playout."""
@@ -170,11 +163,6 @@ class Parser(argparse.ArgumentParser):
     def add_json(self, to: _Group | None = None) -> None:
         """--json."""
         (to or self).add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
-
-    def add_older_optimal(self, to: _Group | None = None) -> None:
-        """What the optimal coupling of version 0.1 was asked with: noted as without effect, for one version."""
-        for name, takes in (("functions", 1), ("filter", 1), ("margin", 1), ("diagonal", 0), ("full", 0)):
-            (to or self).add_argument(f"--{name}", dest="gone", action=_Gone, nargs=takes, help=argparse.SUPPRESS)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -264,11 +252,10 @@ def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 
 def condition(text: str) -> str:
-    """A condition by its name, or by the name that it had before; one of the user's own as it is."""
-    name = older.CONDITIONS.get(text, text)
-    if name not in CONDITIONS and ":" not in text:
+    """The name of a condition, or FILE.py:NAME of a user's own."""
+    if text not in CONDITIONS and ":" not in text:
         raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)} and FILE.py:NAME")
-    return name
+    return text
 
 
 def own_condition(text: str) -> Condition:
@@ -353,8 +340,6 @@ def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) 
 def scenario_from(args: argparse.Namespace) -> Scenario:
     """The scenario that the loop options describe. Raises InputError."""
     scenario = load(args.scenario)
-    if args.scenario in older.SCENARIOS:
-        print(f"scenario {args.scenario} is called {scenario.name} now", file=sys.stderr)
     names = ("theta", "psi", "lam", "latency", "delta", "T", "T_max")
     said = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     changes: dict[str, Any] = {
@@ -362,14 +347,6 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
         for name, value in said.items()
     }
     return scenario.replace(**changes) if changes else scenario
-
-
-class _Gone(argparse.Action):
-    """An option without effect: its name is kept, whatever it was given."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
-        """One name more in `gone`."""
-        namespace.gone = [*(namespace.gone or ()), option_string]
 
 
 def own_or(option: str, text: str, names: Collection[str]) -> Any:

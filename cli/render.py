@@ -207,13 +207,12 @@ def figure(
     default: Any = MISSING,
     json: InJson = "always",
     absent: str | None = None,
-    older: str | None = None,
 ) -> Any:
     """A field that a report's table shows under this name, in this format: of the value, and of the whole report `r`.
 
-    None is shown as `absent`, or not at all. `json` and `older` are as in `off_table` of design/files.py.
+    None is shown as `absent`, or not at all. `json` is as in `off_table` of design/files.py.
     """
-    return field(default=default, metadata={"name": name, "form": form, "json": json, "absent": absent, "older": older})
+    return field(default=default, metadata={"name": name, "form": form, "json": json, "absent": absent})
 
 
 def several(rows: Callable[[Any], Rows], json: InJson = "always") -> Any:

@@ -29,7 +29,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, require_linear, save_
 from haptic_loop.sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
 from haptic_loop.sim.switching import DelaysCovered
 
-_ENVIRONMENTS = ("nominal", "ranges", "box")  # the last is the older name of the second
+_ENVIRONMENTS = ("nominal", "ranges")
 _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
 
@@ -143,7 +143,7 @@ class _Searched:
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, judged: Judged) -> _Searched:
     """The worst humans, in the environment that needs the most damping; what was found before Ctrl-C is kept."""
-    scenario, ratio = question.scenario, judged.requirements["this-environment"].ratio
+    scenario, ratio = question.scenario, judged.certificates["this-environment"].ratio
     if question.environments and judged.whole:
         member, requirement = judged.whole.worst_found
         scenario, ratio = scenario.replace(environment=member.network, ranges=None), requirement.ratio
@@ -209,7 +209,7 @@ class _Own:
 
 def _judged_rows(judged: Judged) -> render.Rows:
     if own := judged.chosen.own:
-        yield from render.certificate_rows({own.name: judged.requirements[own.name]}, 5)
+        yield from render.certificate_rows({own.name: judged.certificates[own.name]}, 5)
     yield "force limits", judged.limiter.words
 
 
@@ -288,7 +288,7 @@ def _reported(
     switching, timing = _varying(question, chosen, findings, certified)
     worst, drawn = (w and verdicts.Attacked.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))
     also = all(part.holds for part in (own, energy, switching, timing, worst, drawn) if part)
-    also = also and not chosen.fails(judged.requirements)
+    also = also and not chosen.fails(judged.certificates)
     traces = verdicts.Traces.of(question, findings) if question.ticks and any_done else None
     both, bad, grows = question.engine != "exact", unstable(findings.exact), unstable(findings.mujoco)
     disagreements, wrong = int(findings.disagreements.sum()), bad | (both & grows & (findings.mujoco > 1e-3))
@@ -326,5 +326,5 @@ def _reported(
         unfinished=findings.lost or None,
         wall_s=wall,
         simulated_s_per_s=findings.simulated / wall,
-        remarks=chosen.remarks(judged.requirements),
+        remarks=chosen.remarks(judged.certificates),
     )

@@ -85,7 +85,7 @@ class _Event:
     exact_growth_rate_per_s: float  # null in JSON where there is none
     exact_frequency_hz: float
     certificates: Mapping[str, Requirement]
-    guarantee: str | None = off_table(older="promise")
+    guarantee: str | None = off_table()
     limiter: Limits = off_table()
 
     @classmethod

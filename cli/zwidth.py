@@ -13,7 +13,6 @@ import msgspec
 from haptic_loop.cli import options, render
 from haptic_loop.cli.judged import chosen_by, judge
 from haptic_loop.controller.lti import Array
-from haptic_loop.controller.older import CONDITIONS as OLDER
 from haptic_loop.design.designs import name_and_own
 from haptic_loop.design.result import Chosen, Requirement
 from haptic_loop.sim import zwidth
@@ -46,7 +45,7 @@ def main(argv: list[str]) -> int:
     sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
         judged = judge(args, scenario, chosen)
-        notes = chosen.remarks(judged.requirements) if chosen.fails(judged.requirements) else chosen.notes
+        notes = chosen.remarks(judged.certificates) if chosen.fails(judged.certificates) else chosen.notes
         fixed = FixedCoupling.of(judged, scenario.loop(args.case).network, notes)
         sweep = replace(sweep, lag=fixed.limiter.rho)
     marks = tuple(args.mark)
@@ -187,7 +186,7 @@ def _share(count: int, report: MapReport) -> str:
 def _designed_rows(fixed: FixedCoupling, limited: bool) -> render.Rows:
     """The fixed coupling in the environment that it was designed for."""
     there = fixed.designed_for
-    asked = [(name, need) for name, need in there.certificates.items() if name not in OLDER]
+    asked = [*there.certificates.items()]
     needs = "; ".join(
         f"{name} needs {100 / need.margin:.4g} % of the damping ({need.proof})" for name, need in asked if need.margin
     )

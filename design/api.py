@@ -162,7 +162,7 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
 class _SwitchingFiled:
     """The guarantee for delays that vary, with its proof or why there is none."""
 
-    guarantee: str = off_table(older="promise")
+    guarantee: str = off_table()
     proof: str | None = off_table()
     reason: str | None = off_table()
 

@@ -18,8 +18,6 @@ from haptic_loop.controller.coupling import (
 )
 from haptic_loop.controller.environment import RIGID_WALL
 from haptic_loop.controller.loop import DelayRange, Loop
-from haptic_loop.controller.older import CONDITIONS as OLDER
-from haptic_loop.controller.older import with_older
 from haptic_loop.design.certificate import RangesCheck, named
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coverage import RangesFigures, Switching
@@ -344,17 +342,17 @@ class Audit:
     coupling: _Coupling
     loop: _Loop
     conditions: dict[str, ConditionAudit] = off_table("inlined")  # also under the names that they had before
-    switching: Switching | None = off_table(older="jitter-proof")
-    ranges: RangesFigures | None = off_table(older="set")
+    switching: Switching | None = off_table()
+    ranges: RangesFigures | None = off_table()
     certified: bool = off_table()
-    guarantee: str | None = off_table(older="promise")
+    guarantee: str | None = off_table()
     helps: list[Help] = off_table()
     not_covered: str = CAVEATS
 
     @property
     def parts(self) -> dict[str, ConditionAudit]:
         """By today's names, in the order of a table: those with names, then the user's own."""
-        return {name: self.conditions[name] for name in {**CONDITIONS, **self.conditions} if name not in OLDER}
+        return {name: self.conditions[name] for name in {**CONDITIONS, **self.conditions}}
 
 
 def audit(
@@ -382,7 +380,7 @@ def audit(
     return Audit(
         _Coupling(coupling.kind, figures.get("K"), figures.get("B")),
         _Loop(loop.T, loop.T_max, loop.latency, loop.theta, loop.psi, loop.delta, rigid),
-        with_older({name: _judged(loop, coupling, conditions[name], r) for name, r in requirements.items()}, OLDER),
+        {name: _judged(loop, coupling, conditions[name], r) for name, r in requirements.items()},
         _switching(loop, coupling, switching) if switching else None,
         whole and RangesFigures.of(whole),
         here and (whole is None or proved or guaranteed == ANY),

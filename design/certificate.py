@@ -16,7 +16,6 @@ from haptic_loop.controller.arithmetic import SingularLoop, TooLong, rational, w
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
-from haptic_loop.controller.older import AUDITS as OLDER
 from haptic_loop.controller.ranges import Member, inside, number_of_vertices
 from haptic_loop.design.conditions import Condition, Demand
 from haptic_loop.design.coupling_file import (
@@ -415,7 +414,7 @@ def _is_ours(condition: Condition) -> bool:
 def named(condition: str | Condition) -> Condition:
     """The condition of that name; one that comes itself is itself. Raises ValueError for an unknown or a taken name."""
     if not isinstance(condition, str):
-        name, taken = getattr(condition, "name", None), {*_NAMED, *OLDER, *(each.name for each in _PARTS)}
+        name, taken = getattr(condition, "name", None), {*_NAMED, *(each.name for each in _PARTS)}
         free = isinstance(name, str) and name.strip() and name not in taken
         if not (free or _is_ours(condition)):
             own = f"condition {type(condition).__name__}: its name is {name!r}"

@@ -17,16 +17,12 @@ import numpy as np
 from haptic_loop.controller.coupling import Coupling, Form, Strict, require_channels
 from haptic_loop.controller.environment import Network
 from haptic_loop.controller.loop import Loop
-from haptic_loop.controller.older import CONDITIONS, GUARANTEES, named_first, named_today
 from haptic_loop.design.files import InputError, counted, read, write
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.result import Guarantee
 
 _Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
 Rows = tuple[tuple[_Rational, ...], ...]  # of a matrix, rationals "p/q"
-
-
-_OLDER = CONDITIONS | GUARANTEES
 
 
 _Part = TypeVar("_Part", bound=msgspec.Struct)
@@ -59,7 +55,7 @@ class Certificate(Strict, frozen=True):
     required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
     available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
     margin: float  # available / required
-    guarantee: Guarantee = msgspec.field(name="promise")
+    guarantee: Guarantee
     proof: Literal["sampled", "kyp", "rational"]
     matrices: dict[str, Rows]
     scenario: str  # digest of the loop and the coupling
@@ -123,7 +119,7 @@ def filed(loop: Loop, coupling: Coupling) -> Coupling:
 def digest(*parts: msgspec.Struct) -> str:
     """sha256 over the canonical JSON (sorted keys, shortest decimals, 7 as 7.0 where it is a float) of the parts."""
     plain = [msgspec.json.decode(_canonical(_read_back(part))) for part in parts]
-    return hashlib.sha256(msgspec.json.encode([named_first(fields) for fields in plain])).hexdigest()
+    return hashlib.sha256(msgspec.json.encode(plain)).hexdigest()
 
 
 def _read_back(part: _Part) -> _Part:
@@ -144,12 +140,9 @@ def own_fields(part: Any) -> Any:
 
 
 def sealed(certificate: Certificate) -> Certificate:
-    """The certificate with the digest of all its other fields, named as in the first files."""
-    older: dict[str, Any] = {name: before for before, name in _OLDER.items()}
-    plain = _read_back(msgspec.structs.replace(certificate, seal=""))
-    guarantee = older.get(plain.guarantee, plain.guarantee)
-    first = msgspec.structs.replace(plain, condition=older.get(plain.condition, plain.condition), guarantee=guarantee)
-    return msgspec.structs.replace(certificate, seal=hashlib.sha256(_canonical([first])).hexdigest())
+    """The certificate with the digest of all its other fields."""
+    unsealed = _read_back(msgspec.structs.replace(certificate, seal=""))
+    return msgspec.structs.replace(certificate, seal=hashlib.sha256(_canonical([unsealed])).hexdigest())
 
 
 def load(path: str | Path) -> Stored:
@@ -158,7 +151,7 @@ def load(path: str | Path) -> Stored:
     if not content.strip():
         raise InputError(f"{path}: is empty, expected a coupling as python -m design stores it")
     try:
-        stored = msgspec.json.decode(_renamed(content), type=Stored)
+        stored = msgspec.json.decode(content, type=Stored)
         json.loads(content, object_pairs_hook=_once)
         return stored
     except _Twice as error:
@@ -167,21 +160,6 @@ def load(path: str | Path) -> Stored:
         raise InputError(f"{path}: is no stored coupling: {counted(' '.join(str(error).split()))}") from None
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: {_place(content, str(error))}{' '.join(str(error).split())}") from None
-
-
-def _renamed(content: bytes) -> bytes:
-    """The content by the names of today; as it is where it has those, or is no stored coupling."""
-    try:
-        whole = msgspec.json.decode(content)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return content
-    match whole:
-        case {"certificate": dict() as claim}:
-            claim |= {key: _OLDER[word] for key, word in claim.items() if isinstance(word, str) and word in _OLDER}
-    match whole:
-        case {"loop": dict() as loop}:
-            whole["loop"] = named_today(loop)
-    return msgspec.json.encode(whole)
 
 
 class _Twice(Exception):

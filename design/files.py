@@ -315,13 +315,13 @@ def _fill(file: BinaryIO, content: Callable[[BinaryIO], None] | bytes | str) -> 
 InJson = Literal["always", "if given", "inlined", "left out"]
 
 
-def off_table(json: InJson = "always", default: Any = MISSING, older: str | None = None) -> Any:
-    """A field of a report that no table shows; `older` is the name that its JSON key had before, which is kept beside.
+def off_table(json: InJson = "always", default: Any = MISSING) -> Any:
+    """A field of a report that no table shows.
 
     In JSON it is a key `always`, or only `if given`, where it is not None; or `left out`; or it is a report of its own
     whose keys are `inlined` among the others.
     """
-    return field(default=default, metadata={"json": json, "older": older})
+    return field(default=default, metadata={"json": json})
 
 
 def plain(report: Any) -> Any:
@@ -349,8 +349,7 @@ def _part(report: Any) -> dict[str, Any]:
         if how == "inlined":
             part |= plain(value) or {}
         elif how == "always" or (how == "if given" and value is not None):
-            key = one.name.removesuffix("_")  # from_, for Python has its own `from`
-            part |= dict.fromkeys((key, one.metadata.get("older") or key), plain(value))
+            part[one.name.removesuffix("_")] = plain(value)  # from_, for Python has its own `from`
     return part
 
 

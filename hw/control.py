@@ -304,7 +304,7 @@ class ProgramFigures:
     coupling: CouplingFigures | None = None
     certificate: Requirement | None = None
     certificates: Mapping[str, Requirement] | None = None
-    guarantee: str | None = off_table(default=None, older="promise")
+    guarantee: str | None = off_table(default=None)
     link_delay: int | None = None
     latency_s: tuple[tuple[float, float], ...] | None = None
     T_max_s: float | None = None

@@ -18,7 +18,6 @@ import msgspec
 import numpy as np
 from haptic_loop.controller.coupling import Form
 from haptic_loop.controller.lti import Array
-from haptic_loop.controller.older import named_today
 from haptic_loop.design.files import counted, read_arrays, write
 from haptic_loop.hw.control import Arming, BudgetPlan, CertifiedCoupling, SentBudget, TraceRow, host_controller
 from haptic_loop.hw.limits import SafetyLimits, Units
@@ -175,9 +174,8 @@ def replay(result: Trace, link: dict[str, Array]) -> _Comparison:
 
 
 def _recipes_of(result: Trace) -> list[Recipe]:
-    """The recipes in a trace, one for each arming, in the words of today."""
-    raw = [recipe | {"scenario": named_today(recipe["scenario"])} for recipe in result.meta["replay"]]
-    return msgspec.convert(raw, Annotated[list[Recipe], msgspec.Meta(min_length=1)])
+    """The recipes in a trace, one for each arming."""
+    return msgspec.convert(result.meta["replay"], Annotated[list[Recipe], msgspec.Meta(min_length=1)])
 
 
 def _again(

@@ -43,7 +43,7 @@ class Alternative:
 
     coupling: str  # its kind
     condition: str | None
-    guarantee: str | None = off_table(default=None, older="promise")
+    guarantee: str | None = off_table(default=None)
     dc_ratio: float | None = None  # share of the static stiffness that is felt
     rms_mismatch_db: float | None = None
     growth_rate_per_s: float | None = None  # of the exact loop
@@ -120,7 +120,7 @@ def _alternative(
     except ValueError as error:
         return Alternative(kind, condition, reason=str(error))
     known = chosen.certificate
-    requirements = own.requirements if own else assess(loop, chosen.coupling, known, False, also)
+    requirements = own.certificates if own else assess(loop, chosen.coupling, known, False, also)
     simulation = assemble(scenario, chosen.coupling, own.limiter.rho if own else _lag(scenario, chosen, requirements))
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)

@@ -9,8 +9,6 @@ from pathlib import Path
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
-from haptic_loop.controller.older import CONDITIONS as OLDER
-from haptic_loop.controller.older import with_older
 from haptic_loop.design import compare
 from haptic_loop.design.files import off_table
 from haptic_loop.design.optimal import nearby as nearby_with_price
@@ -48,7 +46,7 @@ class ComparedCoupling:
     nearby: Nearby = off_table("inlined")
     curves: compare.Curves = off_table("inlined")
     coupling: CouplingFigures = off_table("inlined")
-    conditions: dict[str, ConditionCurve] = off_table("inlined")  # also under the names that they had before
+    conditions: dict[str, ConditionCurve] = off_table("inlined")
 
     @classmethod
     def of(cls, loop: Loop, name: str, chosen: Chosen, judged: compare.Demands, hz: Array) -> ComparedCoupling:
@@ -65,7 +63,7 @@ class ComparedCoupling:
             nearby(loop, chosen.coupling),
             curves,
             CouplingFigures.of(chosen.kind, chosen.coupling, loop.T),
-            with_older(conditions, OLDER),
+            conditions,
         )
 
 
@@ -88,7 +86,7 @@ class LimitCurves:
     case: str
     objective: str
     delays_kept_in: str
-    options: Options = off_table(older="wish")
+    options: Options = off_table()
     here: Here = off_table()
     sweeps: dict[str, compare.Sweep] = off_table()
     gains: list[str] = off_table()
@@ -117,7 +115,7 @@ class Comparison:
     @property
     def conditions(self) -> list[str]:
         """By which every coupling is judged."""
-        return [name for name in self.couplings[0].conditions if name not in OLDER]
+        return [*self.couplings[0].conditions]
 
     @classmethod
     def of(

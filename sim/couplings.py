@@ -9,8 +9,6 @@ from typing import Any
 
 from haptic_loop.controller.coupling import PUBLISHED, Coupling, NoCoupling
 from haptic_loop.controller.loop import DelayRange, Loop
-from haptic_loop.controller.older import CONDITIONS as OLDER
-from haptic_loop.controller.older import with_older
 from haptic_loop.design.api import COUPLING, bare, fitting
 from haptic_loop.design.certificate import RangesCheck, assess, check_ranges, verify
 from haptic_loop.design.conditions import Condition
@@ -229,9 +227,9 @@ class Judged:
     chosen: Chosen = off_table("left out")
     whole: RangesCheck | None = off_table("left out")
     coupling: CouplingFigures = off_table()
-    certificates: dict[str, Requirement] = off_table()  # by condition, also under the names that they had before
-    guarantee: str | None = off_table(older="promise")
-    ranges: RangesFigures | None = off_table(older="set")
+    certificates: dict[str, Requirement] = off_table()  # by condition
+    guarantee: str | None = off_table()
+    ranges: RangesFigures | None = off_table()
     limiter: Limits = off_table()
 
     @classmethod
@@ -248,16 +246,11 @@ class Judged:
             chosen,
             whole,
             CouplingFigures.of(chosen.kind, chosen.coupling, loop.T),
-            with_older(requirements, OLDER),
+            requirements,
             guarantee_of(requirements, loop, bool(whole and whole.proved)),
             whole and RangesFigures.of(whole),
             limits,
         )
-
-    @property
-    def requirements(self) -> dict[str, Requirement]:
-        """The certificates under today's names alone."""
-        return {name: need for name, need in self.certificates.items() if name not in OLDER}
 
     @property
     def proved(self) -> bool:

@@ -67,7 +67,7 @@ class RunReport:
     encoder: EncoderSteps | None
     transparency: Transparency
     stability: Stability
-    varying_delay: VaryingDelays | None = off_table(older="jitter")
+    varying_delay: VaryingDelays | None = off_table()
     run: Ran
     error: accuracy.PositionError
     credible: accuracy.Credible
@@ -87,7 +87,7 @@ class RunReport:
     def notes(self) -> list[str]:
         """Remarks that explain the figures."""
         lines, guarantee = [], self.judged.guarantee
-        certificates, part = self.judged.requirements, self.certificate
+        certificates, part = self.judged.certificates, self.certificate
         if not part.certified and not part.reason:
             source = named(self.judged.chosen.asked).source
             condition = f"the {part.condition} condition" + (f" ({source})" if source else "")
@@ -126,7 +126,7 @@ def run_report(
 ) -> RunReport:
     """The report of a run in the environment of this name; `check` runs another integrator beside it."""
     simulation, trace, loop, chosen = run.simulation, run.trace, scenario.loop(case), judged.chosen
-    covered = any(requirement.certified for requirement in judged.requirements.values())
+    covered = any(requirement.certified for requirement in judged.certificates.values())
     delays, grows = None, None
     if simulation.scenario.varying_delay:
         delays = VaryingDelays.of(simulation, chosen, run.period, trace.t.size, covered)
@@ -151,10 +151,10 @@ def run_report(
         error=accuracy.position_error(trace, run.exact, simulation, grows),
         credible=accuracy.credible(simulation, trace),
         ideal_force=accuracy.force_error(run.ran, trace, loop.lam),
-        energy_budget=budget and replace(budget, idle=idle(simulation, judged.requirements.values(), budget)),
+        energy_budget=budget and replace(budget, idle=idle(simulation, judged.certificates.values(), budget)),
         baseline=net if isinstance(net, BaselineFigures) else None,
         reproducibility=beside_the_paper(simulation.scenario, case, stability, judged.coupling),
-        remarks=(*run.remarks, *chosen.remarks(judged.requirements)),
+        remarks=(*run.remarks, *chosen.remarks(judged.certificates)),
     )
     return replace(found, remarks=(*found.remarks, *found.notes()))
 

@@ -32,8 +32,6 @@ from haptic_loop.controller.environment import (
 )
 from haptic_loop.controller.loop import MOST_SAMPLES, DelayRange, Loop
 from haptic_loop.controller.lti import Lti
-from haptic_loop.controller.older import SCENARIOS as OLDER_SCENARIOS
-from haptic_loop.controller.older import named_first, named_today
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.design.files import InputError, counted, printable, read_text, toml, write
 from haptic_loop.design.own import called, named, place_of, reach_working_directory
@@ -198,7 +196,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """SHA-256 over the scenario's contents."""
         newer = {"T_max", "latency", "period"}  # left out where they are not given: scenarios keep their digest
         contents = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in newer or value}
-        content = msgspec.json.encode(named_first(contents), order="sorted", enc_hook=_contents)
+        content = msgspec.json.encode(contents, order="sorted", enc_hook=_contents)
         return hashlib.sha256(content).hexdigest()
 
     def reference_delays(self, case: str) -> tuple[int, ...]:
@@ -267,8 +265,7 @@ def load(source: str | Path = DEFAULT) -> Scenario:
     if not isinstance(source, str | Path):
         kind = type(source).__name__
         raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
-    name = OLDER_SCENARIOS.get(str(source), str(source))
-    path = SCENARIOS / f"{name}.toml" if name in built_in() else Path(source)
+    path = SCENARIOS / f"{source}.toml" if str(source) in built_in() else Path(source)
     text = read_text(path, f"scenario {source}", f"; give a TOML file or one of: {', '.join(built_in())}")
     return parse(text, str(source))
 
@@ -421,7 +418,7 @@ def _converted(text: str, kind: Any, source: str) -> Any:
     """TOML text as `kind`. Raises InputError with the path of the field and the value that came."""
     raw = toml(text, source)
     try:
-        raw = _whole(named_today(raw)) if kind is Scenario else raw
+        raw = _whole(raw) if kind is Scenario else raw
         return msgspec.convert(_with_own(_with_catalogue(raw)), kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None

@@ -256,7 +256,7 @@ class DelaysCovered:
 
     covered: bool
     covers: str  # which delays, in words
-    switching: Switching | None = off_table(default=None, older="jitter_proof")
+    switching: Switching | None = off_table(default=None)
     on_file: DelayRange | None = None
 
     @classmethod

@@ -105,8 +105,8 @@ class _DesignedFor:
 
     contact_springs: list[_ContactSpring]
     certificates: dict[str, Requirement]
-    guarantee: str | None = off_table(older="promise")
-    ranges: RangesFigures | None = off_table(older="set")
+    guarantee: str | None = off_table()
+    ranges: RangesFigures | None = off_table()
 
 
 @dataclass(frozen=True, eq=False)

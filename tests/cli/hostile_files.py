@@ -214,7 +214,7 @@ CLAIMS = [
     ("certificate.margin", 1e9),
     ("certificate.proof", "magic"),
     ("certificate.condition", "this-environment"),
-    ("certificate.promise", "these ranges"),
+    ("certificate.guarantee", "these ranges"),
     ("certificate.seal", "x"),
     ("certificate.scenario", "x"),
     ("certificate.versions", {}),

@@ -32,7 +32,7 @@ def test_a_proved_coupling_exits_with_0_and_prints_only_json_on_request(path, ca
     out, err = capsys.readouterr()
     result = json.loads(out)
     assert result["proved"]
-    assert result["promise"] == "any passive environment"
+    assert result["guarantee"] == "any passive environment"
     assert result["required_damping"][0] < 1.37
     assert "proved, in exact arithmetic" in err
 
@@ -43,7 +43,7 @@ def test_a_changed_gain_exits_with_1_and_says_why(path, tmp_path, capsys):
     assert "not proved" in capsys.readouterr().out
     result = json.loads((tmp_path / "result.json").read_text())
     assert "digest differs" in result["reason"]
-    assert result["promise"] is None
+    assert result["guarantee"] is None
 
 
 @pytest.mark.parametrize("content", [None, b"", b"{", b"[]", b"\xff", b'{"loop": {}}', b"[" * 100000])

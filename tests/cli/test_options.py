@@ -1,15 +1,10 @@
 """Types of options: one line that names the option, what came and what is allowed; names of conditions, old and new."""
 
 import argparse
-import json
 from dataclasses import dataclass
 
 import pytest
-from haptic_loop.cli import compare as cli_compare
-from haptic_loop.cli import design as cli_design
 from haptic_loop.cli import options, render
-from haptic_loop.cli.audit import main as audit
-from haptic_loop.cli.run import main as run
 from haptic_loop.controller.loop import DelayRange
 from haptic_loop.design.files import one_line
 from haptic_loop.sim.scenario import InputError
@@ -62,28 +57,6 @@ def test_good_words():
         options.per_channel("--K", args.K, 3)
 
 
-OLDER = {"any-environment": "theorem4", "this-environment": "closed-loop"}  # older name
-
-
-@pytest.mark.parametrize("name", OLDER)
-def test_a_condition_has_a_name_and_the_one_that_it_had(name):
-    new, old = (parser().parse_args(["--condition", word]).condition for word in (name, OLDER[name]))
-    assert new == old == name
-
-
-def test_a_report_has_both_keys_of_a_condition(tmp_path, capsys):
-    words = ["--K", "879,552", "--B", ".39,.52", "--out", str(tmp_path)]
-    assert audit([*words, "--json", str(tmp_path / "audit.json")]) == 0
-    found = json.loads((tmp_path / "audit.json").read_text())
-    assert all(found[name] == found[OLDER[name]] for name in OLDER)
-    assert "any-environment" in capsys.readouterr().out
-    quick = ["--case", "none", "--duration", "0.1", "--no-plot", "--no-alternatives", "--out", str(tmp_path)]
-    assert run([*quick, "--json", str(tmp_path / "run.json")]) == 0
-    certificates = json.loads((tmp_path / "run.json").read_text())["certificates"]
-    assert all(certificates[name] == certificates[OLDER[name]] for name in OLDER)
-    assert set(certificates) == {*OLDER, *OLDER.values()}
-
-
 @dataclass(frozen=True)
 class Report:
     name: str = render.figure("loop")
@@ -110,15 +83,3 @@ def test_a_message_quotes_eighty_characters_and_no_control_character():
     assert line.endswith("x1b[31m, 'I', 'II'")
     assert max(len(word) for word in line.split() if "/" not in word) == 80
     assert one_line("the scenario's words " + "and more " * 20 + "'x'").endswith("'x'")
-
-
-def test_what_an_optimal_coupling_was_asked_with_is_accepted_with_one_note(capsys):
-    older = ["--functions", "16", "--filter", "mixed", "--margin", "0.0072", "--diagonal", "--full"]
-    for command, words in ((cli_design, ["--best"]), (cli_compare, ["--over"])):
-        plain, args = (command._parser().parse_args([*words, *more]) for more in ([], older))
-        assert {**vars(args), "gone": None} == vars(plain)
-        assert capsys.readouterr().err.splitlines() == [
-            "--functions, --filter, --margin, --diagonal, --full have no effect any more: "
-            "the basis of an optimal coupling grows by itself"
-        ]
-        assert not [word for word in older if word in command._parser().format_help().split()]

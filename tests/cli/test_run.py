@@ -19,7 +19,7 @@ from haptic_loop.sim import run as loop
 from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.trace import Trace
 
-SECTIONS = {"case", "scenario", "coupling", "certificate", "certificates", "promise", "transparency", "stability"}
+SECTIONS = {"case", "scenario", "coupling", "certificate", "certificates", "guarantee", "transparency", "stability"}
 SECTIONS |= {"run", "error", "files"}
 
 
@@ -34,7 +34,7 @@ def test_case_none_is_figure_5(tmp_path):
     assert code == 0
     assert report["certificate"]["required_damping"] == pytest.approx([1.7229] * 2, rel=1e-4)
     assert not report["certificate"]["certified"]
-    assert report["promise"] is None
+    assert report["guarantee"] is None
     assert stability["verdict"] == stability["exact_verdict"] == "unstable"
     assert stability["exact_growth_rate_per_s"] == pytest.approx(1.481, abs=1e-3)
     assert stability["growth_rate_per_s"] == pytest.approx(1.481, abs=1e-3)
@@ -52,7 +52,7 @@ def test_the_default_is_the_design_for_this_environment_with_the_price_of_others
     assert code == 0
     assert report["certificate"]["condition"] == "this-environment"
     assert report["certificate"]["proof"] == "rational"
-    assert report["promise"] == "this environment"
+    assert report["guarantee"] == "this environment"
     assert report["ideal_force"]["error_percent"] == pytest.approx(15.06, abs=0.1)
     assert report["credible"]["until_s"] is None
     rows = {(row["coupling"], row["condition"]): row for row in report["alternatives"]}
@@ -61,9 +61,9 @@ def test_the_default_is_the_design_for_this_environment_with_the_price_of_others
     none, free, here = rows["none", None], rows[sd, "any-environment"], rows[sd, "this-environment"]
     best = rows["optimal", "this-environment"]
     assert none["growth_rate_per_s"] == pytest.approx(1.481, abs=1e-3)
-    assert (none["promise"], none["force_error_percent"]) == (None, None)
+    assert (none["guarantee"], none["force_error_percent"]) == (None, None)
     assert none["required_damping"]["this-environment"] == pytest.approx([1.7229] * 2, rel=1e-4)
-    assert free["promise"] == "any passive environment"
+    assert free["guarantee"] == "any passive environment"
     assert [row["dc_ratio"] for row in (free, here, best)] == pytest.approx([0.476, 0.850, 1.0], abs=1e-3)
     # the run's own coupling comes to the same there, by the other engine
     assert here["force_error_percent"] == pytest.approx(report["ideal_force"]["error_percent"], rel=1e-6)
@@ -98,7 +98,7 @@ def test_the_papers_case_i_is_designed_certified_and_proved(tmp_path):
     assert report["certificate"]["condition"] == "any-environment"
     assert report["certificate"]["certified"]
     assert report["certificate"]["proof"] == "rational"
-    assert report["promise"] == "any passive environment"
+    assert report["guarantee"] == "any passive environment"
     assert report["stability"]["verdict"] == "stable"
     assert report["stability"]["clipped_ticks"] == 0
     assert report["error"]["position_relative_rms"] < 1e-7

@@ -236,7 +236,7 @@ def test_a_run_reports_the_contact_and_who_covers_it(tmp_path):
         return json.loads((tmp_path / "r.json").read_text())
 
     soft, bare = run(), run("--case", "none")
-    assert soft["promise"] == "any passive environment"
+    assert soft["guarantee"] == "any passive environment"
     assert any("any-environment covers it" in line for line in soft["remarks"])
     assert soft["stability"]["contact"]["made"] == 2
     assert [state["touching"] for state in soft["stability"]["contact"]["frozen"]] == [[], [1]]
@@ -245,7 +245,7 @@ def test_a_run_reports_the_contact_and_who_covers_it(tmp_path):
     # f = p/z, y = x: the block is positive if D g/k >= |1 + g + 1/z|^2/4 with k = K + 2 B/T, at best with g = 2
     needed = bare["certificates"]["this-environment"]["required_damping"]
     assert needed == pytest.approx([2 * (3000.0 * 1e-3 + 2 * 2.0)], rel=1e-6)
-    assert bare["promise"] is None
+    assert bare["guarantee"] is None
     assert any("no certificate covers it" in line for line in bare["remarks"])
 
 

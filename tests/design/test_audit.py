@@ -126,7 +126,7 @@ def test_the_papers_gains_and_their_figures():
     assert outcome["this-environment"]["required_damping"] == pytest.approx([1.39871] * 2, rel=1e-5)
     assert outcome["any-environment"]["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
     assert not outcome["certified"]
-    assert outcome["promise"] is None
+    assert outcome["guarantee"] is None
     assert outcome["any-environment"]["stiffest"]["K"] == [None, None]
     assert "B = 5.47 N s/m alone uses up delta = 1.37" in outcome["any-environment"]["stiffest"]["reason"]
 
@@ -136,7 +136,7 @@ def test_the_any_environment_gains_as_the_literature_rounds_them():
     outcome = report(*pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
     assert outcome["this-environment"]["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
     assert outcome["any-environment"]["required_damping"] == pytest.approx([1.37026, 1.37015], abs=1e-5)
-    assert outcome["promise"] == "this environment"
+    assert outcome["guarantee"] == "this environment"
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
@@ -215,11 +215,11 @@ def test_any_coupling_can_be_audited():
 
 
 def test_promises():
-    assert report(*pair(SAFE))["promise"] == "any passive environment"
-    assert report(*pair(SpringDamper([2000.0, 2000.0], [0.2, 0.2])))["promise"] == "this environment"
-    assert report(*wall(5000, 0))["promise"] is None
-    assert report(*wall(900, 0.2, 1))["promise"] == "any passive environment"
-    assert report(*wall(900, 0, 1))["promise"] == "a rigid wall only"
+    assert report(*pair(SAFE))["guarantee"] == "any passive environment"
+    assert report(*pair(SpringDamper([2000.0, 2000.0], [0.2, 0.2])))["guarantee"] == "this environment"
+    assert report(*wall(5000, 0))["guarantee"] is None
+    assert report(*wall(900, 0.2, 1))["guarantee"] == "any passive environment"
+    assert report(*wall(900, 0, 1))["guarantee"] == "a rigid wall only"
 
 
 def test_edge_takes_the_certified_side():
@@ -253,7 +253,7 @@ def test_the_command(run, argv, code, required):
     assert outcome["certified"] == (code == 0)
     if required:
         assert outcome["this-environment"]["required_damping"][0] == pytest.approx(required, rel=3e-5)
-    assert set(outcome) >= {"any-environment", "this-environment", "promise", "helps", "not_covered", "wall_s"}
+    assert set(outcome) >= {"any-environment", "this-environment", "guarantee", "helps", "not_covered", "wall_s"}
     assert outcome["not_covered"] == CAVEATS
     assert "certified" in err
     assert "not for periods longer than the loop's T_max" in " ".join(err.split())
@@ -261,7 +261,7 @@ def test_the_command(run, argv, code, required):
 
 def test_the_report_is_kept(run, tmp_path):
     assert run("--rigid", "--K", "100", "--B", "0", "--theta", "0", "--out", "here")[0] == 0
-    assert strict((tmp_path / "here" / "report.json").read_text())["promise"] == "any passive environment"
+    assert strict((tmp_path / "here" / "report.json").read_text())["guarantee"] == "any passive environment"
 
 
 def test_gains_of_a_device_name_their_source(run):
@@ -287,7 +287,7 @@ def test_stored_couplings(run):
     for name in ("gains.json", "space.json"):
         code, out, _ = run("--coupling", name, "--json", "-")
         assert code == 0
-        assert strict(out)["promise"] == "any passive environment"
+        assert strict(out)["guarantee"] == "any passive environment"
     code, out, _ = run("--coupling", "unstable.json", "--json", "-")
     assert code == 1
     assert "unit circle" in strict(out)["any-environment"]["reason"]

@@ -213,16 +213,6 @@ def test_tampering_is_rejected_with_the_reason():
         assert any(part in verdict.reason for part in reason.split("|")), verdict.reason
 
 
-def test_a_file_that_calls_the_condition_by_its_older_name_is_read_and_still_proved(tmp_path):
-    good = certified(DEFAULT, STIFF, "this-environment")
-    save(good, tmp_path / "new.json")
-    older = (tmp_path / "new.json").read_text().replace("this-environment", "closed-loop")  # older name
-    (tmp_path / "old.json").write_text(older)  # older name
-    assert "closed-loop" in older  # older name
-    assert load(tmp_path / "old.json") == good
-    assert verify(load(tmp_path / "old.json")).proved
-
-
 def test_a_forger_who_repairs_the_digests_still_has_to_prove():
     good = certified(DEFAULT, STIFF, "this-environment")
     starved = change(DEFAULT, delta=(1.36, 1.36))

@@ -14,17 +14,15 @@ from haptic_loop.cli.run import main as run_main
 from haptic_loop.cli.validate import main as validate_main
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.coupling import SpringDamper as StoredSpringDamper
-from haptic_loop.controller.delay import VaryingDelay
 from haptic_loop.controller.environment import Network, Spring, environment
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices
 from haptic_loop.design import optimal
 from haptic_loop.design.certificate import check_ranges, prove, verify
-from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
+from haptic_loop.design.coupling_file import Stored, digest, load, sealed
 from haptic_loop.design.coverage import RangesFigures
 from haptic_loop.design.program import Options
 from haptic_loop.design.result import NotProved
-from haptic_loop.sim import scenario
 from haptic_loop.sim.scenario import SCENARIOS, InputError, parse
 from worlds import FIGURE_4, environment_by_hand, filter_by_hand, force_map
 
@@ -302,25 +300,6 @@ def test_files_without_ranges_have_the_digest_that_they_always_had():
     expected = "b8cae9c8ced7f5c0abcd4246af3ea609fa292b47b365d074618a2702234f644a"
     assert digest(plain, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68)).form()) == expected
     assert digest(LOOP, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68)).form()) != expected
-    # made by version 0.1.0 for these ranges, where they were called a box
-    older = "dcd355b51f9e5c56cfd8feaaec5d21474d31921375d564f152cf7df6be5ec28d"
-    assert digest(LOOP, StoredSpringDamper((2000.0, 1500.0), (0.3865, 0.522)).form()) == older
-
-
-def test_files_and_scenarios_by_the_older_names_are_read(stored, scenario_file, tmp_path):
-    """box, jitter and "a set" are what files of earlier versions say; seals and digests are those of then."""
-    file = tmp_path / "c.json"
-    save(stored, file)
-    file.write_text(file.read_text().replace('"ranges":', '"box":').replace('"these ranges"', '"a set"'))
-    assert load(file) == stored
-    text = scenario_file.read_text()
-    older, delays = text.replace("[ranges", "[box"), "\n[jitter]\nlo = [1, 1]\nhi = [2, 2]\n"
-    assert older != text
-    assert parse(older) == parse(text)
-    assert parse(TEXT + delays).varying_delay == VaryingDelay((1, 1), (2, 2))
-    with pytest.raises(InputError, match="ranges and box, its older name: give one of them"):
-        parse(text + "\n[box]\nmasses = { mass = [0.5, 2.0] }\n")
-    assert scenario.load("omega-pair-box") == scenario.load("omega-pair-ranges")
 
 
 # the commands
@@ -338,8 +317,7 @@ def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, 
     code, design = told(
         design_main, "--coupling", "optimal", "--seconds", "0.1", "--samples", "8", "--out", str(file), *common
     )
-    assert (code, design["promise"], design["ranges"]["vertices"]) == (0, "these ranges", 3)
-    assert (design["guarantee"], design["set"]) == (design["promise"], design["ranges"])  # today's and older names
+    assert (code, design["guarantee"], design["ranges"]["vertices"]) == (0, "these ranges", 3)
     alone, whole = design["price"]
     assert (alone["coupling"], whole["coupling"], whole["violated"]) == ("nominal only", "whole ranges", 0)
     assert alone["violated"] >= 1
@@ -348,7 +326,7 @@ def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, 
     assert load(file).certificate.guarantee == "these ranges"
 
     code, checked = told(check_main, str(file), "--json", str(report))
-    assert (code, checked["promise"], checked["vertices"]) == (0, "these ranges", 3)
+    assert (code, checked["guarantee"], checked["vertices"]) == (0, "these ranges", 3)
 
     out = ["--out", str(tmp_path / "out"), *common]
     at_vertex = [
@@ -364,12 +342,12 @@ def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, 
         "--no-alternatives",
     ]
     code, run = told(run_main, *at_vertex, *out)
-    assert (code, run["promise"]) == (0, "these ranges")
+    assert (code, run["guarantee"]) == (0, "these ranges")
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")
     assert np.abs(np.load(tmp_path / "out" / "trace.npz")["f"][:, 0]).max() < 1e-3  # of the other's force, filtered
 
     code, audit = told(audit_main, "--coupling", str(file), *out)
-    assert (code, audit["promise"], audit["certified"]) == (0, "these ranges", True)
+    assert (code, audit["guarantee"], audit["certified"]) == (0, "these ranges", True)
 
     quick = ["--humans", "24", "--engine", "exact", "--duration", "0", "--no-plot"]
     code, validated = told(validate_main, "--coupling", str(file), "--environments", "ranges", *quick, *out)
@@ -382,7 +360,7 @@ def test_a_violated_vertex_leaves_the_commands_with_1(scenario_file, tmp_path, c
     stiff = ["--condition", "this-environment", "--scenario", str(scenario_file), "--samples", "4"]
     assert design_main([*stiff, "--out", str(tmp_path / "s.json"), "--json", "-"]) == 1
     outcome = json.loads(capsys.readouterr().out)
-    assert outcome["promise"] == "this environment"
+    assert outcome["guarantee"] == "this environment"
     assert outcome["certificate"]["certified"]
     assert load(tmp_path / "s.json").loop.ranges is None
     assert verify(load(tmp_path / "s.json")).proved

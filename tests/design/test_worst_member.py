@@ -199,7 +199,7 @@ def test_design_check_searches_again_and_rejects_a_file_that_was_made_without(tm
     assert verify(load(file)).proved  # of the vertices it is a proof
     assert check_main([str(file), "--json", "-"]) == 1
     result = json.loads(capsys.readouterr().out)
-    assert (result["proved"], result["promise"]) == (False, None)
+    assert (result["proved"], result["guarantee"]) == (False, None)
     assert result["reason"].startswith("proved at the vertices, but violated between them")
     assert result["between"]["violated"]
 

@@ -112,7 +112,7 @@ def test_a_session_is_certified_and_replayed_bit_for_bit(tmp_path, capsys):
     report = json.loads(file.read_text())
     assert report["theta"] == [0, 0]
     assert report["latency_s"][0] == pytest.approx([30e-6, 230e-6])
-    assert report["promise"] == "this environment"
+    assert report["guarantee"] == "this environment"
     assert report["link"]["age_us"]["p50"] == pytest.approx(TAU)
     said = " ".join(capsys.readouterr().out.split())
     assert "forces act 30 to 230 us after their tick" in said

@@ -79,7 +79,7 @@ def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
     found = design_coupling(loop)
     assert design_command(["--out", str(tmp_path / "c.json"), "--json", str(tmp_path / "r.json")]) == 0
     report = json.loads((tmp_path / "r.json").read_text())
-    assert guarantee(loop, certify(loop, found)) == report["promise"] == "this environment"
+    assert guarantee(loop, certify(loop, found)) == report["guarantee"] == "this environment"
     figures = transparency_of(loop, found)
     assert figures.mismatch_db == report["transparency"]["relative_mismatch_db"]
     assert figures == transparency_of(loop, found.coupling)

@@ -46,7 +46,7 @@ def _tree(path: Path) -> ast.Module:
 
 #: conditions are asked what they say; only their homes know their names
 CONDITIONS = {"any-environment", "this-environment", "ANY_ENVIRONMENT", "THIS_ENVIRONMENT"}
-AT_HOME = ("design/conditions", "design/environments", "design/lmi", "design/result", "controller/older")
+AT_HOME = ("design/conditions", "design/environments", "design/lmi", "design/result")
 #: where they stand as data: what a design is made for, the rows of a table, the styles of a picture, one figure's key
 NAMED_IN = (
     *("design/api", "design/certificate", "design/compare", "design/fixed_order", "design/optimal", "design/program"),

@@ -151,7 +151,7 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
     report, text = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
     assert report["axes"] == "environment"
     assert report["coupling"]["kind"] == "optimal"
-    assert report["designed_for"]["promise"] == "this environment"
+    assert report["designed_for"]["guarantee"] == "this environment"
     assert report["designed_for"]["certificates"]["this-environment"]["proof"] == "rational"
     assert report["conditions"] == ["this-environment", "any-environment"]
     assert report["this-environment"]["contradicted_cells"] == 0

@@ -85,7 +85,7 @@ def test_it_runs_by_command_alone_and_in_a_batch(files, form, tmp_path):
     asked = [*common, "--duration", "0.2", "--no-alternatives", "--out", str(tmp_path)]
     assert run.main(asked) == 0
     report = json.loads((tmp_path / "r.json").read_text())
-    assert report["promise"] == "this environment"
+    assert report["guarantee"] == "this environment"
     assert report["robustness"]["percent"] == 10
     assert (report["designed_for_it"] is None) == (form == "pair")
     assert (report["limiter"]["rho"] is not None) == (form == "filter")

@@ -148,7 +148,6 @@ def test_both_engines_meet_the_same_delays(tmp_path):
     # RK4 in four substeps per period: 1e-7 is what the constant loop reaches too
     assert report["error"]["position_relative_rms"] < 1e-7
     varying_delay = report["varying_delay"]
-    assert report["jitter"] == varying_delay  # by its older name
     assert not varying_delay["covered"]
     assert varying_delay["age"]["least"] == [1, 1]
     assert max(varying_delay["age"]["largest"]) > 2  # losses
