@@ -15,6 +15,7 @@ Without @ a fault is there from the start. Every draw comes from a seeded genera
 from __future__ import annotations
 
 import heapq
+import math
 import os
 import re
 import select
@@ -64,6 +65,7 @@ _LINE = {
     "reorder": ("probability per frame that the one after it overtakes it", 0.0, 1.0, 0.1),
     "delay": ("seconds by which every frame is late", 0.0, 10.0, 1e-3),
     "jitter": ("mean of an exponential extra delay in seconds", 0.0, 10.0, 1e-4),
+    "burst": ("seconds between two bursts, which bring every frame that waits", 1e-6, 1.0, 1e-3),
 }
 #: kind -> the same, for the device
 _DEVICE = {
@@ -157,6 +159,8 @@ class Line:
                     due += 1e6 * fault.value
                 elif fault.kind == "jitter":
                     due += 1e6 * float(self._rng.exponential(fault.value))
+                elif fault.kind == "burst":
+                    due = 1e6 * fault.value * math.ceil(due / (1e6 * fault.value))
                 else:
                     frames = [out for one in frames for out in self._strike(fault, one)]
         return [(due, out) for out in frames]

@@ -85,39 +85,73 @@ class Ages:
 
 
 class Measurement:
-    """Counts answers until there are `needed`, arrived or missing. Its end is certain: it counts STATEs too."""
+    """The ages of answers at zero force, until `needed` have arrived or are missing. It ends in any case.
+
+    A STATE tells the margin of the youngest answer only. Where a burst brings n answers between two STATEs, `echo`
+    advances by n, and the answers that it skips are up to (n-1) T older: they are counted with that age, as the
+    delay has to cover them too.
+    """
 
     def __init__(self, needed: int, theta: int, T: float, most_missing: float) -> None:
-        self.ages: list[int] = []
-        self._missed = 0
         self._needed, self._theta, self._T_us, self._most_missing = needed, theta, 1e6 * T, most_missing
+        self._ages: dict[int, int] = {}  # [us] by the number of the tick that the answer is for, never wrapped
+        self._unanswered: set[int] = set()  # ticks whose answer was not there at its latch
+        self._youngest: int | None = None  # the last one that came
+        self._tick = 0  # of the last STATE, never wrapped
+        self._missed = 0
         self._first: State | None = None
         self._last: State | None = None
         self._ticks: list[int] = []  # [us]
         self._states = 0
 
     def note(self, state: State, margin: int | None, missed: int) -> bool:
-        """Take in a STATE; whether that was the last one. Raises SafetyStop where the link cannot be used."""
+        """Process a STATE and return whether it was the last one. Raises SafetyStop where the link cannot be used."""
         self._first = self._first or state
-        if self._last and distance(state.tick, self._last.tick) == 1:
+        passed = distance(state.tick, self._last.tick) if self._last else 0
+        if self._last and passed == 1:
             self._ticks.append((state.t_us - self._last.t_us) & 0xFFFFFFFF)
-        self._last = state
+        self._last, self._tick = state, self._tick + passed
         self._states += 1
         counted = self._states - 2 * self._theta  # before, the device misses answers to ticks that nobody saw
         if counted <= 0:
             return False
-        self._missed += missed
+        self._note_missed(missed, passed)
         if margin is not None:
-            self.ages.append(round(self._theta * self._T_us) - margin)
-            self._missed -= margin < 0  # it was missed, but came after all
-        everything = len(self.ages) + self.missing
+            self._note_answers(self._tick + distance(state.echo, state.tick), margin)
+        everything = len(self._ages) + self.missing
         if everything < self._needed and counted < _STATES_PER_ANSWER * self._needed:
             return False
-        part = 1 - len(self.ages) / (everything if everything >= self._needed else counted)
+        part = 1 - len(self._ages) / (everything if everything >= self._needed else counted)
         if part > self._most_missing:
             raise SafetyStop(f"{100 * part:.0f} % of the answers never reached the device, {self._states} STATEs came")
         self._check_clock(state)
         return True
+
+    def _note_missed(self, missed: int, passed: int) -> None:
+        """Count `missed` latches without an answer. Where it is known which, that answer has no age."""
+        self._missed += missed
+        if missed == passed:
+            unanswered = range(self._tick - self._theta - missed + 1, self._tick - self._theta + 1)
+            self._unanswered.update(unanswered)
+            for tick in unanswered:
+                self._ages.pop(tick, None)  # it was skipped because it was lost
+
+    def _note_answers(self, youngest: int, margin: int) -> None:
+        """Note the age of the answer to tick `youngest`, and of those that it skips."""
+        age = round(self._theta * self._T_us) - margin
+        after = youngest - 1 if self._youngest is None else self._youngest
+        skipped = range(max(after + 1, youngest - 2 * self._theta), youngest)  # older ones were missed long ago
+        for tick in skipped:
+            if tick not in self._unanswered:
+                self._ages[tick] = age + round((youngest - tick) * self._T_us)
+        self._ages[youngest] = age
+        self._missed -= margin < 0  # it was missed, but came after all
+        self._youngest = youngest if self._youngest is None else max(self._youngest, youngest)
+
+    @property
+    def ages(self) -> list[int]:
+        """Ages of the answers that arrived [us]."""
+        return list(self._ages.values())
 
     @property
     def missing(self) -> int:
@@ -126,7 +160,7 @@ class Measurement:
 
     @property
     def result(self) -> Ages:
-        return Ages(tuple(self.ages), self.missing, tuple(self._ticks))
+        return Ages(tuple(self._ages.values()), self.missing, tuple(self._ticks))
 
     def _check_clock(self, state: State) -> None:
         assert self._first is not None

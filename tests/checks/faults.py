@@ -136,6 +136,8 @@ CASES = (
     Fault("answers get late", G.DISARMED, "theta = 2", _LATE, 500.0, designed=True, counted=("late",), lasts=1.2),
     Fault("late, nothing softer", G.STOPPED, "nothing softer", _LATE, 500.0, counted=("late",), lasts=1.2),
     Fault("a slow link from the start", A, faults=("delay=0.004",), designed=True),
+    Fault("answers in bursts, every 3 ms", A, faults=("down:burst=0.003",), designed=True),
+    Fault("STATEs in bursts, every 3 ms", A, faults=("up:burst=0.003",), designed=True),
     Fault("a link too slow", G.REFUSED, "at most theta = 15", ("delay=0.012",), designed=True),
     Fault("a coupling not certified", G.REFUSED, "published is not certified", coupling="published", designed=True),
     Fault("no coupling", G.REFUSED, "without coupling is not certified", coupling="none", designed=True),

@@ -1,7 +1,6 @@
 """A device that does not do what it was told, or whose ticks are not T: found; one that obeys over a bad line: not."""
 
 from contextlib import nullcontext
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -143,7 +142,7 @@ def hand_driven(scenario, rungs):
         nonlocal t, k
         t, k = t + lasts, k + ticks
         clock = t if lie is None else lie
-        session.take(State(phase, k & 0xFFFF, 0, margin, 0, 0, clock & 0xFFFFFFFF, counts, (0, 0)), t)
+        session.take(State(phase, k & 0xFFFF, (k - 1) & 0xFFFF, margin, 0, 0, clock & 0xFFFFFFFF, counts, (0, 0)), t)
         session.poll(t)
 
     while session.stage == Stage.MEASURING:
@@ -308,15 +307,62 @@ def test_answers_that_never_arrive_count_in_the_quantile():
         ages.quantile(0.95)
 
 
-def test_a_link_that_brings_several_forces_at_once_is_measured():
+def test_skipped_answers_are_older_than_the_youngest():
     """A USB frame of 1 ms with T = 0.3 ms: one margin for three FORCEs, of which none is missed."""
     measurement = Measurement(50, 15, 3e-4, 0.2)
     for k in range(1, 1000):
-        state = State(Phase.DISARMED, k, 0, 0, 0, 0, 300 * k, (0, 0), (0, 0))
-        if measurement.note(state, 3500 if k % 3 == 0 else None, 0):
+        brings = k % 3 == 0
+        state = State(Phase.DISARMED, k, k - 3 - k % 3, 0, 0, 0, 300 * k, (0, 0), (0, 0))
+        if measurement.note(state, 3500 if brings else None, 0):
             break
-    assert replace(measurement.result, ticks=()) == Ages((1000,) * 50, 0)
-    assert measurement.result.longest_tick(300.0) == 300.0
+    result = measurement.result
+    assert sorted(set(result.values)) == [1000, 1300, 1600]
+    assert result.missing == 0
+    assert result.longest_tick(300.0) == 300.0
+    assert result.link_delay(300.0, 0.99, 0.0) == 6  # 1600 us, not the 1000 us of the youngest
+
+
+def test_a_lost_answer_is_missing_and_has_no_age():
+    """Every tenth FORCE is lost: the next echo skips it, and 15 ticks later its latch is missed."""
+    measurement, misses = Measurement(500, 15, 1e-3, 0.2), 0
+    for k in range(1, 5000):
+        lost, latch = k % 10 == 0, k - 15
+        missed = int(latch > 0 and latch % 10 == 0)
+        misses += missed
+        state = State(Phase.DISARMED, k, k - lost, 0, 0, misses & 0xFF, 1000 * k, (0, 0), (0, 0))
+        if measurement.note(state, None if lost else 14_800, missed):
+            break
+    ages = list(measurement.result.values)
+    assert ages.count(200) >= len(ages) - 2  # a skip whose latch is still to come may stand for an answer
+    assert measurement.missing == pytest.approx(len(ages) / 9, abs=2)
+
+
+BURSTS = [(1.2e-3, 3e-3), (1.2e-3, 4e-3), (1.2e-3, 5e-3), (5e-4, 1e-3)]  # [s] T, and between two bursts
+
+
+@pytest.mark.parametrize("where", ["down", "both"])
+@pytest.mark.parametrize(("T", "every"), BURSTS)
+def test_the_measured_delay_covers_answers_in_bursts(scenario, T, every, where):
+    """The emulator itself notes how old every FORCE was: no certified delay is shorter, nor two ticks longer."""
+    scenario = scenario.replace(T=T)
+    direction = "" if where == "both" else f"{where}:"
+    faults = (FaultInjection.parse(f"{direction}burst={every}"),)
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=400))
+    emulator, true = Emulator(scenario, faults), []  # [us]
+    accept = emulator.device.accept
+
+    def noted(frame, now):
+        accept(frame, now)
+        ticks = (emulator.device.k - frame.source) & 0xFFFF
+        true.append(ticks * 1e6 * T + now - emulator.device.now)
+
+    emulator.device.accept = noted
+    Rehearsal(session, emulator, lambda ages: (), faults).run_until_armed(0.0)
+    ages = session.measurement.result
+    assert ages.missing == 0
+    needed = int(-(-max(true) // (1e6 * T)))
+    assert needed <= ages.link_delay(1e6 * T, 1.0, 0.0) <= needed + 1
+    assert np.percentile(true, 99) <= ages.quantile(0.99)
 
 
 def test_an_identification_closes_no_loop_that_could_grow(scenario):
