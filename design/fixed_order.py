@@ -99,11 +99,15 @@ class FixedOrder:
         return self.units.si(self.unit_coupling(p))
 
     def start(self, gains: SpringDamper) -> Array:
-        """p of a spring-damper; further states are driven by nothing yet, but are seen."""
+        """p of a spring-damper; each further state is driven by the one before, and nothing reads it yet.
+
+        All states are reachable, so the storage of the weighted loop is well conditioned. A state that is read but not
+        driven makes it singular, and rounding then decides whether the solver finishes the first step.
+        """
         k, b = gains.K * self.units.T / self.units.usable, gains.B / self.units.usable
         pole = b / (k + b)
         A = np.kron(np.diag(pole), np.diag(np.eye(self.order)[0]))
-        spare = np.diag(np.r_[0.0, _SPARE_POLE ** np.arange(1, self.order)]) + np.eye(self.order, k=1)
+        spare = np.diag(np.r_[0.0, _SPARE_POLE ** np.arange(1, self.order)]) + np.eye(self.order, k=-1)
         A = A + np.kron(np.eye(pole.size), spare)
         # 1/(k + b - b/z) = 1/k - (z - 1) (pole/k) / (z - pole)
         B = np.kron(np.diag(pole / k), np.eye(self.order)[:, :1])

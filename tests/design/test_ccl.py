@@ -9,7 +9,7 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.design import fixed_order as ccl
 from haptic_loop.design import spring_damper
 from haptic_loop.design.conditions import any_environment_demand
-from haptic_loop.design.fixed_order import FixedOrder, FixedPoles, descend
+from haptic_loop.design.fixed_order import _START_ROOM, FixedOrder, FixedPoles, descend
 from haptic_loop.design.lmi import RESERVE, Shaping
 from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
 
@@ -117,11 +117,13 @@ def test_more_poles_never_hurt_and_the_structured_poles_are_beaten(structured):
     assert any_environment(V, (1, 2), DELTA).certified
 
 
-@pytest.mark.parametrize(("order", "diagonal"), [(1, False), (2, True)])
-def test_richer_families_start_no_worse(order, diagonal, structured):
-    found = ccl.design(asked(), order, diagonal, most_sdps=3)
-    assert found.objective < structured.objective
-    assert found.requirement.certified
+@pytest.mark.parametrize(("order", "diagonal"), [(1, False), (2, True), (3, True)])
+def test_three_steps_beat_the_structured_design(order, diagonal, structured):
+    """The start is designed for a thousandth less damping, so it is a thousandth worse; each step gains 1 to 3 %."""
+    design = ccl.design(asked(), order, diagonal, most_sdps=3)
+    assert design.sdps == structured.sdps + 3  # no step ended in the solver's rounding
+    assert design.objective < structured.objective * (1 - 10 * _START_ROOM)
+    assert design.requirement.certified
 
 
 def test_delay_in_the_environment_is_paid_for():
