@@ -115,7 +115,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--hand", type=number(0.0, 10.0), default=0.0, metavar="N_S/M", help=rests)
     parser.add_output()
     parser.only("with --rehearse", lambda args: args.rehearse, "hand")
-    parser.only("with --rehearse or --emulate", lambda args: not args.port, "coulomb")
+    parser.only("with --rehearse", lambda args: not args.port, "coulomb")
     parser.only("with --port", lambda args: args.port, "same_place")
     return parser
 

@@ -37,7 +37,6 @@ COMMANDS = {
     "compare": ("design.compare", "couplings side by side, the ladder, the limits of any coupling"),
     "export": ("design.export", "a stored coupling as C99, plain data or a python-control block"),
     "bridge": ("hw.bridge", "drive a device over a serial port"),
-    "emulator": ("hw.emulator", "an emulated device behind a pseudo-terminal"),
     "identify": ("hw.identify", "mass, damping and transmission of a device from a measurement"),
     "replay": ("hw.replay", "a recorded session through the controller again"),
 }

@@ -19,7 +19,7 @@ from typing import Any
 from haptic_loop.cli import options
 from haptic_loop.cli.render import console, progress
 from haptic_loop.hw.control import Armable
-from haptic_loop.hw.emulator import Emulator, FaultInjection, spawned
+from haptic_loop.hw.emulator import KINDS, Emulator, FaultInjection
 from haptic_loop.hw.force_dimension import FORCE_DIMENSION, ForceDimension
 from haptic_loop.hw.haptic_device import HapticDevice, SerialDevice
 from haptic_loop.hw.limits import Stage
@@ -31,24 +31,24 @@ from haptic_loop.hw.transport import Live, SerialPort, preflight
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 _USUAL_BAUD = 921_600
-_SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself
+_SPARE = 600.0  # [s] beside the run, after which a rehearsal ends by itself
 _SHOWN_US = 100_000  # of a rehearsal, between two moves of its progress bar
 _SHOWN = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale", "host_errors")  # counters
-_PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
 
 
 def add_link_options(parser: options.Parser) -> None:
     """Which device, over which line, and how its delay is judged."""
     link = parser.add_argument_group("the link")
     add, number = link.add_argument, options.number
-    port = f"serial port of the device, /dev/ttyACM0 or an emulator's; or {FORCE_DIMENSION}[:0x,1x], devices and axes"
+    port = f"serial port of the device, such as /dev/ttyACM0; or {FORCE_DIMENSION}[:0x,1x], devices and axes"
     add("--port", metavar="PATH", help=port)
-    add("--emulate", action="store_true", help="start hw.emulator and drive that; it arms by itself")
     virtual = "the whole session in virtual time with an emulated device: no port, no waiting, the same everywhere"
     add("--rehearse", action="store_true", help=virtual)
-    fault = "a fault of the emulated device, as hw.emulator has them (--emulate, --rehearse)"
+    fault = "KIND[=VALUE][@START[+DURATION]], times in seconds after arming, for --rehearse; in front up: or down: for "
+    fault += f"one direction, axis2: for an axis; KIND is {', '.join(KINDS)}"
     add("--fault", action="append", default=[], metavar="FAULT", help=fault)
-    add_pace_option(link, "slow motion of an emulator, for busy machines (default 1)")
+    # for tests that drive an emulator behind a pseudo-terminal in slow motion
+    add("--pace", type=number(0.01, 1), default=1.0, help=argparse.SUPPRESS)
     add("--arm", action="store_true", help="arm without being asked (default: when the key a is pressed)")
     baud = "speed of a UART, checked against T; none: USB without one (default 921600; none for a pseudo-terminal)"
     add("--baud", type=_baud_or_none, metavar="N|none", help=baud)
@@ -58,14 +58,9 @@ def add_link_options(parser: options.Parser) -> None:
     add("--quantile", type=number(0.5, 1.0), default=0.99, metavar="Q", help=share)
     guard = "spare time added to that age (default 1e-4)"
     add("--guard", type=number(0.0, 0.1), default=1e-4, metavar="SECONDS", help=guard)
-    parser.only("with --emulate or --rehearse: a device has faults of its own", lambda args: not args.port, "fault")
-    parser.only("with --port: an emulated device arms by itself", lambda args: args.port, "arm")
+    parser.only("with --rehearse: a device has faults of its own", lambda args: args.rehearse, "fault")
+    parser.only("with --port: a rehearsal arms by itself", lambda args: args.port, "arm")
     parser.only("without --rehearse, whose time is virtual", lambda args: not args.rehearse, "pace")
-
-
-def add_pace_option(parser: argparse._ActionsContainer, what: str) -> None:
-    """--pace: seconds of the device's clock per second."""
-    parser.add_argument("--pace", type=options.number(0.01, 1), default=1.0, metavar="P", help=what)
 
 
 def add_safety_options(parser: options.Parser) -> None:
@@ -137,8 +132,8 @@ def _mtime(path: str) -> int | None:
 
 def check_link(args: argparse.Namespace) -> LinkSettings:
     """The settings of a session. Raises InputError where the options contradict each other."""
-    if bool(args.port) + args.emulate + args.rehearse != 1:
-        raise InputError("give either --port PATH or --emulate or --rehearse")
+    if bool(args.port) == args.rehearse:
+        raise InputError("give either --port PATH or --rehearse")
     if args.port and not args.arm and not sys.stdin.isatty():
         raise InputError("no keyboard to arm with: give --arm, if nobody can get hurt")
     return LinkSettings(baud=_baud(args), measure=args.measure)
@@ -181,7 +176,7 @@ def hold_session(
     alone: Scenario | None = None,
     coulomb: float = 0.0,
 ) -> _Held:
-    """From opening the port, or starting an emulator, to the end of the session.
+    """From opening the port to the end of the session, or the same in virtual time with an emulated device.
 
     Where nobody is to hold an emulated device, `alone` is its scenario; `coulomb` [N] is its dry friction.
     """
@@ -191,7 +186,7 @@ def hold_session(
         incidents.attach(session)
         if args.rehearse:
             return _rehearsed(args, session, plan, seconds, incidents, alone, coulomb)
-        device = _device(args, session, stack, seconds, alone is not None, coulomb)
+        device = _device(args, session, stack)
         if args.port and not args.no_preflight:
             with progress("looking at this machine"):
                 found = preflight(args.port)
@@ -210,26 +205,22 @@ def hold_session(
             _clear()  # for what a plan prints
             return plan(ages)
 
-        operator = Operator(args.arm or args.emulate, seconds, _deadman(args.deadman))
+        operator = Operator(args.arm, seconds, _deadman(args.deadman))
         live = Live(session, device, planned, operator, keyboard, watch, args.pace)
         stack.callback(_clear)
         live.run()
     return _Held(live.signals, device.dropped if isinstance(device, SerialDevice) else 0)
 
 
-def _device(
-    args: argparse.Namespace, session: Session, stack: ExitStack, seconds: float, nobody: bool, coulomb: float
-) -> HapticDevice:
-    """The device behind the port, open as long as the stack; with --emulate an emulator's."""
+def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> HapticDevice:
+    """Open the device behind the port, for as long as the stack."""
     if host_clocked(args):
         adapter = stack.enter_context(ForceDimension(session.scenario, args.port.partition(":")[2] or None))
         if not adapter.guarded:
             console(args).print("the device has no watchdog of its own: were this program killed, its force would stay")
         return adapter
-    with progress("starting the emulator" if args.emulate else "opening the port"):
-        words = [*_emulator_options(args, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
-        path = args.port or stack.enter_context(spawned(words))
-    port = stack.enter_context(SerialPort(path, session.settings.baud))
+    with progress("opening the port"):
+        port = stack.enter_context(SerialPort(args.port, session.settings.baud))
     return SerialDevice(port, lambda: args.pace * time.monotonic())
 
 
@@ -262,14 +253,6 @@ def _rehearsed(
             session, emulator, planned, faults, args.seed, operator=operator, keep=False, watch=watch
         ).run_to_the_end(seconds + _SPARE)
     return _Held()
-
-
-def _emulator_options(args: argparse.Namespace, seconds: float) -> list[str]:
-    """The same loop, the faults of --fault, and an end."""
-    given = {name: getattr(args, name) for name in _PASSED_ON if getattr(args, name) is not None}
-    words = [f"--{name}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in given.items()]
-    words += [f"--fault={fault}" for fault in args.fault]
-    return [*words, f"--seed={args.seed}", f"--pace={args.pace}", f"--duration={seconds + _SPARE:g}"]
 
 
 def _show(session: Session) -> None:

@@ -18,7 +18,7 @@ import time
 from collections import defaultdict
 
 from haptic_loop.hw.control import certified_couplings
-from haptic_loop.hw.emulator import Emulator, Terminal
+from haptic_loop.hw.emulator import Emulator
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.limits import ENDED, Stage
 from haptic_loop.hw.monitor import LinkSettings
@@ -29,6 +29,7 @@ from haptic_loop.hw.transport import Live, SerialPort
 from haptic_loop.sim.scenario import load
 
 from tests.checks.faults import _lively
+from tests.pseudo_terminal import Terminal
 
 BLOCK = 200
 PATIENCE = 5.0  # [s] for bytes on their way through the terminal, which a thread of the kernel's moves

@@ -42,7 +42,6 @@ QUICK = {  # what a command needs beside the option in question
     "compare": (),
     "export": ("c.json",),
     "bridge": ("--rehearse", "--duration", "0.2"),
-    "emulator": ("--duration", "0.01"),
     "identify": ("--rehearse",),
     "replay": ("t.npz",),
 }

@@ -24,7 +24,6 @@ NUMERIC = {
     "compare": "points band seconds",
     "export": "seed",
     "bridge": "pace quantile guard measure force-cap max-speed continuous-force thermal-time duration seed baud",
-    "emulator": "duration coulomb pace parent seed",
     "identify": "force band seconds coulomb sittings hand",
 }
 
@@ -225,9 +224,6 @@ SILENT = [
     (("bridge", "--rehearse", "--deadman", "key"), "--deadman"),
     (("bridge", "--rehearse", "--baud", "fast"), "--baud"),
     (("bridge", "--rehearse", "--condition", "magic"), "--condition"),
-    (("emulator", "--fault", ""), "fault"),
-    (("emulator", "--fault", "drop=2@x", "--duration", "0.01"), "drop"),
-    (("emulator", "--parent", "1"), "--parent"),
     (("identify", "--rehearse", "--band", "80,3"), "--band"),
     (("validate", *QUICK["validate"], "--shards", "2", "--dask", "x:1"), "--dask"),
     (("validate", *QUICK["validate"], "--dask", ""), "--dask"),
@@ -288,13 +284,12 @@ REFUSED = {
         --guard 1e9 | --measure 0 | --measure 1e9 | --force-cap 0 | --force-cap 13 | --max-speed 0
         --energy-budget -1 | --pace 0 | --pace 1e-9 | --baud -1 | --continuous-force 0
         --continuous-force 13 | --continuous-force 1,2,3 | --thermal-time 0 | --T 0.05 | --T 1e-6
-        --varying-delay 0,2 | --port nix | --emulate | --duration -1""",
+        --varying-delay 0,2 | --port nix | --duration -1""",
     "identify": """--force 0 | --force 100 | --force -1 | --band 200,3 | --band 0,0 | --band 1,1e9 | --band 3
         --seconds 0 | --seconds 1e9 | --coulomb -1 | --coulomb 100 | --fault axis9:jump | --pace 0 | --T 0.05
         --port nix | --measure 0 | --quantile 2""",
     "zwidth": """--coupling nix | --K-range 5,1 | --B-range -1,5 | --grid 1 | --rigid --theta 1,2
         --mark 1 | --mark 1,2,3 | --points -1 | --velocity-filter 0""",
-    "emulator": "--fault axis9:jump | --fault drop=-1 | --coulomb -1 | --pace 0 | --parent 1 | --duration -1",
 }
 HUMANS = """from haptic_loop.models.human import Human, Link
 humans = [Human((Link(0.3, 3.0, 200.0),))] * 2

@@ -255,7 +255,7 @@ def test_a_record_with_gaps_gives_no_bound():
 def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as error:
-        identify_command(["--emulate", *options])
+        identify_command(["--port", "x", "--arm", *options])
     assert words in str(error.value)
 
 

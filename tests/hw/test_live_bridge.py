@@ -14,14 +14,13 @@ import subprocess
 import sys
 import termios
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from haptic_loop.cli import bridge, identify, replay
-from haptic_loop.cli import emulator as emulator_command
 from haptic_loop.cli.options import Parser
 from haptic_loop.cli.session_cli import add_link_options, check_link
 from haptic_loop.controller.delay import VaryingDelay
@@ -34,6 +33,8 @@ from haptic_loop.hw.session_report import IncidentLog
 from haptic_loop.hw.transport import Live, SerialPort
 from haptic_loop.sim.scenario import InputError
 
+from tests.pseudo_terminal import emulated
+
 pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
 ROOT = Path(__file__).parent.parent.parent
 PACE = 0.2  # seconds of a session per second: the patience of a session (1 s of silence) is 5 s of the machine
@@ -42,12 +43,12 @@ AT_REST = ("silent", "disarmed", "stopped", "estop", "ramp")
 
 
 class EmulatorProcess:
-    """hw.emulator as a stranger starts it."""
+    """An emulated device behind a pseudo-terminal."""
 
     def __init__(self, *options):
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "hw.emulator", "--duration=300", *options],
-            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            [sys.executable, "-m", "tests.pseudo_terminal", "--duration=300", *options],
+            cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -82,12 +83,12 @@ def run(emulator, scenario, plan, watch=lambda session: None, pace=PACE):
 
 
 def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
-    """What docs/hardware.md begins with: a session, a report, a trace that replays bit by bit."""
+    """A session over a serial line, a report, a trace that replays bit by bit."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     for pace in PACES:
-        options = ["--emulate", "--case", "I", "--duration", "0.1", "--measure", "60", "--pace", str(pace)]
-        code = bridge.main([*options, "--json", "-"])
+        options = ["--arm", "--case", "I", "--duration", "0.1", "--measure", "60", "--pace", str(pace)]
+        with emulated(f"--pace={pace}") as path:
+            code = bridge.main([*options, "--port", path, "--no-preflight", "--json", "-"])
         report = json.loads(capsys.readouterr().out)
         stage = report["session"]["stage"]
         assert Stage(stage) in ENDED
@@ -104,7 +105,6 @@ def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
 def test_an_interrupt_while_forces_act_is_130_after_a_ramp(tmp_path, capsys, monkeypatch):
     """The whole command: the gain comes down to zero in 100 ms, and the exit code tells of the interrupt."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     look = IncidentLog.update
 
     def update(incidents, session):
@@ -116,8 +116,9 @@ def test_an_interrupt_while_forces_act_is_130_after_a_ramp(tmp_path, capsys, mon
     monkeypatch.setattr(IncidentLog, "update", update)
     for pace in PACES:
         sent = []
-        options = ["--emulate", "--case", "I", "--duration", "20", "--measure", "60", "--pace", str(pace)]
-        code = bridge.main([*options, "--no-plot", "--json", "-"])
+        options = ["--arm", "--case", "I", "--duration", "20", "--measure", "60", "--pace", str(pace)]
+        with emulated(f"--pace={pace}") as path:
+            code = bridge.main([*options, "--port", path, "--no-preflight", "--no-plot", "--json", "-"])
         report = json.loads(capsys.readouterr().out)
         if sent and report["session"]["stage"] == "finished":  # else the machine was too busy
             break
@@ -181,10 +182,19 @@ def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, rungs, name):
 class BridgeOnTerminal:
     """hw.bridge with a terminal of its own, measuring for as long as the machine likes: nothing is armed."""
 
-    def __init__(self, out):
+    def __init__(self, out, port):
         self.master, self.slave = os.openpty()
         self.before = termios.tcgetattr(self.slave)
-        options = ["--emulate", "--case=I", "--pace=0.05", "--measure=100000", "--no-plot", f"--out={out}"]
+        options = [
+            "--port",
+            port,
+            "--no-preflight",
+            "--case=I",
+            "--pace=0.05",
+            "--measure=100000",
+            "--no-plot",
+            f"--out={out}",
+        ]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "hw.bridge", *options],
             env=os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm"},
@@ -218,8 +228,12 @@ class BridgeOnTerminal:
 
 def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
     """With the line of status drawn and single keys read; SIGQUIT by its key. All at once, since they mostly wait."""
-    bridges = {name: BridgeOnTerminal(tmp_path / name) for name in ("SIGQUIT", "SIGTERM", "SIGHUP")}
-    try:
+    names = ("SIGQUIT", "SIGTERM", "SIGHUP")
+    with ExitStack() as devices:
+        ports = [devices.enter_context(emulated("--pace=0.05")) for _ in names]
+        bridges = {name: BridgeOnTerminal(tmp_path / name, port) for name, port in zip(names, ports, strict=True)}
+        for bridge_on in bridges.values():
+            devices.callback(bridge_on.close)
         for bridge_on in bridges.values():
             assert b"measuring" in bridge_on.read_until(b"measuring")
             assert not bridge_on.settings[3] & (termios.ICANON | termios.ECHO)
@@ -231,18 +245,14 @@ def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
             assert bridge_on.process.wait(60) == 130
             assert name.encode() in shown
             assert bridge_on.settings == bridge_on.before
-    finally:
-        for bridge_on in bridges.values():
-            bridge_on.close()
 
 
-def test_a_device_is_identified_over_the_line(tmp_path, monkeypatch):
+def test_a_device_is_identified_over_the_line(tmp_path):
     """Half a second a sweep, nobody at the handles: a bound below the emulated device's 1.37 N s/m, or why not."""
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     for pace in (1.0, *PACES):
-        options = ["--emulate", "--seconds", "0.5", "--measure", "60", "--sittings", "1"]
-        options += ["--pace", str(pace), "--out", str(tmp_path)]
-        identify.main(options)
+        options = ["--arm", "--seconds", "0.5", "--measure", "60", "--sittings", "1"]
+        with emulated("--nobody", f"--pace={pace}") as path:
+            identify.main([*options, "--port", path, "--pace", str(pace), "--out", str(tmp_path)])
         report = json.loads((tmp_path / "report.json").read_text())
         if report["session"]["log"][-1]["stage"] == "finished" and "without a STATE" not in report.get("reason", ""):
             break
@@ -310,24 +320,6 @@ def test_an_exception_stops_the_device_first(emulator, scenario):
         run(emulator, scenario, plan)
 
 
-def test_an_emulator_ends_with_the_bridge_that_started_it():
-    """However that ended: here by SIGKILL, which nobody can catch. An orphan would keep its terminal for minutes."""
-    code = (
-        "import time; from haptic_loop.hw.emulator import spawned\n"
-        "with spawned(['--case=I', '--pace=0.2', '--duration=660']) as path: print(path, flush=True); time.sleep(600)"
-    )
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    bridge_like = subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
-    path = bridge_like.stdout.readline().strip()
-    assert Path(path).exists()
-    bridge_like.kill()
-    bridge_like.communicate()
-    end = time.monotonic() + 60
-    while Path(path).exists() and time.monotonic() < end:
-        time.sleep(0.02)
-    assert not Path(path).exists()
-
-
 def test_a_coupling_that_is_not_certified_is_not_armed(emulator, scenario):
     def plan(ages):
         return [certified_coupling(scenario, "I", "published", None, 1)]
@@ -348,26 +340,25 @@ def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ([], "either --port PATH or --emulate"),
-        (["--emulate", "--port", "x"], "either --port PATH or --emulate"),
-        (["--port", "/dev/null", "--fault", "drop"], "--fault is only with --emulate"),
+        ([], "either --port PATH or --rehearse"),
+        (["--rehearse", "--port", "x"], "either --port PATH or --rehearse"),
+        (["--port", "/dev/null", "--fault", "drop"], "--fault is only with --rehearse"),
         (["--port", "/nowhere", "--arm"], "--port /nowhere"),
-        (["--emulate", "--case", "none"], "no coupling"),
-        (["--emulate", "--baud", "5"], "--baud is 5, allowed are"),
-        (["--emulate", "--baud", "no"], "--baud is 'no', expected a whole number"),
-        (["--emulate", "--quantile", "2"], "--quantile is 2"),
-        (["--emulate", "--guard", "nan"], "--guard is nan"),
-        (["--emulate", "--measure", "1"], "--measure is 1"),
-        (["--emulate", "--duration", "0"], "--duration is 0"),
-        (["--emulate", "--pace", "2"], "--pace is 2, allowed are 0.01 to 1"),
-        (["--emulate", "--T", "0.05"], "T is 0.05 s"),
-        (["--emulate", "--T", "0.006"], "at most 0.004 s: the host's watchdog is five ticks"),
-        (["--emulate", "--fault", "nonsense"], "the emulator did not start: --fault is 'nonsense'"),
+        (["--rehearse", "--case", "none"], "no coupling"),
+        (["--rehearse", "--baud", "5"], "--baud is 5, allowed are"),
+        (["--rehearse", "--baud", "no"], "--baud is 'no', expected a whole number"),
+        (["--rehearse", "--quantile", "2"], "--quantile is 2"),
+        (["--rehearse", "--guard", "nan"], "--guard is nan"),
+        (["--rehearse", "--measure", "1"], "--measure is 1"),
+        (["--rehearse", "--duration", "0"], "--duration is 0"),
+        (["--port", "x", "--pace", "2"], "--pace is 2, allowed are 0.01 to 1"),
+        (["--rehearse", "--T", "0.05"], "T is 0.05 s"),
+        (["--rehearse", "--T", "0.006"], "at most 0.004 s: the host's watchdog is five ticks"),
+        (["--rehearse", "--fault", "nonsense"], "--fault is 'nonsense'"),
     ],
 )
 def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
     with pytest.raises(InputError) as error:
         bridge.main(options)
     assert words in str(error.value)
@@ -376,8 +367,8 @@ def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "baud"),
     [
-        (["--emulate"], None),
-        (["--emulate", "--baud", "115200"], 115_200),
+        (["--rehearse"], None),
+        (["--rehearse", "--baud", "115200"], 115_200),
         (["--port", "/dev/ttyACM0", "--arm"], 921_600),  # may be an Uno, with a UART behind its USB chip
         (["--port", "/dev/ttyACM0", "--arm", "--baud", "none"], None),
         (["--port", "/dev/ttyUSB0", "--arm", "--baud", "2000000"], 2_000_000),
@@ -406,11 +397,11 @@ def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
     os.close(slave)
 
 
-@pytest.mark.parametrize("module", [bridge, emulator_command, identify])
+@pytest.mark.parametrize("module", [bridge, identify])
 def test_delays_that_vary_in_the_scenario_are_refused_by_name(module, scenario, tmp_path, monkeypatch):
     """The link has the delays that it has; a table that nothing reads would promise something else."""
     monkeypatch.setattr(
         module.options, "scenario_from", lambda args: scenario.replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
     )
     with pytest.raises(InputError, match=r"varying_delay: hw\.\w+ takes the delays that its link has"):
-        module.main([] if module is emulator_command else ["--emulate", "--out", str(tmp_path)])
+        module.main(["--rehearse", "--out", str(tmp_path)])

@@ -115,11 +115,11 @@ def test_a_file_that_is_touched(tmp_path):
 
 
 def test_a_first_session_is_gentle(scenario):
-    args = _parser().parse_args(["--emulate"])
+    args = _parser().parse_args(["--rehearse"])
     limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
     assert limits.cap == (2.0, 2.0)
     assert limits.speed == 1.0
-    args = _parser().parse_args(["--emulate", "--force-cap", "12", "--max-speed", "0.5", "--continuous-force", "3"])
+    args = _parser().parse_args(["--rehearse", "--force-cap", "12", "--max-speed", "0.5", "--continuous-force", "3"])
     limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
     assert (limits.cap, limits.speed, limits.continuous) == ((12.0, 12.0), 0.5, (3.0, 3.0))
 
@@ -137,7 +137,7 @@ def test_a_first_session_is_gentle(scenario):
 )
 def test_impossible_limits_are_refused(scenario, options, words):
     with pytest.raises(InputError) as error:
-        session_for(scenario, LinkSettings(), **limits_from(_parser().parse_args(["--emulate", *options]), scenario))
+        session_for(scenario, LinkSettings(), **limits_from(_parser().parse_args(["--rehearse", *options]), scenario))
     assert words in str(error.value)
 
 

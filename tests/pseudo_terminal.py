@@ -1,0 +1,181 @@
+"""An emulated device behind a pseudo-terminal: in real time, in a process of its own, for tests of the serial stack."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import heapq
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import termios
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from itertools import count
+from pathlib import Path
+
+from haptic_loop.hw.emulator import Emulator, FaultInjection, Line, nobody
+from haptic_loop.sim.scenario import load
+
+_ROOT = Path(__file__).parents[1]
+_PATIENCE = 60.0  # [s] for the emulator to load MuJoCo and print its path
+_LINGER_US = 50_000  # after the cable was pulled: the device comes to rest by itself
+
+
+class Terminal:
+    """A pseudo-terminal whose far end a host can open by its path."""
+
+    def __init__(self) -> None:
+        self.master, self._slave = os.openpty()
+        self.path = os.ttyname(self._slave)
+        tty.setraw(self._slave, termios.TCSANOW)
+        os.set_blocking(self.master, False)
+
+    def read(self) -> bytes:
+        try:
+            return os.read(self.master, 4096)
+        except OSError:  # nothing there, or nobody
+            return b""
+
+    def write(self, data: bytes) -> None:
+        with suppress(OSError):  # nobody reads: a cable keeps nothing either
+            os.write(self.master, data)
+
+    def unplug(self) -> None:
+        """Close both ends: a host that has the path open sees the device disappear."""
+        for end in (self.master, self._slave):
+            os.close(end)
+
+
+class RealTimeEmulator:
+    """The emulator in real time. Its timer never catches up.
+
+    Where this process was held up, the missed time is taken out of the device's clock, since catching up would look to
+    the host like answers that came too late.
+    """
+
+    def __init__(self, emulator: Emulator, terminal: Terminal, up: Line, down: Line, T: float, pace: float) -> None:
+        self.emulator, self.terminal = emulator, terminal
+        self._up, self._down = up, down
+        self._period, self._pace = 1e6 * T, pace
+        self._start = time.monotonic_ns()
+        self._lost = 0.0  # [us] that this process was held up
+        self.late = 0  # ticks that began more than half a period late
+        self._queue: list[tuple[float, int, Callable[[bytes], None], bytes]] = []
+        self._number = count()
+        self._partial = b""
+
+    def now(self) -> float:
+        """The device's clock [us]."""
+        return (time.monotonic_ns() - self._start) * self._pace / 1000 - self._lost
+
+    def run(self, seconds: float, asked_to_stop: Callable[[], bool]) -> None:
+        """Tick until the time is over, the cable is pulled or it is stopped."""
+        due, unplugged_at = self._period, None
+        while not asked_to_stop() and self.now() < 1e6 * seconds:
+            self._wait(due)
+            now = self.now()
+            if now < due:
+                continue
+            if not self.emulator.unplugged:
+                self._hear(self.terminal.read(), due)  # what came while this process was held up is not late
+            if now - due > self._period / 2:  # held up: the device's timer was not
+                self.late += 1
+                self._lost += now - due
+            self._send(self.emulator.tick(round(due)), due)
+            self.emulator.advance()
+            due = max(due + self._period * self.emulator.stretch, self.emulator.stalled_until)
+            if self.emulator.unplugged and unplugged_at is None:
+                unplugged_at = due
+                self.terminal.unplug()
+            if unplugged_at is not None and due > unplugged_at + _LINGER_US:
+                return
+
+    def _wait(self, due: float) -> None:
+        """Until the next tick is due or bytes come or go, and see to those first."""
+        first = min(due, self._queue[0][0]) if self._queue else due
+        timeout = max(0.0, 1e-6 * (first - self.now()) / self._pace)
+        if self.emulator.unplugged:
+            time.sleep(timeout)
+            return
+        if select.select([self.terminal.master], [], [], timeout)[0]:
+            self._hear(self.terminal.read(), min(self.now(), due))
+        while self._queue and self._queue[0][0] <= self.now():
+            _, _, deliver, data = heapq.heappop(self._queue)
+            deliver(data)
+
+    def _hear(self, data: bytes, now: float) -> None:
+        *frames, self._partial = (self._partial + data).split(b"\0")
+        if len(self._partial) > 4096:
+            self._partial = b""
+        for frame in filter(None, frames):
+            for when, part in self._down.send(frame + b"\0", now, self.emulator.since_armed(round(now))):
+                if when <= now:
+                    self.emulator.receive(part, round(now))
+                else:
+                    self._later(when, lambda part: self.emulator.receive(part, round(self.now())), part)
+
+    def _send(self, data: bytes, now: float) -> None:
+        for when, part in self._up.send(data, now, self.emulator.since_armed(round(now))) if data else []:
+            if when <= now:
+                self.terminal.write(part)
+            else:
+                self._later(when, self.terminal.write, part)
+
+    def _later(self, when: float, deliver: Callable[[bytes], None], data: bytes) -> None:
+        heapq.heappush(self._queue, (when, next(self._number), deliver, data))
+
+
+@contextmanager
+def emulated(*options: str) -> Iterator[str]:
+    """Yield the path of an emulator in a process of its own, which is started with `options` and ended afterwards."""
+    child = subprocess.Popen(
+        [sys.executable, "-m", "tests.pseudo_terminal", f"--parent={os.getpid()}", *options],
+        cwd=_ROOT,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C is for the bridge, which ramps out first
+        text=True,
+    )
+    assert child.stdout is not None
+    try:
+        ready = select.select([child.stdout], [], [], _PATIENCE)[0]
+        path = child.stdout.readline().strip() if ready else ""
+        assert path, "the emulator did not start"
+        yield path
+    finally:
+        child.terminate()
+        child.communicate()
+
+
+def main() -> None:
+    """Emulate the built-in pair until a signal comes, the time is over or the cable is pulled; print the path first."""
+    parser = argparse.ArgumentParser(description="The built-in devices behind a pseudo-terminal.")
+    parser.add_argument("--fault", action="append", default=[])
+    parser.add_argument("--duration", type=float, default=660.0)
+    parser.add_argument("--pace", type=float, default=1.0)
+    parser.add_argument("--parent", type=int, default=0)
+    parser.add_argument("--nobody", action="store_true")
+    args = parser.parse_args()
+    scenario, faults = load(), tuple(FaultInjection.parse(text) for text in args.fault)
+    emulator, terminal, stops = Emulator(nobody(scenario) if args.nobody else scenario, faults), Terminal(), []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda received, frame: stops.append(received))
+    print(terminal.path, flush=True)
+    up, down = (Line(direction, faults, 0) for direction in ("up", "down"))
+    running = RealTimeEmulator(emulator, terminal, up, down, scenario.T, args.pace)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    running.run(args.duration, lambda: bool(stops) or args.parent not in (0, os.getppid()))
+    print(json.dumps({"phase": emulator.device.phase.name.lower()}), file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()
