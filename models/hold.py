@@ -1,6 +1,6 @@
-"""The plant under a zero-order hold: exponentials of one plant, or of many at once.
+"""The plant under a zero-order hold: matrix exponentials of one plant, or of many plants at once.
 
-The state [s; forces that the actuators hold] is that of a plant whose forces latch late.
+If forces latch later than the tick, the state is [s; forces that the actuators hold].
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ _Array = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, eq=False)
 class HeldPlant:
-    """s[k+1] = A s[k] + B [w; f][k], x[k] = C s[k]: the plant under a zero-order hold of T seconds.
+    """The plant under a zero-order hold of T seconds: s[k+1] = A s[k] + B [w; f][k], x[k] = C s[k].
 
-    Many plants at once have a leading axis in A and B.
+    A and B with a leading axis hold many plants.
     """
 
     A: _Array  # (..., 2n, 2n)
@@ -33,10 +33,10 @@ class HeldPlant:
 
 
 def hold(plant: Plant, T: float, late: Sequence[float] | None = None) -> HeldPlant:
-    """Sample a continuous plant, or many of them, with the input held for T.
+    """Sample a continuous plant, or many plants, with its input held for T [s].
 
-    Where forces latch `late` (m,) [s] after the tick, the state is [s; forces that the actuators hold]: until then
-    the last ones act, s+ = A(T) s + B(T) [w; held] + B(T - late) (f - held).
+    If forces latch `late` (m,) [s] after the tick, the state is [s; forces that the actuators hold], and the held
+    forces act until then: s+ = A(T) s + B(T) [w; held] + B(T - late) (f - held).
     """
     if late is not None:
         return latched(partial(hold, plant), T, late)
@@ -51,21 +51,21 @@ def hold(plant: Plant, T: float, late: Sequence[float] | None = None) -> HeldPla
 
 
 def latched(held: Callable[[float], HeldPlant], T: float, late: Sequence[float]) -> HeldPlant:
-    """As hold with `late`, from the plant held for the times that are asked for."""
-    whole, m = held(T), len(late)
-    *many, n, inputs = whole.B.shape
+    """Return the plant of `hold` with `late`, where `held(t)` samples the plant for a time t [s]."""
+    period, m = held(T), len(late)
+    *many, n, inputs = period.B.shape
     w = inputs - m
     A, B = np.zeros((*many, n + m, n + m)), np.zeros((*many, n + m, inputs))
-    A[..., :n, :n], B[..., :n, :w], B[..., n:, w:] = whole.A, whole.B[..., :w], np.eye(m)
+    A[..., :n, :n], B[..., :n, :w], B[..., n:, w:] = period.A, period.B[..., :w], np.eye(m)
     for i, tau in enumerate(late):
         if tau < T:
             B[..., :n, w + i] = held(T - tau).B[..., w + i]
-    A[..., :n, n:] = whole.B[..., w:] - B[..., :n, w:]
-    return HeldPlant(A, B, np.pad(whole.C, ((0, 0), (0, m))), T)
+    A[..., :n, n:] = period.B[..., w:] - B[..., :n, w:]
+    return HeldPlant(A, B, np.pad(period.C, ((0, 0), (0, m))), T)
 
 
 def at_the_latch(plant: Plant, late: Sequence[float]) -> _Array:
-    """[s; forces held; w; f] of a tick to where each device is when its own force latches, (..., m, entries)."""
+    """Return rows (..., m, entries): from [s; held forces; w; f] of a tick to each position when its force latches."""
     *many, n, inputs = plant.B.shape
     m = len(late)
     rows = np.zeros((*many, m, n + m + inputs))
@@ -73,16 +73,17 @@ def at_the_latch(plant: Plant, late: Sequence[float]) -> _Array:
         if tau == 0:
             rows[..., i, :n] = plant.C[i]
             continue
-        held = hold(plant, tau, [min(other, tau) for other in late])  # the forces that latch before act by then
+        held = hold(plant, tau, [min(other, tau) for other in late])  # forces that latch earlier act already
         rows[..., i, :] = held.C[i] @ np.concatenate([held.A, held.B], axis=-1)
     return rows
 
 
 def exponential_step(J: _Array, h: float, n: int, felt: _Array | None = None) -> _Array:
-    """What makes s + h phi1(h J) s' of [s; a], (nsim, states, states + n), for J (nsim, states, states) and a step h.
+    """Return the matrix (nsim, states, states + n) that maps [s; a] to s + h phi1(h J) s', for a step of h seconds.
 
-    s = [q; v; the states of impedances], of n joints; s' = [v; a; 0] + felt s where the accelerations a (n,) [m/s^2]
-    are those of the bodies, to which the impedances add `felt` (nsim, states, states).
+    J is (nsim, states, states). The state s = [q; v; states of impedances] has n joints, and s' = [v; a; 0] + felt s.
+    The accelerations a (n,) [m/s^2] are those of the bodies, and `felt` (nsim, states, states) is the contribution of
+    the impedances.
     phi1(X) = X^-1 (e^X - I) is the upper right block of exp [[X, I], [0, 0]].
     """
     nsim, states, _ = J.shape
@@ -98,10 +99,10 @@ def exponential_step(J: _Array, h: float, n: int, felt: _Array | None = None) ->
 
 
 def expm_each(matrices: _Array) -> _Array:
-    """exp of each of (nsim, n, n) matrices, by scaling and squaring; a result depends on its own matrix only.
+    """Return the exponential of each of (nsim, n, n) matrices, by scaling and squaring.
 
-    scipy.linalg.expm hands every matrix to a BLAS that wakes all its threads for it: on busy cores that made verdicts
-    about many humans several times slower than their arithmetic.
+    Each result depends on its own matrix only. scipy.linalg.expm calls a threaded BLAS for every matrix, which made
+    verdicts about many humans several times slower on busy cores.
     """
     norm = np.abs(matrices).sum(axis=1).max(axis=1)
     halvings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, _LARGEST) / _LARGEST))).astype(int)
@@ -120,10 +121,11 @@ def expm_each(matrices: _Array) -> _Array:
 
 
 def _units(A: _Array, h: float) -> _Array:
-    """What to measure the states of s' = A s in, (nsim, 2n), where exp(h A) is asked for.
+    """Return units (nsim, 2n) for the states of s' = A s in which exp(h A) is computed accurately.
 
-    Velocities in units of a rate near the fastest mode's: then a stiff plant has no larger norm than that mode times h,
-    and its exponential is rounded by 1e-16 instead of 1e-11. Powers of two, which round nothing themselves.
+    Velocities are measured in units of a rate near that of the fastest mode. The norm of a stiff plant is then at most
+    that rate times h, and its exponential has a rounding error of 1e-16 instead of 1e-11. The units are powers of two,
+    so that scaling is exact.
     """
     n = A.shape[2] // 2
     fastest = np.sqrt(np.abs(A[:, n:, :n]).max(axis=(1, 2)))
@@ -133,7 +135,7 @@ def _units(A: _Array, h: float) -> _Array:
 
 
 def _expm_in_units(matrices: _Array, unit: _Array) -> _Array:
-    """exp of (nsim, n, n) matrices, computed with entry i of what they act on measured in unit[:, i]."""
+    """Return the exponentials of (nsim, n, n) matrices, computed with entry i of the state in units of unit[:, i]."""
     return expm_each(matrices * unit[:, None, :] / unit[:, :, None]) * unit[:, :, None] / unit[:, None, :]
 
 
@@ -141,15 +143,15 @@ _ORDER = 13  # of the diagonal Padé approximant, Higham (2005), table 2.3
 _LARGEST = 5.37  # 1-norm up to which that order has the accuracy of double precision
 _PADE = [math.comb(_ORDER, k) * math.factorial(2 * _ORDER - k) / math.factorial(2 * _ORDER) for k in range(_ORDER + 1)]
 
-Product = Callable[[_Array, _Array], object]  # (columns, nsim), (rows, nsim): writes the second
+Product = Callable[[_Array, _Array], object]  # reads a slab (columns, nsim) and writes the product (rows, nsim)
 _Which = NDArray[np.intp]
 
 
 def product_of(matrices: _Array) -> Product:
-    """The product of a matrix, or of (nsim, rows, columns) of them, with a slab, the simulation last and contiguous.
+    """Return a function that multiplies a matrix, or (nsim, rows, columns) matrices, with a slab (columns, nsim).
 
-    What devices and humans do not share splits a plant into separate blocks (one device with its human each), found
-    from the zeros of the matrices; only they are multiplied.
+    A plant splits into independent blocks (each device with its human). They are detected from the zeros of the
+    matrices, and only they are multiplied.
     """
     if matrices.ndim == 2:
         return np.ascontiguousarray(matrices).dot
@@ -170,9 +172,9 @@ def product_of(matrices: _Array) -> Product:
 
 
 def _blocks(pattern: NDArray[np.bool_]) -> tuple[_Which, _Which]:
-    """Rows and columns of the independent blocks of a (2n, 2n + inputs) pattern of nonzeros.
+    """Return rows and columns of the independent blocks of a (2n, 2n + inputs) pattern of nonzeros.
 
-    Shapes (blocks, rows) and (blocks, columns); smaller blocks are filled up with -1.
+    Their shapes are (blocks, rows) and (blocks, columns). Smaller blocks are padded with -1.
     """
     n, width = pattern.shape
     graph = np.zeros((width, width), dtype=bool)
@@ -180,7 +182,7 @@ def _blocks(pattern: NDArray[np.bool_]) -> tuple[_Which, _Which]:
     count, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
     rows = [np.flatnonzero(label[:n] == c) for c in range(count)]
     columns = [np.flatnonzero(label == c) for c in range(count)]
-    # an input that moves nothing is a block without rows
+    # An input that acts on no state is a block without rows; it is dropped.
     pairs = [(r, c) for r, c in zip(rows, columns, strict=True) if r.size]
     return _filled([r for r, _ in pairs]), _filled([c for _, c in pairs])
 

@@ -1,8 +1,8 @@
-"""Humans as passive ports at the handles: chains, persons with several devices, random draws, and a user's own hand.
+"""Humans as passive ports at the handles: chains of masses, persons with several devices, random draws, own hands.
 
-Whatever has the two methods of `Hand` can hold a device. Its `port()` says what the handle feels: masses and
-spring-dampers, and if need be an impedance (A, B, C, D).
-A `Port` cannot be built unless it is passive, so there is nothing else to prove.
+Any object with the two methods of `Hand` can hold a device. Its `port()` describes the mechanics that the handle
+feels: masses, spring-dampers, and optionally an impedance (A, B, C, D). A `Port` checks that it is passive when it is
+built, so every human in a simulation is passive.
 """
 
 from __future__ import annotations
@@ -22,18 +22,21 @@ from numpy.typing import NDArray
 _Array = NDArray[np.floating[Any]]
 _Range = tuple[float, float]
 
-_ROUNDING = 1e-9  # of |Z|: what rounding may take from the real part of a lossless impedance
+_ROUNDING = 1e-9  # relative to |Z|: bound on the rounding error of Re Z of a lossless impedance
 
 # ----------------------------------------------------------------------------------------------------
-# Ports: what a handle feels.
+# Ports: the mechanics that a handle feels.
 
 
 @dataclass(frozen=True, eq=False)
 class Impedance:
-    """Z(s) = C (s I - A)^-1 B + D [N s/m], from the velocity of a handle to the force against it; passive.
+    """A passive impedance Z(s) = C (s I - A)^-1 B + D [N s/m], from the velocity of a handle to the force against it.
 
-    Raises ValueError where it is not. For what decays: all eigenvalues of A have negative real parts. A spring (a pole
-    at zero) and a mass are parts of the Port. Many impedances alike have leading axes.
+    All eigenvalues of A must have negative real parts. A spring (a pole at zero) and a mass belong to the Port. Arrays
+    with leading axes hold many impedances of the same order.
+
+    Raises:
+        ValueError: The impedance is not stable, or Re Z(jw) < 0 at some frequency.
     """
 
     A: _Array  # (..., n, n)
@@ -53,11 +56,11 @@ class Impedance:
             _check_positive_real(*(getattr(self, name)[i] for name in "ABCD"))
 
     def changed(self, change: Callable[[_Array], _Array]) -> Impedance:
-        """Each of A, B, C and D taken or repeated along the leading axes: as passive as it is."""
-        made = object.__new__(Impedance)
+        """Apply an indexing or repetition along the leading axes to A, B, C and D. It keeps passivity: no new check."""
+        changed = object.__new__(Impedance)
         for name in "ABCD":
-            _freeze(made, name, change(getattr(self, name)))
-        return made
+            _freeze(changed, name, change(getattr(self, name)))
+        return changed
 
     @property
     def order(self) -> int:
@@ -67,12 +70,12 @@ class Impedance:
 def _check_positive_real(A: _Array, B: _Array, C: _Array, D: _Array) -> None:
     """Raise ValueError unless Z is stable and Re Z(jw) >= 0 at every frequency.
 
-    Re Z(jw) = D - C A (w^2 I + A^2)^-1 B is rational in w^2, so its sign changes at the real zeros of that function
-    only, which are eigenvalues of a pencil: one look between each two of them decides all frequencies.
+    Re Z(jw) = D - C A (w^2 I + A^2)^-1 B is a rational function of w^2. Its sign can only change at its real zeros,
+    which are eigenvalues of a pencil. So one sample between each two neighbouring zeros decides all frequencies.
     """
     n = A.shape[0]
     if n and not np.linalg.eigvals(A).real.max() < 0:
-        raise ValueError("impedance: A has an eigenvalue on or right of the imaginary axis, expected what decays")
+        raise ValueError("impedance: A has an eigenvalue on or right of the imaginary axis, expected a stable A")
     zeros = scipy.linalg.eig(-np.block([[A @ A, B], [C @ A, D]]), np.diag([*[1.0] * n, 0.0]), right=False)
     zeros = np.sort(zeros[np.isfinite(zeros)])
     real = np.real(zeros[(np.real(zeros) > 0) & (np.abs(np.imag(zeros)) <= 1e-6 * np.abs(zeros))])
@@ -85,12 +88,16 @@ def _check_positive_real(A: _Array, B: _Array, C: _Array, D: _Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Port:
-    """What handles feel of a passive human: masses, the spring-dampers across them, and perhaps an impedance.
+    """A passive human at its handles: masses, the spring-dampers between them, and optionally an impedance.
 
-    Points are the handles first (one, or those that a person holds), then the human's own masses; last comes the base,
-    which is ground, or the body of the person whose arm this is. A row of `across` says by how much its spring-damper
-    lengthens with the points and the base: -1 and 1 for one between two of them, other numbers for a lever. Passive,
-    because no number may be negative, and an Impedance is. Many humans alike have a leading axis.
+    The points are the handles (one, or several of a person), then the human's own masses, then the base, which is
+    ground or the body of the person to whom this arm belongs. Row i of `across` holds the derivatives of the length of
+    spring-damper i with respect to the points and the base: -1 and 1 between two points, other numbers for a lever.
+    The port is passive because no parameter is negative and the impedance is passive. Arrays with a leading axis hold
+    many humans of the same structure.
+
+    Raises:
+        ValueError: A shape does not match, a parameter is negative, or a point that is no handle has no mass.
     """
 
     mass: _Array  # (..., points) [kg]; 0 is allowed at the handles only
@@ -122,14 +129,14 @@ class Port:
 
     @classmethod
     def chain(cls, links: _Array) -> Self:
-        """A chain from the handle to the base; links (..., n, 3) are mass, damping and stiffness of each."""
+        """Return a chain from the handle to the base; links (..., n, 3) hold mass, damping and stiffness."""
         n = links.shape[-2]
         across = np.eye(n, n + 1, 1) - np.eye(n, n + 1)
         return cls(links[..., 0], across, links[..., 1], links[..., 2])
 
     @classmethod
     def body(cls, hands: int, values: _Array) -> Self:
-        """A body on ground, and the hands joined one to the next; values (..., 5) as in Crowd.bodies."""
+        """Return a body on ground whose hands are joined one to the next; values (..., 5) as in Crowd.bodies."""
         mass, damping, stiffness, cross_damping, cross_stiffness = np.moveaxis(values, -1, 0)[..., None]
         across = np.eye(hands, hands + 2, 1) - np.eye(hands, hands + 2)
         across[-1] = 0.0
@@ -146,7 +153,7 @@ class Port:
 
     @classmethod
     def stack(cls, ports: Sequence[Self]) -> Self:
-        """Many humans alike as one port with a leading axis. Raises ValueError where they are built differently."""
+        """Stack humans of one structure along a new leading axis. Raises ValueError if their structures differ."""
         first = ports[0]
         if any(port.layout != first.layout for port in ports):
             raise ValueError("ports: expected humans with the same points and the same spring-dampers between them")
@@ -156,34 +163,36 @@ class Port:
         return cls(mass, first.across, damping, stiffness, impedance, first.handles, first.pull)
 
     def of(self, i: int) -> Self:
-        """Port i of a stack."""
+        """Return port i of a stack."""
         impedance = self.impedance and self.impedance.changed(lambda part: part[i])
         one = self.mass[i], self.across, self.damping[i], self.stiffness[i]
         return type(self)(*one, impedance, self.handles, self.pull)
 
     @property
     def layout(self) -> tuple[Any, ...]:
-        """The structure of the port without its numbers: equal for humans that can be stacked."""
+        """The structure of the port without its parameters. Humans of equal layout can be stacked."""
         order = self.impedance.order if self.impedance else None
         return self.across.shape, self.across.tobytes(), order, self.handles, self.pull
 
 
 def state_space(A: Any, B: Any, C: Any, D: Any, mass: float = 0.0) -> Port:
-    """The port of a hand of `mass` [kg] with the impedance C (s I - A)^-1 B + D from velocity [m/s] to force [N].
+    """Return the port of a hand of `mass` [kg] and impedance C (s I - A)^-1 B + D, from velocity [m/s] to force [N].
 
-    A may have one eigenvalue at zero, which is the hand's static stiffness: k/s is split off as a spring. Raises
-    ValueError for what is not passive.
+    A may have one eigenvalue at zero: the hand's static stiffness k. Its part k/s of the impedance becomes a spring.
+
+    Raises:
+        ValueError: The hand is not passive, or A has a double eigenvalue at zero.
     """
     A, B, C, D = (np.atleast_2d(np.asarray(part, dtype=float)) for part in (A, B, C, D))
     stiffness = 0.0
-    right, sizes, left = np.linalg.svd(A)  # A x = 0 and y A = 0 for the last vectors, where A is singular
+    right, sizes, left = np.linalg.svd(A)  # if A is singular, the last vectors span its right and left null spaces
     if A.size and sizes[-1] <= 1e-12 * max(sizes[0], 1e-300):
         null, left = left[-1], right[:, -1]
         if abs(left @ null) <= 1e-9:
             raise ValueError("impedance: A has a double eigenvalue at zero, expected one spring at most")
         left = left / (left @ null)
         stiffness = float((C @ null).item() * (left @ B).item())
-        # the rest lives where `left` vanishes: an orthonormal basis of that is invariant under A
+        # The states without the eigenvalue at zero are those orthogonal to `left`, which A maps to themselves.
         rest = np.linalg.svd(left[None])[2][1:].T
         B = B - np.outer(null, left @ B)
         A, B, C = rest.T @ A @ rest, rest.T @ B, C @ rest
@@ -192,19 +201,19 @@ def state_space(A: Any, B: Any, C: Any, D: Any, mass: float = 0.0) -> Port:
 
 
 class Hand(Protocol):
-    """What can hold a device: a passive port and a voluntary force."""
+    """A human who can hold a device: a passive port and a voluntary force."""
 
     def port(self) -> Port:
-        """The port that the handle feels."""
+        """Return the mechanics that the handle feels."""
         ...
 
     def voluntary_force(self, t: _Array) -> _Array:
-        """Force [N] at the times t [s] that contracts the spring-damper `pull` of the port."""
+        """Return the force [N] at the times t [s] that contracts the spring-damper `pull` of the port."""
         ...
 
 
 def _freeze(record: object, name: str, values: Any) -> None:
-    """The field as a read-only array of floats."""
+    """Set a field of a frozen record to a read-only array of floats."""
     array = np.array(values, dtype=float)
     array.setflags(write=False)
     object.__setattr__(record, name, array)
@@ -228,7 +237,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The equilibrium moves as amplitude sin(2 pi frequency t + phase), eased in by a raised cosine."""
+    """A motion of the equilibrium, amplitude sin(2 pi frequency t + phase), faded in by a raised cosine."""
 
     amplitude: float  # [m]
     frequency: float  # [Hz]
@@ -242,7 +251,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         require("ease", self.ease, 0.0, 1e4, "s")
 
     def force(self, t: _Array, stiffness: float, damping: float) -> _Array:
-        """What pulls the end of a spring-damper along, k x + b x' [N] at times t [s]."""
+        """Return k x + b x' [N] at the times t [s]: the force of a spring-damper whose end moves."""
         w, rate = 2 * np.pi * self.frequency, np.pi / self.ease if self.ease else 0.0
         pull, ahead = self.amplitude * math.hypot(stiffness, damping * w), math.atan2(damping * w, stiffness)
         force = pull * np.sin(w * t + (self.phase + ahead))
@@ -256,8 +265,8 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A chain of masses and spring-dampers, from the handle to the equilibrium.
 
-    Passive by construction: no parameter can be negative. One link is the usual mass-damper-spring hand; two
-    are a hand on a grip on an arm; without damping it is a lossless ladder.
+    It is passive because no parameter can be negative. One link is the usual mass-damper-spring hand, two links are a
+    hand with a grip on an arm, and links without damping form a lossless chain.
     """
 
     links: Annotated[tuple[Link, ...], msgspec.Meta(min_length=1)]
@@ -269,11 +278,11 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"links #{i}.mass is 0: only the mass at the handle may be missing")
 
     def port(self) -> Port:
-        """The chain as the handle feels it."""
+        """Return the mechanics that the handle feels."""
         return Port.chain(np.array([(link.mass, link.damping, link.stiffness) for link in self.links]))
 
     def voluntary_force(self, t: _Array) -> _Array:
-        """k x_eq + b x_eq' [N] on the last mass, at times t [s]."""
+        """Return the force k x_eq + b x_eq' [N] on the last mass at the times t [s]."""
         if self.voluntary is None:
             return np.zeros_like(t)
         return self.voluntary.force(t, self.links[-1].stiffness, self.links[-1].damping)
@@ -282,7 +291,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A hand as a transfer function, `mass` s + C (s I - A)^-1 B + D from velocity to force; see `state_space`.
 
-    It has no bodies: MuJoCo's engines move its state beside those of the scene (sim.engines).
+    It has no bodies. The MuJoCo engines integrate its state beside those of the scene (sim.engines).
     """
 
     A: tuple[tuple[float, ...], ...]
@@ -296,16 +305,16 @@ class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         self.port()
 
     def port(self) -> Port:
-        """Raises ValueError where it is not passive."""
+        """Return the mechanics that the handle feels. Raises ValueError if the hand is not passive."""
         return state_space(self.A, self.B, self.C, self.D, self.mass)
 
     def voluntary_force(self, t: _Array) -> _Array:
-        """No voluntary force."""
+        """Return zero: a measured hand has no voluntary force."""
         return np.zeros_like(t)
 
 
 class Cross(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A spring-damper from hand to hand of one person."""
+    """A spring-damper between two hands of one person."""
 
     damping: float = 0.0  # [N s/m]
     stiffness: float = 0.0  # [N/m]
@@ -318,8 +327,8 @@ class Cross(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A person who holds several devices: a passive mechanical multi-port.
 
-    The arms of these channels' humans end on this person's body instead of on ground: a mass with a spring-damper
-    to ground. `cross` joins each hand to the next, in the order of `holds`.
+    The arms of these channels end on the person's body instead of on ground. The body is a mass with a spring-damper
+    to ground. The spring-damper `cross` joins each hand to the next, in the order of `holds`.
     """
 
     holds: tuple[int, ...]  # channels, counted from 1
@@ -336,7 +345,7 @@ class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         require("stiffness", self.stiffness, 0.0, 1e9, "N/m")
 
     def port(self) -> Port:
-        """Body and cross springs as the hands feel them; the arms end on the body, the last point."""
+        """Return the body and the cross springs as the hands feel them. The arms end on the body, the last point."""
         cross = self.cross
         values = (self.mass, self.damping, self.stiffness, cross.damping, cross.stiffness)
         return Port.body(len(self.holds), np.array(values))
@@ -355,7 +364,7 @@ def check_holds(held_by: Sequence[tuple[int, ...]], channels: int) -> None:
 
 
 class Population(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Random humans: every parameter log-uniform in its range, one link (a hand) or two (hand, grip and arm)."""
+    """Random humans with log-uniform parameters and one link (a hand) or two (a hand with a grip on an arm)."""
 
     mass: _Range = (0.01, 3.0)  # [kg]
     damping: _Range = (0.1, 30.0)  # [N s/m]
@@ -370,7 +379,7 @@ class Population(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         require("links", self.links, 1, 8, "links")
 
     def draw(self, rng: np.random.Generator, n: int) -> list[Human]:
-        """n humans without voluntary motion."""
+        """Draw n humans without voluntary motion."""
         ranges = np.log([self.mass, self.damping, self.stiffness])
         values = np.exp(rng.uniform(ranges[:, 0], ranges[:, 1], size=(n, self.links, 3)))
         return [Human(tuple(Link(*link) for link in human)) for human in values.tolist()]

@@ -1,4 +1,4 @@
-"""Devices and the humans who hold them as one MuJoCo scene, the same plant as matrices, and many humans at once."""
+"""Devices and the humans who hold them as one MuJoCo scene, as matrices of the same plant, and with many humans."""
 
 from __future__ import annotations
 
@@ -25,54 +25,55 @@ from haptic_loop.models.human import (
 )
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:  # a third of a second: loaded where it is used
+if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions import it when they need it
     import mujoco
 
 # ----------------------------------------------------------------------------------------------------
 # Devices and humans as one MuJoCo model, and the same plant as matrices, read from that model.
 #
-# The only place that knows joint names. Every body slides along x. Joints come in the order motors, handles (of
-# compliant devices), further masses of the humans, bodies, so that the first m positions are the encoders':
+# Only this file knows the names of joints. Every body slides along x. The order of the joints is motors, handles of
+# compliant devices, further masses of the humans, bodies of persons. So the first m positions are the encoders':
 #
 #     actuator (-f) -> motor ==transmission== handle (with the human's first mass) ==link== human_i_2 == ...
 #
-# Motor, handle and transmission come from compliant.xml or rigid.xml, which open in a viewer by themselves; those of
-# device i are called device_i/motor and so on. Their numbers are the scenario's. What is drawn is kept in the scene's
-# XML only, so that nothing is computed for it.
+# Motor, handle and transmission come from compliant.xml or rigid.xml, which a viewer can open. Those of device i are
+# called device_i/motor and so on. The scenario gives their parameters. Shapes that are only drawn stay in the scene's
+# XML and are removed from the model that is simulated.
 #
 # The last link of a human ends on ground, or on the body of a person who holds several devices (the last joints).
-# Gravity, contacts and constraints are off, but for the Coulomb friction of devices that have some. Inputs are MuJoCo
-# actuators: first the outside forces (voluntary motion and taps), then one motor per device with gear -1, because the
+# Gravity, contacts and constraints are off, except for the Coulomb friction of devices. The inputs are MuJoCo
+# actuators: first the external forces (voluntary motion and taps), then one motor per device with gear -1, because the
 # device feels -f.
 #
-# A human is a passive port (models.human.Port). Its masses become bodies, a spring-damper that lies between one point
-# and ground belongs to a joint, any other one is a fixed tendon. An impedance (A, B, C, D) is no body: it is kept
-# among the model's custom numbers, from where `plant` takes it; engines move its state beside those of the bodies.
+# A human is a passive port (models.human.Port). Its masses become bodies. A spring-damper between one point and ground
+# becomes a property of the joint, any other one a fixed tendon. An impedance (A, B, C, D) has no body: it is stored in
+# the model's custom numbers, where `plant` reads it, and the engines integrate its state beside those of the bodies.
 
 
 _Array = NDArray[np.floating[Any]]
 
-#: MuJoCo's friction constraint creeps while it sticks; this hard it stops a 0.25 kg device within 1.5e-6 m of where
-#: Coulomb's law does, and creeps at 1e-7 m/s under half its force (MuJoCo's defaults: 7e-5 m and 6e-4 m/s)
+#: MuJoCo's friction constraint creeps while it sticks. With these parameters a device of 0.25 kg stops within 1.5e-6 m
+#: of the point given by Coulomb's law and creeps at 1e-7 m/s under half the friction force. MuJoCo's defaults give
+#: 7e-5 m and 6e-4 m/s.
 _STICK, _HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
-_FILES = Path(__file__).parent  # of the devices
+_FILES = Path(__file__).parent  # folder of the devices' MJCF
 APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] between devices, between the bodies of one, and above the rail
 DRAWN = "drawn transmission"
 _SKY: dict[str, Any] = {"name": "sky", "width": 32, "height": 192, "rgb1": [0.93] * 3, "rgb2": [0.93] * 3}
 _EMPTY_CLASSES = re.compile(r" *<default>\s*(<default class=\"[^\"]*\"/>\s*)*</default>\s*\n")  # of attached files
-_IMPEDANCE = "impedance_"  # custom numbers: joint of the handle, joint of the base or -1, then A, B, C, D row by row
+_IMPEDANCE = "impedance_"  # custom numbers: joint of the handle, joint of the base or -1, then [[A, B], [C, D]] by rows
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A compiled model and where the loop's signals are in it."""
+    """A compiled model and the places of the loop's signals in it."""
 
     model: mujoco.MjModel
     xml: str
     handles: tuple[int, ...]  # (m,) joint of each handle
-    pushed: tuple[int, ...]  # (m,) outside input that reaches the end of each human (voluntary force)
-    tapped: tuple[int, ...]  # (m,) outside input that reaches each handle
-    points: tuple[tuple[int, ...], ...]  # (m + persons,) joints that the points of each port move on, handles first
+    pushed: tuple[int, ...]  # (m,) external input that acts on the end of each human (voluntary force)
+    tapped: tuple[int, ...]  # (m,) external input that acts on each handle
+    points: tuple[tuple[int, ...], ...]  # (m + persons,) joints of the points of each port, handles first
 
     @property
     def channels(self) -> int:
@@ -80,7 +81,7 @@ class Scene:
 
     @property
     def outside(self) -> int:
-        """Number of outside inputs: the actuators before the motors."""
+        """Number of external inputs: the actuators before the motors."""
         return int(self.model.nu) - self.channels
 
     @cached_property
@@ -91,30 +92,31 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """x' = A x + B u, y = C x with u = [outside forces; f], y = encoder positions.
+    """The linear plant x' = A x + B u, y = C x, with u = [external forces; f] and the encoder positions y.
 
-    x holds n positions, n velocities, and the states of the humans' impedances where there are some.
+    x holds n positions, n velocities, and the states of the humans' impedances.
     """
 
     A: _Array  # (2n + states, 2n + states)
     B: _Array  # (2n + states, outside + m)
     C: _Array  # (m, 2n + states)
-    felt: _Array | None = None  # what impedances add to A, which MuJoCo does not know; None without any
+    felt: _Array | None = None  # the impedances' part of A, which MuJoCo does not simulate; None without impedances
 
 
 def build(devices: Sequence[Device], humans: Sequence[Hand], persons: Sequence[Person] = ()) -> Scene:
-    """One scene of devices, each held by its human; `persons` are those who hold several.
+    """Build one scene of devices, each held by its human. `persons` hold several devices.
 
-    Raises ValueError where the numbers of devices and humans differ, or a device is held twice.
+    Raises:
+        ValueError: The numbers of devices and humans differ, or a device is held twice.
     """
     held = tuple((person.holds, person.port()) for person in persons)
     return _compiled(devices, _placed(devices, tuple(human.port() for human in humans), held))
 
 
 def plant(model: mujoco.MjModel) -> Plant:
-    """The linear plant that `model` simulates: its mass, damping, stiffness and _actuation matrices, no friction.
+    """Return the linear plant of `model`, from its mass, damping, stiffness and actuation matrices, without friction.
 
-    With the humans' impedances, which MuJoCo itself leaves out.
+    The plant includes the humans' impedances, which MuJoCo itself does not simulate.
     """
     import mujoco
 
@@ -132,7 +134,7 @@ def plant(model: mujoco.MjModel) -> Plant:
 
 
 class _Felt(NamedTuple):
-    """An impedance at its place: the velocity of `row` over the joints goes in, its force acts back along `row`."""
+    """An impedance and its place: its input is `row` times the joint velocities, its force acts along `row`."""
 
     row: _Array  # (n,)
     Z: Impedance
@@ -141,7 +143,7 @@ class _Felt(NamedTuple):
 def _plant(
     solved: Callable[[_Array], _Array], K: _Array, D: _Array, forces: _Array, motors: int, felt: Sequence[_Felt]
 ) -> Plant:
-    """The plant M q'' = -K q - D q' + forces u and the impedances; `solved` multiplies by M^-1."""
+    """Return the plant M q'' = -K q - D q' + forces u with the impedances; `solved` multiplies by M^-1."""
     *many, n, _ = K.shape
     size = 2 * n + sum(z.order for _, z in felt)
     A, B = np.zeros((*many, size, size)), np.zeros((*many, size, forces.shape[-1]))
@@ -162,28 +164,30 @@ def _plant(
 
 
 def _impedances(model: mujoco.MjModel) -> list[_Felt]:
-    """The impedances among the custom numbers of a model."""
+    """Read the impedances from the custom numbers of a model."""
     felt = []
     for i in range(model.nnumeric):
         first, size = int(model.numeric_adr[i]), int(model.numeric_size[i])
         if model.numeric(i).name.startswith(_IMPEDANCE):
             (handle, base), numbers = model.numeric_data[first : first + 2].astype(int), model.numeric_data[first + 2 :]
             n = math.isqrt(size - 2) - 1  # (n + 1)^2 numbers
-            whole = numbers[: (n + 1) ** 2].reshape(n + 1, n + 1)
+            matrix = numbers[: (n + 1) ** 2].reshape(n + 1, n + 1)
             row = np.zeros(model.nv)
             row[handle] = 1.0
             if base >= 0:
                 row[base] = -1.0
-            felt.append(_Felt(row, Impedance(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:])))
+            felt.append(_Felt(row, Impedance(matrix[:n, :n], matrix[:n, n:], matrix[n:, :n], matrix[n:, n:])))
     return felt
 
 
 def from_mjcf(xml: str, handle: str = "handle", pull: str | None = None) -> Port:
-    """The port of a hand that is drawn in MJCF: bodies that slide along x, with springs and dampers between them.
+    """Return the port of a hand written in MJCF: bodies that slide along x, with springs and dampers between them.
 
-    The body `handle` is the part of the hand that moves with the handle; the world is the base. The voluntary force
-    contracts the joint or tendon named `pull` (default: the last spring-damper). Gravity and shapes are left out.
-    Raises ValueError unless it is a network of masses, springs and dampers.
+    The body `handle` is the part of the hand that moves with the handle, and the world is the base. The voluntary force
+    contracts the joint or tendon named `pull` (default: the last spring-damper). Gravity and shapes are ignored.
+
+    Raises:
+        ValueError: The model is not a network of masses, springs and dampers along x.
     """
     import mujoco
 
@@ -198,7 +202,7 @@ def from_mjcf(xml: str, handle: str = "handle", pull: str | None = None) -> Port
     point = {int(model.jnt_bodyid[j]): k for k, j in enumerate(order)} | {0: model.njnt}
     mass = np.zeros(model.njnt + 1)
     np.add.at(mass, [point[int(b)] for b in model.body_weldid], model.body_mass)
-    slides = np.zeros((model.njnt, model.njnt + 1))  # by how much each joint slides, over the points and the base
+    slides = np.zeros((model.njnt, model.njnt + 1))  # derivative of each joint's position by the points and the base
     for j, b in enumerate(model.jnt_bodyid):
         slides[j, point[int(b)]] = 1.0
         slides[j, point[int(model.body_weldid[model.body_parentid[b]])]] = -1.0
@@ -222,7 +226,7 @@ def _check_linear(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     slide, fixed = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtWrap.mjWRAP_JOINT
     rubbing = ("dof_frictionloss", "tendon_frictionloss", "dof_armature", "tendon_armature")
     curved = ("jnt_stiffnesspoly", "tendon_stiffnesspoly", "dof_dampingpoly", "tendon_dampingpoly")
-    found = {
+    unsupported = {
         "a joint that does not slide along x": (model.jnt_type != slide).any()
         or not np.allclose(data.xaxis, [1.0, 0.0, 0.0]),
         "several joints in one body": len(set(model.jnt_bodyid)) < model.njnt,
@@ -233,26 +237,26 @@ def _check_linear(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         "a tendon that is not fixed": (model.wrap_type != fixed).any(),
         "a spring that is not at rest": model.qpos_spring.any() or model.qpos0.any() or model.tendon_lengthspring.any(),
     }
-    for what, there in found.items():
-        if there:
-            raise ValueError(f"MJCF of a hand: it has {what}, expected masses, springs and dampers along x, at rest")
+    for part, present in unsupported.items():
+        if present:
+            raise ValueError(f"MJCF of a hand: it has {part}, expected masses, springs and dampers along x, at rest")
 
 
 def _tendon_jacobian(model: mujoco.MjModel) -> _Array:
-    """How each tendon lengthens when a joint moves, shape (tendons, n)."""
+    """Return the derivative of each tendon's length by the joint positions, shape (tendons, n)."""
     import mujoco
 
     rows = np.zeros((model.ntendon, model.nv))
     for t in range(model.ntendon):
         first, count = int(model.tendon_adr[t]), int(model.tendon_num[t])
         for wrap in range(first, first + count):
-            if model.wrap_type[wrap] == mujoco.mjtWrap.mjWRAP_JOINT:  # not of a tendon that is only drawn
+            if model.wrap_type[wrap] == mujoco.mjtWrap.mjWRAP_JOINT:  # skip tendons that are only drawn
                 rows[t, model.wrap_objid[wrap]] += model.wrap_prm[wrap]
     return rows
 
 
 def _actuation(model: mujoco.MjModel) -> _Array:
-    """Force on each joint per unit of each input, shape (n, outside + m)."""
+    """Return the force on each joint per unit of each input, shape (n, external + m)."""
     import mujoco
 
     columns, across = np.zeros((model.nv, model.nu)), _tendon_jacobian(model)
@@ -281,20 +285,20 @@ def _handle(i: int, device: Device) -> str:
 
 
 class _Placed(NamedTuple):
-    """A port in the scene."""
+    """A port and the joints and tendons that represent it in the scene."""
 
     port: Port
-    joints: tuple[str, ...]  # of its points
+    joints: tuple[str, ...]  # joint of each point
     base: str | None  # joint of the body that it ends on; None for ground
-    springs: tuple[str, ...]  # the tendon, or the one joint, that each of its spring-dampers is on
+    springs: tuple[str, ...]  # the tendon or joint that carries each spring-damper
 
 
 def _placed(
     devices: Sequence[Device], ports: Sequence[Port], held: Sequence[tuple[tuple[int, ...], Port]]
 ) -> tuple[_Placed, ...]:
-    """The ports of all channels, then those of the persons who hold several of them.
+    """Return the placed ports of all channels, then those of the persons who hold several devices.
 
-    Raises ValueError where the numbers of devices and humans differ, or a device is held twice.
+    Raises ValueError if the numbers of devices and humans differ, or if a device is held twice.
     """
     if len(devices) != len(ports) or not devices:
         raise ValueError(f"{len(devices)} devices and {len(ports)} humans: each device needs one human")
@@ -321,7 +325,7 @@ def _place(port: Port, joints: tuple[str, ...], base: str | None, name: str) -> 
     ends = (*joints, base) if base else joints
     springs = []
     for j, row in enumerate(port.across, start=1):
-        between = [joint for joint, c in zip(ends, row, strict=False) if c]  # ground is no end
+        between = [joint for joint, c in zip(ends, row, strict=False) if c]  # ground has no joint
         springs.append(between[0] if len(between) == 1 and between[0] in joints else f"{name}_{j}")
     return _Placed(port, joints, base, tuple(springs))
 
@@ -335,7 +339,7 @@ class _Amounts(NamedTuple):
 
 
 def _amounts(devices: Sequence[Device], placed: Sequence[_Placed]) -> _Amounts:
-    """What devices and humans add up to."""
+    """Sum the masses, dampings and stiffnesses of devices and humans per joint and tendon."""
     mass: dict[str, Any] = {}
     damping: dict[str, Any] = {}
     stiffness: dict[str, Any] = {}
@@ -421,7 +425,7 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
 
 
 def _attach_devices(spec: mujoco.MjSpec, devices: Sequence[Device]) -> None:
-    """Motors and handles of the devices' own files, side by side: first all motors, then all handles."""
+    """Add the motors and handles of the devices' files, side by side: first all motors, then all handles."""
     parts = [_file(device.file).copy() for device in devices]
     for name in ("motor", "handle"):
         for i, part in enumerate(parts, start=1):
@@ -432,7 +436,7 @@ def _attach_devices(spec: mujoco.MjSpec, devices: Sequence[Device]) -> None:
 
 @cache
 def _file(name: str) -> mujoco.MjSpec:
-    """A device's file as the scene takes it: without actuators, which have an order there."""
+    """Read a device's file without its actuators: the scene adds them in its own order."""
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(_FILES / f"{name}.xml"))
@@ -442,7 +446,7 @@ def _file(name: str) -> mujoco.MjSpec:
 
 
 def _pulled(part: _Placed) -> tuple[str, float]:
-    """What the voluntary force of a human acts on, and its gear: it contracts a spring-damper."""
+    """Return the joint or tendon on which the voluntary force of a human acts, and its gear."""
     name = part.springs[part.port.pull]
     if name not in part.joints:
         return name, -1.0
@@ -450,7 +454,7 @@ def _pulled(part: _Placed) -> tuple[str, float]:
 
 
 def _add_springs(spec: mujoco.MjSpec, part: _Placed, damping: Mapping[str, Any], stiffness: Mapping[str, Any]) -> None:
-    """The spring-dampers of a port that lie between joints, as fixed tendons."""
+    """Add the spring-dampers of a port that lie between joints, as fixed tendons."""
     for name, row in zip(part.springs, part.port.across, strict=True):
         if name not in part.joints:
             joints = (*part.joints, part.base) if part.base else part.joints
@@ -459,9 +463,9 @@ def _add_springs(spec: mujoco.MjSpec, part: _Placed, damping: Mapping[str, Any],
 
 
 def _add_spring(spec: mujoco.MjSpec, name: str, ends: Mapping[str, float], stiffness: float, damping: float) -> None:
-    """A fixed tendon that lengthens by its factor with each joint."""
+    """Add a fixed tendon with a spring and a damper; `ends` are the derivatives of its length by the joints."""
     tendon = spec.add_tendon(name=name)
-    # entry 0 is the linear term; MuJoCo also knows two nonlinear ones
+    # Entry 0 is the linear coefficient; MuJoCo has two nonlinear ones as well.
     tendon.stiffness[0], tendon.damping[0] = stiffness, damping
     tendon.springlength = [0, 0]
     for joint, factor in sorted(ends.items(), key=lambda end: -end[1]):
@@ -487,15 +491,15 @@ def _motors(model: mujoco.MjModel) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Crowd:
-    """Sets of humans, one per device, all with the same number of links. They have no voluntary motion.
+    """Sets of humans, one per device, all with the same number of links and without voluntary motion.
 
-    `holds` says which channels' humans are arms of one person, whose body and cross spring are in `bodies`.
+    `holds` lists the channels of each person with several devices. Their bodies and cross springs are in `bodies`.
     """
 
     links: _Array  # (nsim, m, links, 3): mass [kg], damping [N s/m], stiffness [N/m]
     holds: tuple[tuple[int, ...], ...] = ()  # (persons,) channels, counted from 1
     bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
-    # (nsim, persons, 5): mass, damping, stiffness as above, damping and stiffness from hand to hand
+    # (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
 
     def __post_init__(self) -> None:
         links = np.array(self.links, dtype=float)
@@ -517,7 +521,7 @@ class Crowd:
 
     @property
     def ports(self) -> tuple[Port, ...]:
-        """One per device, each with a leading axis over the sets."""
+        """One port per device, each with a leading axis over the sets."""
         return tuple(Port.chain(self.links[:, i]) for i in range(self.links.shape[1]))
 
     @property
@@ -535,13 +539,13 @@ class Crowd:
         return tuple(Person(holds, m, b, k, Cross(*cross)) for holds, (m, b, k, *cross) in pairs)
 
 
-MIXED = 0  # as a number of links: half the humans are simple, half are networks of two links
+MIXED = 0  # a number of links: half of the humans have one link and half have two
 
 
 def draw(population: Population, channels: int, seed: int, index: int, links: int) -> _Array:
-    """Links of the humans with this index, one per channel: (channels, links, 3) as in Crowd.
+    """Draw the links (channels, links, 3) of the humans with this index, one per channel, as in Crowd.
 
-    They depend on (seed, index) and the population only. `links` = MIXED tosses a coin between 1 and 2.
+    They depend on (seed, index) and the population only. With `links` = MIXED the number of links is 1 or 2.
     """
     rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
     count = int(rng.integers(1, 3)) if links == MIXED else links
@@ -557,9 +561,9 @@ def crowds(
     links: int,
     holds: tuple[tuple[int, ...], ...] = (),
 ) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
-    """The humans of these indices, grouped by their number of links: (indices of the group, crowd).
+    """Yield the humans of these indices, grouped by their number of links, as (indices of the group, crowd).
 
-    `holds` says which channels one person holds, as in Crowd.
+    `holds` lists the channels of each person with several devices, as in Crowd.
     """
     drawn = {i: draw(population, channels, seed, i, links) for i in indices}
     for count in sorted({values.shape[1] for values in drawn.values()}):
@@ -569,9 +573,9 @@ def crowds(
 
 
 def _draw_bodies(population: Population, persons: int, seed: int, index: int) -> _Array:
-    """Bodies of the persons with this index who hold several devices: (persons, 5) as in Crowd, from the same ranges.
+    """Draw the bodies (persons, 5) of the persons with this index who hold several devices, as in Crowd.
 
-    Drawn apart from the links, which are the same whether or not a person holds several devices.
+    They come from the same ranges and from a random stream of their own, so that the links do not depend on them.
     """
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
     ranges = (population.mass, population.damping, population.stiffness, population.damping, population.stiffness)
@@ -581,7 +585,7 @@ def _draw_bodies(population: Population, persons: int, seed: int, index: int) ->
 
 @dataclass(frozen=True, eq=False)
 class HumanSets:
-    """Sets of any humans, one per device, that differ in their numbers only; persons are the same for all sets."""
+    """Sets of any humans, one per device, that differ in their parameters only. All sets have the same persons."""
 
     sets: tuple[tuple[Hand, ...], ...]  # (nsim, m)
     people: tuple[Person, ...] = ()
@@ -591,12 +595,12 @@ class HumanSets:
 
     @property
     def ports(self) -> tuple[Port, ...]:
-        """As Crowd.ports. Raises ValueError where two humans of a device are built differently."""
+        """One port per device, with a leading axis over the sets. Raises ValueError if their structures differ."""
         return tuple(Port.stack([human.port() for human in column]) for column in zip(*self.sets, strict=True))
 
     @property
     def held(self) -> tuple[tuple[tuple[int, ...], Port], ...]:
-        """As in Crowd."""
+        """The persons with several devices: their channels, and their port with a leading axis over the sets."""
         return tuple((person.holds, Port.stack([person.port()] * len(self))) for person in self.people)
 
     def humans(self, i: int) -> tuple[Hand, ...]:
@@ -610,7 +614,7 @@ class HumanSets:
 
 @dataclass(frozen=True, eq=False)
 class Variants:
-    """The fields in which the models of a crowd differ, by MuJoCo's names, with one row per set of humans."""
+    """The fields of MuJoCo's model in which the models of a crowd differ, one row per set of humans."""
 
     scene: Scene
     fields: dict[str, _Array]  # (nsim, bodies | joints | tendons)
@@ -621,11 +625,11 @@ class Variants:
 
     @property
     def states(self) -> int:
-        """Of each plant."""
+        """Number of states of each plant."""
         return 2 * self.scene.model.nv + sum(z.order for _, z in self.impedances)
 
     def repeated(self, times: int) -> Variants:
-        """Every set of humans `times` times in succession."""
+        """Return a copy in which every set of humans stands `times` times in succession."""
 
         def again(rows: _Array) -> _Array:
             return np.repeat(rows, times, axis=0)
@@ -634,7 +638,7 @@ class Variants:
         return Variants(self.scene, {name: again(rows) for name, rows in self.fields.items()}, felt)
 
     def plants(self) -> Plant:
-        """All plants at once, A (nsim, 2n, 2n) and B (nsim, 2n, inputs): the same matrices as of each one's model."""
+        """Return all plants, A (nsim, 2n, 2n) and B (nsim, 2n, inputs), equal to the plant of each model."""
         model = self.scene.model
         across, mass = _tendon_jacobian(model), self.fields["body_mass"][:, model.jnt_bodyid]
 
@@ -649,7 +653,7 @@ class Variants:
 
 
 def variants(devices: Sequence[Device], crowd: Crowd | HumanSets) -> Variants:
-    """The devices in the hands of every set of humans. Raises ValueError where their numbers differ."""
+    """Return the models of the devices with every set of humans. Raises ValueError if their numbers differ."""
     placed = _placed(devices, crowd.ports, crowd.held)
     first = tuple(part._replace(port=part.port.of(0)) for part in placed)
     scene = _compiled(devices, first)

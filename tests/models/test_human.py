@@ -72,8 +72,8 @@ def test_a_lossless_impedance_is_no_rounding_victim():
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        (([[1.0]], [[1.0]], [[1.0]], [[0.0]]), "expected what decays"),
-        (([[0.0]], [[1.0]], [[1.0]], [[0.0]]), "expected what decays"),
+        (([[1.0]], [[1.0]], [[1.0]], [[0.0]]), "expected a stable A"),
+        (([[0.0]], [[1.0]], [[1.0]], [[0.0]]), "expected a stable A"),
         (([[-1.0]], [[1.0]], [[1.0]], [[-0.1]]), "not passive"),
         (([[-1.0]], [[1.0]], [[-1.0]], [[0.0]]), "not passive"),
         (([[-1.0]], [[1.0, 2.0]], [[1.0]], [[0.0]]), r"B has the shape \(1, 2\), expected \(1, 1\)"),
