@@ -1,13 +1,13 @@
 """Discrete-time linear systems x+ = A x + B u, y = C x + D u, in any arithmetic, and their sampled responses.
 
-One expression serves every use. `Lti` holds floats, a stack of systems (leading axes), or Fractions; `Sampled` holds
-G(z) at points of the circle. They share the operators
+A condition is written once as an expression over blocks and evaluated in several ways. `Lti` holds floats, a stack of
+systems (leading axes), or Fractions. `Sampled` holds G(z) at points of the unit circle. Both have the operators
 
     G @ H   series G(z) H(z)        G + H, G - H, -G, c * G        M @ G, G @ M, G + M   with a constant matrix M
     G.feedback(H)   (I + G H)^-1 G                                 G.over_z_minus_one()  G(1), G/(z - 1) less its pole
 
-The period decides the arithmetic: built with a float T, blocks are floating point; with a Fraction T they are exact,
-and a stored float stands for its shortest decimal, the one that a person wrote: 0.0012 is 12/10000.
+The type of the period decides the arithmetic. A block with a float T is floating point. A block with a Fraction T is
+exact, and a stored float then means its shortest decimal, as a person wrote it: 0.0012 is 12/10000.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
-import scipy  # its parts load when they are used
+import scipy  # its submodules are imported on first use
 from haptic_loop.controller.arithmetic import (
     Array,
     Number,
@@ -38,7 +38,7 @@ Complex = NDArray[np.complex128]
 
 
 def frozen(value: ArrayLike, ndim: int, name: str = "") -> Array:
-    """A read-only float64 copy of `value`, which must have `ndim` axes. Raises ValueError beginning with `name`."""
+    """Return a read-only float64 copy of `value`. Raises ValueError, with `name`, unless it has `ndim` axes."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -50,13 +50,13 @@ def frozen(value: ArrayLike, ndim: int, name: str = "") -> Array:
 
 
 def _unlike(name: str, value: ArrayLike, ndim: int, got: str = "") -> ValueError:
-    """The error of `frozen`, apart: to write a matrix as text costs far more than to copy it."""
+    """Return the error of `frozen`. It is built on demand, because formatting a matrix costs more than copying it."""
     expected = "a list of numbers" if ndim == 1 else f"an array of numbers with {ndim} axes"
     return ValueError(f"{name} is {value!r}, expected {expected}{got}" if name else f"expected {expected}{got}")
 
 
 class ReadOnly:
-    """A record of arrays that nobody writes to, also after it was pickled or copied, where NumPy forgets that."""
+    """A record whose arrays stay read-only after pickling and copying, which make NumPy arrays writeable again."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         for value in state.values():
@@ -65,12 +65,12 @@ class ReadOnly:
         self.__dict__.update(state)
 
 
-_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # of a response at once: what stays in the processor's cache
+_ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # sizes of the parts of a response, so that they stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
 class Lti(ReadOnly):
-    """A state-space block with n states, m inputs and p outputs; `...` are the axes of a stack, none for one system."""
+    """A state-space block with n states, m inputs and p outputs. The axes `...` index the systems of a stack."""
 
     A: Array  # (..., n, n)
     B: Array  # (..., n, m)
@@ -78,9 +78,9 @@ class Lti(ReadOnly):
     D: Array  # (..., p, m)
     T: Any  # [s] float or Fraction
 
-    __array_ufunc__ = None  # so that `matrix @ G` comes here
+    __array_ufunc__ = None  # lets `matrix @ G` call __rmatmul__
 
-    if TYPE_CHECKING:  # what __post_init__ accepts is more than what the fields then hold
+    if TYPE_CHECKING:  # __post_init__ accepts more types than the fields have afterwards
 
         def __init__(self, A: ArrayLike, B: ArrayLike, C: ArrayLike, D: ArrayLike, T: Number) -> None: ...
 
@@ -102,7 +102,7 @@ class Lti(ReadOnly):
 
     @classmethod
     def constant(cls, D: ArrayLike, T: Number) -> Self:
-        """The memoryless block y = D u."""
+        """Return the memoryless block y = D u."""
         gain: Any = numbers(D, T) if isinstance(T, Fraction) else np.asarray(D, dtype=np.float64)
         if gain.ndim < 2:
             raise ValueError(f"expected an array of numbers with 2 axes, got shape {gain.shape}")
@@ -111,24 +111,24 @@ class Lti(ReadOnly):
 
     @classmethod
     def with_rest(cls, A: Array, B: Array, R: Array, static: Array, T: Number) -> Self:
-        """G = static + (R - R z)(z I - A)^-1 B, whose G(1) and R = C (I - A)^-1 are known, not solved for.
+        """Return G = static + (R - R z)(z I - A)^-1 B, for which G(1) = static and C (I - A)^-1 = R are known.
 
-        With R held its matrices are affine in A, B and G(1).
+        For a fixed R the matrices of the block are affine in A, B and G(1).
         """
-        whole = cls(A, B, R - R @ A, static - R @ B, T)
-        whole.__dict__["_rest"] = static, R
-        return whole
+        block = cls(A, B, R - R @ A, static - R @ B, T)
+        block.__dict__["_rest"] = static, R
+        return block
 
     @classmethod
     def diag(cls, *blocks: Lti) -> Self:
-        """The blocks side by side, each with its own inputs and outputs."""
+        """Return the block-diagonal system: each block keeps its own inputs and outputs."""
         A, B, C, D = (_block_diagonal([getattr(g, name) for g in blocks]) for name in "ABCD")
-        whole = cls(A, B, C, D, _common_period(*blocks))
-        return _made(whole, lambda: tuple(map(_block_diagonal, zip(*(g._rest for g in blocks), strict=True))))
+        joined = cls(A, B, C, D, _common_period(*blocks))
+        return _with_parts(joined, lambda: tuple(map(_block_diagonal, zip(*(g._rest for g in blocks), strict=True))))
 
     @classmethod
     def stacked(cls, blocks: Sequence[Lti]) -> Self:
-        """A stack of systems of the same shape."""
+        """Return a stack of systems of the same shape."""
         A, B, C, D = (np.stack([getattr(g, name) for g in blocks]) for name in "ABCD")
         return cls(A, B, C, D, _common_period(*blocks))
 
@@ -138,7 +138,7 @@ class Lti(ReadOnly):
 
     @property
     def inner_order(self) -> int:
-        """States without those that delays at the outputs add, which cost a response nothing."""
+        """Number of states without the delay lines at the outputs, which cost a frequency response nothing."""
         return self._lines[0].size
 
     @property
@@ -155,24 +155,24 @@ class Lti(ReadOnly):
 
     @property
     def count(self) -> int:
-        """How many systems are in the stack."""
+        """Number of systems in the stack."""
         return np.broadcast_shapes(*(getattr(self, name).shape[:-2] for name in "ABCD"))[0]
 
     def __getitem__(self, i: int) -> Lti:
-        """System i of a stack."""
+        """Return system i of a stack."""
         A, B, C, D = (part[i] if part.ndim > 2 else part for part in (self.A, self.B, self.C, self.D))
         return Lti(A, B, C, D, self.T)
 
     def floats(self) -> Lti:
-        """The same in floating point, every coefficient correctly rounded."""
+        """Return the system in floating point, with every coefficient correctly rounded."""
         A, B, C, D = (np.asarray(getattr(self, name), dtype=np.float64) for name in "ABCD")
         return Lti(A, B, C, D, float(self.T))
 
     def at(self, z: ArrayLike) -> Complex:
-        """G(z), shape z.shape + (p, m); of a stack, whose axes come first in z: (n, k) or (1, k) to (n, k, p, m).
+        """Return G(z), shape z.shape + (p, m). A stack takes z (n, k) or (1, k) and returns (n, k, p, m).
 
-        One system: by back substitution in the complex Schur form of A, which stays accurate for the defective
-        matrices of delay lines where an eigenvector basis does not exist.
+        One system is evaluated by back substitution in the complex Schur form of A. This remains accurate for the
+        defective matrices of delay lines, which have no basis of eigenvectors.
         """
         z = np.asarray(z, dtype=np.complex128)
         if self.A.ndim > 2 or self.B.ndim > 2 or self.C.ndim > 2 or self.D.ndim > 2:
@@ -186,9 +186,9 @@ class Lti(ReadOnly):
         return np.moveaxis(G, -1, 0).reshape(*z.shape, self.outputs, self.inputs)
 
     def _resolved(self, points: Complex) -> Complex:
-        """C (z I - A)^-1 B, shape (p, m, points): row by row from the last one up, _ROWS of them into those above.
+        """Return C (z I - A)^-1 B, shape (p, m, points), by back substitution in blocks of _ROWS rows.
 
-        What only repeats another state later is no row: it is that state times a power of z.
+        Delay lines at the outputs are not part of the substitution: their states are core states times powers of 1/z.
         """
         on_time()
         S, U = self._schur
@@ -208,18 +208,18 @@ class Lti(ReadOnly):
         return G
 
     def at_rest(self, x: Array) -> Array:
-        """The state z = A z + B x in which it rests with the inputs x held.
+        """Return the equilibrium state z = A z + B x for constant inputs x.
 
-        Where it drifts (an environment with a free mass, whose place no x decides), the shortest such z.
+        If the equilibrium is not unique (an environment with a free mass), return the solution of least norm.
         """
         z: Array = np.linalg.lstsq(np.eye(self.order) - self.A, self.B @ x, rcond=None)[0]
         return z
 
     @cached_property
     def _lines(self) -> tuple[NDArray[np.intp], list[tuple[int, NDArray[np.intp], NDArray[np.intp]]]]:
-        """The states without those that delays at the outputs add; and those: (place among the first, states, delays).
+        """Split the states into core states and delay lines, given as (index of the core state, states, delays).
 
-        A state of the second kind is one of the first kind some samples before, and only the output reads it.
+        The states of a delay line are delayed copies of a core state, and only the output reads them.
         """
         reads = self.A != 0
         repeats = (reads.sum(axis=1) == 1) & (self.A.sum(axis=1) == 1) & ~self.B.any(axis=1)
@@ -230,7 +230,7 @@ class Lti(ReadOnly):
             followers.setdefault(int(reads[i].argmax()), []).append(int(i))
         lines = {head: [(head, 0)] for head in followers if not repeats[head]}
         for line in lines.values():
-            for i, late in line:  # which grows
+            for i, late in line:  # the list grows while it is read
                 line += [(follower, late + 1) for follower in followers.get(i, ())]
         core = np.setdiff1d(np.arange(self.order), [i for line in lines.values() for i, _ in line[1:]])
         places = np.searchsorted(core, list(lines))
@@ -239,7 +239,7 @@ class Lti(ReadOnly):
 
     @cached_property
     def _schur(self) -> tuple[Complex, Complex]:
-        """S, U with A = U S U* and S upper triangular, without delays at the outputs: once per block."""
+        """The Schur form A = U S U* of the core states, with S upper triangular."""
         core = self._lines[0]
         if not core.size:
             return np.zeros((0, 0), dtype=np.complex128), np.zeros((0, 0), dtype=np.complex128)
@@ -247,21 +247,20 @@ class Lti(ReadOnly):
         return S, U
 
     def dc(self) -> Array:
-        """G(1), shape (..., p, m)."""
+        """Return G(1), shape (..., p, m)."""
         return self._rest[0] if self.is_exact else self.C @ solve(_identity(self) - self.A, self.B) + self.D
 
     @cached_property
     def _rest(self) -> tuple[Array, Array]:
-        """G(1) and C (I - A)^-1, (..., p, m) and (..., p, n): what constant inputs and pushes of states add up to.
+        """G(1), shape (..., p, m), and R = C (I - A)^-1, shape (..., p, n).
 
-        Of an exact block that was made of others they are made of theirs: the states of a loop all feed each other, and
-        to eliminate them costs far more than to close the loop at z = 1. Raises SingularLoop where A has the
-        eigenvalue one.
+        An exact block that was composed of others computes them from its parts: closing a loop at z = 1 costs far less
+        than eliminating all states of the closed loop. Raises SingularLoop if A has the eigenvalue one.
         """
-        if made := self.__dict__.get("_made"):
+        if from_parts := self.__dict__.get("_parts"):
             try:
-                return made()
-            except SingularLoop:  # of a part, perhaps not of the whole
+                return from_parts()
+            except SingularLoop:  # a part is singular at z = 1; the composed block may be regular
                 pass
         R = np.swapaxes(solve(np.swapaxes(_identity(self) - self.A, -1, -2), np.swapaxes(self.C, -1, -2)), -1, -2)
         return self.D + times(R, self.B), R
@@ -270,29 +269,30 @@ class Lti(ReadOnly):
         return {name: getattr(self, name) for name in ("A", "B", "C", "D", "T")}
 
     def poles(self) -> Complex:
-        """Eigenvalues of A, shape (..., n); delays at the outputs have theirs at zero, exactly."""
+        """Return the eigenvalues of A, shape (..., n). Delay lines at the outputs have exact zeros."""
         if self.A.ndim > 2:
             return np.linalg.eigvals(self.A).astype(np.complex128)
         core = self._lines[0]
-        kept = np.linalg.eigvals(self.A[np.ix_(core, core)])
-        return np.append(kept, np.zeros(self.order - core.size)).astype(np.complex128)
+        eigenvalues = np.linalg.eigvals(self.A[np.ix_(core, core)])
+        return np.append(eigenvalues, np.zeros(self.order - core.size)).astype(np.complex128)
 
     def is_stable(self) -> bool:
-        """Whether every pole lies strictly inside the unit circle."""
+        """Return whether every pole lies strictly inside the unit circle."""
         return bool(np.all(np.abs(self.poles()) < 1))
 
     def split_at_one(self) -> tuple[Array, Lti]:
-        """G(1), and (G(z) - G(1))/(z - 1): stable where G is, so G/(z - 1) without its pole at z = 1.
+        """Return G(1) and (G(z) - G(1))/(z - 1), which is G/(z - 1) without its pole at z = 1 and stable if G is.
 
-        Raises SingularLoop where A has the eigenvalue one.
+        Raises SingularLoop if A has the eigenvalue one.
         """
         static, R = self._rest
         return static, Lti(self.A, self.B, -R, np.zeros_like(self.D), self.T)
 
     def over_z_minus_one(self) -> tuple[Array, Lti]:
-        """G(1), and a block that is stable where G is, with the Hermitian part of G/(z - 1) on the circle but at z = 1.
+        """Return G(1) and a stable block with the Hermitian part of G/(z - 1) on the circle except at z = 1.
 
-        It is (G - G(1))/(z - 1) - G(1)/2: the real part of 1/(z - 1) is -1/2 there, and G(1) must be symmetric.
+        The block is (G - G(1))/(z - 1) - G(1)/2, since the real part of 1/(z - 1) is -1/2 on the circle. G must be
+        stable and G(1) symmetric.
         """
         static, quotient = self.split_at_one()
         return static, quotient - static / 2
@@ -300,19 +300,19 @@ class Lti(ReadOnly):
     def __matmul__(self, other: Lti | Array) -> Lti:
         B, D = self.B, self.D
         if not isinstance(other, Lti):
-            whole = Lti(self.A, times(B, other), self.C, times(D, other), self.T)
-            return _made(whole, lambda: (times(self._rest[0], other), self._rest[1]))
+            product = Lti(self.A, times(B, other), self.C, times(D, other), self.T)
+            return _with_parts(product, lambda: (times(self._rest[0], other), self._rest[1]))
         T = _common_period(self, other)
         zero = np.zeros((other.order, self.order), dtype=int)
         A = _block([[other.A, zero], [times(B, other.C), self.A]])
         C = _block([[times(D, other.C), self.C]])
-        whole = Lti(A, _block([[other.B], [times(B, other.D)]]), C, times(D, other.D), T)
+        series = Lti(A, _block([[other.B], [times(B, other.D)]]), C, times(D, other.D), T)
 
         def rest() -> tuple[Array, Array]:
             (own, R), (static, S) = self._rest, other._rest
             return times(own, static), _block([[times(own, S), R]])
 
-        return _made(whole, rest)
+        return _with_parts(series, rest)
 
     def __rmatmul__(self, matrix: Array) -> Lti:
         return Lti(self.A, self.B, times(matrix, self.C), times(matrix, self.D), self.T)
@@ -341,14 +341,14 @@ class Lti(ReadOnly):
     __rmul__ = __mul__
 
     def rows(self, which: Any) -> Lti:
-        """Some of the outputs, with the same states."""
+        """Return the system with the outputs `which` only."""
         some = Lti(self.A, self.B, self.C[..., which, :], self.D[..., which, :], self.T)
-        return _made(some, lambda: tuple(part[..., which, :] for part in self._rest))
+        return _with_parts(some, lambda: tuple(part[..., which, :] for part in self._rest))
 
     def feedback(self, other: Lti) -> Lti:
-        """(I + G H)^-1 G: this block with H = `other` in negative feedback around it.
+        """Return (I + G H)^-1 G: this block G with H = `other` in negative feedback.
 
-        Raises SingularLoop where I + D_G D_H cannot be inverted.
+        Raises SingularLoop if I + D_G D_H cannot be inverted.
         """
         T = _common_period(self, other)
         S = inverse(eye(self.outputs, T) + times(self.D, other.D))
@@ -358,17 +358,17 @@ class Lti(ReadOnly):
         u_x = _block([[np.zeros((self.inputs, self.order), dtype=int), -other.C]]) - times(other.D, y_x)
         u_u = eye(self.inputs, T) - times(other.D, y_u)
         A = _block_diagonal([self.A, other.A]) + _block([[times(self.B, u_x)], [times(other.B, y_x)]])
-        whole = Lti(A, _block([[times(self.B, u_u)], [times(other.B, y_u)]]), y_x, y_u, T)
+        loop = Lti(A, _block([[times(self.B, u_u)], [times(other.B, y_u)]]), y_x, y_u, T)
 
         def rest() -> tuple[Array, Array]:
             (own, R), (static, Q) = self._rest, other._rest
             closed = inverse(eye(self.outputs, T) + times(own, static))
             return times(closed, own), times(closed, _block([[R, -times(own, Q)]]))
 
-        return _made(whole, rest)
+        return _with_parts(loop, rest)
 
     def inverse(self) -> Lti:
-        """G^-1, where D has an inverse. Raises SingularLoop where it has none."""
+        """Return G^-1. Raises SingularLoop if D cannot be inverted."""
         D = inverse(self.D)
         B, C = times(self.B, D), times(D, self.C)
         return Lti(self.A - times(B, self.C), B, -C, D, self.T)
@@ -376,10 +376,10 @@ class Lti(ReadOnly):
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """G(z) at points z of the circle other than 1: the responses of many systems, one where n = 1."""
+    """Responses G(z) of n systems at points z of the unit circle other than 1."""
 
     z: Complex  # (n, k) or (1, k)
-    G: Complex  # (n, k, p, m), or what broadcasts to it
+    G: Complex  # (n, k, p, m), or a shape that broadcasts to it
     T: float  # [s]
 
     __array_ufunc__ = None
@@ -418,12 +418,12 @@ class Sampled:
 
     def feedback(self, other: Sampled) -> Sampled:
         m = self.G.shape[-1]
-        if m == 2:  # (I + G H)^-1 G = (G + det(G) adj(H))/det(I + G H), far faster than a call for each matrix
+        if m == 2:  # (I + G H)^-1 G = (G + det(G) adj(H))/det(I + G H) is far faster than a solve for each matrix
             (a, b), (c, d) = _entries(self.G)
             (e, f), (g, h) = _entries(other.G)
             det = a * d - b * c
-            whole = 1 + a * e + b * g + c * f + d * h + det * (e * h - f * g)
-            return self._with(_matrix((a + det * h, b - det * f), (c - det * g, d + det * e)) / whole[..., None, None])
+            closed = 1 + a * e + b * g + c * f + d * h + det * (e * h - f * g)
+            return self._with(_matrix((a + det * h, b - det * f), (c - det * g, d + det * e)) / closed[..., None, None])
         loop = np.eye(m) + self.G @ other.G
         return self._with(self.G / loop if m == 1 else np.linalg.solve(loop, self.G))
 
@@ -431,8 +431,8 @@ class Sampled:
         return self._with(1 / self.G if self.G.shape[-1] == 1 else np.linalg.inv(self.G))
 
     def over_z_minus_one(self) -> tuple[Array, Sampled]:
-        """0, as responses do not tell G(1), and G/(z - 1) itself."""
-        step = -0.5 - 0.5j / np.tan(np.angle(self.z) / 2)  # 1/(z - 1), whose real part 1 - z would lose near z = 1
+        """Return zero in place of G(1), which responses do not contain, and G/(z - 1)."""
+        step = -0.5 - 0.5j / np.tan(np.angle(self.z) / 2)  # 1/(z - 1), without the cancellation of z - 1 near z = 1
         return np.zeros(self.G.shape[-2:]), self._with(self.G * step[..., None, None])
 
     def _with(self, G: Any) -> Sampled:
@@ -440,12 +440,12 @@ class Sampled:
 
 
 def _entries(G: Complex) -> tuple[tuple[Complex, Complex], tuple[Complex, Complex]]:
-    """The four entries of 2 x 2 matrices over the last two axes."""
+    """Return the four entries of 2 x 2 matrices over the last two axes."""
     return (G[..., 0, 0], G[..., 0, 1]), (G[..., 1, 0], G[..., 1, 1])
 
 
 def _matrix(*rows: Sequence[Complex]) -> Complex:
-    """2 x 2 matrices over the last two axes from their entries."""
+    """Return 2 x 2 matrices over the last two axes from their entries."""
     out = np.empty((*np.broadcast_shapes(*(entry.shape for row in rows for entry in row)), 2, 2), dtype=np.complex128)
     for i, row in enumerate(rows):
         for j, entry in enumerate(row):
@@ -454,7 +454,7 @@ def _matrix(*rows: Sequence[Complex]) -> Complex:
 
 
 def _product(G: Any, H: Any) -> Any:
-    """G @ H; small ones entry by entry, which is far faster than a call for each pair of matrices."""
+    """Return G @ H. Small matrices are multiplied entry by entry, which is far faster than a call for each pair."""
     if G.shape[-1] == 1:
         return G * H
     if G.shape[-2:] == H.shape[-2:] == (2, 2):
@@ -464,11 +464,11 @@ def _product(G: Any, H: Any) -> Any:
     return G @ H
 
 
-Block = TypeVar("Block", Lti, Sampled)  # what an expression over blocks is written for
+Block = TypeVar("Block", Lti, Sampled)  # the two types over which conditions are written
 
 
 def vstack(*blocks: Any) -> Any:
-    """The outputs of several blocks of one input, one below the other; those that share A and B share the states."""
+    """Stack the outputs of several blocks with one common input. Blocks with the same A and B share their states."""
     first = blocks[0]
     if isinstance(first, Sampled):
         return first._with(_block([[b.G] for b in blocks]))
@@ -481,37 +481,37 @@ def vstack(*blocks: Any) -> Any:
 
 
 def hstack(*blocks: Any) -> Any:
-    """One output from the inputs of several blocks, side by side."""
+    """Add the outputs of several blocks; their inputs stand side by side."""
     first = blocks[0]
     if isinstance(first, Sampled):
         return first._with(_block([[b.G for b in blocks]]))
     T = _common_period(*blocks)
     A, B = _block_diagonal([b.A for b in blocks]), _block_diagonal([b.B for b in blocks])
-    whole = Lti(A, B, _block([[b.C for b in blocks]]), _block([[b.D for b in blocks]]), T)
-    return _made(whole, lambda: tuple(_block([parts]) for parts in zip(*(b._rest for b in blocks), strict=True)))
+    joined = Lti(A, B, _block([[b.C for b in blocks]]), _block([[b.D for b in blocks]]), T)
+    return _with_parts(joined, lambda: tuple(_block([parts]) for parts in zip(*(b._rest for b in blocks), strict=True)))
 
 
-def _made(block: Any, rest: Callable[[], tuple[Array, ...]]) -> Any:
-    """The block, which knows how to make its `_rest` of its parts' where it is exact."""
+def _with_parts(block: Any, rest: Callable[[], tuple[Array, ...]]) -> Any:
+    """Remember how to compute G(1) and C (I - A)^-1 from the parts of an exact block."""
     if block.is_exact:
-        object.__setattr__(block, "_made", rest)
+        object.__setattr__(block, "_parts", rest)
     return block
 
 
 def as_like(block: Lti | Sampled, system: Lti) -> Any:
-    """A system as it is, or sampled where the block is."""
+    """Return the system, sampled at the points of `block` if `block` is sampled."""
     return Sampled(block.z, system.at(block.z), block.T) if isinstance(block, Sampled) else system
 
 
 def constant_like(block: Block, D: Any) -> Block:
-    """The memoryless block y = D u, of the kind of another."""
+    """Return the memoryless block y = D u, of the same type as `block`."""
     if isinstance(block, Sampled):
         return block._with(np.asarray(D, dtype=np.complex128)[None, None])
     return Lti.constant(D, block.T)
 
 
 def taps(weights: Sequence[Any], T: Number) -> Lti:
-    """One channel, w_0 + w_1/z + ... + w_n z^-n."""
+    """Return the filter w_0 + w_1/z + ... + w_n z^-n of one channel."""
     n = len(weights) - 1
     row = numbers(list(weights), T)
     if n < 0:
@@ -522,25 +522,25 @@ def taps(weights: Sequence[Any], T: Number) -> Lti:
 
 
 def _block_diagonal(parts: Sequence[Array]) -> Array:
-    """The parts along the diagonal, of any arithmetic and any stack."""
+    """Return the block-diagonal matrix of the parts, in any arithmetic and for any stack."""
     lead = np.broadcast_shapes(*(p.shape[:-2] for p in parts))
     ends = np.cumsum([(0, 0), *(p.shape[-2:] for p in parts)], axis=0)
-    whole = np.zeros((*lead, *ends[-1]), dtype=np.result_type(*parts))
+    matrix = np.zeros((*lead, *ends[-1]), dtype=np.result_type(*parts))
     for part, (top, left), (low, right) in zip(parts, ends[:-1], ends[1:], strict=True):
-        whole[..., top:low, left:right] = part
-    return whole
+        matrix[..., top:low, left:right] = part
+    return matrix
 
 
 def _block(rows: Sequence[Sequence[Array]]) -> Array:
-    """numpy.block over the last two axes; the leading ones are broadcast."""
+    """Return numpy.block over the last two axes; the leading axes are broadcast."""
     lead = np.broadcast_shapes(*(b.shape[:-2] for row in rows for b in row))
-    whole = [[np.broadcast_to(b, (*lead, *b.shape[-2:])) for b in row] for row in rows]
-    return np.concatenate([np.concatenate(row, axis=-1) for row in whole], axis=-2)
+    table = [[np.broadcast_to(b, (*lead, *b.shape[-2:])) for b in row] for row in rows]
+    return np.concatenate([np.concatenate(row, axis=-1) for row in table], axis=-2)
 
 
 def _floats(value: ArrayLike, name: str) -> Array:
     if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.ndim > 1 and not value.flags.writeable:
-        return value  # blocks that share their states keep sharing them, see vstack
+        return value  # not copied, so that vstack can detect blocks that share their states
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
