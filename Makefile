@@ -5,6 +5,7 @@
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on: a report in out/validate/report.md, and the slow pages: half an hour
 # make mutate  small mistakes in what verdicts rest on, and whether a test notices: about ten minutes
+# make kernels  the numerical tests under every kernel of OpenBLAS that this processor runs, and a table: an hour
 # make oldest  the tests of models, blocks and files with the oldest packages that pyproject.toml allows, in .venv-oldest
 # make installed  the wheel in an empty environment, run beside a user's own models/, sim.py and cli.py
 # make figures  the pictures that README and docs show, and the output in their blocks
@@ -14,7 +15,7 @@ PY := .venv/bin/python
 # than cores, since sessions in real time mostly wait; tests/conftest.py has the longest files first
 PARALLEL := -n $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1) --dist loadfile --no-loadscope-reorder
 
-.PHONY: run test check validate lint coverage bench mutate oldest installed figures clean
+.PHONY: run test check validate lint coverage bench mutate kernels oldest installed figures clean
 
 run: .venv/ready
 	$(PY) -m sim.run --case I
@@ -36,6 +37,9 @@ validate: .venv/ready
 
 mutate: .venv/ready
 	$(PY) tests/mutate.py
+
+kernels: .venv/ready
+	$(PY) tests/tools/kernels.py
 
 # links from one folder, by which pyright finds haptic_loop.sim in the folder sim
 build/typed: Makefile

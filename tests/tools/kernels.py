@@ -1,0 +1,132 @@
+"""Run the numerical tests under every linear-algebra kernel of this processor, and print a table of the results.
+
+A kernel is a build of OpenBLAS for one kind of processor. Kernels add in different orders and round differently: no
+test may pass on one of them only. Two more settings round differently, too: NumPy without the instruction sets that it
+chooses at run time, and OpenBLAS with eight threads instead of one.
+
+    python tests/tools/kernels.py                 every setting (half an hour to an hour on two cores)
+    python tests/tools/kernels.py --one           one foreign kernel; the next commit takes the next one (for CI)
+    python tests/tools/kernels.py --only HASWELL  this setting
+    python tests/tools/kernels.py --list          the settings of this processor
+
+What pytest prints stands in build/kernels/SETTING.txt. The exit code is 1 if a test fails under any setting.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+OUT = ROOT / "build" / "kernels"
+TESTS = ("tests/controller", "tests/design", "tests/models", "tests/sim")
+
+#: kernels of OpenBLAS, and the feature of the processor, in NumPy's words, that each needs
+NEEDS = {
+    "PRESCOTT": "SSE3",
+    "NEHALEM": "SSE42",
+    "SANDYBRIDGE": "AVX",
+    "HASWELL": "AVX2",
+    "ZEN": "AVX2",
+    "SKYLAKEX": "AVX512_SKX",
+}
+#: asks NumPy for its features, and threadpoolctl for the kernels that its own and SciPy's OpenBLAS use
+_ASK = """
+import json, numpy, scipy.linalg
+from threadpoolctl import threadpool_info
+from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
+blas = [pool.get("architecture") for pool in threadpool_info() if pool["user_api"] == "blas"]
+have = [name for name, there in __cpu_features__.items() if there]
+print(json.dumps([blas, have, [name for name in __cpu_dispatch__ if name in have]]))
+"""
+
+
+def asked(**variables: str) -> tuple[list[str], list[str], list[str]]:
+    """(kernels in use, features of the processor, those of them that NumPy chooses at run time)."""
+    out = subprocess.run([sys.executable, "-c", _ASK], env={**os.environ, **variables}, capture_output=True, check=True)
+    return tuple(json.loads(out.stdout))
+
+
+def settings() -> dict[str, dict[str, str]]:
+    """Name to environment variables, of every setting that this processor can run, the native kernel first.
+
+    OpenBLAS may have one build for several names, or none for a name: it then takes another without a word. A
+    name of the same kernel as one before is left out.
+    """
+    blas, have, dispatched = asked()
+    every: dict[str, dict[str, str]] = {"native": {}}
+    there = {str(blas): "native"}
+    for kernel, feature in NEEDS.items():
+        if feature in have:
+            name = str(asked(OPENBLAS_CORETYPE=kernel)[0])
+            if name in there:
+                print(f"{kernel} is the same kernel as {there[name]}")
+            else:
+                there[name], every[kernel] = kernel, {"OPENBLAS_CORETYPE": kernel}
+    if dispatched:
+        every["NumPy baseline"] = {"NPY_DISABLE_CPU_FEATURES": " ".join(dispatched)}
+    every["8 threads"] = {"OPENBLAS_NUM_THREADS": "8"}
+    print(f"the native kernel is {' and '.join(sorted(set(blas)))}", flush=True)
+    return every
+
+
+def foreign(every: dict[str, dict[str, str]]) -> str:
+    """A kernel that is not the native one: consecutive commits take them in turn. "native" if there is no other."""
+    others = [name for name in every if name in NEEDS]
+    count = subprocess.run(["git", "rev-list", "--count", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout
+    return others[int(count or 0) % len(others)] if others else "native"
+
+
+def tested(name: str, variables: dict[str, str], workers: int) -> tuple[int, int, int, float]:
+    """(passed, failed, skipped, seconds) of the numerical tests under a setting; the lines of failures are printed."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    parallel = ["-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder"]
+    words = [sys.executable, "-m", "pytest", *parallel, "-rfEs", *TESTS]
+    environment = {"OPENBLAS_NUM_THREADS": "1", **os.environ, **variables}
+    path = OUT / f"{name.replace(' ', '-')}.txt"
+    with path.open("w") as file:
+        code = subprocess.run(words, cwd=ROOT, env=environment, stdout=file, stderr=subprocess.STDOUT).returncode
+    lines = path.read_text().splitlines()
+    print(
+        f"\n{name}:",
+        *(line for line in lines if line.startswith(("FAILED", "ERROR"))),
+        *lines[-1:],
+        sep="\n",
+        flush=True,
+    )
+    counts = [
+        sum(int(n) for n in re.findall(rf"(\d+) {word}", lines[-1])) for word in ("passed", "failed|error", "skipped")
+    ]
+    return counts[0], counts[1] or int(code != 0), counts[2], time.monotonic() - began
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", action="append", metavar="SETTING")
+    parser.add_argument("--one", action="store_true", help="one foreign kernel")
+    parser.add_argument("--list", action="store_true", help="name the settings, run nothing")
+    parser.add_argument("-n", type=int, default=os.cpu_count() or 1, help="tests at a time (default: one per core)")
+    args = parser.parse_args()
+    every = settings()
+    names = [foreign(every)] if args.one else args.only or list(every)
+    if unknown := [name for name in names if name not in every]:
+        parser.error(f"--only {unknown[0]}: this processor runs {', '.join(every)}")
+    if args.list:
+        print(*names, sep="\n")
+        return 0
+    rows = [(name, *tested(name, every[name], args.n)) for name in names]
+    print(f"\n{'setting':16}{'passed':>8}{'failed':>8}{'skipped':>9}{'seconds':>9}")
+    for name, passed, failed, skipped, seconds in rows:
+        print(f"{name:16}{passed:8}{failed:8}{skipped:9}{seconds:9.0f}")
+    return int(any(failed for _, _, failed, *_ in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
