@@ -1,4 +1,4 @@
-"""What a tick solves where it is not linear: complementarity problems with one solution, of walls and of limits."""
+"""The nonlinear equations of a tick: complementarity problems of walls and of force limits, each with one solution."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import numpy as np
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.lti import Array, ReadOnly, frozen
 
-_LEAST_MINOR = 1e-12  # of a matrix whose diagonal is one: what is smaller counts as singular
-_MOST_CANDIDATES = 27  # three channels, or two with a wall: beyond, the sets are not listed but pivoted through
-GROUNDED = 1e-10  # of the largest diagonal entry: what makes a singular matrix regular for pivoting
-PIVOT_ROUNDING = 1e-12  # of the numbers that are subtracted
+_LEAST_MINOR = 1e-12  # a smaller principal minor of a matrix with unit diagonal counts as zero
+_MOST_CANDIDATES = 27  # active sets that are enumerated (three channels, or two with a wall); pivoting beyond
+GROUNDED = 1e-10  # regularisation of a singular matrix for pivoting, relative to its largest diagonal entry
+PIVOT_ROUNDING = 1e-12  # rounding error of a residual, relative to the terms of its difference
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem(ReadOnly):
-    """Complementarity in the forces of a tick; M says what each does to the ways along which all of them push."""
+    """A complementarity problem in the forces of a tick. M maps these forces to displacements along them."""
 
     M: Array  # (n, n)
 
@@ -28,15 +28,16 @@ class _Problem(ReadOnly):
 
     @cached_property
     def _separate(self) -> bool:
-        """Whether no force moves another one's way within the tick."""
+        """Whether M is diagonal, so that each force can be solved for by itself."""
         return np.count_nonzero(self.M - np.diag(np.diag(self.M))) == 0
 
 
 @dataclass(frozen=True, eq=False)
 class Complementarity(_Problem):
-    """p >= 0, M p - q >= 0, p'(M p - q) = 0: one solution for every q if M has positive principal minors.
+    """p >= 0, M p - q >= 0, p'(M p - q) = 0. It has one solution for every q if M is a P-matrix.
 
-    Raises SingularLoop where it has not.
+    Raises:
+        SingularLoop: A principal minor of M is not positive.
     """
 
     def __post_init__(self) -> None:
@@ -44,19 +45,19 @@ class Complementarity(_Problem):
         _ = self._candidates
 
     def solve(self, q: Array) -> Array:
-        """p for every column of q, (w, nsim)."""
+        """Return p (w, nsim) for every column of q (w, nsim)."""
         diagonal = self._diagonal
         if self._separate:
             return np.maximum(q, 0.0) / diagonal
         forces = (self._candidates @ q).reshape(-1, *q.shape)
-        # rounding leaves the right set some 1e-16 short of either sign, every other set more
+        # The solution violates its inequalities by rounding only; every other active set violates them by more.
         short = np.minimum(forces * diagonal, np.matmul(self.M, forces) - q).min(axis=1)
         best = np.take_along_axis(forces, short.argmax(axis=0)[None, None, :], axis=0)[0]
         return np.maximum(best, 0.0)
 
     @cached_property
     def _candidates(self) -> Array:
-        """q to p, if exactly the walls of a set push: for every set, stacked, (2^w w, w)."""
+        """The maps from q to p for every set of pushing walls, stacked, (2^w w, w)."""
         w, maps = len(self.M), []
         for pushing in itertools.product((False, True), repeat=w):
             chosen = np.ix_(pushing, pushing)
@@ -71,14 +72,16 @@ class Complementarity(_Problem):
 
 @dataclass(frozen=True, eq=False)
 class BoxProblem(_Problem):
-    """f = q - M v with lower <= f <= upper, v >= 0 where f is at its upper limit, <= 0 at its lower, 0 in between.
+    """f = q - M v with lower <= f <= upper, v >= 0 at the upper limit, v <= 0 at the lower limit, v = 0 in between.
 
-    There is exactly one solution for every q where M has positive principal minors. Sets on which M is singular, as of
-    an environment that nothing holds, are passed over: f is unique all the same. Raises SingularLoop where a minor is
-    negative.
+    If M is a P-matrix, there is exactly one solution for every q. Active sets on which M is singular (an environment
+    that nothing holds) are skipped, since f is unique nevertheless.
+
+    Raises:
+        SingularLoop: A principal minor of M is negative.
     """
 
-    lower: Array  # (n,) -inf where there is no limit
+    lower: Array  # (n,) -inf without a limit
     upper: Array  # (n,) > lower
 
     def __post_init__(self) -> None:
@@ -90,7 +93,7 @@ class BoxProblem(_Problem):
         _ = self.regular
 
     def solve(self, q: Array) -> tuple[Array, Array]:
-        """(v, f) for every column of q, both (n, nsim); what is at a limit is exactly there."""
+        """Return (v, f), both (n, nsim), for every column of q. A force at a limit is equal to it."""
         lower, upper = self.lower[:, None], self.upper[:, None]
         if self._separate:
             f = np.minimum(np.maximum(q, lower), upper)
@@ -103,7 +106,7 @@ class BoxProblem(_Problem):
 
     @cached_property
     def regular(self) -> bool:
-        """Whether all principal minors are positive; of more than ten unknowns, those of order one."""
+        """Whether all principal minors are positive. With more than ten unknowns only the diagonal is checked."""
         n = len(self.M)
         scale = np.sqrt(np.maximum(np.abs(np.diag(self.M)), 1e-300))
         unit, regular = self.M / scale / scale[:, None], True
@@ -118,10 +121,10 @@ class BoxProblem(_Problem):
 
     @cached_property
     def _candidates(self) -> tuple[Array, ...]:
-        """Of every set of active limits, of c: its signs, [v; f] by q and by one, and how far from wrong it is by both.
+        """For each of c active sets: its signs, and the affine maps from q to (v, f) and from q to the slack.
 
-        Shapes (c, n, 1), (c, 2n, n), (c, 2n, 1), (c 2n, n), (c 2n, 1); none where there are too many sets. A limit's
-        sign must be that of its v, and what is free must be within both limits.
+        The shapes are (c, n, 1), (c, 2n, n), (c, 2n, 1), (c 2n, n), (c 2n, 1). The tuple is empty if there are too many
+        sets. The slack is nonnegative if v has the sign of its limit and every free force is within both limits.
         """
         n, diagonal, one = len(self.M), self._diagonal[:, 0], np.eye(len(self.M))
         kinds = [
@@ -130,7 +133,7 @@ class BoxProblem(_Problem):
         ]
         if np.prod([len(kind) for kind in kinds]) > _MOST_CANDIDATES:
             return ()
-        scale, found = np.sqrt(np.maximum(np.abs(diagonal), 1e-300)), []
+        scale, sets = np.sqrt(np.maximum(np.abs(diagonal), 1e-300)), []
         for signs in map(np.array, itertools.product(*kinds)):
             active = np.flatnonzero(signs)
             chosen = np.ix_(active, active)
@@ -138,7 +141,7 @@ class BoxProblem(_Problem):
                 v, free = np.zeros((n, n)), signs == 0
                 v[chosen] = np.linalg.inv(self.M[chosen])
                 bounds = np.where(signs > 0, self.upper, np.where(signs < 0, self.lower, 0.0))
-                f = np.where(free[:, None], one - self.M @ v, 0.0)  # q - M v, and exactly the limit where it acts
+                f = np.where(free[:, None], one - self.M @ v, 0.0)  # q - M v if free, and exactly the limit if active
                 v_one, f_one = -v @ bounds, np.where(free, self.M @ v @ bounds, bounds)
                 pushed, pushed_one = (signs * diagonal)[:, None] * v, signs * diagonal * v_one
                 below, above = np.where(free[:, None], -f, pushed), np.where(free[:, None], f, pushed)
@@ -146,12 +149,12 @@ class BoxProblem(_Problem):
                 room_above = np.where(free, f_one - self.lower, pushed_one)
                 solved = np.vstack([v, f]), np.append(v_one, f_one)[:, None]
                 room = np.vstack([below, above]), np.append(room_below, room_above)[:, None]
-                found.append((signs[:, None], *solved, *room))
-        signs, by_q, by_one, room, room_one = map(np.stack, zip(*found, strict=True))
+                sets.append((signs[:, None], *solved, *room))
+        signs, by_q, by_one, room, room_one = map(np.stack, zip(*sets, strict=True))
         return signs, by_q, by_one, room.reshape(-1, n), room_one.reshape(-1, 1)
 
     def _listed(self, q: Array) -> tuple[Array, Array]:
-        """(v, f) of the set that is least wrong: rounding leaves the right one some 1e-16 short, every other more."""
+        """Return (v, f) of the active set with the largest slack: that of the solution is negative by rounding only."""
         signs, by_q, by_one, room, room_one = self._candidates
         n, k = q.shape
         best = (room @ q + room_one).reshape(len(signs), 2 * n, k).min(axis=1).argmax(axis=0)
@@ -161,11 +164,11 @@ class BoxProblem(_Problem):
         return v, np.minimum(np.maximum(f, self.lower[:, None]), self.upper[:, None])
 
     def _pivoted(self, q: Array) -> Array:
-        """v by switching limits on and off, all that are wrong at once and, should that go round, the first only.
+        """Solve for v by principal pivoting: all wrong limits at once, and only the first one if that cycles.
 
-        Switching the first alone ends for every M with positive principal minors. Index n is switched only when the
-        others are right for it; then uniqueness shows on which side of its limit the solution lies, so n takes each
-        of its three states at most once. The same holds of n - 1 in between, and so on.
+        Pivoting on the first wrong index ends for every P-matrix M. Index n is pivoted only when all others are right
+        for it. Uniqueness then shows on which side of its limit the solution lies, so that n takes each of its three
+        states at most once. The same holds for n - 1 in between, and so on.
         """
         n, k = q.shape
         M = self.M if self.regular else self.M + GROUNDED * self._diagonal.max() * np.eye(n)

@@ -1,8 +1,8 @@
-"""Virtual couplings: what stands between the devices and the environment. A new coupling is one class here.
+"""Virtual couplings, the controllers between the devices and the environment.
 
-V maps force to displacement (a compliance) and sits in negative feedback around Psi E, so that the environment sees
-u = x - V f. A coupling is anything that turns Psi E into G = (I + Psi E V)^-1 Psi E, in the arithmetic of Psi E:
-floats, a stack, Fractions, or sampled responses (controller.lti). Its form is what a file holds of it.
+V maps force to displacement (a compliance). It closes a negative feedback loop around Psi E, so that the environment
+sees u = x - V f. A coupling maps Psi E to G = (I + Psi E V)^-1 Psi E, in the arithmetic of Psi E: floats, a stack,
+Fractions, or sampled responses (controller.lti). The form of a coupling is its content in a file.
 """
 
 from __future__ import annotations
@@ -18,26 +18,27 @@ from haptic_loop.controller.arithmetic import Number, numbers
 from haptic_loop.controller.lti import Array, Block, Complex, Lti, ReadOnly, Sampled, as_like, frozen, taps
 from numpy.typing import ArrayLike, NDArray
 
-_LARGEST_COEFFICIENT = 1e12  # of a stored coupling, SI units
-_MOST_TERMS = 2000  # of a moving average; every one is a state
-_LARGEST_WEIGHT = 1e9  # of a force filter: beyond it arithmetic would overflow before the filter could be judged
+_LARGEST_COEFFICIENT = 1e12  # largest coefficient of a stored coupling, SI units
+_MOST_TERMS = 2000  # longest moving average; each term is a state
+_LARGEST_WEIGHT = 1e9  # largest weight of a force filter; larger ones would overflow in the sweep
 _Rows = tuple[tuple[float, ...], ...]
 
 
 class Coupling:
-    """Anything that can be closed around the (delayed) environment.
+    """Base class of couplings, which close a loop around the delayed environment.
 
-    A new one is derived from it and has `compliance` and `form`; its own `around` where it is no V in feedback.
+    A subclass defines `compliance` and `form`. It overrides `around` if it is not a V in negative feedback.
     """
 
-    kind: ClassVar[str] = "own"  # how reports name it
-    holds_model: ClassVar[bool] = False  # a linear model of the environment: it cannot face walls
-    one_period: ClassVar[bool] = False  # its coefficients are for the T that it was designed for
+    kind: ClassVar[str] = "own"  # its name in reports
+    holds_model: ClassVar[bool] = False  # whether it contains a linear model of the environment, which excludes walls
+    one_period: ClassVar[bool] = False  # whether its coefficients are valid only for the T of its design
 
     def around(self, environment: Block, further: int = 0) -> Block:
-        """(I + Psi E V)^-1 Psi E, given Psi E, whose last `further` ports lie behind no coupling: walls have them.
+        """Return (I + Psi E V)^-1 Psi E for `environment` = Psi E. The last `further` ports (walls) have no coupling.
 
-        Raises ValueError for another number of contacts, and where there is no V.
+        Raises:
+            ValueError: The number of contacts differs, or the class defines no compliance.
         """
         V = self.compliance(environment.T)
         if V is None:
@@ -51,42 +52,42 @@ class Coupling:
         return environment.feedback(as_like(environment, V))
 
     def compliance(self, T: Number) -> Lti | None:
-        """V(z) in the arithmetic of T; None where the coupling is not a V in feedback around any environment."""
+        """Return V(z) in the arithmetic of T, or None if the coupling is not a V in feedback."""
         return Lti.diag(*channels) if (channels := self.channels(T)) else None
 
     def channels(self, T: Number) -> list[Lti] | None:
-        """V_i(z) of each channel, where V is diagonal by construction."""
+        """Return V_i(z) of each channel if V is diagonal by construction, otherwise None."""
         return None
 
     def sampled(self, z: Complex, T: float) -> Sampled:
-        """V at z (n, k) or (1, k), of a coupling that has one."""
+        """Return V at z (n, k) or (1, k). The coupling must have a compliance."""
         V = self.compliance(T)
         assert V is not None
         return Sampled.of(V, z)
 
     def with_model(self, model: Lti) -> Compliance | None:
-        """The V that results where its model of the environment stays `model`; None for a coupling without a model."""
+        """Return the V that results if the internal model stays `model`; None for a coupling without a model."""
         return None
 
     def at_period(self, T: float) -> Coupling:
-        """The same gains, or coefficients, with another period T [s]."""
+        """Return the coupling with the same gains or coefficients and the period T [s]."""
         return self
 
     def scaled(self, stiffness: float = 1.0, damping: float = 1.0) -> Coupling:
-        """The same with all K and all B, where it has such gains, times as much."""
+        """Return the coupling with all K and all B multiplied by factors, if it has such gains."""
         return self
 
     def in_series(self, T: Number) -> Lti | None:
-        """A block with the poles that it adds to those of the environment, where it feeds nothing back."""
+        """Return a block with the poles that it adds to the environment, if it closes no loop; otherwise None."""
         return None
 
     def figures(self, T: float) -> dict[str, Any]:
-        """Figures for a report: the order of V, Q or R, and the gains where it has gains."""
+        """Return the figures of a report: the order of V, Q or R, and the gains if there are any."""
         V = self.compliance(T)
         return {"order": V.order if V else 0}
 
     def form(self) -> Form:
-        """Its form in a file."""
+        """Return its form in a file."""
         raise ValueError(f"a coupling of class {type(self).__name__} has no form in a file")
 
 
@@ -105,19 +106,20 @@ class NoCoupling(Coupling):
 
 @dataclass(frozen=True, eq=False)
 class SpringDamper(ReadOnly, Coupling):
-    """V = [K + B (z-1)/(Tz)]^-1, one spring and damper per channel (26); many of them at once with leading axes.
+    """V = [K + B (z-1)/(Tz)]^-1, one spring and damper per channel (26). Leading axes hold many couplings.
 
-    The damper may act on a filtered velocity: backward Euler of B s / (tau s + 1), a damper in series with a spring of
-    stiffness B / tau, so it stays passive: 1/V = K + B (1 - beta)/(1 - beta/z) (1 - 1/z)/T, beta = tau/(tau + T).
+    The damper may act on a filtered velocity: backward Euler of B s/(tau s + 1), which is a damper in series with a
+    spring of stiffness B/tau and therefore passive. Then 1/V = K + B (1 - beta)/(1 - beta/z) (1 - 1/z)/T with
+    beta = tau/(tau + T).
     """
 
     K: Array  # (..., m) [N/m]
     B: Array  # (..., m) [N s/m]
-    cutoff: float | None = None  # [Hz] of the velocity filter, 1/(2 pi tau); None for none
+    cutoff: float | None = None  # [Hz] cut-off frequency 1/(2 pi tau) of the velocity filter; None without filter
 
     kind = "spring-damper"
 
-    if TYPE_CHECKING:  # what __post_init__ accepts is more than what the fields then hold
+    if TYPE_CHECKING:  # __post_init__ accepts more types than the fields have afterwards
 
         def __init__(self, K: ArrayLike, B: ArrayLike, cutoff: float | None = None) -> None: ...
 
@@ -140,7 +142,7 @@ class SpringDamper(ReadOnly, Coupling):
             raise ValueError(f"cutoff is {self.cutoff}, expected a positive frequency in Hz")
 
     def channels(self, T: Number) -> list[Lti]:
-        """V_i(z): a state only where there is a damper."""
+        """Return V_i(z) of each channel. A channel without damper has no state."""
         beta = self._beta(T)
         return [
             _spring_damper(k, b, beta, T)
@@ -148,7 +150,7 @@ class SpringDamper(ReadOnly, Coupling):
         ]
 
     def compliance(self, T: Number) -> Lti:
-        """V(z), diagonal."""
+        """Return the diagonal V(z)."""
         return Lti.diag(*self.channels(T))
 
     def figures(self, T: float) -> dict[str, Any]:
@@ -158,7 +160,7 @@ class SpringDamper(ReadOnly, Coupling):
         return replace(self, K=stiffness * self.K, B=damping * self.B)
 
     def sampled(self, z: Complex, T: float) -> Sampled:
-        """V at z (n, k) or (1, k), for gains (n, m) or (m,)."""
+        """Return V at z (n, k) or (1, k), for gains (n, m) or (m,)."""
         beta, points = self._beta(T), np.asarray(z)[..., None]
         rate = (1 - beta) / (1 - beta / points) * (1 - 1 / points) / T
         values = 1 / (self.K[..., None, :] + self.B[..., None, :] * rate)
@@ -179,7 +181,7 @@ class SpringDamper(ReadOnly, Coupling):
 
 
 def _spring_damper(k: Array, b: Array, beta: Any, T: Number) -> Lti:
-    """V = c b/(z - a) + d of one channel, a stack where k and b have axes."""
+    """Return V = c b/(z - a) + d of one channel, or a stack if k and b have axes."""
     stiffness, step = numbers(k, T), numbers(b, T) * (1 - beta) / T
     gain = 1 / (stiffness + step)
     if not np.any(b):
@@ -189,12 +191,12 @@ def _spring_damper(k: Array, b: Array, beta: Any, T: Number) -> Lti:
 
 
 def _scalar(value: Any) -> Any:
-    """A number, or numbers with axes, as 1 x 1 matrices."""
+    """Return a number, or an array of numbers, as 1 x 1 matrices."""
     return np.asarray(value)[..., None, None]
 
 
-#: The gains that the paper prints, by case: (27) for Lambda = Theta Psi and (28) for Lambda = I. Neither satisfies the
-#: paper's own condition.
+#: The gains that the paper prints: (27) for case I, Lambda = Theta Psi, and (28) for case II, Lambda = I. Neither
+#: satisfies the paper's own condition.
 PUBLISHED = {
     "I": SpringDamper(K=[2870.0, 2320.0], B=[5.47, 5.55]),
     "II": SpringDamper(K=[1810.0, 120.0], B=[5.78, 3.81]),
@@ -203,10 +205,10 @@ PUBLISHED = {
 
 @dataclass(frozen=True, eq=False)
 class MovingAverage(ReadOnly, Coupling):
-    """V_i = weight_i (1 + 1/z + ... + z^-(terms_i - 1)) + constant_i: the sum of the last forces, and a plain spring.
+    """V_i = weight_i (1 + 1/z + ... + z^-(terms_i - 1)) + constant_i: a moving sum of the forces and a plain spring.
 
-    With weight T/(2 delta), as many terms as a force takes ticks to act and a constant however small it is the
-    stiffest coupling that any-environment admits (docs/theory.md).
+    With weight T/(2 delta), theta + 1 terms and a small constant it is the stiffest coupling that any-environment
+    admits (docs/theory.md).
     """
 
     weight: Array  # (m,) [m/N]
@@ -238,7 +240,7 @@ class MovingAverage(ReadOnly, Coupling):
         return 1 / (self.weight * self.terms + self.constant)
 
     def channels(self, T: Number) -> list[Lti]:
-        """V_i(z)."""
+        """Return V_i(z) of each channel."""
         rows = zip(numbers(self.weight, T), self.terms, numbers(self.constant, T), strict=True)
         return [taps([w + e, *[w] * (n - 1)], T) for w, n, e in rows]
 
@@ -251,7 +253,7 @@ class MovingAverage(ReadOnly, Coupling):
 
 @dataclass(frozen=True, eq=False)
 class Compliance(Coupling):
-    """A general V(z), given as a state-space block."""
+    """A general V(z), as a state-space block."""
 
     V: Lti
 
@@ -269,14 +271,14 @@ class Compliance(Coupling):
 
 @dataclass(frozen=True, eq=False)
 class InternalModel(ReadOnly, Coupling):
-    """The pair of a parameter Q(z) and the environment itself: u = x - Q y, where y = Psi E x is the model's answer.
+    """Internal model control with a parameter Q(z): u = x - Q y, where y = Psi E x is the output of the model.
 
-    G = Psi E - Psi E Q Psi E: the same as V = Q (I - Psi E Q)^-1 in feedback, but affine in Q, and stable whenever Q
-    and the environment are. Q(z) = sum_k Q_k b_k(z) over the functions of `basis`, all of which are 1 at z = 1, so
-    the static Q(1) is the plain sum of the coefficients.
+    G = Psi E - Psi E Q Psi E equals V = Q (I - Psi E Q)^-1 in feedback. It is affine in Q, and stable if Q and the
+    environment are. Q(z) = sum_k Q_k b_k(z) with the functions of `basis`, which are 1 at z = 1, so that Q(1) is the
+    sum of the coefficients.
     """
 
-    poles: Array  # (n,) in (-1, 1); all zero: an FIR filter of n + 1 taps
+    poles: Array  # (n,) in (-1, 1); if all are zero, Q is an FIR filter of n + 1 taps
     Q: Array  # (n + 1, m, m) [m/N]
 
     kind, holds_model, one_period = "internal-model", True, True
@@ -297,7 +299,7 @@ class InternalModel(ReadOnly, Coupling):
             raise ValueError("Q has entries that are not finite")
 
     def parameter(self, T: Number) -> Lti:
-        """Q(z), one chain of sections per input."""
+        """Return Q(z), realised with one chain of sections per input."""
         return _realised(self.poles, NO_PAIRS, self.Q, T)
 
     def with_model(self, model: Lti) -> Compliance:
@@ -324,19 +326,20 @@ class InternalModel(ReadOnly, Coupling):
 
 @dataclass(frozen=True, eq=False)
 class ForceFilter(ReadOnly, Coupling):
-    """R in F = Theta R Psi E: one copy of the environment, moved by the devices, then a filter R(z) of its forces.
+    """A filter R(z) of the environment's forces: F = Theta R Psi E, with one copy of the environment.
 
-    Nothing is fed back, so R and the environment are stable or not by themselves, and F is affine in R. R = I - Psi E Q
-    makes it the pair of `InternalModel`. R(z) = sum_k R_k b_k(z) over the functions of `basis`, all of them 1 at z = 1,
-    and R(1) = g I exactly so in the decimals of the coefficients: F(1) = g E(1) is symmetric whatever the springs are.
-    R_k has a column per channel's force and, where it has m + 1 of them, one for the sum of all forces.
+    There is no feedback, so F is stable if R and the environment are, and F is affine in R. R = I - Psi E Q gives the
+    coupling `InternalModel`. R(z) = sum_k R_k b_k(z) with the functions of `basis`, which are 1 at z = 1. The decimals
+    of the coefficients give R(1) = g I exactly, so that F(1) = g E(1) is symmetric for all springs. R_k has one column
+    for the force of each channel, and optionally one more for the sum of all forces.
 
-    Raises ValueError for poles that are not stable and for coefficients whose sum is not g I with g >= 0.
+    Raises:
+        ValueError: A pole is not stable, or the coefficients do not sum to g I with g >= 0.
     """
 
-    poles: Array  # (n,) in (-1, 1); at zero they make delays
-    pairs: Array  # (p, 2): b1, b2 of z^2 + b1 z + b2
-    R: Array  # (1 + n + 2 p, m, m) or (1 + n + 2 p, m, m + 1), without unit
+    poles: Array  # (n,) in (-1, 1); poles at zero are delays
+    pairs: Array  # (p, 2): b1, b2 of the pole pairs z^2 + b1 z + b2
+    R: Array  # (1 + n + 2 p, m, m) or (1 + n + 2 p, m, m + 1), dimensionless
 
     kind, holds_model, one_period = "force-filter", True, True
 
@@ -377,11 +380,11 @@ class ForceFilter(ReadOnly, Coupling):
         return float(self._static()[0, 0])
 
     def _static(self) -> Array:
-        """R(1), exactly."""
+        """Return R(1) in exact arithmetic."""
         return _own_columns(numbers(self.R, Fraction(1)).sum(axis=0))
 
     def filter(self, T: Number) -> Lti:
-        """R(z), in the arithmetic of T."""
+        """Return R(z) in the arithmetic of T."""
         return _realised(self.poles, self.pairs, self.R, T)
 
     def in_series(self, T: Number) -> Lti:
@@ -391,7 +394,7 @@ class ForceFilter(ReadOnly, Coupling):
         return {"order": self.filter(T).order}
 
     def around(self, environment: Block, further: int = 0) -> Block:
-        """R Psi E, given Psi E."""
+        """Return R Psi E for `environment` = Psi E."""
         m = self.R.shape[1]
         if isinstance(environment, Sampled):
             values = basis(self.poles, environment.z, self.pairs)
@@ -413,11 +416,11 @@ NO_PAIRS = np.zeros((0, 2))
 
 
 def basis(poles: Array, z: NDArray[np.complex128], pairs: Array = NO_PAIRS) -> NDArray[np.complex128]:
-    """b_k(z) of a filter, k = 0..n + 2 p; shape z.shape + (1 + n + 2 p,). All of them are 1 at z = 1.
+    """Return the basis functions b_k(z) of a filter, shape z.shape + (1 + n + 2 p,). All are 1 at z = 1.
 
-    b_0 = 1; a real pole a adds (1 - a)/(z - a), a pair the two functions (1 + b1 + b2) {z, 1}/(z^2 + b1 z + b2), each
-    behind the all-pass sections of those before it: Takenaka-Malmquist functions up to their lengths. Poles at zero
-    make 1, 1/z, 1/z^2, ..
+    b_0 = 1. A real pole a adds (1 - a)/(z - a), and a pair adds (1 + b1 + b2) {z, 1}/(z^2 + b1 z + b2). Each is
+    multiplied by the all-pass sections of the poles before it. So these are Takenaka-Malmquist functions up to scale.
+    Poles at zero give 1, 1/z, 1/z^2 and so on.
     """
     values, through = [np.ones_like(z)], np.ones_like(z)
     for a in poles:
@@ -431,16 +434,16 @@ def basis(poles: Array, z: NDArray[np.complex128], pairs: Array = NO_PAIRS) -> N
 
 
 def _own_columns(R: Array) -> Array:
-    """Coefficients (.., m, m) from those of the forces and, in one more column, of their sum."""
+    """Return coefficients (.., m, m), with the optional column for the sum of all forces added to each column."""
     m = R.shape[-2]
     return R[..., :m] + R[..., m:].sum(axis=-1)[..., None] if R.shape[-1] > m else R
 
 
 def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
-    """sum_k R_k b_k(z), one chain of sections per input, in the arithmetic of T.
+    """Realise sum_k R_k b_k(z) in the arithmetic of T, with one chain of sections per input.
 
-    A chain ends with the last function that has a coefficient. What the sum of all inputs drives is the sum of the
-    chains, and has states of its own only beyond the shortest of them.
+    A chain ends with the last function whose coefficient is not zero. The chain of the sum of all inputs is the sum of
+    the inputs' chains, so it has states of its own only beyond the shortest one.
     """
     rows, columns = R.shape[1:]
     n, reals = R.shape[0] - 1, poles.size
@@ -454,14 +457,17 @@ def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
         after.append(a * state + through)
         through = (1 - a * a) * state - a * through
     for b1, b2 in pairs:
-        first, second = signals[len(after)], signals[len(after) + 1]  # z/den and 1/den behind what comes through
+        first, second = (
+            signals[len(after)],
+            signals[len(after) + 1],
+        )  # z/den, 1/den times earlier sections
         read[len(after) + 1] = read[len(after) + 2] = 1 + b1 + b2
         after += [through - b1 * first - b2 * second, first]
         through = b2 * through + b1 * (1 - b2) * first + (1 - b2 * b2) * second
     sections = np.array(after, dtype=R.dtype).reshape(n, n + 1)
 
     reached = [_reached(R[1:, :, j], reals) for j in range(columns)]
-    shared = min(reached[:rows])  # the states of the sum's chain up to here are the sums of the others'
+    shared = min(reached[:rows])  # up to here, the states of the sum's chain are sums of the other chains' states
     own = sum(reached[:rows])
     total = own + sum(max(length - shared, 0) for length in reached[rows:])
     A, B, C = (np.full(shape, one - one) for shape in ((total, total), (total, rows), (rows, total)))
@@ -485,7 +491,7 @@ def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
 
 
 def _reached(R: Array, reals: int) -> int:
-    """The states of a chain, given the coefficients of its functions: up to the last that is used, a pair whole."""
+    """Return the number of states of a chain: up to its last nonzero coefficient, without splitting a pair."""
     used = np.flatnonzero((R != 0).any(axis=1))
     if not used.size:
         return 0
@@ -494,7 +500,7 @@ def _reached(R: Array, reals: int) -> int:
 
 
 class Strict(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Immutable, and refuses fields that it does not know."""
+    """An immutable record that refuses unknown fields."""
 
 
 class _NoForm(Strict, frozen=True, tag_field="kind", tag="none"):
@@ -502,7 +508,7 @@ class _NoForm(Strict, frozen=True, tag_field="kind", tag="none"):
 
     @property
     def shape(self) -> None:
-        """The field that says how many channels there are, and its size."""
+        """The field that determines the number of channels, and its size; None for any number."""
         return None
 
     def build(self, T: float) -> NoCoupling:
@@ -510,7 +516,7 @@ class _NoForm(Strict, frozen=True, tag_field="kind", tag="none"):
 
 
 class _SpringDamperForm(Strict, frozen=True, tag_field="kind", tag="spring-damper"):
-    """One spring and damper per channel (26)."""
+    """The form of a spring and damper per channel (26)."""
 
     K: tuple[float, ...]  # (m,) [N/m]
     B: tuple[float, ...]  # (m,) [N s/m]
@@ -527,7 +533,7 @@ class _SpringDamperForm(Strict, frozen=True, tag_field="kind", tag="spring-dampe
 
 
 class _MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-average"):
-    """A weighted sum of the last forces and a plain spring per channel."""
+    """The form of a moving sum of the forces and a plain spring per channel."""
 
     weight: tuple[float, ...]  # (m,) [m/N]
     terms: tuple[int, ...]  # (m,)
@@ -545,7 +551,7 @@ class _MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-aver
 
 
 class _ComplianceForm(Strict, frozen=True, tag_field="kind", tag="compliance"):
-    """A general V(z), as the rows of its state-space matrices."""
+    """The form of a general V(z): the rows of its state-space matrices."""
 
     A: _Rows
     B: _Rows
@@ -567,7 +573,7 @@ class _ComplianceForm(Strict, frozen=True, tag_field="kind", tag="compliance"):
 
 
 class _InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-model"):
-    """The parameter Q(z) of the pair with the environment: poles of its basis, and a coefficient per function."""
+    """The form of an internal-model coupling: the poles of its basis, and a coefficient per function."""
 
     poles: tuple[float, ...]  # (n,)
     Q: tuple[_Rows, ...]  # (n + 1, m, m) [m/N]
@@ -588,7 +594,7 @@ class _InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-mo
 
 
 class _ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter"):
-    """The filter R(z) of the environment's forces: poles of its basis, and a coefficient per function."""
+    """The form of a force filter: the poles of its basis, and a coefficient per function."""
 
     poles: tuple[float, ...]  # (n,)
     pairs: tuple[tuple[float, float], ...]  # (p, 2)
@@ -611,7 +617,7 @@ Form = _NoForm | _SpringDamperForm | _MovingAverageForm | _ComplianceForm | _Int
 
 
 def require_channels(form: Form, m: int) -> None:
-    """Raises ValueError where a form is of another number of channels."""
+    """Raise ValueError if the form does not have m channels."""
     shape = form.shape
     if shape is not None and any(size != m for size in shape[1:]):
         size = f"is {shape[1]} x {shape[2]}" if len(shape) > 2 else f"has {shape[1]} entries"
@@ -619,7 +625,7 @@ def require_channels(form: Form, m: int) -> None:
 
 
 def _require_sensible(name: str, rows: _Rows) -> None:
-    """Raise ValueError where a coefficient is so large that arithmetic would overflow before it could be judged."""
+    """Raise ValueError if a coefficient is so large that a sweep would overflow."""
     for value in (value for row in rows for value in row):
         if not abs(value) <= _LARGEST_COEFFICIENT:
             raise ValueError(f"{name} has an entry {value:g}, allowed are up to {_LARGEST_COEFFICIENT:g}")
