@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
+import flint
 import numpy as np
 import scipy  # its parts load when they are used
 from haptic_loop.controller.arithmetic import on_time, rational
@@ -78,66 +78,19 @@ class Matrix:
         return self.shape == other.shape and bool((self.num * other.den == other.num * self.den).all())
 
 
-_DIGIT = 16  # bits
-_MOST_ROWS = 1 << 15  # of a product of digits
+def _congruence(X: _Integers, M: _Integers) -> _Integers:
+    """Multiply X' M X exactly. This is the one place that converts to FLINT's matrices and back.
 
-# Fixed point: an integer is a sum of digits d_k 2^(16 k) with |d_k| <= 2^15, whole numbers in floating point. A product
-# of digits is a product of matrices there: every sum is a whole number below 2^53, and so is exact in any order.
-
-
-def _digits(a: _Integers) -> Floats:
-    """Of every entry, (digits, ..) from the lowest on."""
-    size = 2 * (max((int(v).bit_length() for v in a.flat), default=0) // _DIGIT + 1)
-    numbers = b"".join([int(v).to_bytes(size, "little", signed=True) for v in a.flat])
-    digits = np.moveaxis(np.frombuffer(numbers, dtype="<u2").reshape(*a.shape, size // 2), -1, 0).astype(np.int64)
-    digits[-1] -= (digits[-1] >> (_DIGIT - 1)) << _DIGIT
-    return _carried(digits)
-
-
-def _carried(sums: NDArray[np.int64]) -> Floats:
-    """The digits of what any whole numbers in their places make, without leading zeros."""
-    half, digits = 1 << (_DIGIT - 1), []
-    carry = np.zeros(sums.shape[1:], dtype=np.int64)
-    for part in [*sums, *[np.zeros(sums.shape[1:], dtype=np.int64)] * 4]:
-        whole = part + carry
-        carry = (whole + half) >> _DIGIT
-        digits.append((whole - (carry << _DIGIT)).astype(np.float64))
-    while len(digits) > 1 and not digits[-1].any():
-        digits.pop()
-    return np.array(digits)
-
-
-def _times(left: Floats, right: Floats) -> Floats:
-    """left @ right in digits (digits, rows, columns)."""
+    Args: X (n, m), M (n, n), Python integers. Returns (m, m). Raises TooLong where the time of `within` is over.
+    """
     on_time()
-    (_, n, inner), m = left.shape, right.shape[2]
-    if inner > _MOST_ROWS:
-        raise ValueError(f"a product over {inner} rows, allowed are {_MOST_ROWS}")
-    beside = right.transpose(1, 0, 2).reshape(inner, len(right) * m)
-    sums = np.zeros((len(left) + len(right), n, m), dtype=np.int64)
-    for i, digit in enumerate(left):
-        few = np.count_nonzero(digit) < _SPARSE * digit.size  # as of delays, which only shift
-        product = (scipy.sparse.csr_array(digit) if few else digit) @ beside
-        sums[i : i + len(right)] += product.astype(np.int64).reshape(n, len(right), m).transpose(1, 0, 2)
-    return _carried(sums)
-
-
-_SPARSE = 0.05  # share of entries that are not zero, below which a digit is multiplied as a sparse matrix
-
-
-def _integers(digits: Floats) -> _Integers:
-    """What the digits make."""
-    sums = np.concatenate([digits, np.zeros((2, *digits.shape[1:]))]).astype(np.int64)
-    for low, high in itertools.pairwise(sums):  # now all but the last one positive, which keeps the sign
-        high += low >> _DIGIT
-        low &= (1 << _DIGIT) - 1
-    numbers, size = np.ascontiguousarray(np.moveaxis(sums, 0, -1)).astype("<u2").tobytes(), 2 * len(sums)
-    found = [int.from_bytes(numbers[i : i + size], "little", signed=True) for i in range(0, len(numbers), size)]
-    return np.array(found, dtype=object).reshape(digits.shape[1:])
-
-
-def _transposed(digits: Floats) -> Floats:
-    return digits.transpose(0, 2, 1)
+    (n, m) = X.shape
+    product = np.zeros(m * m, dtype=object)
+    if X.size:
+        right = flint.fmpz_mat(n, m, X.ravel().tolist())
+        result = right.transpose() * (flint.fmpz_mat(n, n, M.ravel().tolist()) * right)
+        product[:] = [int(v) for v in result.entries()]
+    return product.reshape(m, m)
 
 
 @dataclass(frozen=True)
@@ -212,8 +165,7 @@ def strictly_positive(S: Matrix) -> bool:
         raise ValueError(f"a {S.shape[0]} x {S.shape[1]} matrix is not exactly symmetric")
     if any(v <= 0 for v in np.diag(S.num)):
         return False
-    rounded = _rounded(S, _halves(S), BITS)
-    return _definite(_less(_digits(rounded), S.shape[0]), BITS)
+    return _definite(_less(_rounded(S, _halves(S), BITS), S.shape[0]), BITS)
 
 
 def _halves(S: Matrix) -> list[int]:
@@ -237,62 +189,65 @@ def _nearest(num: int, den: int, shift: int) -> int:
     return (2 * num + den) // (2 * den)
 
 
-def _less(W: Floats, units: int) -> Floats:
-    """W less so many units on its diagonal."""
-    sums = W.astype(np.int64)
-    sums[0] -= units * np.eye(W.shape[1], dtype=np.int64)
-    return _carried(sums)
+def _less(W: _Integers, units: int) -> _Integers:
+    """W - units I."""
+    W = W.copy()
+    W[np.diag_indices(len(W))] -= units
+    return W
 
 
-def _definite(W: Floats, bits: int) -> bool:
-    """Whether the symmetric W > 0 is proved, in digits. Between passes more than bits beyond the first are dropped.
+def _definite(W: _Integers, bits: int) -> bool:
+    """Whether the symmetric integer matrix W (n, n) > 0 is proved.
 
-    Each entry then changes by less than a unit, and the matrix by less than n of them, which its diagonal pays.
+    Between passes the entries are shortened to about 32 bits more than `bits`: each entry then changes by less than one
+    unit, and the matrix by less than n units in norm, which are subtracted from the diagonal.
     """
-    kept = bits // _DIGIT + 2
     for _ in range(_PASSES):
-        if _dominates(W):
+        floats = _floats(W)
+        if _dominates(floats):
             return True
-        even = _even(W)
-        if even is None or (R := _whitening(_floats(even))) is None:
+        if (R := _whitening(floats)) is None:
             return False
-        W = _times(_transposed(R), _times(even, R))
-        if len(W) > kept:
-            W = _less(W[-kept:], W.shape[1])
-    return _dominates(W)
+        W = _congruence(R, W)
+        if (dropped := _longest(W) - bits - 32) > 0:
+            W = _less(W >> dropped, len(W))
+    return _dominates(_floats(W))
+
+
+def _longest(W: _Integers) -> int:
+    """Bits of the largest entry."""
+    return max((v.bit_length() for v in W.ravel().tolist()), default=0)
 
 
 def _dominates(W: Floats) -> bool:
-    """Whether every diagonal entry is larger than the sum of the absolute values of the others in its row.
+    """Whether every diagonal entry exceeds the sum of the absolute values of the others in its row.
 
-    Of the first three digits, which are off by less than one unit of the last of them.
+    Decided for the integers of which `_floats` made W. Those are within 2^-53 of each entry and 2^-900 of the largest
+    one, and a sum of n < 2^11 terms is within n 2^-53 of its value: both are far below the factor 1 + 2^-40.
     """
-    first = sum(d.astype(np.int64) << (_DIGIT * k) for k, d in enumerate(W[-3:]))
-    return bool((2 * np.diag(first) - 2 > (np.abs(first) + 1).sum(axis=1)).all())
+    diagonal = np.diag(W)
+    others = np.abs(W).sum(axis=1) - np.abs(diagonal)
+    return bool((diagonal > (1 + 2.0**-40) * (others + 2.0**-40 * np.abs(diagonal) + 2.0**-800)).all())
 
 
-def _floats(W: Floats) -> Floats:
-    """W to double precision, times a power of two that brings its largest entry near one."""
-    return np.einsum("k,kij->ij", np.exp2(_DIGIT * (np.arange(len(W)) - len(W))), W)
+def _floats(W: _Integers) -> Floats:
+    """W in double precision, times a power of two that brings its largest entry near one.
+
+    Each entry is off by at most 2^-53 of itself and 2^-900 of the largest.
+    """
+    longest = _longest(W)
+    shift = max(longest - 950, 0)
+    return np.ldexp((W >> shift).astype(np.float64), shift - longest)
 
 
-def _even(W: Floats) -> Floats | None:
-    """W with rows and columns times powers of two that make its diagonal nearly even; None where it is not positive."""
-    diagonal = np.diag(_floats(W))
+def _whitening(W: Floats) -> _Integers | None:
+    """R such that R'WR is nearly a multiple of the identity, or None where W is far from definite."""
+    diagonal = np.diag(W)
     if not (diagonal > 0).all():
         return None
-    half = (np.frexp(diagonal.max())[1] - np.frexp(diagonal)[1]) // 2
-    whole, part = np.divmod(np.add.outer(half, half), _DIGIT)
-    times = W.astype(np.int64) << part
-    sums = np.zeros((len(W) + int(whole.max(initial=0)), *W.shape[1:]), dtype=np.int64)
-    for more in np.unique(whole):
-        sums[more : more + len(W)] += times * (whole == more)
-    return _carried(sums)
-
-
-def _whitening(W: Floats) -> Floats | None:
-    """R in digits such that R'WR is nearly a multiple of the identity, or None where W is far from definite."""
-    W = W / np.diag(W).max(initial=0.0)
+    half = (np.frexp(diagonal.max())[1] - np.frexp(diagonal)[1]) // 2  # powers of two that make the diagonal even
+    with np.errstate(over="ignore"):
+        W = np.ldexp(W, np.add.outer(half, half)) / diagonal.max()
     if not np.isfinite(W).all():  # entries beyond all proportion to the diagonal
         return None
     for added in (0.0, GROWTH):
@@ -302,7 +257,8 @@ def _whitening(W: Floats) -> Floats | None:
             continue
         inverse = scipy.linalg.solve_triangular(L, np.eye(len(W)), lower=True).T
         size = _FACTOR_BITS - np.ceil(np.log2(np.abs(inverse).max()))
-        return _carried(np.round(np.ldexp(inverse, int(size))).astype(np.int64)[None])
+        R = np.rint(np.ldexp(inverse, int(size))).astype(np.int64)
+        return R.astype(object) << half.astype(object)[:, None]
     return None
 
 
@@ -319,7 +275,7 @@ def _whitening(W: Floats) -> Floats | None:
 LARGEST = 800  # states of a model that a proof is tried for: .3 s at 100, 1 s at 200, 5 s at 400, 30 s at 800
 _MOST_BITS = 4000  # of the common denominator of a stored P, a power of two of some hundred bits when we made it
 _STORED_BITS = 48  # of each entry of P, relative to its diagonal
-_WORDS = 6  # digits of what is multiplied exactly, relative to the largest: more than extended precision has
+_EXTENDED_BITS = 96  # of what is multiplied exactly, relative to the largest entry: more than extended precision has
 _LEAST_MOVED = 1e-10  # of the largest: a smaller variance of states that move by as much each is taken for this
 _MOST_DOUBLINGS = 60
 _MOST_STEPS, _LEFT = 4, 0.02  # of Newton, and part of the drive that rounding may leave of the Riccati equation
@@ -329,46 +285,41 @@ _MOST_UNITS = 2.0**50
 _SAMPLES = 400  # frequencies at which states are looked at, about
 
 
-def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[Floats, float]:
-    """The matrix of (KYP) in digits, in units of u = 2^-finer, and how many units its error has at most, as a norm.
+def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, float]:
+    """The matrix of (KYP) in units of u = 2^-finer, and the largest norm of its error in these units.
 
-    In states and channels that are scaled by powers of two, in which P and D + D' have diagonals near one. P is taken
-    rounded to multiples of 2^-bits: a matrix as good as any other, and exactly known. The rest is rounded to multiples
-    of u, which changes C by u/2, D + D' by u and J = [A B] by E, |E_ij| <= u/2. Digits below u are dropped: balanced,
-    |d_k| <= 2^15, they weigh half a u and a little. So every entry is off by less than 2 u, and all by less than
-    2 (n + m) u as a norm, but for what E makes: |E'PJ + J'PE + E'PE| <= (2 |J| + |E|) |E| |P| in the norm of Frobenius,
-    which floating point gives to better than a hundredth.
+    States and channels are scaled by powers of two, so that P and D + D' have diagonals near one. P is rounded to
+    multiples of 2^-bits: the rounded P is as good a proof as any other, and is exactly known. The other matrices are
+    rounded to multiples of u, which changes C by u/2, D + D' by u and J = [A B] by E, |E_ij| <= u/2. The sum is rounded
+    down to multiples of u. So every entry is off by less than 2 u, and the matrix by less than 2 (n + m) u in norm,
+    apart from E: |E'PJ + J'PE + E'PE| <= (2 |J| + |E|) |E| |P| in the Frobenius norm, which floating point gives to
+    better than a hundredth.
     """
     n, m = G.B.shape
     state, channel = _halves(P), _halves(Matrix.of(G.D + G.D.T))
 
-    def rounded(part: Any, rows: Sequence[int], columns: Sequence[int]) -> Floats:
+    def rounded(part: Any, rows: Sequence[int], columns: Sequence[int]) -> _Integers:
         numbers = np.zeros(part.shape, dtype=object)
         for i, j in zip(*np.nonzero(part), strict=True):
             v = part[i, j]
             numbers[i, j] = _nearest(v.numerator, v.denominator, finer + rows[i] - columns[j])
-        return _digits(numbers)
+        return numbers
 
-    whole = _digits(_rounded(P, state, bits))
+    storage = _rounded(P, state, bits)
     J = rounded(np.hstack([G.A, G.B]), state, [*state, *channel])
     C = rounded(G.C, minus := [-h for h in channel], state)
     D = rounded(G.D, minus, channel)
-    after = _times(_transposed(J), _transposed(_times(_transposed(J), whole)))  # J'PJ, in units of 2^-bits u^2
-    at, low = (bits + finer) // _DIGIT, 2 * finer // _DIGIT
-    sums = np.zeros((max(len(after), low + len(whole), at + len(C), at + len(D)), n + m, n + m), dtype=np.int64)
-    sums[low : low + len(whole), :n, :n] += whole.astype(np.int64)
-    for part, rows, columns in ((C, slice(n, None), slice(n)), (D, slice(n, None), slice(n, None))):
-        digits = np.zeros((len(part), n + m, n + m), dtype=np.int64)
-        digits[:, rows, columns] = part
-        sums[at : at + len(part)] += digits + digits.transpose(0, 2, 1)
-    sums[: len(after)] -= after.astype(np.int64)
+    W = -_congruence(J, storage)  # in units of 2^-bits u^2, like the parts that are added to it
+    W[:n, :n] += storage << 2 * finer
+    W[n:, :n] += C << bits + finer
+    W[:n, n:] += C.T << bits + finer
+    W[n:, n:] += (D + D.T) << bits + finer
     p, j = (
-        float(np.linalg.norm(_floats(part)) * 2.0 ** (_DIGIT * len(part) - unit))
-        for part, unit in ((whole, bits), (J, finer))
+        float(np.linalg.norm(_floats(part)) * 2.0 ** (_longest(part) - unit))
+        for part, unit in ((storage, bits), (J, finer))
     )
     e = 0.5 * math.sqrt(n * (n + m))
-    kept = _carried(sums)[at:]
-    return kept if len(kept) else np.zeros((1, n + m, n + m)), 2.0 * (n + m) + 1.02 * e * p * (2 * j + e * 2.0**-finer)
+    return W >> bits + finer, 2.0 * (n + m) + 1.02 * e * p * (2 * j + e * 2.0**-finer)
 
 
 def too_large(states: int) -> str | None:
@@ -398,7 +349,7 @@ def prove_positive_real(G: Lti, P: Matrix) -> str | None:
         return "the KYP matrix has a negative direction, beyond the error bound of floating point"
     reason, diagonal = "P", [*np.diag(P.num), *np.diag(G.D)]
     for bits, finer in _ACCURACIES if all(v > 0 for v in diagonal) else ():
-        if _definite(_digits(_rounded(P, _halves(P), bits)), bits):
+        if _definite(_rounded(P, _halves(P), bits), bits):
             reason = "the KYP matrix"
             W, units = _kyp_matrix(G, P, bits, finer)
             if units < _MOST_UNITS and _definite(_less(W, math.ceil(units)), finer):
@@ -604,20 +555,14 @@ def _doubled(A: Array, H: Array, S: Array | None = None) -> Array:
 
 
 def _congruent(out: Array, P: Array, half: NDArray[np.int64]) -> Matrix:
-    """out' P out, with rows and columns divided by powers of two; exact of `out` and P as they are rounded here."""
+    """out' P out, with rows and columns divided by powers of two, exact for `out` and P as they are rounded here."""
 
-    def digits(a: Array) -> tuple[Floats, int]:
-        power, found = -int(np.frexp(np.abs(a).max())[1]), []
-        a = np.ldexp(a, power)
-        for _ in range(_WORDS):
-            a = np.ldexp(a, _DIGIT)
-            found.append(np.rint(a).astype(np.int64))
-            a = a - found[-1]
-        return _carried(np.array(found[::-1])), power + _WORDS * _DIGIT
+    def integers(a: Array) -> tuple[_Integers, int]:
+        power = _EXTENDED_BITS - int(np.frexp(np.abs(a).max())[1])
+        return np.vectorize(int, otypes=[object])(np.rint(np.ldexp(a, power))), power
 
-    (left, one), (middle, other) = digits(out), digits((P + P.T) / 2)
-    numbers = _integers(_times(_transposed(left), _times(middle, left)))
-    return _divided(numbers, half, 2 * one + other)
+    (left, one), (middle, other) = integers(out), integers((P + P.T) / 2)
+    return _divided(_congruence(left, middle), half, 2 * one + other)
 
 
 def _divided(numbers: _Integers, half: Sequence[int] | NDArray[np.int64], power: int) -> Matrix:

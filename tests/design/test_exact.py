@@ -235,7 +235,7 @@ def test_what_rounding_changes_of_the_kyp_matrix_is_within_its_bound(bits, finer
         taken = size @ exact._rounded(P, row, bits) @ size * Fraction(1, 2**bits)
         found, most = exact._kyp_matrix(G, P, bits, finer)
         size = np.diag([Fraction(2) ** -h for h in [*row, *column]])
-        error = 2**finer * (size @ kyp(G, taken) @ size) - exact._integers(found)
+        error = 2**finer * (size @ kyp(G, taken) @ size) - found
         worst = np.abs(np.linalg.eigvalsh(error.astype(float))).max() / most
         assert worst <= 1
         fullest = max(fullest, worst)
@@ -305,19 +305,20 @@ def test_a_model_of_more_states_than_are_tried_is_told_so():
 
 
 @pytest.mark.parametrize(("bits", "others"), [(3, 3), (16, 15), (192, 57), (31, 500)])
-def test_products_are_those_of_pythons_integers(bits, others):
-    """Among them the largest sums that can be, of either sign, and rows with next to nothing but zeros."""
+def test_integer_products_are_exact(bits, others):
+    """Against Python's integers, for entries of the largest size and of either sign, and for empty matrices."""
     draw = random.Random(bits)
-    left, right = (
-        np.array([[draw.randint(-(2**b), 2**b) for _ in range(columns)] for _ in range(rows)], dtype=object)
-        for b, rows, columns in ((bits, 25, 30), (others, 30, 20))
+    X, M = (
+        np.array([[draw.randint(-(2**b), 2**b) for _ in range(columns)] for _ in range(30)], dtype=object)
+        for b, columns in ((bits, 25), (others, 30))
     )
-    left[0], left[1], left[2], right[:, 0], right[:, 1] = 2**bits, -(2**bits), 0, 2**others, 1 - 2**others
-    few = left * (np.arange(750).reshape(25, 30) % 31 == 0)
-    for one in (left, few, left[:, :0]):
-        product = exact._times(exact._digits(one), exact._digits(right[: one.shape[1]]))
-        assert (np.abs(product) <= 2**15).all()
-        assert (exact._integers(product) == one @ right[: one.shape[1]]).all()
+    X[:, 0], X[:, 1], X[:, 2], M[:, 0], M[:, 1] = 2**bits, -(2**bits), 0, 2**others, 1 - 2**others
+    for columns in (25, 1, 0):
+        product = exact._congruence(X[:, :columns], M)
+        assert product.shape == (columns, columns)
+        assert (product == X[:, :columns].T @ M @ X[:, :columns]).all()
+        assert all(type(v) is int for v in product.flat)
+    assert exact._congruence(X[:0], M[:0, :0]).tolist() == [[0] * 25] * 25
 
 
 def test_a_matrix_that_is_not_symmetric_is_refused():
