@@ -5,7 +5,8 @@
                               ^-               |
                               +----- V <-------+                F = Theta (I + Psi E V)^-1 Psi E     (6)
 
-No device is known but by its damping, and no human at all. It computes nothing in time: the tick is controller.tick.
+Of a device its damping is known, and bounds of motor and transmission where they are guaranteed; of a human nothing.
+It computes nothing in time: the tick is controller.tick.
 """
 
 from __future__ import annotations
@@ -49,6 +50,20 @@ class DelayRange(Strict, frozen=True):
         return all(a <= b for a, b in below) and all(a >= b for a, b in above)
 
 
+class DeviceBounds(Strict, frozen=True):
+    """What is guaranteed of a device beside its damping: every device within these bounds is meant."""
+
+    motor_mass_min: _Positive  # [kg] of all that moves rigidly with the motor's shaft, at the encoder's coordinate
+    transmission_stiffness_max: _Positive  # [N/m] between the motor and everything behind it
+    transmission_damping_min: _Positive  # [N s/m] in parallel to that stiffness
+    transmission_damping_max: _Positive  # [N s/m]
+
+    def __post_init__(self) -> None:
+        least, most = self.transmission_damping_min, self.transmission_damping_max
+        if least > most:
+            raise ValueError(f"transmission_damping_min is {least:g} N s/m, above transmission_damping_max = {most:g}")
+
+
 class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without the newer fields keeps the digest it had
     """All that enters a condition beside the coupling."""
 
@@ -62,6 +77,8 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
     varying_delay: DelayRange | None = None  # what else the delays of the forces may be, switching at every tick
     T_max: _Positive | None = None  # [s] the longest period there is, where it varies from tick to tick; T if None
     latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] least and most by which forces latch after kT
+    T_min: _Positive | None = None  # [s] the shortest period there is; only the known-device condition asks for it
+    known_devices: tuple[DeviceBounds, ...] | None = None  # (m,) bounds of the devices, where they are guaranteed
 
     def __post_init__(self) -> None:
         m = len(self.environment.contacts)
@@ -83,6 +100,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
             self._check_varying_delay(self.varying_delay)
         if self.T_max is not None and not self.T <= self.T_max < float("inf"):
             raise ValueError(f"T_max is {self.T_max:g} s, expected at least T = {self.T:g} s")
+        if self.T_min is not None and not self.T_min <= self.T:
+            raise ValueError(f"T_min is {self.T_min:g} s, expected at most T = {self.T:g} s")
+        if self.known_devices is not None and len(self.known_devices) != m:
+            raise ValueError(f"known_devices has {len(self.known_devices)} entries for {m} channels")
         if self.latency is not None:
             self._check_latency(self.latency)
 
@@ -191,7 +212,18 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
 
     def channel(self, i: int) -> Loop:
         """Device i alone, at a rigid wall: any-environment is of the same gains whatever is behind them."""
-        return Loop(self.T, self.theta[i : i + 1], (0,), (0,), self.delta[i : i + 1], RIGID_WALL, T_max=self.T_max)
+        own, known = slice(i, i + 1), self.known_devices
+        return Loop(
+            self.T,
+            self.theta[own],
+            (0,),
+            (0,),
+            self.delta[own],
+            RIGID_WALL,
+            T_max=self.T_max,
+            T_min=self.T_min,
+            known_devices=known and known[own],
+        )
 
     def delayed(self, theta: _Steps) -> Loop:
         """The loop whose forces have these delays, constant ones."""

@@ -1,0 +1,532 @@
+"""Count what is known of a device: the mass of its motor, and a transmission that loses energy. Theorem B.
+
+this-environment charges the virtual damping against a hand of any stiffness at the motor's shaft. Behind a transmission
+(a spring of at most k and a damper of at least b, in parallel) no hand is stiffer than the transmission, and the mass
+of the motor keeps its speed from changing at once. With P = k^2/b and any beta > 0 [s] the motor, its transmission and
+every passive hand behind it satisfy, over each period in which the force f is held,
+
+    sum f'(dx + beta dv) + sum L(dx, v, v+) <= const,     L = min of the integral of c0 v^2 + c2 v'^2,
+
+with c0 = delta - beta^2 P/4, c2 = beta m - beta^2 b/4, the displacement dx and the speeds v, v+ at both ends.
+docs/theory.md has the proof. The blocks below say that the environment's side gives back less than L.
+
+`Theorem A` at the end is exact for a linear motor, swept and not proved: it shows how much the proof gives away.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import flint
+import numpy as np
+import scipy  # its parts load when they are used
+from haptic_loop.controller.arithmetic import Number, numbers, rational
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Complex, Lti, hstack, taps, vstack
+from haptic_loop.design.conditions import even_damping, v_hat
+from haptic_loop.design.frequency import frequencies, hermitian, largest_eigenvalue, on_circle, supremum
+from haptic_loop.design.result import NotProved
+
+# ----------------------------------------------------------------------------------------------------
+# The least cost of a period.
+
+
+class PeriodCost(NamedTuple):
+    """L(dx, v, v+) = dx^2 move - 2 dx vb cross + vb^2 mean + (v+ - v)^2 step, vb = (v + v+)/2; (m,) each.
+
+    In floating point or over Fractions, [N/m], [N s/m], [N s^2/m] and [N s^2/m].
+    """
+
+    move: Any  # c0/(T - q)
+    cross: Any  # c0 q/(T - q)
+    mean: Any  # c0 q T/(T - q)
+    step: Any  # c2/q
+
+
+def shortest_period(loop: Loop) -> float | None:
+    """The shortest period [s] of the loop; None where periods vary and no shortest one is declared."""
+    if loop.T_min is not None:
+        return loop.T_min
+    return loop.T if loop.T_max in (None, loop.T) else None
+
+
+class _Known(NamedTuple):
+    """What is known of the devices, (m,) each, in one arithmetic."""
+
+    P: Any  # [N/(m s)] largest k^2/b of the transmission
+    damping: Any  # [N s/m] its largest damping
+    mass: Any  # [kg] least mass of the motor
+
+
+def _known(loop: Loop, T: Number) -> _Known:
+    devices = loop.known_devices or ()
+    stiffness, least = (
+        numbers([getattr(device, f"transmission_{name}") for device in devices], T)
+        for name in ("stiffness_max", "damping_min")
+    )
+    damping = numbers([device.transmission_damping_max for device in devices], T)
+    return _Known(stiffness**2 / least, damping, numbers([device.motor_mass_min for device in devices], T))
+
+
+def _rates(known: _Known, delta: Any, beta: Any) -> tuple[Any, Any]:
+    """Return c0 [N s/m] and c2 [N s^3/m], (..., m) each."""
+    return delta - beta**2 * known.P / 4, beta * known.mass - beta**2 * known.damping / 4
+
+
+def _shortfall(y: Array) -> Array:
+    """1 - tanh(y)/y, (m,), to full relative precision also for small y."""
+    small = np.minimum(y, _SERIES) ** 2
+    series = small * (1 / 3 - small * (2 / 15 - small * (17 / 315 - small * 62 / 2835)))
+    return np.where(y < _SERIES, series, 1 - np.tanh(y) / np.maximum(y, _SERIES))
+
+
+_SERIES = 0.03  # below it the next term of the series is 2e-14 of the value, above it cancellation costs 4e-13
+
+
+def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
+    """The least cost of a period for devices of damping `share` Delta, (..., m) in floating point.
+
+    Where periods lie in [T1, T2], L is at least c0 (dx, vb) [[T2, 1], [1, 1/q(T1)]]^-1 (dx, vb)' + c2 dv^2/q(T2).
+    Entries are NaN where beta is too large for this damping.
+    """
+    longest, shortest = loop.T_max or loop.T, shortest_period(loop) or loop.T
+    c0, c2 = _rates(_known(loop, loop.T), np.asarray(share)[..., None] * np.array(loop.delta), beta)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rate = np.sqrt(c0 / c2)
+        short, long = (_shortfall(rate * T / 2) for T in (shortest, longest))
+        q, q_long = shortest * (1 - short), longest * (1 - long)
+        move = c0 / (longest - shortest + shortest * short)
+        return PeriodCost(move, move * q, move * q * longest, c2 / q_long)
+
+
+_BITS = 320  # of the balls in which q is enclosed
+_FINER = 60  # bits of q beyond those that T - q has lost
+
+
+def q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[Fraction, ...], tuple[Fraction, ...]]:
+    """Rational bounds [s] below q of the shortest and above q of the longest period, channel by channel.
+
+    q = T tanh(y)/y with y^2 = c0 T^2/(4 c2) at the damping of the loop. Raises NotProved for a beta that is too large.
+    """
+    below, above = [], []
+    with flint.ctx.workprec(_BITS):
+        for short, long in _enclosed(loop, beta):
+            digits = _FINER - 2 * min(int(np.floor(np.log2(max(float(1 - short[0] / short[1]), 2.0**-80)))), 0)
+            units = []
+            for q, T in (short, long):
+                scale = digits - int(np.floor(np.log2(float(T))))
+                found = (q * flint.arb(2) ** scale).floor().unique_fmpz()
+                if found is None:
+                    raise NotProved("q of the known device lies too near to a binary fraction to be enclosed")
+                units.append((int(found), 1 << scale))
+            below.append(Fraction(*units[0]))
+            above.append(Fraction(units[1][0] + 1, units[1][1]))
+    return tuple(below), tuple(above)
+
+
+def check_q(loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], above: Sequence[Fraction]) -> None:
+    """Raise NotProved unless below < q(T1) and q(T2) < above on every channel, by balls that contain q."""
+    m = loop.channels
+    if not len(beta) == len(below) == len(above) == m:
+        raise NotProved(f"q has {len(below)} and {len(above)} bounds, expected {m} each")
+    with flint.ctx.workprec(_BITS):
+        for i, ((short, _), (long, _)) in enumerate(_enclosed(loop, beta)):
+            least, most = (flint.arb(_fmpq(value[i])) for value in (below, above))
+            if not (below[i] > 0 and least < short and long < most):
+                raise NotProved(
+                    f"q #{i + 1} lies outside of its bounds on file, {float(below[i]):g} to {float(above[i]):g}"
+                )
+
+
+def _enclosed(loop: Loop, beta: Sequence[Fraction]) -> list[tuple[tuple[Any, Any], tuple[Any, Any]]]:
+    """(q, T) as balls for the shortest and for the longest period, channel by channel. Raises NotProved."""
+    exact = loop.period(True)
+    c0, c2 = _checked_rates(loop, beta)
+    periods = [rational(T) for T in (shortest_period(loop) or exact, loop.T_max or exact)]
+    found = []
+    for spread, inertia in zip(c0, c2, strict=True):
+        pair = []
+        for T in periods:
+            y = flint.arb(_fmpq(spread * T * T / (4 * inertia))).sqrt()
+            ball = flint.arb(_fmpq(T))
+            pair.append((ball * y.tanh() / y, ball))
+        found.append((pair[0], pair[1]))
+    return found
+
+
+def _checked_rates(loop: Loop, beta: Sequence[Fraction]) -> tuple[Any, Any]:
+    """c0 and c2 over Fractions, positive. Raises NotProved."""
+    exact = loop.period(True)
+    c0, c2 = _rates(_known(loop, exact), numbers(loop.delta, exact), _row(beta))
+    if not ((c0 > 0).all() and (c2 > 0).all() and all(b > 0 for b in beta)):
+        raise NotProved(f"beta is {[float(b) for b in beta]}, too large for the bounds of the devices")
+    return c0, c2
+
+
+def _row(values: Sequence[Fraction]) -> Any:
+    return np.array(list(values), dtype=object)
+
+
+def _fmpq(value: Fraction) -> Any:
+    return flint.fmpq(value.numerator, value.denominator)
+
+
+def exact_cost(
+    loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], above: Sequence[Fraction]
+) -> PeriodCost:
+    """A rational bound below the cost at the loop's damping, from bounds of q that `check_q` has checked."""
+    exact = loop.period(True)
+    c0, c2 = _checked_rates(loop, beta)
+    longest = rational(loop.T_max) if loop.T_max else exact
+    q = _row(below)
+    move = c0 / (longest - q)
+    return PeriodCost(move, move * q, move * q * longest, c2 / _row(above))
+
+
+# ----------------------------------------------------------------------------------------------------
+# The blocks, in floating point or over Fractions.
+
+
+def known_device_block(F: Lti, cost: PeriodCost, beta: Any) -> tuple[Array, Lti]:
+    """Return F(1) and the block of Theorem B on (dx, v), which must be strictly positive real.
+
+        [[F/(z-1) + move, 0], [-beta F/z - cross (1 + 1/z), mean (1 + 1/z)/2 + 2 step (1 - 1/z)]]
+    with the pole at z = 1 split off. Everything that comes a sample late shares one delay per channel.
+    """
+    m, T = F.inputs, F.T
+    zero, one = (numbers(part, T) for part in (np.zeros((m, m)), np.eye(m)))
+    move, cross, mean, step = (np.diag(part) for part in cost)
+    static, regular = F.over_z_minus_one()
+    weights = np.block([[one, zero], [zero, -np.diag(numbers(beta, T))]])
+    early = weights @ (vstack(regular, F) @ np.hstack([one, zero]))
+    early = early + np.block([[move, zero], [-cross, mean / 2 - 2 * step]])
+    lines = Lti.diag(Lti.constant(one, T), delay((1,) * m, T))
+    return static, lines @ early + np.block([[zero, zero], [-cross, mean / 2 + 2 * step]])
+
+
+def known_device_any_block(V: Lti, theta: Sequence[int], cost: PeriodCost, beta: Any) -> tuple[Array, Lti]:
+    """Return V(1) and the block on (dx, v, df_e) for every passive environment behind the coupling V with psi = 0.
+
+    It is the block above with F = 0 and a third column [-vt; -beta z^-n; V(1)/2 - (V - V(1))/(z-1)], n = theta + 1 and
+    vt = 1 + 1/z + .. + z^-theta; the third row is otherwise zero.
+    """
+    m, T = len(theta), V.T
+    nothing = Lti.constant(np.zeros((m, m), dtype=int), T)
+    _, device = known_device_block(nothing, cost, beta)
+    lines = [_window_and_last(n, b, T) for n, b in zip(theta, numbers(beta, T), strict=True)]
+    columns = Lti.diag(*lines).rows([*range(0, 2 * m, 2), *range(1, 2 * m, 2)])
+    V1, own = v_hat(V)
+    return V1, vstack(hstack(device, -columns), own @ np.eye(3 * m, dtype=int)[2 * m :])
+
+
+def _window_and_last(theta: int, beta: Any, T: Number) -> Lti:
+    """[1 + 1/z + .. + z^-theta; beta z^-(theta + 1)] of one channel over one line of delays."""
+    window, last = taps([1] * (theta + 1) + [0], T), taps([0] * (theta + 1) + [beta], T)
+    return Lti(window.A, window.B, np.vstack([window.C, last.C]), np.vstack([window.D, last.D]), T)
+
+
+# ----------------------------------------------------------------------------------------------------
+# The required damping s Delta: the least s for which some beta satisfies the condition with the same other bounds.
+#
+# For a fixed beta each frequency has a least s, because L grows with the damping; s(beta) is the largest of them. A
+# search on a grid is refined by golden section. The result is what a refined sweep says of the beta found.
+
+_LARGEST_ETA = 0.9999  # of the largest beta, at which c0 or c2 would be zero
+_SCANNED = np.concatenate([np.geomspace(1e-4, 0.6, 36), 1 - np.geomspace(0.35, 1e-4, 14)])  # shares of the largest beta
+_BISECTIONS = 52  # of an interval of shares: to 2e-16 of its length
+_THIN = 5  # every so many frequencies of the grid are looked at while the best beta is located
+_WORST = 6  # frequencies of least room at which the least share is found at once
+_MOST_CUTS = 40
+_GOLDEN, _SECTIONS = (5**0.5 - 1) / 2, 30  # thirty sections locate log beta to 1e-6 of the bracket
+_STEPS = 0.2, 0.05, 0.0125, 0.003  # of log beta, channel by channel
+_MOST_MOVES = 12  # per channel and step
+_DIGITS = 7  # of beta, which the exact proof takes as it is printed
+
+
+class Best(NamedTuple):
+    """The least share of the damping that a form of Theorem B needs."""
+
+    share: float  # inf where no beta was found that needs less than the share allowed
+    w: float  # where it binds [rad/sample]
+    beta: tuple[float, ...]  # (m,) [s]
+
+
+class _Sampled(NamedTuple):
+    """The environment's side at frequencies on the circle."""
+
+    z: Complex  # (k,)
+    own: Complex  # (k, m, m) Hermitian part of F/(z-1), or of V/(1-z)
+    forces: Complex  # (k, m, m) F, or V
+
+
+class Sweep(ABC):
+    """The least share of the damping for which Theorem B holds, with its best beta; one subclass per form."""
+
+    def __init__(self, loop: Loop, *systems: Lti) -> None:
+        self.loop, known = loop, _known(loop, loop.T)
+        self._P, self._highest = known.P, 4 * known.mass / known.damping  # [s] where c2 = 0
+        self._root = 1 / np.sqrt(even_damping(loop))
+        self.grid = np.concatenate([[0.0], frequencies(*systems)])
+        self._all = self.sampled(self.grid)
+        self._few = _Sampled(*(part[::_THIN] for part in self._all))
+
+    @abstractmethod
+    def sampled(self, w: Array) -> _Sampled:
+        """Return the environment's side at w (k,) [rad/sample]."""
+
+    @abstractmethod
+    def room(self, here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
+        """Return Hermitian matrices (k, m, m) that must be positive; entries of the cost are (k, m)."""
+
+    def shares(self, here: _Sampled, beta: Array, low: float, high: float) -> Array:
+        """Return the least share (k,) in [low, high] at each frequency, inf where `high` is too little."""
+        least, most = np.full(here.z.size, low), np.full(here.z.size, high)
+        enough, plenty = (self._least_room(here, share, beta) > 0 for share in (least, most))
+        for _ in range(_BISECTIONS):
+            middle = (least + most) / 2
+            holds = self._least_room(here, middle, beta) > 0
+            least, most = np.where(holds, least, middle), np.where(holds, middle, most)
+        return np.where(enough, low, np.where(plenty, most, np.inf))
+
+    def _least_room(self, here: _Sampled, share: Any, beta: Array) -> Array:
+        """Return the least eigenvalue (k,) of `room`."""
+        cost = period_cost(self.loop, np.broadcast_to(share, here.z.shape), beta)
+        return -largest_eigenvalue(-(self._root[:, None] * self.room(here, cost, beta) * self._root))
+
+    def floor(self, beta: Array) -> float:
+        """Return the share at which beta is the largest that is tried; inf where no damping allows it."""
+        if (beta > _LARGEST_ETA * self._highest).any():
+            return np.inf
+        return float((beta**2 * self._P / (4 * np.array(self.loop.delta))).max()) / _LARGEST_ETA**2
+
+    def least(self, beta: Array, high: float, thin: bool = False) -> float:
+        """Return the least share on the grid for this beta, from below by cuts; inf where it is not below `high`."""
+        share, here = self.floor(beta), self._few if thin else self._all
+        for _ in range(_MOST_CUTS):
+            if not share < high:
+                return np.inf
+            room = self._least_room(here, share, beta)
+            worst = np.argsort(room)[:_WORST]
+            worst = worst[room[worst] <= 0]
+            if not worst.size:
+                return share
+            at = _Sampled(*(part[worst] for part in here))
+            share = float(self.shares(at, beta, share, high).max())
+        return share
+
+    def required(self, beta: Array, high: float) -> tuple[float, float]:
+        """Return the least share below `high` (inf if there is none) by a refined sweep, and where it binds."""
+        low = self.floor(beta)
+        if not low < high:
+            return np.inf, 0.0
+        return supremum(lambda w: self.shares(self.sampled(w), beta, low, high), self.grid)
+
+    def best(self, high: float) -> Best:
+        """Return the least share below `high` over all beta that were tried."""
+        scale = np.minimum(2 * np.sqrt(high * np.array(self.loop.delta) / self._P), self._highest)
+
+        def along(logarithm: float) -> float:
+            return self.least(np.exp(logarithm) * scale, high)
+
+        logs = np.log(_LARGEST_ETA * _SCANNED)
+        values = [self.least(eta * scale, high, thin=True) for eta in _LARGEST_ETA * _SCANNED]
+        at = int(np.argmin(values))
+        if not np.isfinite(values[at]):
+            return Best(np.inf, 0.0, ())
+        beta = np.exp(_golden(along, logs[max(at - 1, 0)], logs[min(at + 1, logs.size - 1)])) * scale
+        if self.loop.channels > 1:
+            beta = self._each_channel(beta, high)
+        beta = np.array([float(f"{b:.{_DIGITS}g}") for b in beta])
+        share, w = self.required(beta, high)
+        return Best(share, w, tuple(beta.tolist()))
+
+    def _each_channel(self, beta: Array, high: float) -> Array:
+        """Return a better beta where the channels' own differ, by a pattern search in log beta."""
+        best = self.least(beta, high)
+        for step in _STEPS:
+            for i in range(beta.size):
+                for factor in (np.exp(step), np.exp(-step)):
+                    for _ in range(_MOST_MOVES):
+                        trial = beta.copy()
+                        trial[i] *= factor
+                        share = self.least(trial, high)
+                        if not share < best * (1 - _SAME):
+                            break
+                        best, beta = share, trial
+        return beta
+
+
+_SAME = 1e-9  # a smaller relative gain is rounding
+
+
+def _golden(value: Callable[[float], float], left: float, right: float) -> float:
+    """Return where `value` is least in [left, right], if it has one valley there."""
+    inner = [right - _GOLDEN * (right - left), left + _GOLDEN * (right - left)]
+    found = [value(x) for x in inner]
+    for _ in range(_SECTIONS):
+        if found[0] < found[1]:
+            right, inner, found = inner[1], [0.0, inner[0]], [0.0, found[0]]
+            inner[0] = right - _GOLDEN * (right - left)
+            found[0] = value(inner[0])
+        else:
+            left, inner, found = inner[0], [inner[1], 0.0], [found[1], 0.0]
+            inner[1] = left + _GOLDEN * (right - left)
+            found[1] = value(inner[1])
+    return inner[int(np.argmin(found))]
+
+
+def _device_rows(z: Complex, cost: PeriodCost) -> tuple[Array, Complex, Array]:
+    """Return the entries 11, 21 (twice the Hermitian one) and 22 of L on (dx, v) at z (k,), shapes (k, m)."""
+    turn, cosine = 1 + 1 / z[:, None], z.real[:, None]
+    return cost.move, -cost.cross * turn, cost.mean * (1 + cosine) / 2 + 2 * cost.step * (1 - cosine)
+
+
+class ThisEnvironmentSweep(Sweep):
+    """Theorem B around the force map F of one environment."""
+
+    def __init__(self, F: Lti, loop: Loop) -> None:
+        self._F, (_, self._regular) = F, F.over_z_minus_one()
+        super().__init__(loop, F)
+
+    def sampled(self, w: Array) -> _Sampled:
+        z = on_circle(w)
+        return _Sampled(z, hermitian(self._regular.at(z)), self._F.at(z))
+
+    def room(self, here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
+        """He[F/(z-1)] + l11 - M*M/(4 l22) with M = -beta F/z + l21: the Schur complement of the row of v."""
+        own, cross, speed = _device_rows(here.z, cost)
+        one = np.eye(beta.size)
+        M = -beta[:, None] * here.forces / here.z[:, None, None] + cross[..., None] * one
+        return here.own + own[..., None] * one - np.conj(np.swapaxes(M, 1, 2)) @ (M / (4 * speed[..., None]))
+
+
+class AnyEnvironmentSweep(Sweep):
+    """Theorem B around every passive environment behind the coupling V, without delay in the environment."""
+
+    def __init__(self, V: Lti, loop: Loop) -> None:
+        self._V, (_, self._own) = V, v_hat(V)
+        super().__init__(loop, V)
+
+    def sampled(self, w: Array) -> _Sampled:
+        z = on_circle(w)
+        return _Sampled(z, hermitian(self._own.at(z)), self._V.at(z))
+
+    def room(self, here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
+        """He[V/(1-z)] - diag chi."""
+        return here.own - chi(here.z, self.loop.theta, cost, beta)[..., None] * np.eye(beta.size)
+
+
+def chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Array:
+    """l Lam^-1 l*/4 with l = [(z^n - 1)/(z - 1), beta z^n], n = theta + 1: what V must exceed, (k, m) [m/N]."""
+    own, cross, speed = _device_rows(z, cost)
+    n = np.array(theta) + 1
+    window = np.stack([sum(z**i for i in range(each)) for each in n], axis=1)
+    last, cross = beta * z[:, None] ** n, cross / 2
+    both = speed * np.abs(window) ** 2 + own * beta**2 - 2 * (last * cross * np.conj(window)).real
+    return both / (4 * (own * speed - np.abs(cross) ** 2))
+
+
+# ----------------------------------------------------------------------------------------------------
+# Theorem A: what no condition for these devices can undercut.
+#
+# For one linear motor (mass m, damping delta) behind a spring k and a damper b the sampled response to a held force
+# fills a disk as the passive hand varies: at each alias w_n = (w + 2 pi n)/T the hand may answer as it likes. The loop
+# is stable for every passive hand if no response in the disk closes it and it is stable with the far end of the
+# transmission held. With one channel, or channels with equal devices, some lossless hand attains every point of the
+# disk. The member of the class is the one with the least mass and damping, the stiffest spring and the least damper.
+# Compare Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for one channel.
+
+
+def alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: float) -> tuple[Array, Complex]:
+    """Return sig0 and sig2 (k,) [m/(N s)] at w (k,) [rad/sample] for motors of `damping` (k,) [N s/m], in closed form.
+
+    sig_i = |z - 1|^2 S_i/T^2 with S0 = sum 1/(w_n^2 c_n), S2 = sum g_n conj(a_n)/(w_n^2 c_n), a_n = delta + j m w_n,
+    g_n = b w_n^2/(k^2 + b^2 w_n^2) and c_n = delta + g_n |a_n|^2. Both are rational in W = w_n^2 with the denominator
+    b m^2 W^2 + (delta b^2 + b delta^2) W + delta k^2, and sums of partial fractions are cotangents.
+    """
+    high, middle, low = b * mass**2, damping * b * (b + damping), damping * k**2
+    root: Complex = np.sqrt((middle**2 - 4 * high * low).astype(np.complex128))
+    W1, W2 = (-middle - root) / (2 * high), (-middle + root) / (2 * high)
+    W2 = np.where(np.abs(W2) < np.abs(W1), low / (high * W1), W2)  # without cancellation
+
+    def sums(W: Any) -> tuple[Any, Any]:
+        """Return the sums of 1/(w_n^2 - W) and of w_n/(w_n^2 - W)."""
+        y = np.sqrt(W) * T
+        less, more = 1 / np.tan((w - y) / 2), 1 / np.tan((w + y) / 2)
+        return T**2 / (4 * y) * (less - more), T / 4 * (less + more)
+
+    (even1, odd1), (even2, odd2) = sums(W1), sums(W2)
+    apart = high * (W1 - W2)
+    numerator = [(k**2 + b**2 * W) / W for W in (W1, W2)]
+    S0 = k**2 / low * T**2 / (4 * np.sin(w / 2) ** 2) + (numerator[0] * even1 - numerator[1] * even2) / apart
+    S2 = b / apart * (damping * (even1 - even2) - 1j * mass * (odd1 - odd2))
+    turn = 4 * np.sin(w / 2) ** 2 / T**2
+    return turn * S0.real, turn * S2
+
+
+class Necessary(NamedTuple):
+    """The least share of the damping for which Theorem A holds."""
+
+    share: float
+    w: float  # where it binds [rad/sample]
+    held: bool  # whether the loop is stable at this share with the far ends of the transmissions held
+
+
+_LOWEST = 1e-4  # [rad/sample]: at z = 1 the disk touches the point that it must not contain
+_SMALL, _LARGE = 1e-6, 1e3  # shares of the damping between which the least one is searched
+
+
+def necessary_share(F: Lti, loop: Loop) -> Necessary:
+    """Return the least share of the damping at which no passive hand destabilises linear motors, by a refined sweep.
+
+    It is a lower bound for every condition of this class of devices where the loop has one channel or equal devices;
+    otherwise it is sufficient, and close.
+    """
+    assert loop.known_devices
+    known, T, m = loop.known_devices, loop.T, loop.channels
+
+    def holds(w: Array, response: Complex, share: Array) -> Any:
+        sums = [
+            alias_sums(w, T, d.motor_mass_min, share * delta, d.transmission_stiffness_max, d.transmission_damping_min)
+            for d, delta in zip(known, loop.delta, strict=True)
+        ]
+        radius = np.stack([np.maximum(sig0, 1e-300) / 2 for sig0, _ in sums], axis=1)
+        centre = radius + np.stack([sig2 for _, sig2 in sums], axis=1)
+        root = np.sqrt(radius)
+        z = on_circle(w)
+        closed = (z - 1)[:, None, None] * np.eye(m) + T * centre[..., None] * response
+        left, right = closed / root[..., None], T * root[..., None] * response
+        adjoint = [np.conj(np.swapaxes(part, 1, 2)) for part in (left, right)]
+        return -largest_eigenvalue(adjoint[1] @ right - adjoint[0] @ left) > 0
+
+    def shares(w: Array) -> Array:
+        response = F.at(on_circle(w))
+        least, most = np.full(w.size, _SMALL), np.full(w.size, _LARGE)
+        plenty = holds(w, response, most)
+        for _ in range(_BISECTIONS):
+            middle = (least + most) / 2
+            enough = holds(w, response, middle)
+            least, most = np.where(enough, least, middle), np.where(enough, middle, most)
+        return np.where(plenty, most, np.inf)
+
+    share, w = supremum(shares, frequencies(F, low=_LOWEST))
+    return Necessary(share, w, bool(np.isfinite(share)) and _stable_with_held_ends(F, loop, share * (1 + 1e-6)))
+
+
+def _stable_with_held_ends(F: Lti, loop: Loop, share: float) -> bool:
+    """Whether the loop is stable at `share` of the damping with the far end of every transmission held."""
+    m, known = loop.channels, loop.known_devices or ()
+    generator = np.zeros((3 * m, 3 * m))
+    for i, (device, delta) in enumerate(zip(known, loop.delta, strict=True)):
+        mass, k, b = device.motor_mass_min, device.transmission_stiffness_max, device.transmission_damping_min
+        generator[i, m + i] = 1
+        generator[m + i, [i, m + i, 2 * m + i]] = -k / mass, -(share * delta + b) / mass, -1 / mass
+    step = scipy.linalg.expm(generator * loop.T)[: 2 * m]
+    A, B = step[:, : 2 * m], step[:, 2 * m :]
+    C = np.eye(m, 2 * m)
+    closed = np.block([[A + B @ F.D @ C, B @ F.C], [F.B @ C, F.A]])
+    return bool(np.abs(np.linalg.eigvals(closed)).max() < 1)
