@@ -17,7 +17,7 @@ from haptic_loop.cli import options, render
 from haptic_loop.cli.session_cli import add_link_options, check_link, hold_session, steady_scenario
 from haptic_loop.design.files import off_table, plain, write
 from haptic_loop.hw.emulator import nobody
-from haptic_loop.hw.identify import Estimate, Excitation, capped, chirp, estimate, held, settled
+from haptic_loop.hw.identify import Estimate, Excitation, Swing, capped, chirp, estimate, held, settled
 from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.recording import Recorder
@@ -34,7 +34,7 @@ _LIMITS = (
     "its transmission apart from the motor's. A hand that rests on the handle springs it: refused from 5 N/m on. One "
     "that only damps is not in the bound if nobody touched the handle in one of the sittings. Dry friction is left out "
     "of delta: it dissipates too, but ever less than a viscous damper as speed grows. Lag of the amplifier is not in "
-    "delta: it belongs to the delay."
+    "delta: it belongs to the delay. The bound holds up to the speed of the records; hw.bridge stops a handle there."
 )
 
 
@@ -107,6 +107,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--seconds", type=number(0.5, 30.0), default=2.5, metavar="SECONDS", help="length of the chirp (default 2.5)")
     rub = "dry friction of an emulated device (default 0)"
     add("--coulomb", type=number(0.0, 10.0), default=0.0, metavar="NEWTON", help=rub)
+    fast = "speed that a slow swing reaches, and up to which the bound holds (default 0.5)"
+    add("--speed", type=number(0.05, 1.5), default=0.5, metavar="M/S", help=fast)
+    far = "amplitude of that swing (default 30)"
+    add("--travel", type=number(2.0, 200.0), default=30.0, metavar="MM", help=far)
     count = "records of every axis, each with the handles at another place; two have to agree (default 2)"
     add("--sittings", type=options.whole(1, 20), default=2, metavar="N", help=count)
     stay = "leave the handles where they are between sittings (an emulator has nobody to move them)"
@@ -123,11 +127,13 @@ def _parser() -> argparse.ArgumentParser:
 def _sitting(args: argparse.Namespace, scenario: Scenario, settings: LinkSettings, out: Path, number: int) -> _Sitting:
     """Play the excitation to every axis, record and estimate."""
     asks_nothing = scenario.replace(delta=(1e-6,) * scenario.channels)  # what the damping is, is the question
-    session = session_for(asks_nothing, settings, cap=args.force)
+    swing = Swing.of(scenario, args.speed, 1e-3 * args.travel)
+    fastest = min(2.5, max(1.0, 2 * args.speed))  # a lighter device than declared is stopped there
+    session = session_for(asks_nothing, settings, cap=max(args.force, *swing.force), speed=fastest)
     session.record = recorder = Recorder(scenario.channels)
 
     def played(link: int) -> Excitation:
-        return chirp(scenario.channels, scenario.T, link, args.force, args.band, args.seconds)
+        return chirp(scenario.channels, scenario.T, link, args.force, args.band, args.seconds, swing)
 
     def plan(ages: Ages) -> Sequence[Excitation]:
         return [played(ages.link_delay(1e6 * scenario.T, args.quantile, 1e6 * args.guard))]
@@ -175,6 +181,8 @@ def _table(e: Estimate, scenario: Scenario, i: int) -> str:
     """One [[device]] table for a scenario file; a transmission that was not found is the scenario's."""
     device, mass = scenario.device[i], e.friction.mass
     lines = ["[[device]]", f"damping = {e.viscous:.6g}", f"delta = {np.floor(1e6 * e.delta) / 1e6:.6f}"]
+    speed = np.floor(1e3 * e.viscosity.speed) / 1e3
+    lines.append(f"credible_speed = {speed:.3f}  # [m/s] of the record: delta is not known beyond it")
     if isinstance(device, RigidDevice):
         return "\n".join([*lines, 'kind = "rigid"', f"mass = {mass:.6g}", ""])
     if (found := e.transmission) is not None:
@@ -194,6 +202,10 @@ def _figures(report: _Report) -> Table:
         mode = "-" if axis.transmission is None else f"{axis.transmission.mode_hz:.2f}"
         names = ("mass", "viscous", "coulomb", "stiffness")
         figures = [f"{getattr(found, name):.5g} ± {2 * found.errors[name]:.2g}" for name in names]
-        cells.append((str(i), *figures, mode, f"{found.delta:.4f}" if report.bounded else "-"))
-    heads = ("axis", "mass [kg]", "viscous [N s/m]", "dry [N]", "to ground [N/m]", "mode [Hz]", "delta at least")
+        bound = f"{found.delta:.4f}" if report.bounded else "-"
+        cells.append((str(i), *figures, mode, bound, f"{axis.viscosity.speed:.2f}"))
+    heads = (
+        *("axis", "mass [kg]", "viscous [N s/m]", "dry [N]", "to ground [N/m]", "mode [Hz]", "delta at least"),
+        "up to [m/s]",
+    )
     return render.grid(f"{report.session.scenario}, identified", heads, cells, left=())

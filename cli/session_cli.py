@@ -68,8 +68,8 @@ def add_safety_options(parser: options.Parser) -> None:
     add, number = parser.add_argument_group("safety").add_argument, options.number
     cap = "largest force (default 2, for first sessions)"
     add("--force-cap", type=number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
-    speed = "fastest motion of a handle while forces act (default 1)"
-    add("--max-speed", type=number(1e-3, 2.5), default=1.0, metavar="M/S", help=speed)
+    speed = "fastest motion of a handle while forces act (default 1, or the least credible_speed of the devices)"
+    add("--max-speed", type=number(1e-3, 2.5), metavar="M/S", help=speed)
     heat = "force that each motor stands for ever, one is for all; above it, I2t (default: not watched)"
     add("--continuous-force", type=options.several(float), metavar="N,N,..", help=heat)
     warm = "time constant of the motors' heating (default 10)"
@@ -93,12 +93,25 @@ def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
 
 def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
     """The limits of the safety options, with `cap`. Raises InputError."""
-    more: dict[str, Any] = {"cap": args.force_cap, "speed": args.max_speed, "thermal": args.thermal_time}
+    more: dict[str, Any] = {"cap": args.force_cap, "speed": _speed(args, scenario), "thermal": args.thermal_time}
     if args.continuous_force is not None:
         more["continuous"] = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)
     if args.deadman == "key" and not sys.stdin.isatty():
         raise InputError("--deadman key needs a terminal; without one give it a file to be touched")
     return more
+
+
+def _speed(args: argparse.Namespace, scenario: Scenario) -> float:
+    """The speed [m/s] at which a session stops, within what the devices' damping is known for. Raises InputError."""
+    known = min(device.credible_speed for device in scenario.device)
+    if args.max_speed is None:
+        return min(1.0, known)
+    if args.max_speed > known:
+        raise InputError(
+            f"--max-speed is {args.max_speed:g} m/s, the least credible_speed of the devices is {known:g}: "
+            "their damping is not known beyond it (hw.identify --speed)"
+        )
+    return args.max_speed
 
 
 def touched(path: str) -> Callable[[], bool]:

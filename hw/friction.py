@@ -38,10 +38,12 @@ _SPACING = 0.4  # standard deviations of the window between two rows: what it le
 _NEARBY = 3.5  # standard deviations that a row keeps from where the balance does not hold
 _REACH = 6  # standard deviations that a window is cut at
 _STILL = 0.02  # [s] within one count of which an encoder stands still
-_SLIPS = (5e-4, 1e-3, 2e-3, 3.5e-3, 6e-3, 1e-2, 1.4e-2, 2e-2, 3e-2)  # [m/s] speed at which dry friction is at 3/4
+#: [m/s] speed at which dry friction is at 3/4
+_SLIPS = (5e-4, 1e-3, 2e-3, 3.5e-3, 6e-3, 1e-2, 1.4e-2, 2e-2, 3e-2, 5e-2, 8e-2, 0.12)
 _BRISTLES = (1e-5, 1.7e-5, 3e-5, 5.5e-5, 1e-4, 1.7e-4)  # [m] over which friction reverses by position (Dahl 1968)
 _STRIBECK = 0.02  # [m/s] above which the rest of static friction is gone
 _SLOW, _WEAK = 0.2, 0.05  # part of a force that the window has to pass, unless it is so small a part of the strongest
+_SLIP = 0.002  # [m/s] of dry friction where its law is of another kind
 _BLOCKS = 10  # of the record, that are left out in turn
 _HIDDEN = 0.03  # of what is left unexplained, that may be damping in disguise
 _SCALE = 5e-3  # of the encoder, that nobody can tell: 20 um of eccentricity over a part of a turn of 40 mm are 3e-3
@@ -270,6 +272,11 @@ def _apart(columns: Array, i: int) -> Array:
     """The part of a column that the others do not explain."""
     others = np.linalg.qr(np.delete(columns, i, axis=1))[0]
     return columns[:, i] - others @ (others.T @ columns[:, i])
+
+
+def dry_friction(x: Array, T: float, found: Friction) -> Array:
+    """Dry friction [N] of displacements x (N,) [m] by the law that fits best, without its Stribeck part."""
+    return found.coulomb * np.tanh(np.diff(x, append=x[-1]) / T / (found.slip or _SLIP))
 
 
 def friction(x: Array, force: Array, T: float, step: float) -> Friction:

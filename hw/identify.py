@@ -1,8 +1,9 @@
 """Mass, friction and transmission of one axis from a record of forces and displacements, and a bound on its friction.
 
-The excitation is a chirp of a small force, slow motion at half of it, then silence: a force that does not depend on the
-motion closes no loop, so no certificate is needed. Mass and friction come from the balance of forces (hw/friction.py),
-the transmission from the spectra of what force is left and of the motion: least squares over the chirp's frequencies.
+The excitation is a chirp of a small force, slow motion at half of it, a swing that reaches the speed of a session, then
+silence: a force that does not depend on the motion closes no loop, so no certificate is needed. Mass and friction come
+from the balance of forces (hw/friction.py), which must be one of viscous friction (hw/viscosity.py); the transmission
+comes from the spectra of what force is left and of the motion: least squares over the chirp's frequencies.
 """
 
 from __future__ import annotations
@@ -16,13 +17,16 @@ import numpy as np
 import scipy  # its parts load when they are used
 from haptic_loop.controller.lti import Array, frozen
 from haptic_loop.hw.control import Controller
-from haptic_loop.hw.friction import Friction, friction
+from haptic_loop.hw.friction import Friction, dry_friction, friction
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import Session
+from haptic_loop.hw.viscosity import Viscosity, doubt, viscosity
 from haptic_loop.sim.scenario import Scenario
 from numpy.typing import NDArray
 
 _SLOW_SPAN = 4.0  # of the slow sweeps' frequencies
+_LEVELS = (0.4, 0.6, 0.8, 1.0)  # amplitudes of the swing, as parts of its largest
+_CYCLES = 3  # of each of them
 _LEAD = 0.3  # [s] of zero force, in which the gain comes up
 _MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a mode is looked for first
 _PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
@@ -32,7 +36,6 @@ _SLOWEST_HZ, _LOUD = 20.0, 0.2  # where the motion tells of a transmission; part
 _FLOOR = 1e-12  # of a ratio whose logarithm is taken
 _OUTLIER = 0.1  # of a logarithm, from which it counts less: a resonance is narrow
 _STEPS = 40  # of a fit
-_SLIP = 0.002  # [m/s] of dry friction where its law is of another kind
 _VAGUE = 0.3  # part of the motion that may stay unexplained: beyond, it is not this transmission
 _SPRUNG = 5.0  # [N/m] from which on it may be a hand: a cable has less
 _SUSPICIOUS = 0.1  # part by which an estimate may exceed the declared damping
@@ -81,28 +84,66 @@ class _Player:
         return next(self._forces, [0.0] * len(x))
 
 
-def chirp(
-    channels: int, T: float, link: int, amplitude: float, band: tuple[float, float], seconds: float
-) -> Excitation:
-    """The force [N] that is played to a device: three cosines of exponentially rising frequency, then silence.
+@dataclass(frozen=True)
+class Swing:
+    """A slow swing of every axis at rising amplitudes, the last of which reaches the speed of a session."""
 
-    The first passes through `band` [Hz]; the second and the third are slow, the third at half the force. Each takes
-    `seconds`, the silence half of that. Two slow motions at two levels of force show friction that is not viscous.
-    Each cosine ends at a whole cycle, so that a free mass does not drift away; the last one ends a quarter of a cycle
-    later, so that the device is released with a speed.
+    force: tuple[float, ...]  # (m,) [N] amplitude of the fastest part
+    hz: float
+
+    @classmethod
+    def of(cls, scenario: Scenario, speed: float, travel: float) -> Swing:
+        """A swing that reaches `speed` [m/s] within +-`travel` [m] where the scenario's masses and dampings are right.
+
+        No force is above the device's limit: such an axis stays slower.
+        """
+        w = speed / travel
+        need = [
+            min(device.force_limit, speed * abs(complex(device.damping, w * sum(device.bodies.values()))))
+            for device in scenario.device
+        ]
+        return cls(tuple(need), w / (2 * np.pi))
+
+    def signal(self, T: float) -> Array:
+        """Forces (ticks, m) [N]: whole cycles of a cosine at each of _LEVELS."""
+        t = np.arange(round(_CYCLES / self.hz / T)) / round(_CYCLES / self.hz / T)
+        wave = np.concatenate([level * np.cos(2 * np.pi * _CYCLES * t) for level in _LEVELS])
+        return wave[:, None] * np.array(self.force)
+
+
+def chirp(
+    channels: int,
+    T: float,
+    link: int,
+    amplitude: float,
+    band: tuple[float, float],
+    seconds: float,
+    swing: Swing | None = None,
+) -> Excitation:
+    """The force [N] that is played to a device: cosines of exponentially rising frequency, a swing, then silence.
+
+    The first cosine passes through `band` [Hz]; the second and the last are slow, the last at half the force. Each
+    takes `seconds`, the silence half of that. Two slow motions at two levels of force show friction that is not
+    viscous, and the swing between them shows it at the speed of a session. Each part ends at a whole cycle, so that a
+    free mass does not drift away; the last one ends a quarter of a cycle later, so that the device is released with a
+    speed.
     """
     t = np.arange(round(seconds / T)) / round(seconds / T)
 
     def sweep(low: float, high: float, further: float = 0.0) -> Array:
         ratio = high / low
         cycles = max(1, round(seconds * (high - low) / np.log(ratio))) + further
-        return amplitude * np.cos(2 * np.pi * cycles * (ratio**t - 1) / (ratio - 1))
+        wave = amplitude * np.cos(2 * np.pi * cycles * (ratio**t - 1) / (ratio - 1))
+        return np.tile(wave[:, None], channels)
 
     low, high = band
     slower, span = low / np.sqrt(2.0), min(_SLOW_SPAN, high / low)
-    parts = sweep(low, high), sweep(low, span * low), sweep(slower, span * slower, 0.25) / 2
-    lead, tail = np.zeros(round(_LEAD / T)), np.zeros(round(seconds / 2 / T))
-    return Excitation(np.tile(np.concatenate([lead, *parts, tail])[:, None], channels), T, link)
+    parts = [sweep(low, high), sweep(low, span * low)]
+    if swing:
+        parts.append(swing.signal(T))
+    parts.append(sweep(slower, span * slower, 0.25) / 2)
+    lead, tail = (np.zeros((round(s / T), channels)) for s in (_LEAD, seconds / 2))
+    return Excitation(np.concatenate([lead, *parts, tail]), T, link)
 
 
 @dataclass(frozen=True)
@@ -121,6 +162,7 @@ class Estimate:
 
     friction: Friction
     transmission: _Transmission | None  # None for a rigid device, and where none explains the record
+    viscosity: Viscosity
 
     @property
     def viscous(self) -> float:
@@ -134,7 +176,8 @@ class Estimate:
 def identify(x: Array, force: Array, T: float, step: float, rigid: bool) -> Estimate:
     """Fit one axis: displacements x (N,) [m], what the motor did (N,) [N], period [s], encoder step [m].
 
-    Raises ValueError where the device did not move, a hand holds it or nothing is left of its damping.
+    Raises ValueError where the device did not move, a hand holds it, nothing is left of its damping, or its damping
+    falls with speed or frequency.
     """
     if np.ptp(x) < 20 * step:
         raise ValueError(f"the axis moved by {np.ptp(x) / step:.0f} encoder steps, at least 20 are needed")
@@ -150,7 +193,10 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool) -> Esti
             f"the record does not tell viscous from dry friction: {found.viscous:.3g} N s/m viscous, "
             f"{found.coulomb:.3g} N dry, {1e3 * found.rms:.2g} mN unexplained; take one with more force or a longer one"
         )
-    return Estimate(found, None if rigid else _transmission(x, force, T, found))
+    examined = viscosity(x, force, T, found)
+    if reason := doubt(examined, found):
+        raise ValueError(reason)
+    return Estimate(found, None if rigid else _transmission(x, force, T, found), examined)
 
 
 # The transmission. The encoder is the motor's, where dry friction acts, so that the force less that friction drives a
@@ -205,8 +251,7 @@ class _Spectrum:
 
 def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmission | None:
     """The transmission that explains a record, None where there is none."""
-    dry = found.coulomb * np.tanh(np.diff(x, append=x[-1]) / T / (found.slip or _SLIP))
-    spectrum, fits = _Spectrum(x, force - dry, T), []
+    spectrum, fits = _Spectrum(x, force - dry_friction(x, T, found), T), []
     for start in spectrum.starts(found):
         robust: dict[str, Any] = {"loss": "soft_l1", "f_scale": _OUTLIER, "max_nfev": _STEPS}
         near = scipy.optimize.least_squares(spectrum.decades, start, **robust).x
@@ -256,7 +301,9 @@ def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], lis
             raise ValueError(f"{told} one at least. The two least have to agree: let go, and take more (--sittings)")
         if hands := [f"{k}" for k, e in enumerate(axis, start=1) if _more_damped(e, least)]:
             words.append(f"{told} {', '.join(hands)}, which did not count")
-        found.append(replace(least, friction=replace(least.friction, delta=min(e.delta for e in axis))))
+        slowest = min(axis, key=lambda e: e.viscosity.speed).viscosity  # no sitting's bound holds beyond its speed
+        bound = replace(least.friction, delta=min(e.delta for e in axis))
+        found.append(replace(least, friction=bound, viscosity=slowest))
     return found, words
 
 

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from haptic_loop.controller.lti import Array
 from haptic_loop.hw.friction import Friction
-from haptic_loop.hw.identify import chirp, identify
+from haptic_loop.hw.identify import Swing, chirp, identify
+from haptic_loop.sim.scenario import load as scenario_of
 
 #: what the fit of before, one mass and Coulomb friction by output error, made of these; "none" of all others
 EARLIER = {"coulomb 0.05, slip 0.02": "3.5 % above", "hand (0.01, 0.1, 20.0)": "7 to 17 % above"}
@@ -37,7 +38,11 @@ class Rig:
     step: float = 5e-6  # [m] encoder
     coulomb: float = 0.0  # [N]
     slip: float = 0.002  # [m/s]
-    static: float = 0.0  # [N] above Coulomb's, gone at 20 mm/s
+    static: float = 0.0  # [N] above Coulomb's
+    stribeck: float = 0.02  # [m/s] at which it is gone
+    thin: float = np.inf  # [m/s] at which viscous friction is down to a half
+    memory: float = 0.0  # [N s/m] dashpot of a Maxwell element
+    relax: float = 1.0  # [s] its time constant
     drag: float = 0.0  # [N s2/m2]
     bristle: float = 0.0  # [N/m] presliding (Dahl's law) in place of tanh
     constant: float = 0.0  # [N]
@@ -122,9 +127,10 @@ def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBST
     lag, late, period, turn = T * of("lag"), of("late"), of("period"), of("turn")
     cogging, eccentric = of("cogging"), of("eccentric")
     constant, drift, cable = of("constant"), of("drift"), of("cable")
+    thin, memory, relax, stribeck = of("thin"), of("memory"), of("relax"), of("stribeck")
     draw = np.random.default_rng(seed)
     origin, phase = draw.uniform(size=len(many)), draw.uniform(0, 2 * np.pi, (2, len(many)))
-    x, v, y, w, z, felt = (np.zeros(len(many)) for _ in range(6))
+    x, v, y, w, z, felt, wound = (np.zeros(len(many)) for _ in range(7))
     h, out, before = T / substeps, np.zeros((len(signal), len(many))), 0.0
     dahl = bristle > 0
     for n, force in enumerate(signal):
@@ -139,8 +145,18 @@ def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBST
             contact = np.sign(stretch) * np.maximum(np.abs(stretch) - gap / 2, 0.0)
             link = k * contact + np.where((gap == 0) | (contact != 0), d * (v - w), 0.0)
             z = np.clip(z + h * v, -c / np.maximum(bristle, 1e-9), c / np.maximum(bristle, 1e-9))
-            dry = np.where(dahl, bristle * z, np.tanh(v / slip) * (c + static * np.exp(-((v / 0.02) ** 2))))
-            total = felt + outside - link - b * v - drag * v * np.abs(v) - dry - cable * x
+            dry = np.where(dahl, bristle * z, np.tanh(v / slip) * (c + static * np.exp(-((v / stribeck) ** 2))))
+            wound = wound + h * (v - wound / relax)  # [m] of the Maxwell element's spring
+            total = (
+                felt
+                + outside
+                - link
+                - b * v / (1 + np.abs(v) / thin)
+                - memory / relax * wound
+                - drag * v * np.abs(v)
+                - dry
+                - cable * x
+            )
             total = total + cogging * np.sin(2 * np.pi * x / period + phase[1])
             v = v + h * total / m1
             w = w + h * (link - hand[:, 1] * w - hand[:, 2] * y + shake) / m2
@@ -151,7 +167,8 @@ def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBST
 
 def excitation() -> Array:
     """The command's own (ticks,) [N], in whole steps."""
-    signal = chirp(1, T, 1, 1.0, (3.0, 200.0), 2.5).signal[:, 0]
+    swing = Swing.of(scenario_of(), 0.5, 0.03)
+    signal = chirp(1, T, 1, 1.0, (3.0, 200.0), 2.5, Swing(swing.force[:1], swing.hz)).signal[:, 0]
     return FORCE_STEP * np.round(signal / FORCE_STEP)
 
 

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from haptic_loop.cli.identify import main as identify_command
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
-from haptic_loop.hw.identify import Estimate, capped, chirp, estimate, held, identify, settled
+from haptic_loop.hw.identify import Estimate, Swing, capped, chirp, estimate, held, identify, settled
 from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Operator, Session
+from haptic_loop.hw.viscosity import Viscosity
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.trace import Trace
@@ -133,6 +134,57 @@ def test_rigs_that_are_not_ideal_have_bounds(odd, name):
     assert odd[name].stiffness == pytest.approx(1.0 if name == "cable 1" else 0.0, abs=0.1)
 
 
+#: friction that is not b v at all speeds or frequencies: what it is in terms of the rig, and its least damping
+#: [N s/m] over speeds up to the record's (0.5 m/s) and over all frequencies, by its definition
+NOT_VISCOUS = {
+    **{f"thins at {v0:g} m/s": ({"thin": v0}, 1 / (1 + 0.5 / v0)) for v0 in (0.1, 0.3, 1.0)},
+    "memory of 3 ms, 20 N s/m": ({"memory": 20.0, "relax": 3e-3}, 1.0),
+    "memory of 3 ms, 2 N s/m": ({"memory": 2.0, "relax": 3e-3}, 1.0),
+    "memory of 10 ms, 1 N s/m": ({"memory": 1.0, "relax": 1e-2}, 1.0),
+    **{f"dry friction that bends at {v:g} m/s": ({"coulomb": 0.05, "slip": v}, 1.0) for v in (0.06, 0.1)},
+    **{f"Stribeck up to {v:g} m/s": ({"coulomb": 0.04, "static": 0.03, "stribeck": v}, 1.0) for v in (0.06, 0.1)},
+}
+
+
+@pytest.fixture(scope="module")
+def not_viscous():
+    """What comes of the benchmark's plant with friction that is not viscous."""
+    bench = run_path(str(Path(__file__).parents[1] / "benchmarks/odd_rigs.py"))
+    rigs, signal = [bench["Rig"](name, **more) for name, (more, _) in NOT_VISCOUS.items()], bench["excitation"]()
+    x = bench["records"](rigs, signal, substeps=8)
+    return {rig.name: bench["judged"](rig, x[:, i], signal)[0] for i, rig in enumerate(rigs)}
+
+
+@pytest.mark.parametrize("name", NOT_VISCOUS)
+def test_no_bound_exceeds_friction_that_is_not_viscous(not_viscous, name):
+    """Dry friction is left out of the truth, as of the bound: what bends with speed is viscous at no level."""
+    found, least = not_viscous[name], NOT_VISCOUS[name][1]
+    if isinstance(found, str):
+        assert re.search("energy of a stroke does not grow|damping falls with frequency", found)
+    else:
+        assert found.delta <= least
+
+
+@pytest.mark.parametrize("name", [name for name in NOT_VISCOUS if "thins" in name or "memory" in name])
+def test_thinning_and_memory_are_refused(not_viscous, name):
+    words = "energy of a stroke does not grow" if "thins" in name else "damping falls with frequency"
+    assert words in not_viscous[name]
+
+
+def test_the_swing_reaches_its_speed_within_its_travel():
+    """By the closed form of a mass with a damper under a cosine; a weak motor stays slower."""
+    scenario = load("omega-pair-rigid")
+    swing = Swing.of(scenario, 0.5, 0.03)
+    device, w = scenario.device[0], 2 * np.pi * swing.hz
+    assert 0.5 / w == pytest.approx(0.03)
+    assert swing.force[0] == pytest.approx(0.5 * np.hypot(device.damping, w * device.mass))
+    weak = scenario.replace(device=tuple(msgspec.structs.replace(d, force_limit=1.0) for d in scenario.device))
+    assert Swing.of(weak, 0.5, 0.03).force == (1.0, 1.0)
+    signal = swing.signal(scenario.T)[:, 0]
+    assert abs(signal.sum()) < 1e-9 * len(signal)  # whole cycles push nothing away
+    assert np.abs(signal).max() == pytest.approx(swing.force[0])
+
+
 @pytest.mark.parametrize("name", HANDS)
 def test_a_hand_or_finger_on_the_handle_is_found_out(odd, name):
     """Its damping, 0.1 to 3 N s/m, is not the device's; its spring says that it is there."""
@@ -141,7 +193,7 @@ def test_a_hand_or_finger_on_the_handle_is_found_out(odd, name):
 
 def sitting(odd, *names):
     """One record of as many axes."""
-    return [Estimate(odd[name], None) for name in names]
+    return [Estimate(odd[name], None, Viscosity(0.5, 0.0, 0.0, None, 0.0)) for name in names]
 
 
 def test_a_hand_that_only_damps_is_found_out_by_a_sitting_without_it(odd):
@@ -157,7 +209,7 @@ def test_a_hand_that_only_damps_is_found_out_by_a_sitting_without_it(odd):
     three = [sitting(odd, *names) for names in (("firm", "ideal"), ("ideal", "ideal"), ("late 0.3", "firm"))]
     (first, second), words = settled(three)
     assert words == [
-        "axis 1: 1.3, 1, 0.9997 N s/m in sittings 1 to 3, a hand damped it in 1, which did not count",
+        "axis 1: 1.3, 1, 0.9999 N s/m in sittings 1 to 3, a hand damped it in 1, which did not count",
         "axis 2: 1, 1, 1.3 N s/m in sittings 1 to 3, a hand damped it in 3, which did not count",
     ]
     assert (first.viscous, second.viscous) == (min(odd["ideal"].viscous, odd["late 0.3"].viscous), odd["ideal"].viscous)

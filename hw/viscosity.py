@@ -1,0 +1,181 @@
+"""Whether the damping of an axis is the same at every speed and at every frequency of a record.
+
+The bound of hw/friction.py is a statement about one number b. Friction that thins with speed (grease), or that has a
+memory (a dashpot behind a spring, a belt, a rubber mount), has no such number: it damps less at the speeds and at the
+frequencies where a session needs it. A record that shows either is refused.
+
+Speed: in a stroke, from one turning point to the next, the kinetic energy begins and ends at zero, so the work of the
+motor is dissipated: W = b S2 + c S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt, with S_n = int |v|^n dt; l is the lag
+of an amplifier. For viscous and dry friction q = 0, whatever the amplitude; where friction thins, q < 0, and at the
+speed v the damping is b + q v.
+
+Frequency: the motion that the motor's spectrum causes, with a transmission, an amplifier's lag and dry friction taken
+into account, is compared with and without a Maxwell element (c, tau) beside b. Its damping c/(1 + (w tau)^2) is in the
+record's slow strokes, and gone at high frequency, where b alone is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise, product
+
+import numpy as np
+import scipy  # its parts load when they are used
+from haptic_loop.controller.lti import Array
+from haptic_loop.hw.friction import Friction, dry_friction
+from numpy.typing import NDArray
+
+_FAST = 0.25  # part of the highest speed from which on a stroke counts: dry friction has reached its level there
+_FEW = 8  # strokes
+_SIGMAS = 2.0  # standard errors
+_TAUS = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3)  # [s] of a memory: shorter than a tick it acts as viscous friction
+_BAND_HZ = (6.0, 130.0)  # below, cables and drift act; above, an encoder of 5 um sees nothing of 1 N
+_LOUD = 0.05  # part of the strongest force in the band that a frequency must have
+_POINTS = 200  # frequencies that are compared
+_ALIASES = (-1, 0, 1)  # sampling adds what is whole multiples of 1/T away; the next are below 1e-3
+_MODES_HZ = np.geomspace(25.0, 300.0, 40)  # where a transmission's mode is looked for first
+_PARTS = (0.15, 0.3, 0.5)  # of the mass, that the motor may have
+_STEPS = 30  # of a fit
+_SURE = 30.0  # log likelihood ratio from which on a memory is not chance: 6 values of tau, some unmodelled motion
+
+
+@dataclass(frozen=True)
+class Viscosity:
+    """What a record says beyond one number."""
+
+    speed: float  # [m/s] highest speed of the record
+    thinning: float  # [N s/m] damping that is lost from slow motion to that speed; 0 where friction does not thin
+    thinning_error: float  # [N s/m] its standard error
+    lasting: float | None  # [N s/m] damping that is left at high frequency; None where no memory was found
+    memory: float  # [s] time constant of that memory
+
+
+def viscosity(x: Array, force: Array, T: float, friction: Friction) -> Viscosity:
+    """Examine displacements x (N,) [m] under forces (N,) [N] held for T [s], of an axis with this `friction`."""
+    speed, thinning, error = _thinning(x, force, T)
+    lasting, tau = _memory(x, force, T, friction)
+    return Viscosity(speed, thinning, error, lasting, tau)
+
+
+def doubt(found: Viscosity, friction: Friction) -> str | None:
+    """Why one number does not describe the damping, within the error of its bound; None where it does."""
+    error = friction.viscous - friction.delta
+    if found.thinning > _SIGMAS * found.thinning_error + error:
+        return (
+            "the energy of a stroke does not grow with the square of its speed: the damping falls by "
+            f"{found.thinning:.2g} N s/m up to {found.speed:.2g} m/s, the bound's error is {error:.2g}"
+        )
+    if found.lasting is not None and found.lasting < friction.delta:
+        return (
+            f"the damping falls with frequency, from {friction.viscous:.3g} N s/m to {found.lasting:.3g} beyond "
+            f"{1 / (2 * np.pi * found.memory):.2g} Hz: friction with a memory has no viscous bound"
+        )
+    return None
+
+
+# speed
+
+
+def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
+    """Highest speed [m/s], the damping that is lost up to it, at least 0, and its standard error [N s/m]."""
+    n = max(3, round(6e-3 / T) | 1)  # a cubic over 6 ms: its error in a stroke of 3 Hz is far below an encoder's count
+    smooth = scipy.signal.savgol_filter(x, n + 2, 3)
+    v = scipy.signal.savgol_filter(x, n + 2, 3, deriv=1, delta=T)
+    top = float(np.percentile(np.abs(v), 99.5))
+    turns = np.flatnonzero(np.signbit(v[1:]) != np.signbit(v[:-1])) + 1
+    rows = []
+    for begin, end in pairwise(turns):
+        part = slice(begin, end + 1)
+        if np.abs(v[part]).max() < _FAST * top or end - begin < 2 * n:
+            continue
+        moments = [np.trapezoid(np.abs(v[part]) ** k, dx=T) for k in (1, 2, 3)]
+        steps, rise = np.diff(smooth[begin : end + 1]), (force[begin:end] - force[begin - 1 : end - 1]) / T
+        work, lag, ends = float(force[begin:end] @ steps), float(rise @ steps), (smooth[begin], smooth[end])
+        rows.append((work, *moments, ends[1] - ends[0], (ends[1] ** 2 - ends[0] ** 2) / 2, lag))
+    if len(rows) < _FEW:
+        return top, 0.0, np.inf
+    work, *columns = np.array(rows).T
+    A = np.stack(columns, axis=1)
+    scale = np.linalg.norm(A, axis=0)
+    weight = 1 / np.sqrt(columns[1])  # the error of a stroke's work grows with the stroke
+
+    def cubic(keep: NDArray[np.bool_]) -> float:
+        """The coefficient q of S3."""
+        w = weight[keep]
+        return float(np.linalg.lstsq(A[keep] / scale * w[:, None], work[keep] * w, rcond=None)[0][2] / scale[2])
+
+    everything = np.ones(len(work), dtype=bool)
+    group = np.arange(len(work)) % min(10, len(work) // 2)
+    others = np.array([cubic(group != g) for g in range(group.max() + 1)])
+    error = np.sqrt((len(others) - 1) / len(others) * np.sum((others - others.mean()) ** 2))
+    return top, max(0.0, -cubic(everything) * top), float(error * top)
+
+
+# frequency
+
+
+class _Spectra:
+    """The spectrum of a motion, and of what a model makes of the force's."""
+
+    def __init__(self, x: Array, force: Array, T: float) -> None:
+        F, hz = np.fft.rfft(force), np.fft.rfftfreq(len(x), T)
+        steps = np.fft.rfft(np.diff(x, append=x[-1]))
+        heard = (hz > _BAND_HZ[0]) & (hz < min(_BAND_HZ[1], 0.35 / T))
+        heard &= np.abs(F) > _LOUD * np.abs(F[heard]).max()
+        chosen = np.flatnonzero(heard)
+        chosen = chosen[:: max(1, len(chosen) // _POINTS)]
+        w = 2 * np.pi * hz[chosen]
+        self.force, self.motion = F[chosen], steps[chosen] / (np.exp(1j * w * T) - 1)
+        self._s = 1j * (w + 2 * np.pi / T * np.array(_ALIASES)[:, None])
+        self._hold = -np.expm1(-self._s * T) / (self._s * T)
+
+    def model(self, p: Array, tau: float) -> NDArray[np.complex128]:
+        """The motion by p = [log m1, log m2, log k, log d, b, lag, delay, c] and a memory of `tau` [s]."""
+        (m1, m2, k, d), (b, lag, late, c), s = np.exp(p[:4]), p[4:], self._s
+        handle = m2 * s * (k + d * s) / (m2 * s * s + d * s + k)
+        impedance = m1 * s + b + c / (1 + tau * s) + handle
+        return (self._hold * np.exp(-s * late) / (1 + lag * s) / (s * impedance)).sum(axis=0) * self.force
+
+    def error(self, p: Array, tau: float) -> Array:
+        """Motion less model: real and imaginary parts."""
+        error = self.motion - self.model(p, tau)
+        return np.concatenate([error.real, error.imag]) / np.abs(self.motion).max()
+
+    def starts(self, friction: Friction) -> list[Array]:
+        """Parameters to begin with: the two splits of the mass that explain the spectrum's size best."""
+        tried = []
+        for hz, part in product(_MODES_HZ, _PARTS):
+            m1, m2 = part * friction.mass, (1 - part) * friction.mass
+            k = (2 * np.pi * hz) ** 2 * m1 * m2 / friction.mass
+            p = np.array([*np.log([m1, m2, k, 0.02 * np.sqrt(k * m2)]), max(friction.viscous, 1e-3), 1e-5, 1e-5, 0.0])
+            size = np.log(np.abs(self.model(p, 1.0)) + 1e-15) - np.log(np.abs(self.motion) + 1e-15)
+            tried.append((float(np.abs(size).mean()), len(tried), p))
+        return [p for *_, p in sorted(tried)[:2]]
+
+
+def _memory(x: Array, force: Array, T: float, friction: Friction) -> tuple[float | None, float]:
+    """The damping [N s/m] beside the memory that explains a record best, and its time constant; None without one."""
+    spectra = _Spectra(x, force - dry_friction(x, T, friction), T)
+    low = np.array([-20.0] * 4 + [0.0] * 4)
+    high = np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T, np.inf])
+
+    def fitted(start: Array, tau: float, memory: bool) -> tuple[float, Array]:
+        most = high.copy()
+        most[7] = np.inf if memory else 1e-12
+        begin = np.clip(start, low + 1e-13, most - 1e-13)
+        fit = scipy.optimize.least_squares(
+            spectra.error, begin, bounds=(low, most), x_scale="jac", args=(tau,), max_nfev=_STEPS
+        )
+        return float(2 * fit.cost), fit.x
+
+    plain, p = min((fitted(start, 1.0, False) for start in spectra.starts(friction)), key=lambda fit: fit[0])
+    best, tau, q = plain, 0.0, p
+    for candidate in _TAUS:
+        start = p.copy()
+        start[4], start[7] = p[4] / 2, p[4] / 2
+        squares, parameters = fitted(start, candidate, True)
+        if squares < best:
+            best, tau, q = squares, candidate, parameters
+    if len(spectra.force) * np.log(plain / best) < _SURE:
+        return None, 0.0
+    return float(q[4]), tau
