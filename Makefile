@@ -3,7 +3,7 @@
 # make check  lint and the tests of what your change touches, under a minute
 # make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
-# make validate  every check that a verdict rests on: a report in out/validate/report.md, and the slow pages: half an hour
+# make validate  every check that a verdict rests on, and the slow pages: half an hour
 # make mutate  small mistakes in what verdicts rest on, and whether a test notices: about ten minutes
 # make kernels  the numerical tests under every kernel of OpenBLAS that this processor runs, and a table: an hour
 # make oldest  the tests of models, blocks and files with the oldest packages that pyproject.toml allows, in .venv-oldest
@@ -30,7 +30,7 @@ check: .venv/ready build/typed
 	$(PY) -m pytest -rs $(PARALLEL) $$($(PY) tests/touched.py)
 
 validate: .venv/ready
-	$(PY) -m sim.suite --out out/validate
+	$(PY) -m pytest -m validate tests/checks
 	$(PY) tests/cli/hostile.py --signals
 	$(PY) docs/regenerate.py --check
 	$(MAKE) installed
@@ -57,15 +57,15 @@ coverage: .venv/ready
 
 figures: .venv/ready
 	$(PY) -m sim.run --case none --out out/figure-5
-	$(PY) -m sim.run --case I --condition any-environment --side-by-side --out out/figure-6
-	cp out/figure-6/couplings.png docs/pictures/side-by-side.png
+	$(PY) -m sim.run --case I --condition any-environment --out out/figure-6
+	$(PY) -m design.compare --out out/compare
+	cp out/compare/couplings.png docs/pictures/side-by-side.png
 	cp out/figure-5/figure.png docs/pictures/figure-5.png
 	cp out/figure-6/figure.png docs/pictures/figure-6.png
 	$(PY) -m design.compare --coupling published,spring-damper:any-environment,spring-damper --out out/couplings
 	for name in required-damping perceived singular-values; do cp out/couplings/$$name.png docs/pictures/; done
 	$(PY) -m sim.view --case I --video docs/pictures/view.gif --fps 5
-	$(PY) -m design.compare --over --out out/limits
-	cp out/limits/limits.png docs/pictures/limits.png
+	cd docs/pictures && ../../$(PY) ../../examples/limits_of_any_coupling.py
 	$(PY) -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0 --out out/zwidth || test $$? -eq 1 # 1: not certified
 	cp out/zwidth/zwidth.png docs/pictures/zwidth.png
 	$(PY) -m sim.zwidth --coupling optimal --out out/zwidth-optimal

@@ -1,32 +1,29 @@
-"""python -m design.compare: couplings over frequency, every design as a ladder, and the limits of any coupling.
+"""python -m design.compare: the same devices and hands with every coupling, or couplings over frequency.
 
-Without --over and --ladder the couplings of --coupling are drawn: singular values, required damping, perceived
-stiffness and damping. --ladder designs what the project can design, for cases I and II. --over designs the optimal
-coupling along an axis of the loop, which shows how good any coupling could be with another device, delay or period.
+Without --coupling every coupling that is possible in the loop drives the scenario's own hands: one row each, and their
+forces side by side in couplings.png. The couplings of --coupling are drawn over frequency: singular values, required
+damping, perceived stiffness and damping.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from haptic_loop.cli import options, render
-from haptic_loop.cli.design import add_optimal_options, asked_of
-from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
-from haptic_loop.design import compare
-from haptic_loop.design.compare import AXES, FEEL_HZ, LADDERS, LadderRow, Limit, Point, points_along
+from haptic_loop.design.compare import FEEL_HZ
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.program import Options
 from haptic_loop.design.result import CONDITIONS, Chosen, DesignFailed, finite
 from haptic_loop.design.robustness import Nearby, Robustness
-from haptic_loop.sim import baselines
-from haptic_loop.sim.compare_report import ComparedCoupling, Comparison, ConditionCurve, Here, LimitCurves, nearby
+from haptic_loop.sim.alternatives import Alternative, alternatives
+from haptic_loop.sim.compare_report import ComparedCoupling, Comparison, ConditionCurve
 from haptic_loop.sim.couplings import NAMES, choose
 from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.stability import MARGINAL
 from rich.table import Table
 
 _MOST = 6  # curves that can be told apart in one panel
@@ -34,67 +31,88 @@ _MOST = 6  # curves that can be told apart in one panel
 
 def main(argv: list[str]) -> int:
     """Compare. 0: done, 1: something could not be designed, 130: interrupted, with what was done until then."""
-    parser = _parser()
-    args = parser.parse_args(argv)
+    args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
-    _check_mode(args, parser)
-    if args.baselines:
-        return _baselines(args, scenario)
-    if args.ladder:
-        return _ladder(args, scenario)
-    return _limits(args, scenario) if args.over else _couplings(args, scenario)
+    return _couplings(args, scenario) if args.coupling else _alternatives(args, scenario)
 
 
 def _parser() -> options.Parser:
-    example = """python -m design.compare --coupling published,spring-damper:any-environment,optimal
-  python -m design.compare --ladder
-  python -m design.compare --baselines
-  python -m design.compare --over damping=0.7:10,delay --points 5"""
-    what = "Compare couplings over frequency, all designs as a ladder, or the best coupling along an axis of the loop."
+    example = """python -m design.compare
+  python -m design.compare --coupling published,spring-damper:any-environment,optimal"""
+    what = "Run the same devices and hands with every coupling, or compare the couplings of --coupling over frequency."
     parser = options.Parser("design.compare", what, example)
     parser.add_loop()
     given = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION asks for a condition"
-    parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"{given} (default none,spring-damper)")
-    parser.add_condition("of designs that name none")
-    short = "every design side by side, cases I and II (full: minutes)"
-    parser.add_argument("--ladder", nargs="?", const="short", choices=tuple(LADDERS), help=short)
-    classics = "on the same runs: no coupling, the classics (PO/PC, energy bounding), the energy budget, our designs"
-    parser.add_argument("--baselines", action="store_true", help=classics)
-    axes, names = ",".join(AXES), "damping, delay, period, order"
-    parser.add_limiter("with --baselines clip the forces of our designs")
-    over = f"the best coupling along these axes: {names} (default: all of them)"
-    parser.add_argument("--over", nargs="?", const=axes, metavar="NAME[=LOW:HIGH],..", help=over)
-    curve = parser.add_argument_group("with --over")
-    curve.add_argument(
-        "--points", type=options.whole(1, 100), default=6, metavar="N", help="designs of each (default 6)"
-    )
-    curve.add_argument("--keep", choices=("samples", "seconds"), default="samples", help="delays, as the period varies")
-    beside = "spring-dampers drawn: none, any-environment, this-environment or both (default both)"
-    curve.add_argument("--beside", type=_beside, default=tuple(CONDITIONS), metavar="NAME", help=beside)
-    add_optimal_options(parser, "the optimal coupling of --over")
+    parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"over frequency: {given}")
+    parser.add_condition("of designs that name none; one of your own judges all couplings")
     parser.add_output(picture=True)
-    plain = "without --over, --ladder and --baselines"
-    parser.only(plain, lambda args: not (args.over or args.ladder or args.baselines), "coupling", "condition")
-    parser.only("without --ladder, which has no picture", lambda args: not args.ladder, "no_plot")
-    parser.only("with --baselines", lambda args: args.baselines, "limiter")
-    optimal = ("objective", "band_hz", "high_gain", "seconds")
-    parser.only("with --over", lambda args: args.over, "points", "keep", "beside", *optimal)
     return parser
 
 
-def _beside(text: str) -> tuple[str, ...]:
-    return {"none": (), "both": tuple(CONDITIONS)}[text] if text in ("none", "both") else (options.condition(text),)
+# ----------------------------------------------------------------------------------------------------
+# Every coupling with the same devices and hands.
 
 
-def _check_mode(args: argparse.Namespace, parser: options.Parser) -> None:
-    """Raises InputError where two comparisons are asked for, or a case that this one does not have."""
-    asked = [f"--{name}" for name in ("over", "ladder", "baselines") if getattr(args, name)]
-    if len(asked) > 1:
-        raise InputError(f"{' with '.join(asked)}: give one of them")
-    if args.ladder and args.case != parser.get_default("case"):
-        raise InputError(f"--ladder shows both cases: leave out --case {args.case}")
-    if asked and args.case == "none":
-        raise InputError("--case none has no coupling to design: give I or II")
+@dataclass(frozen=True)
+class _Alternatives:
+    """What every coupling costs and gives the same devices and hands."""
+
+    scenario: str
+    case: str
+    alternatives: list[Alternative]
+
+
+def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
+    if isinstance(args.condition, str):
+        raise InputError("--condition is for the designs of --coupling; without it every coupling is a row")
+    out = options.out_folder(args, "compare")
+    with render.progress("running every coupling") as move:
+        made = alternatives(scenario, args.case, move, args.condition)
+    files = []
+    if not args.no_plot and any(each.trace is not None for each in made):
+        files.append(_side_by_side(made, out / "couplings.png", scenario.environment.contacts))
+    report = _Alternatives(scenario.name, args.case, made)
+    render.publish(args, report, [_beside(made, args.condition)], (), out, files)
+    return options.exit_code(True)
+
+
+def _beside(made: Sequence[Alternative], own: Condition | None) -> Table:
+    names, cells = [*CONDITIONS, *([own.name] if own else [])], []
+    for each in made:
+        if each.reason:
+            cells.append((each.name, *[""] * len(names), f"not possible: {each.reason}", "", ""))
+            continue
+        needs = (_share(each.needs(condition), "never") for condition in names)
+        grows = each.growth_rate_per_s is None or each.growth_rate_per_s > MARGINAL
+        error = "grows" if grows else render.optional(each.force_error_percent, "{:.3g} %")
+        cells.append((each.name, *needs, each.guarantee or "none", _share(each.dc_ratio, "-"), error))
+    heads = ("coupling", *map(render.short, names), "guarantee", "stiffness", "error")
+    title = "required damping in % of the devices', guarantee,\nrendered stiffness and force error"
+    return render.grid(title, heads, cells, left=(0, heads.index("guarantee")))
+
+
+def _side_by_side(made: Sequence[Alternative], path: Path, names: tuple[str, ...]) -> Path:
+    from haptic_loop.sim.plots import Panel, plot_side_by_side
+
+    panels = [
+        Panel(_panel_title(each), each.trace, each.ideal, each.until_s)
+        for each in made
+        if each.trace is not None and each.ideal is not None and each.coupling != "published"
+    ]
+    return plot_side_by_side(panels, path, names)
+
+
+def _panel_title(each: Alternative) -> str:
+    kind = ", spring-damper" if each.coupling == "spring-damper" else ""
+    guarantee = f"guarantee: {each.guarantee}" if each.guarantee else "no guarantee"
+    felt = f"grows: {render.optional(each.growth_rate_per_s, '{:+.2f} 1/s')}"
+    if each.force_error_percent is not None:
+        felt = f"force error {each.force_error_percent:.2g} %"
+    return f"{'no coupling' if each.coupling == 'none' else each.name + kind}\n{felt}; {guarantee}"
+
+
+def _share(value: float | None, absent: str) -> str:
+    return absent if value is None else f"{100 * value:.3g} %" if value < 10 else f"{100 * value:.0f} %"
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -102,9 +120,8 @@ def _check_mode(args: argparse.Namespace, parser: options.Parser) -> None:
 
 
 def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
-    names = args.coupling or (("none",) if args.case == "none" else ("none", "spring-damper"))
     out = options.out_folder(args, "compare")
-    chosen, failed = _chosen(scenario, args, names)
+    chosen, failed = _chosen(scenario, args, args.coupling)
     report = Comparison.of(scenario, args.case, chosen, failed, args.seed)
     files = render.pictures(args, report, out, _PICTURES)
     prices = [line for c in report.couplings for line in _price(c.name, c.nearby)]
@@ -222,165 +239,3 @@ def _list(values: Iterable[float]) -> str:
     """The values with commas between them; a single one where all are equal."""
     shown = [format(v, ".0f" if abs(v) >= 1000 else ".3g") for v in values]
     return shown[0] if len(set(shown)) == 1 else ", ".join(shown)
-
-
-# ----------------------------------------------------------------------------------------------------
-# Every design as a ladder.
-
-
-@dataclass(frozen=True)
-class _Ladder:
-    """Every design side by side, for both cases."""
-
-    scenario: str
-    seed: int
-    rows: Sequence[LadderRow]
-    wall_s: float
-    interrupted: bool
-
-
-def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
-    out, begin = options.out_folder(args, "compare"), time.perf_counter()
-    called = {case: f"case {case}" for case in ("I", "II")}
-    if scenario.lam is not None:  # both cases are the same loop then
-        called = {"I": f"lam {', '.join(map(str, scenario.lam))}"}
-    loops = {case: scenario.loop(case) for case in called}
-    with render.progress("designing") as move:
-        rows, interrupted = options.until_interrupted(
-            compare.compare_designs(loops, LADDERS[args.ladder], move, nearby)
-        )
-    report = _Ladder(scenario.name, args.seed, rows, time.perf_counter() - begin, interrupted)
-    shown = []
-    for case in loops:
-        some = [row for row in rows if row.case == case]
-        shown.append(render.columns(f"the ladder · {scenario.name}, {called[case]}", _LADDER, some, left=(0, 5)))
-    lines = [f"{row.design}, {called[row.case]}: {row.reason}" for row in rows if row.reason]
-    lines += [line for row in rows for line in _price(f"{row.design}, {called[row.case]}", row.nearby)]
-    render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out)
-    return options.exit_code(True, interrupted)
-
-
-#: what stands in a column, given a row; a bound has no damping and only an rms error, a failed design neither
-_LADDER: dict[str, str | Callable[[LadderRow], str]] = {
-    "design": "{r.design}",
-    "needs N s/m": lambda r: (
-        "-" if r.required_damping is None else f"{max(r.required_damping):.4f}" + ("" if r.certified else " (no)")
-    ),
-    "x, 10 %": lambda r: _robust(r.nearby.robustness),
-    "sup dB": lambda r: (
-        "-" if r.required_damping is None else render.optional(r.relative_mismatch_db, "{:.2f}", "exact")
-    ),
-    "rms dB": lambda r: (
-        "-" if r.required_damping is None and r.reason else render.optional(r.rms_mismatch_db, "{:.2f}", "exact")
-    ),
-    "proof": lambda r: r.proof or "-",
-    "s": "{r.wall_s:.2f}",
-}
-
-
-# ----------------------------------------------------------------------------------------------------
-# The classics beside ours.
-
-
-def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
-    with render.progress("comparing") as move:
-        all_of_them = baselines.rivals(scenario, args.case, move, args.limiter)
-        out, begin = options.out_folder(args, "compare"), time.perf_counter()
-        rows, interrupted = options.until_interrupted(all_of_them)
-    report = baselines.Baselines(scenario.name, args.case, args.seed, rows, time.perf_counter() - begin, interrupted)
-    files = render.pictures(args, report, out, {"baselines.png": "plot_baselines"} if rows else {})
-    shown = [render.columns(f"on the same runs · {scenario.title(args.case)}", _RIVALS, rows, left=(0, 7))]
-    lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
-    began = f"{baselines.SLOW:g} m/s they began with"
-    lines.append(f"hands: of {baselines.PAIRS} lossless pairs, faster after {baselines.SECONDS:g} s than the {began}.")
-    lines += sorted({f"error: {row.reason}." for row in rows if row.reason})
-    render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out, files)
-    return options.exit_code(True, interrupted)
-
-
-_RIVALS: dict[str, str | Callable[[baselines.Rival], str]] = {
-    "": lambda r: f"{r.name}{' *' if r.baseline else ''}",
-    "error %": lambda r: render.optional(r.error_percent, "{:.2f}"),
-    "> 40 Hz N": "{r.fast_n:.3f}",
-    "peak N": "{r.peak_n:.1f}",
-    "acted %": "{r.acted_percent:.0f}",
-    "hands": "{r.moving}",
-    "m/s": "{r.fastest_m_s:.3f}",
-    "guarantee": lambda r: "energy" if r.name == "energy budget" else r.guarantee or "none",
-}
-
-
-# ----------------------------------------------------------------------------------------------------
-# The limits of any coupling along an axis.
-
-
-def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
-    loop = scenario.loop(args.case)
-    if min(loop.delta) <= 0:
-        raise InputError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
-    with options.refused(args=args):
-        asked = Options(**asked_of(args, "optimal"))
-    plan, out = _plan(args, loop, asked), options.out_folder(args, "compare")
-    begin = time.perf_counter()
-    with render.progress("designing") as move:
-        sweeps, interrupted = compare.limits(plan, args.beside, move)
-    here = Here(loop.delta, loop.theta, loop.psi, loop.T)
-    about = scenario.name, args.seed, args.case, asked.objective, args.keep, asked, here
-    wall, gains = time.perf_counter() - begin, compare.gains(plan, sweeps, loop, asked)
-    report = LimitCurves(*about, sweeps, gains, wall, interrupted)
-    points = [(name, row) for name, sweep in sweeps.items() for row in sweep.curves["optimal"]]
-    files = render.pictures(args, report, out, {"limits.png": "plot_limits"} if points else {})
-    names = " and by ".join(args.beside)
-    lines = [f"beside the optimum: the designed spring-damper by {names}"] if names else []
-    lines += [f"{name} {row.value:.4g}: {row.reason}" for name, row in points if row.reason]
-    tables = [_limit_table(report, name, args.beside) for name in sweeps]
-    render.publish(args, report, tables, [*lines, *gains, f"{wall:.1f} s"], out, files)
-    return options.exit_code(any(row.rms_mismatch_db is not None for _, row in points), interrupted)
-
-
-def _plan(args: argparse.Namespace, loop: Loop, asked: Options) -> dict[str, list[Point]]:
-    """The points of every sweep that is asked for. Raises InputError."""
-    plan = {}
-    for part in args.over.split(","):
-        name, given, text = part.partition("=")
-        if name not in AXES:
-            raise InputError(f"--over has {name!r}, allowed are {', '.join(AXES)}")
-        low, colon, high = text.partition(":")
-        if given and not colon:
-            raise InputError(f"--over {part}: expected LOW:HIGH in {AXES[name].unit}")
-        ends = (options.numbers(f"--over {name}", end, float, 1)[0] for end in (low, high))
-        span = (next(ends), next(ends)) if given else None
-        with options.refused(f"--over {part}: "):
-            plan[name] = points_along(name, loop, asked, args.points, span, args.keep)
-    return plan
-
-
-def _limit_table(report: LimitCurves, name: str, beside: Sequence[str]) -> Table:
-    sweep, designs = report.sweeps[name], ("optimal", *beside)
-    rows = []
-    for i, row in enumerate(sweep.curves["optimal"]):
-        limits = {design: sweep.curves[design][i] if i < len(sweep.curves[design]) else None for design in designs}
-        errors = [_error(limit, report.objective) for limit in limits.values()]
-        theta = ",".join(map(str, row.theta))
-        rows.append((f"{row.value:.4g}", theta, *errors, _proofs(limits), f"{row.wall_s:.1f}"))
-    title = f"{report.objective} transparency error over {name} · {report.scenario}, case {report.case}"
-    heads = (sweep.unit, "theta", "optimal", *beside, "proof", "seconds")
-    return render.grid(title, heads, rows, left=(1,))
-
-
-def _error(limit: Limit | None, objective: str) -> str:
-    if limit is None:
-        return ""
-    value = limit.rms_mismatch_db if objective == "rms" else limit.relative_mismatch_db
-    if value is None:
-        return "exact" if limit.proof else "infeasible"
-    return compare.printed_decibels(value)
-
-
-def _proofs(limits: dict[str, Limit | None]) -> str:
-    """'rational' where every design of a row is proved exactly, else the names of those that are only sampled."""
-    found = {name: limit.proof for name, limit in limits.items() if limit and limit.proof}
-    sampled = [name for name, proof in found.items() if proof != "rational"]
-    if not found:
-        return "-"
-    return f"sampled: {', '.join(sampled)}" if sampled else "rational"

@@ -18,21 +18,20 @@ from haptic_loop.design.certificate import named
 from haptic_loop.design.files import write
 from haptic_loop.design.guarantees import ANY
 from haptic_loop.design.optimal import nearby
-from haptic_loop.design.result import CONDITIONS, Chosen, finite, listed
+from haptic_loop.design.result import finite, listed
 from haptic_loop.design.robustness import Nearby
 from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim import accuracy
-from haptic_loop.sim import passivity_layer as layer
 from haptic_loop.sim.accuracy import MOST
-from haptic_loop.sim.alternatives import Alternative, alternatives
 from haptic_loop.sim.api import ScenarioRun, run_scenario
-from haptic_loop.sim.couplings import NAMES, Judged, choose
+from haptic_loop.sim.couplings import NAMES, Judged
 from haptic_loop.sim.engines import INTEGRATORS
-from haptic_loop.sim.passivity_layer import BaselineFigures
+from haptic_loop.sim.passivity_layer import EnergyNet
+from haptic_loop.sim.report import PaperRow, beside_the_paper
 from haptic_loop.sim.run import ENGINES, AnyEngine, EngineSettings
 from haptic_loop.sim.run_report import Ran, RunReport, run_report
 from haptic_loop.sim.scenario import InputError, Scenario
-from haptic_loop.sim.stability import MARGINAL, ExactVerdict
+from haptic_loop.sim.stability import ExactVerdict
 
 
 def main(argv: list[str]) -> int:
@@ -43,15 +42,14 @@ def main(argv: list[str]) -> int:
         raise InputError("--error chooses integrator and substeps of MuJoCo: give no other --engine, --integrator, ..")
     scenario, out = _scenario(args), options.out_folder(args, "run")
     environment, simulated = _environment(args, scenario)
-    chosen = _chosen(args, scenario)  # V, Q or R
+    chosen = chosen_by(args, scenario)  # V, Q or R
     judged = judge(args, scenario, chosen, simulated)  # what each condition asks of the devices, and what is proved
     done = _run(args, simulated, judged, engine)  # sample, compute, limit, hold, advance
-    others, nearby = _alternatives(args, scenario, done, judged), _nearby(scenario.loop(args.case), judged)
     report = run_report(scenario, args.case, judged, done, environment, args.band_hz or BAND_HZ, args.cross_check)
-    report = replace(report, alternatives=others, nearby=nearby)
+    report = replace(report, nearby=_nearby(scenario.loop(args.case), judged))
+    if args.paper:
+        report = replace(report, paper=_paper(args, simulated, report))
     files = _save(args, out, done, report)
-    if args.side_by_side:
-        files.append(_side_by_side(others, out / "couplings.png", scenario.environment.contacts))
     render.publish(args, report, _tables(scenario, report), report.remarks, out, files)
     return options.exit_code(True, done.trace.interrupted)
 
@@ -63,7 +61,7 @@ def _parser() -> options.Parser:
     add = parser.add_argument
     parser.add_loop()
     parser.add_varying_delays()
-    parser.add_coupling(f"{', '.join(NAMES)}, as baselines {', '.join(layer.BASELINES)}")
+    parser.add_coupling(", ".join(NAMES))
     parser.add_energy_budget()
     engines = "mujoco (default), exact, or package.module:Class of your own"
     add("--engine", default="mujoco", metavar="NAME|MODULE:CLASS", help=engines)
@@ -82,20 +80,8 @@ def _parser() -> options.Parser:
     vertex = "simulate at this vertex of the scenario's ranges (default 0: nominal)"
     add("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
     parser.add_output(picture=True)
-    beside = parser.add_argument_group("the same devices and hands with other couplings")
-    beside.add_argument("--no-alternatives", action="store_true", help="no table of them, which takes a second or two")
-    beside.add_argument("--side-by-side", action="store_true", help="draw their forces, too, as couplings.png")
+    add("--paper", action="store_true", help="a table of the figures that the paper prints, beside those of this run")
     return parser
-
-
-def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
-    """The coupling that was asked for. A baseline has none, and a note names its authors. Raises InputError."""
-    if args.coupling not in layer.BASELINES:
-        return chosen_by(args, scenario)
-    if args.energy_budget:
-        raise InputError(f"--energy-budget with --coupling {args.coupling}: give one of them")
-    note = f"baseline, without a guarantee here: {layer.BASELINES[args.coupling]}; no coupling besides."
-    return replace(choose(scenario, args.case, "none", args.condition), kind=args.coupling, notes=(note,))
 
 
 def _scenario(args: argparse.Namespace) -> Scenario:
@@ -121,48 +107,19 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
 
 def _run(args: argparse.Namespace, scenario: Scenario, judged: Judged, engine: AnyEngine) -> ScenarioRun:
     """Close the loop as the options say. Raises InputError for settings that cannot be."""
-    net: layer.Wanted | None = None
-    if args.coupling in layer.BASELINES:
-        net = layer.Classic(args.coupling)
-    elif args.energy_budget:
-        net = layer.EnergyNet(*args.energy_budget)
+    net = EnergyNet(*args.energy_budget) if args.energy_budget else None
     settings = EngineSettings(engine, args.integrator, args.substeps, args.error)
     coupling, lag = judged.chosen.coupling, judged.limiter.rho
     with render.progress("simulating") as move:
         return run_scenario(scenario, coupling, lag, settings, args.seed, net, move)
 
 
-def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun, judged: Judged) -> list[Alternative]:
-    """The run repeated with other couplings. Raises InputError where --side-by-side would have nothing to draw."""
-    skipped = args.no_alternatives or run.trace.interrupted or args.vertex > 0
-    same = args.limiter is None and not scenario.ranges and args.case != "none"
-    with render.progress("other couplings") as move:
-        made = []
-        if not skipped:
-            made = alternatives(scenario, args.case, move, judged if same else None, judged.chosen.own)
-    if args.side_by_side and not any(other.trace is not None for other in made):
-        raise InputError("--side-by-side is for runs without walls, friction, varying delays and --no-alternatives")
-    return made
-
-
-def _side_by_side(others: list[Alternative], path: Path, names: tuple[str, ...]) -> Path:
-    from haptic_loop.sim.plots import Panel, plot_side_by_side
-
-    panels = [
-        Panel(_panel_title(other), other.trace, other.ideal, other.until_s)
-        for other in others
-        if other.trace is not None and other.ideal is not None and other.coupling != "published"
-    ]
-    return plot_side_by_side(panels, path, names)
-
-
-def _panel_title(other: Alternative) -> str:
-    kind = ", spring-damper" if other.coupling == "spring-damper" else ""
-    guarantee = f"guarantee: {other.guarantee}" if other.guarantee else "no guarantee"
-    felt = f"grows: {render.optional(other.growth_rate_per_s, '{:+.2f} 1/s')}"
-    if other.force_error_percent is not None:
-        felt = f"force error {other.force_error_percent:.2g} %"
-    return f"{'no coupling' if other.coupling == 'none' else other.name + kind}\n{felt}; {guarantee}"
+def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> tuple[PaperRow, ...]:
+    """The figures of the paper beside those of this run. Raises InputError for a loop that is not the paper's."""
+    rows = beside_the_paper(scenario, args.case, report.stability, report.judged.coupling)
+    if not rows:
+        raise InputError("--paper: the paper prints figures of its own two cases only; leave the loop as it is")
+    return rows
 
 
 def _nearby(loop: Loop, judged: Judged) -> Nearby:
@@ -231,11 +188,9 @@ def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
     shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(report)])]
     if report.run.engines:
         shown.append(_speed_against_error(report.run, report.run.engines))
-    if report.alternatives:
-        shown.append(_beside(report))
-    if report.reproducibility:
+    if report.paper:
         cells = {"": "{r.what}", "paper": "{r.paper}", "here": "{r.here}", "why": "{r.why}"}
-        shown.append(render.columns("beside the paper", cells, report.reproducibility, range(4)))
+        shown.append(render.columns("beside the paper", cells, report.paper, range(4)))
     return shown
 
 
@@ -261,7 +216,7 @@ def _rows(report: RunReport) -> render.Rows:
     apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
     yield "force error", f"{apart}, before the force limits" if apart else f"- ({report.ideal_force.reason})"
     yield "rendered stiffness", f"{100 * ratio:.1f} %" if ratio else "-"
-    yield from _net_rows(report.energy_budget, report.baseline)
+    yield from _net_rows(report.energy_budget)
     yield "growth, eigenvalues", _growth(stability)
     yield f"growth, {how}", f"{measured}: {render.verdict(stability.verdict)}"
     yield render.timing_row(run.timing)
@@ -298,32 +253,6 @@ def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> 
     return render.columns(title, cells, engines)
 
 
-def _beside(report: RunReport) -> Any:
-    """A table of other couplings; the one of this run is marked."""
-    own = report.judged.coupling.kind, report.certificate.condition
-    names = [*CONDITIONS, *([own[1]] if own[1] not in CONDITIONS else [])]
-    cells = []
-    for other in report.alternatives:
-        if other.reason:
-            cells.append((other.name, *[""] * len(names), f"not possible: {other.reason}", "", ""))
-            continue
-        same = own == (other.coupling, other.condition) or own[0] == other.coupling != "spring-damper"
-        needs = (_share(other.needs(condition), "never") for condition in names)
-        grows = other.growth_rate_per_s is None or other.growth_rate_per_s > MARGINAL
-        error = "grows" if grows else render.optional(other.force_error_percent, "{:.3g} %")
-        felt = _share(other.dc_ratio, "-")
-        cells.append((other.name + "*" * same, *needs, other.guarantee or "none", felt, error))
-    heads = ("coupling", *map(render.short, names), "guarantee", "stiffness", "error")
-    marked = " (*: this run)" if any(cell[0].endswith("*") for cell in cells) else ""
-    title = f"the same devices with other couplings{marked}: required damping\nin % of theirs"
-    what = f"{title}, guarantee, rendered stiffness and force error"
-    return render.grid(what, heads, cells, left=(0, heads.index("guarantee")))
-
-
-def _share(value: float | None, absent: str) -> str:
-    return absent if value is None else f"{100 * value:.3g} %" if value < 10 else f"{100 * value:.0f} %"
-
-
 def _crossed(other: accuracy.CrossCheck) -> str:
     apart = render.optional(finite(other.position_relative_rms), "{:.1e} relative rms apart")
     growth = f"its loop grows {other.growth_rate_difference_per_s:+.1e} 1/s otherwise"
@@ -331,10 +260,7 @@ def _crossed(other: accuracy.CrossCheck) -> str:
     return f"{other.integrator} x {other.substeps}: {apart}, {growth}: {verdict}"
 
 
-def _net_rows(budget: BudgetFigures | None, baseline: BaselineFigures | None) -> render.Rows:
-    if baseline:
-        acted = f"acted in {baseline.limited_ticks} of {baseline.ticks} ticks"
-        yield "baseline", f"{baseline.name}, {acted}; no guarantee"
+def _net_rows(budget: BudgetFigures | None) -> render.Rows:
     if budget:
         why = f" ({budget.idle})" if budget.idle else ""
         yield "energy budget", f"limited {budget.limited_ticks} of {budget.ticks} ticks{why}"

@@ -324,56 +324,6 @@ class Shell(_Net):
         return scale
 
 
-class PassivityControl(_Acting):
-    """Passivity observer and series passivity controller at the devices: a baseline, without a guarantee here.
-
-    After Hannaford & Ryu, *Time-domain passivity control of haptic interfaces*, IEEE Trans. Robotics and Automation
-    18 (2002) 1-10, for the impedance causality: the observer adds up f dx of the newest force and the displacement
-    just measured, and where the sum E is negative a damper alpha = -E T/dx^2 for that one tick returns it. Written
-    anew from the published idea. Ours is the credit E + delta dx^2/T for what the device dissipates. The force acts in
-    the tick to come, whose displacement is another: so E is no bound on what hands receive. It stands at the devices,
-    behind the delays.
-    """
-
-    def __init__(self, m: int, T: float, *, delta: ArrayLike | None = None, nsim: int = 1) -> None:
-        """`delta` (m,) [N s/m] is credited where given."""
-        super().__init__(nsim)
-        self._credit = (np.zeros((m, 1)) if delta is None else np.array(delta, dtype=float)[:, None]) / T
-        self.energy = np.zeros((m, nsim))  # [J] observed at each device, its dampers' share included
-
-    def limit(self, wanted: Array, dx: Array) -> Array:
-        """The force to apply, (m, nsim) [N], given the arriving one and the displacement of the last tick [m]."""
-        self.energy += wanted * dx + self._credit * dx**2
-        missing, moved = np.maximum(-self.energy, 0.0), dx**2
-        damper = np.divide(missing, moved, out=np.zeros_like(moved), where=moved > 0)
-        self.energy += damper * moved
-        self._act(np.any(damper > 0, axis=0))
-        return wanted + damper * dx
-
-
-class EnergyBounding(_Acting):
-    """The energy bounding algorithm, channel by channel: a baseline, whose guarantee is for loops without delay.
-
-    After Kim & Ryu, *Robustly stable haptic interaction control using an energy-bounding algorithm*, Int. J. Robotics
-    Research 29 (2010) 666-679: f = f_- + b dx with b between -c1 - 2 f_-/dx and c1, held where dx = 0. Re-derived here
-    with c1 = 2 delta/T, the most that the damping allows: the bounds say |f| <= |f_- + c1 dx|, that is
-    r(f) <= r(f_-) + f_- dx + delta dx^2/T. So it is the energy budget for theta = 0 that saves nothing: whatever W
-    exceeds r(f) is thrown away in the same tick.
-    """
-
-    def __init__(self, delta: ArrayLike, T: float, *, nsim: int = 1) -> None:
-        super().__init__(nsim)
-        self._c1 = 2 * np.array(delta, dtype=float)[:, None] / T
-        self._force = np.zeros((self._c1.size, nsim))
-
-    def limit(self, wanted: Array, dx: Array) -> Array:
-        """The force to apply, (m, nsim) [N], given the wanted one and the displacement of the last tick [m]."""
-        most = np.abs(self._force + self._c1 * dx)
-        self._force = np.where(dx == 0, self._force, np.clip(wanted, -most, most))
-        self._act(np.any(self._force != wanted, axis=0))
-        return self._force.copy()
-
-
 def _root(square: Array, linear: Array, most: Array) -> Array:
     """The largest s >= 0 with square s^2 + linear s <= most, all >= 0; inf where there is none."""
     slope = linear + np.sqrt(linear**2 + 4 * square * most)

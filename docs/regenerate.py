@@ -1,7 +1,5 @@
 """python docs/regenerate.py: run what README and docs command, and write the real output where a block asks for it.
 
-The designs that come with the package are made anew first (sim/designs).
-
 `--check` runs the slow commands alone (`make validate` does) and compares what they print with what the pages show, of
 what is measured all but times: exit code 1 where that is something else.
 
@@ -37,15 +35,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-from haptic_loop.controller.lti import Lti
-from haptic_loop.design.coupling_file import Stored, save
-from haptic_loop.design.coupling_file import load as read_stored
-from haptic_loop.design.designs import design_by_kind
-from haptic_loop.design.frequency import frequencies, on_circle
-from haptic_loop.sim.design_cache import proved, shipped
-
-from haptic_loop import load
-
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 _BLOCK = r"(<!-- {}(?:: (.+))? -->\n```{}\n\$ (python (?:-m|examples/).+)\n)((?:(?!.*```).*\n)*)(?=```)"
@@ -57,7 +46,7 @@ PICTURE = re.compile(r"<!-- picture: (\S+) (\S+) -->")
 #: a design that a sentence names
 IN_SENTENCES = re.compile(r"`(python -m design -[^`]*)`")
 #: commands that take most of a minute
-SLOW = re.compile(r"--coupling optimal --(grid 10|varying-delay)|ranges|--over damping --points")
+SLOW = re.compile(r"--coupling optimal --(grid 10|varying-delay)|ranges")
 
 
 class Step(NamedTuple):
@@ -117,37 +106,6 @@ def renewed(text: str, printed: dict[str, str]) -> str:
     return text
 
 
-#: what comes with the package, of the default scenario in each case: a first run designs nothing
-DESIGNS = (
-    ("spring-damper", "any-environment"),
-    ("spring-damper", "this-environment"),
-    ("optimal", "this-environment"),
-)
-
-
-def designs(check: bool = False) -> int:
-    """Write the designs that come with the package, or say how many are not what is designed today."""
-    found = 0
-    for case, (kind, condition) in itertools.product(("I", "II"), DESIGNS):
-        loop = load().loop(case)
-        print(f"case {case}: {kind}, {condition}", flush=True)
-        made, path = design_by_kind(loop, kind, condition), shipped(loop, kind, condition)
-        if not check:
-            # of a hundred states the proof is 400 kB, and takes half a second to be found again
-            save(Stored.of(loop, made.coupling, None if kind == "optimal" else proved(made, loop)), path)
-        elif not path.exists() or not alike(loop.F(made.coupling), loop.F(read_stored(path).built())):
-            found += 1
-            print(f"  {path.name} is another: python docs/regenerate.py --designs")
-    return found
-
-
-def alike(F: Lti, G: Lti) -> bool:
-    """Whether two force maps differ by a ten-thousandth of the largest force at most."""
-    z = on_circle(frequencies(F, G))
-    here, there = F.at(z), G.at(z)
-    return bool(abs(here - there).max() <= 1e-4 * abs(here).max())
-
-
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?(?![\w])")
 #: what a machine decides: seconds, speeds, what costs what, and the last column of a table, of times or of rounding
 _TIMES = re.compile(
@@ -181,7 +139,7 @@ def _close(shown: str, number: str, measured: bool) -> bool:
 
 def check() -> int:
     """Run what is slow or measured and say which lines of which pages are something else now."""
-    found, printed = designs(check=True), {}
+    found, printed = 0, {}
     with TemporaryDirectory() as place:
         for page in PAGES:
             text = page.read_text(encoding="utf-8")
@@ -210,17 +168,12 @@ def main() -> int:
     """Run every page that shows output, and rewrite those whose output is another."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="run the slow commands and compare, and write nothing")
-    parser.add_argument("--designs", action="store_true", help="write the designs that come with the package alone")
     parser.add_argument(
         "pages", nargs="*", metavar="PAGE", help="renew these alone, by name or path, without what is measured"
     )
     args = parser.parse_args()
     if args.check:
         return check()
-    if args.designs or not args.pages:
-        designs()
-    if args.designs:
-        return 0
     names = {page.name for page in PAGES}
     some = {Path(page).name for page in args.pages}
     if unknown := some - names:

@@ -1,9 +1,8 @@
-"""The same devices and hands with other couplings: what each guarantee costs, from no coupling to the best one.
+"""The same devices and hands with every coupling: what each guarantee costs, from no coupling to the optimal one.
 
-A run is of one coupling. Beside it stand the loop without any, the paper's printed gains where the loop is the paper's,
-the spring-damper for any passive environment, the one for this environment, and the optimal coupling where it is quick
-to find. Every one is judged as the run's own is, with the one proof that it comes with, and drives the same hands with
-the exact engine, its forces clipped where its proof is one without a limiter.
+The couplings are: none, the paper's printed gains where the loop is the paper's, the spring-damper for any passive
+environment, the one for this environment, and the optimal coupling where it is quick to find. Each is judged with the
+proof that it comes with and drives the same hands in the exact engine.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ from haptic_loop.design.guarantees import guarantee_of
 from haptic_loop.design.result import Chosen, Requirement, finite
 from haptic_loop.design.transparency import decibels, transparency
 from haptic_loop.sim.accuracy import credible, force_error
-from haptic_loop.sim.couplings import Judged, choose, limits_of
+from haptic_loop.sim.couplings import choose, limits_of
 from haptic_loop.sim.run import assemble, run
-from haptic_loop.sim.scenario import Scenario, load
+from haptic_loop.sim.scenario import InputError, Scenario, load
 from haptic_loop.sim.stability import exact_growth, unstable
 from haptic_loop.sim.trace import Trace
 
@@ -60,7 +59,7 @@ class Alternative:
         """The name in tables and pictures; that of a spring-damper is its condition."""
         if self.coupling == "spring-damper":
             return self.condition or ""
-        return {"optimal": "best (optimal)"}.get(self.coupling, self.coupling)
+        return self.coupling
 
     def needs(self, condition: str) -> float | None:
         """Required over available damping of the worst device; None where no damping is enough."""
@@ -75,23 +74,24 @@ def alternatives(
     scenario: Scenario,
     case: str,
     progress: Callable[[int, int], None] = lambda done, of: None,
-    own: Judged | None = None,
     also: Condition | None = None,
 ) -> list[Alternative]:
-    """Every coupling that can stand in the place of the run's own; none where the delays switch.
+    """Run the scenario with each coupling that is possible in its loop.
 
-    `own` is the run's, with what was found of it in the same loop; `also` a condition of the user's that judges all.
-    Of ranges only couplings for any environment are shown, and the optimal one holds a linear model: none before walls.
+    Scenarios with ranges get couplings for any environment only; before walls there is no optimal coupling, which
+    contains a linear model. `also` is a user's own condition, by which all are judged, too.
+
+    Raises:
+        InputError: the delays switch.
     """
     if scenario.switches:
-        return []
+        raise InputError("varying_delay: the table of couplings is for constant delays; give --coupling NAME,..")
     case = "I" if case == "none" else case
-    present = (own.chosen.kind, own.chosen.condition) if own else None
-    rows = [row for row in _ROWS if row == present or _possible(scenario, case, *row)]
+    rows = [row for row in _ROWS if _possible(scenario, case, *row)]
     made = []
     for i, row in enumerate(rows):
         progress(i, len(rows))
-        made.append(_alternative(scenario, case, *row, own if row == present else None, also))
+        made.append(_alternative(scenario, case, *row, also))
     return made
 
 
@@ -111,17 +111,16 @@ def _alternative(
     case: str,
     kind: str,
     condition: str | None,
-    own: Judged | None = None,
     also: Condition | None = None,
 ) -> Alternative:
     loop = scenario.loop(case)
     try:
-        chosen = own.chosen if own else choose(scenario, case, kind, condition)
+        chosen = choose(scenario, case, kind, condition)
     except ValueError as error:
         return Alternative(kind, condition, reason=str(error))
     known = chosen.certificate
-    requirements = own.certificates if own else assess(loop, chosen.coupling, known, False, also)
-    simulation = assemble(scenario, chosen.coupling, own.limiter.rho if own else _lag(scenario, chosen, requirements))
+    requirements = assess(loop, chosen.coupling, known, False, also)
+    simulation = assemble(scenario, chosen.coupling, _lag(scenario, chosen, requirements))
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
     made = Alternative(

@@ -12,7 +12,6 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.design import compare
 from haptic_loop.design.files import off_table
 from haptic_loop.design.optimal import nearby as nearby_with_price
-from haptic_loop.design.program import Options
 from haptic_loop.design.result import CONDITIONS, Chosen, Requirement
 from haptic_loop.design.robustness import Nearby, robustness_nearby
 from haptic_loop.design.transparency import Transparency, transparency
@@ -65,33 +64,6 @@ class ComparedCoupling:
             CouplingFigures.of(chosen.kind, chosen.coupling, loop.T),
             conditions,
         )
-
-
-@dataclass(frozen=True)
-class Here:
-    """Where the scenario's own loop stands on the axes of a comparison."""
-
-    delta: tuple[float, ...]  # [N s/m]
-    theta: tuple[int, ...]
-    psi: tuple[int, ...]
-    T_s: float
-
-
-@dataclass(frozen=True)
-class LimitCurves:
-    """How good a coupling can be, along axes of the loop."""
-
-    scenario: str
-    seed: int
-    case: str
-    objective: str
-    delays_kept_in: str
-    options: Options = off_table()
-    here: Here = off_table()
-    sweeps: dict[str, compare.Sweep] = off_table()
-    gains: list[str] = off_table()
-    wall_s: float = off_table()
-    interrupted: bool = off_table()
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,6 @@ from haptic_loop.design.guarantees import guarantee_of
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.own import called, place_of
 from haptic_loop.design.result import CONDITIONS, Chosen, Design, DesignFailed, Requirement, switching_guarantee
-from haptic_loop.sim import design_cache
 from haptic_loop.sim.scenario import InputError, Scenario
 
 NAMES = ("none", "published", *KINDS)
@@ -81,16 +80,7 @@ def _choose(
         loop = scenario.loop(case)
         condition = condition or usual_condition(loop, name)
         asked: dict[str, Any] = {"limiter": limiter} if limiter is not None and KINDS[name].limited else {}
-        question = (loop, name, condition, *asked.items())
-        if own:  # a class has no digest, so nothing is kept of it
-            return replace(design_by_kind(loop, name, own, progress, **asked), kind=name)
-        if kept := design_cache.find(*question):
-            assert kept.certificate
-            proof = kept.certificate.limiter or None
-            return Chosen(kept.built(), condition, kind=name, limiter=proof, certificate=kept.certificate)
-        design = design_by_kind(loop, name, condition, progress, **asked)
-        known = design_cache.keep(design, *question)
-        return replace(design, kind=name, certificate=known, limiter=(known and known.limiter) or None)
+        return replace(design_by_kind(loop, name, own or condition, progress, **asked), kind=name)
     if Path(name).suffix != ".json":
         raise InputError(
             f"--coupling is {name!r}, allowed are {', '.join(NAMES)}, a FILE.json or package.module:function"

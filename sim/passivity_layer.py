@@ -1,10 +1,10 @@
-"""Passivity layers under a simulated controller: the energy budget, and the classics that it is compared with.
+"""Passivity layers under a simulated controller: the energy budget, and the shell around a user's own environment.
 
     traced = run(netted(simulation, EnergyNet(0.01)), "exact").net.figures()
 
 With a net, Theta is no part of a tick's block: the forces of G = (I + Psi E V)^-1 Psi E go through the net, then
-through a line that holds them, constant delays or not. The budget and energy bounding stand before the line, and see
-forces that the actuators can apply; the passivity controller stands behind it, at the devices.
+through a line that holds them, constant delays or not. The budget stands before the line and sees forces that the
+actuators can apply.
 """
 
 from __future__ import annotations
@@ -12,17 +12,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from haptic_loop.controller.budget import (
     EPS,
     BudgetFigures,
-    EnergyBounding,
     EnergyBudget,
-    NetFigures,
     Packets,
-    PassivityControl,
     Shell,
     ShellFigures,
 )
@@ -36,23 +33,6 @@ from haptic_loop.sim.scenario import InputError
 
 _HELD = 4  # ticks for which a device goes on holding a force, beyond the largest delay, where packets are lost
 
-_HANNAFORD = "Hannaford and Ryu, IEEE Trans. Robotics and Automation 18 (2002)"
-_KIM = "Kim and Ryu, Int. J. Robotics Research 29 (2010)"
-#: the classics by the names that commands have for them -> what they are, and whose
-BASELINES = {
-    "po-pc": f"passivity observer and controller at each device, after {_HANNAFORD}",
-    "po-pc:delta": f"the same with our credit for the devices' damping, after {_HANNAFORD}",
-    "eba": f"energy bounding on each channel, made for no delay, re-derived after {_KIM}",
-}
-
-
-@dataclass(frozen=True, kw_only=True)
-class BaselineFigures(NetFigures):
-    """What one of the classics has done."""
-
-    name: str
-    what: str
-
 
 @dataclass(frozen=True)
 class EnergyNet:
@@ -60,8 +40,6 @@ class EnergyNet:
 
     start: float  # W0 [J]
     cap: float = np.inf  # the most that it may save [J]
-
-    name, source = "energy budget", None
 
     @property
     def guarantee(self) -> str:
@@ -81,27 +59,6 @@ class EnergyNet:
             raise InputError(f"energy budget: {error}") from None
         late = ages(process.delays) if lost else None
         return _Budgeted(budget, self.guarantee, process, late, np.array(span.hi) + hold)
-
-
-@dataclass(frozen=True)
-class Classic:
-    """One of BASELINES."""
-
-    name: str
-    guarantee = None
-
-    @property
-    def source(self) -> str:
-        """What it is, and whose."""
-        return BASELINES[self.name]
-
-    def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
-        """A fresh one."""
-        delta, T = np.array(simulation.loop.delta), simulation.loop.T
-        if self.name == "eba":
-            return _Baseline(EnergyBounding(delta, T, nsim=nsim), self.name, process, False)
-        credit = delta if self.name.endswith(":delta") else None
-        return _Baseline(PassivityControl(len(delta), T, delta=credit, nsim=nsim), self.name, process, True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +82,12 @@ def _more_than(start: float) -> str:
     return f"{f'more than {start:g} J' if start else 'any energy'} beyond what the devices dissipate"
 
 
-Wanted = EnergyNet | Classic | Plugged
+class Wanted(Protocol):
+    """A net that is asked for: EnergyNet, Plugged, or one of your own."""
+
+    def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
+        """Return a fresh net for one record of `nsim` runs."""
+        ...
 
 
 def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> Simulation:
@@ -221,23 +183,3 @@ class _Shelled(_InLoop):
     def figures(self) -> ShellFigures:
         given = f"no passive hand is given {_more_than(self._asked.start)}, whatever computes the force"
         return self._shell.figures(f"behind a coupling certified for any environment, {given}")
-
-
-class _Baseline(_InLoop):
-    """One of the classics: energy bounding at the computer, or the passivity controller at the devices."""
-
-    def __init__(self, net: PassivityControl | EnergyBounding, name: str, process: Process, at_device: bool) -> None:
-        super().__init__(process)
-        self._net, self._name, self._at_device = net, name, at_device
-        self._dx: Array = np.zeros(())
-
-    def send(self, x: Array, force: Array, /) -> None:
-        self._dx, within = self._moved(x), self._within(force)
-        force[...] = within if self._at_device else self._net.limit(within, self._dx)
-
-    def apply(self, k: int, force: Array, /) -> None:
-        if self._at_device:
-            force[...] = self._net.limit(force, self._dx)
-
-    def figures(self) -> BaselineFigures:
-        return BaselineFigures(**vars(self._net.figures()), name=self._name, what=BASELINES[self._name])

@@ -20,16 +20,13 @@ from haptic_loop.sim.trace import Trace
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
-from matplotlib.patches import Patch
 from matplotlib.text import Text
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # whose figures are drawn
-    from haptic_loop.design.compare import Limit, Sweep
     from haptic_loop.sim.accuracy import Row
-    from haptic_loop.sim.baselines import Baselines
-    from haptic_loop.sim.compare_report import Comparison, LimitCurves
+    from haptic_loop.sim.compare_report import Comparison
 
 # ----------------------------------------------------------------------------------------------------
 # The style.
@@ -527,99 +524,3 @@ def plot_perceived(report: Comparison, path: Path) -> Path:
 def _over_frequency(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, Any]:
     """Panels of `size` each, wide enough together for the title."""
     return _panels(title, rows, columns, (max(columns * size[0], 5.5), rows * size[1] + 0.6), sharex=True)
-
-
-# ----------------------------------------------------------------------------------------------------
-# How good a coupling could be, against what a laboratory could change.
-
-#: design -> what it is called, and how it is drawn
-_CURVES: dict[str, tuple[str, dict[str, Any]]] = {
-    "optimal": ("the optimal coupling", STYLES[0] | {"marker": "o"}),
-    "this-environment": (f"spring-damper, {CONDITIONS['this-environment']}", STYLES[1] | {"marker": "s"}),
-    "any-environment": (f"spring-damper, {CONDITIONS['any-environment']}", STYLES[2] | {"marker": "^"}),
-}
-#: the floor of the picture [dB]: in case I a loop that needs no coupling has minus infinity
-_EXACT = -60.0
-_FIGURES = {"rms": "rms_mismatch_db", "sup": "relative_mismatch_db"}
-
-
-def plot_limits(report: LimitCurves, path: Path) -> Path:
-    """One panel per sweep; a point without a solution is a cross at the top of its panel."""
-    sweeps = {name: sweep for name, sweep in report.sweeps.items() if sweep.curves["optimal"]}
-    rows, columns = (len(sweeps) + 1) // 2, min(len(sweeps), 2)
-    title = f"The best reachable mismatch: {report.scenario}, case {report.case}"
-    figure, axes = _panels(title, rows, columns, (5.5 * columns + 0.5, 3.6 * rows + 0.9), sharey=True)
-    entries: dict[str, Any] = {}
-    for axis, (name, sweep) in zip(axes.flat, sweeps.items(), strict=False):
-        entries |= _draw_sweep(axis, name, sweep, _FIGURES[report.objective], _here(name, report))
-    for axis in axes.flat[len(sweeps) :]:
-        axis.set_visible(False)
-    for axis in axes[:, 0]:
-        axis.set_ylabel(f"{report.objective} mismatch [dB]")
-    _legend(figure, entries, 3, fontsize=9)
-    return save(figure, path)
-
-
-def plot_baselines(report: Baselines, path: Path) -> Path:
-    """Bars, a row per rival: force error, force above 40 Hz, the fastest of the lossless hands that are left alone."""
-    rows = report.rows
-    title = f"Classics and ours on the same runs: {report.scenario}, case {report.case}"
-    figure, axes = _panels(title, 1, 3, (12.0, 0.4 * len(rows) + 1.8), sharey=True)
-    labels = [f"{row.name} (baseline)" if row.baseline else row.name for row in rows]
-    colours = ["tab:orange" if row.baseline else "tab:blue" if row.guarantee else "tab:grey" for row in rows]
-    panels = (("error_percent", "force error [%]"), ("fast_n", "force rms above 40 Hz [N]"))
-    for axis, (name, label) in zip(axes[0], (*panels, ("fastest_m_s", "fastest lossless hand [m/s]")), strict=True):
-        axis.barh(labels, [getattr(row, name) or 0.0 for row in rows], color=colours)
-        axis.set_xlabel(label)
-    axes[0, 1].set_xscale("symlog", linthresh=1e-3)
-    axes[0, 2].set_xscale("log")
-    axes[0, 2].axvline(report.start_m_s, color="black", linestyle=":")
-    axes[0, 0].invert_yaxis()
-    names = {"baseline": "tab:orange", "with a guarantee": "tab:blue", "without": "tab:grey"}
-    _legend(figure, {name: Patch(color=colour) for name, colour in names.items()}, 3)
-    return save(figure, path)
-
-
-def _here(name: str, report: LimitCurves) -> float:
-    """Where the scenario stands on this axis, in the unit drawn."""
-    here = report.here
-    each = {"damping": min(here.delta), "delay": max(here.theta), "period": 1e3 * here.T_s}
-    return (each | {"order": len(report.options.ladder)})[name]
-
-
-def _level(row: Limit, figure: str) -> float | None:
-    """The mismatch [dB]; of a coupling that is exact the least that is drawn, None where there is no coupling."""
-    level = getattr(row, figure)
-    return _EXACT if level is None and row.proof else level
-
-
-def _draw_sweep(axis: Axes, name: str, sweep: Sweep, figure: str, here: float) -> dict[str, Any]:
-    """Draw one sweep and return its entries of the legend."""
-    scale, unit = (1e3, "ms") if sweep.unit == "s" else (1.0, sweep.unit)
-    entries: dict[str, Any] = {}
-    for kind, (words, style) in _CURVES.items():
-        levels = [(scale * row.value, _level(row, figure)) for row in sweep.curves.get(kind, [])]
-        known = [(x, y) for x, y in levels if y is not None]
-        if known:
-            points = [(x, max(y, _EXACT)) for x, y in known]
-            (entries[words],) = axis.plot(*zip(*points, strict=True), markersize=5, **style)
-        exact = [x for x, y in known if y <= _EXACT]
-        if exact and kind == "optimal":
-            low = [_EXACT] * len(exact)
-            (entries[f"{_EXACT:g} dB or less"],) = axis.plot(exact, low, "v", color="black", markersize=9, zorder=3)
-    top = axis.get_xaxis_transform()
-    nothing = [scale * row.value for row in sweep.curves["optimal"] if _level(row, figure) is None]
-    if nothing:
-        (entries["no such optimal coupling"],) = axis.plot(
-            nothing, [0.96] * len(nothing), "kx", markersize=8, transform=top, clip_on=False
-        )
-    entries["this scenario"] = axis.axvline(here, color="grey", linewidth=0.8, linestyle=(0, (4, 3)), zorder=0)
-    if name in ("damping", "period"):
-        axis.set_xscale("log")
-        ticks = [scale * row.value for row in sweep.curves["optimal"]]
-        axis.set_xticks(ticks, [f"{tick:.3g}" for tick in ticks])
-        axis.set_xticks([], minor=True)
-    else:
-        axis.set_xticks([row.value for row in sweep.curves["optimal"]])
-    axis.set_xlabel(f"{sweep.label}" + ("" if name == "order" else f" [{unit}]"))
-    return entries

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from haptic_loop.controller.budget import BudgetFigures
 from haptic_loop.controller.lti import Array
@@ -13,15 +13,13 @@ from haptic_loop.design.result import Requirement, listed
 from haptic_loop.design.robustness import Nearby
 from haptic_loop.design.transparency import Transparency, transparency
 from haptic_loop.sim import accuracy
-from haptic_loop.sim.alternatives import Alternative
 from haptic_loop.sim.api import ScenarioRun
 from haptic_loop.sim.couplings import Judged
-from haptic_loop.sim.passivity_layer import BaselineFigures, idle
+from haptic_loop.sim.passivity_layer import idle
 from haptic_loop.sim.report import (
     PaperRow,
     UnevenTicks,
     VaryingDelays,
-    beside_the_paper,
     encoder_steps,
     switched_stability,
 )
@@ -73,10 +71,8 @@ class RunReport:
     credible: accuracy.Credible
     ideal_force: accuracy.ForceError
     energy_budget: BudgetFigures | None
-    baseline: BaselineFigures | None
     nearby: Nearby = off_table("inlined", default=Nearby())
-    alternatives: list[Alternative] = field(default_factory=list)
-    reproducibility: tuple[PaperRow, ...]
+    paper: tuple[PaperRow, ...] | None = off_table("if given", None)  # the figures that the paper prints
     remarks: tuple[str, ...]
 
     @property
@@ -152,8 +148,6 @@ def run_report(
         credible=accuracy.credible(simulation, trace),
         ideal_force=accuracy.force_error(run.ran, trace, loop.lam),
         energy_budget=budget and replace(budget, idle=idle(simulation, judged.certificates.values(), budget)),
-        baseline=net if isinstance(net, BaselineFigures) else None,
-        reproducibility=beside_the_paper(simulation.scenario, case, stability, judged.coupling),
         remarks=(*run.remarks, *chosen.remarks(judged.certificates)),
     )
     return replace(found, remarks=(*found.remarks, *found.notes()))

@@ -32,12 +32,12 @@ def share_designs(folder: Path, patch=setattr) -> None:
     own are judged. What makes them, design.designs and the modules behind it, is as it was.
     """
     import haptic_loop.cli.design
-    from haptic_loop.design import api, bound, compare, coverage, designs, optimal
+    from haptic_loop.design import api, bound, coverage, designs, optimal
     from haptic_loop.sim import alternatives, couplings
 
     for made, modules in (
-        (designs.design_by_kind, (haptic_loop.cli.design, api, compare, couplings)),
-        (bound.bound, (bound, compare)),
+        (designs.design_by_kind, (haptic_loop.cli.design, api, couplings)),
+        (bound.bound, (bound,)),
         (optimal.spread, (optimal,)),
         (coverage.required_damping, (coverage,)),
         (alternatives.assess, (alternatives,)),

@@ -1,4 +1,4 @@
-"""Each guarantee beyond the plain linear loop, put to the test at its edge: `python -m sim.suite --only guarantees`.
+"""Each guarantee beyond the plain linear loop, put to the test at its edge: `make validate`.
 
 A loop is drawn, and its devices get a little more or much less damping than its guarantee asks for. Then two
 adversaries try to take energy out of it, from rest. One moves the devices as it likes: waves, noise, and at every tick

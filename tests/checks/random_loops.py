@@ -1,4 +1,4 @@
-"""Loops drawn at random, against two laws: `python -m sim.suite --only proofs,traces`.
+"""Loops drawn at random, against two laws: `make validate`.
 
 An exact proof succeeds where the sweep asks for less damping than there is, and nowhere else. The verdict that is read
 from a simulated trace is never the opposite of the eigenvalues'; where nothing excites the mode that decides, it says

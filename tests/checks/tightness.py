@@ -1,6 +1,6 @@
 """How tight the condition is: the search for the worst hand against loops that lack some of the damping required.
 
-`python -m sim.suite --only tightness,delayed` runs it.
+`make validate` runs it.
 """
 
 from __future__ import annotations

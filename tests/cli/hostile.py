@@ -187,7 +187,7 @@ MOMENTS = 30
 
 def signalled(folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
     """MOMENTS of a run in which Ctrl-C comes, half as many for SIGTERM: what came, and what is wrong with its end."""
-    words = ("run", "--no-alternatives", "--duration", "2", "--out", "new")
+    words = ("run", "--duration", "2", "--out", "new")
     rng, whole, missed, code = np.random.default_rng(7), 0.0, 0, 99
     signals = [0, *MOMENTS * [signal.SIGINT], *(MOMENTS // 2) * [signal.SIGTERM]]  # the first one measures how long
     for number, sent in enumerate(signals):

@@ -29,13 +29,12 @@ class Case:
 
 
 QUICK = {  # what a command needs beside the option in question
-    "run": ("--no-plot", "--no-alternatives", "--duration", "0.1"),
+    "run": ("--no-plot", "--duration", "0.1"),
     "validate": ("--humans", "2", "--duration", "0", "--no-plot"),
     "zwidth": ("--grid", "4", "--points", "0", "--humans", "2", "--no-plot"),
     "view": ("--video", "v.gif"),
     "trace": ("t.npz",),
     "accuracy": (),
-    "suite": ("--only", "I"),
     "design": (),
     "audit": ("--K", "400,300", "--B", ".1,.1"),
     "check": ("c.json",),

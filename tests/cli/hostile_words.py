@@ -18,7 +18,6 @@ NUMERIC = {
     "zwidth": "grid K-range B-range mark humans points trials duration start press threshold quantisation friction",
     "view": "fps duration",
     "accuracy": "duration",
-    "suite": "humans",
     "design": "ranges samples band high-gain seconds order varying-delay delta",
     "audit": "K B varying-delay",
     "compare": "points band seconds",
@@ -79,13 +78,13 @@ def odd_paths() -> Iterator[Case]:
             yield Case(f"{command} {kind}", (command, *(w for w in words[1:] if w != "--"), "--json=r.json")
                        if path and not path.startswith("-") else words)  # fmt: skip
     outputs = [("run", "--out"), ("run", "--json"), ("design", "--out"), ("export", "--out"), ("trace", "--plot"),
-               ("audit", "--json"), ("view", "--video"), ("bridge", "--out"), ("suite", "--out")]  # fmt: skip
+               ("audit", "--json"), ("view", "--video"), ("bridge", "--out")]  # fmt: skip
     for command, option in outputs:
         for kind in ("below a file", "very long", "long", "circle", "folder", "no folder", "kernel", "zero"):
             path = {"no folder": "nix/r", "kernel": "/proc/self/r", "zero": "r\0"} | NO_FILES
-            if kind == "no folder" and (command, option) in {("run", "--out"), ("bridge", "--out"), ("suite", "--out")}:
+            if kind == "no folder" and (command, option) in {("run", "--out"), ("bridge", "--out")}:
                 continue  # a folder is made
-            if kind == "folder" and option == "--out" and command in ("run", "bridge", "suite"):
+            if kind == "folder" and option == "--out" and command in ("run", "bridge"):
                 continue
             suffix = ".gif" if option == "--video" and kind not in ("folder", "circle") else ""
             words = (
@@ -173,15 +172,6 @@ SILENT = [
     (("compare", "--coupling", "none,,published"), "--coupling"),
     (("compare", "--coupling", ",none"), "--coupling"),
     (("compare", "--coupling", "none,"), "--coupling"),
-    (("compare", "--over", ""), "--over"),
-    (("compare", "--over", "delay,"), "--over"),
-    (("compare", "--over", "moon"), "--over"),
-    (("compare", "--over", "damping=2"), "--over"),
-    (("compare", "--over", "damping=2:1"), "--over"),
-    (("compare", "--over", "damping=nan:1"), "--over"),
-    (("suite", "--only", ""), "--only"),
-    (("suite", "--only", "I,,hard"), "--only"),
-    (("suite", "--only", "I,"), "--only"),
     (("run", *QUICK["run"], "--theta", "1,"), "--theta"),
     (("run", *QUICK["run"], "--delta", ",1"), "--delta"),
     (("run", *QUICK["run"], "--varying-delay", "1,"), "--varying-delay"),
@@ -191,7 +181,6 @@ SILENT = [
     (("run", *QUICK["run"], "--engine", "exact", "--integrator", "RK4"), "--integrator"),
     (("run", *QUICK["run"], "--engine", "exact", "--substeps", "4"), "--substeps"),
     (("run", *QUICK["run"], "--vertex", "1"), "--vertex"),
-    (("run", *QUICK["run"], "--no-plot", "--no-plot", "--side-by-side"), "--side-by-side"),
     (("design", "--best", "--coupling", "ccl"), "--coupling"),
     (("run", *QUICK["run"], "--error", "nan"), "--error is nan, allowed are 1e-18 to 1"),
     (("design", "--order", "2"), "--order"),

@@ -58,7 +58,7 @@ AUDIT = ["design.audit", "--K", "2870,2320", "--B", "5.47,5.55"]  # not certifie
 @pytest.mark.parametrize(
     ("command", "code"),
     [
-        (["sim.run", "--coupling", "published", "--duration", "0.3", "--no-plot", "--no-alternatives"], 0),
+        (["sim.run", "--coupling", "published", "--duration", "0.3", "--no-plot"], 0),
         (["sim.run", "--help"], 0),
         ([*AUDIT, "--json", "-"], 1),
     ],
@@ -115,7 +115,6 @@ def test_a_command_that_draws_nothing_does_not_need_what_mujoco_gl_names(asked, 
         "--duration",
         "0.05",
         "--no-plot",
-        "--no-alternatives",
     ]
     environment = ENVIRONMENT | {"MUJOCO_GL": asked}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)

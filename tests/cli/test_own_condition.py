@@ -53,7 +53,7 @@ def test_a_design_for_it_is_proved_and_uses_nearly_all_that_it_allows(folder):
         ("audit", ["--coupling", "joined.json"]),
         ("export", ["joined.json"]),
         ("compare", ["--coupling", f"joined.json,moving-average:{OWN}", "--no-plot"]),
-        ("run", ["--coupling", "joined.json", "--duration", ".1", "--no-plot", "--no-alternatives"]),
+        ("run", ["--coupling", "joined.json", "--duration", ".1", "--no-plot"]),
         ("validate", ["--coupling", "joined.json", "--humans", "3", "--duration", "0", "--no-plot"]),
         ("zwidth", ["--grid", "4", "--points", "0", "--humans", "3", "--mark", "900,.4"]),
         ("zwidth", ["--coupling", "joined.json", "--grid", "4", "--points", "0", "--humans", "3", "--no-plot"]),
@@ -88,7 +88,7 @@ def test_a_file_says_so_where_its_condition_is_not_given(folder, monkeypatch):
     monkeypatch.chdir(folder)
     assert import_module("haptic_loop.cli.check").main(["joined.json", *JSON]) == 1
     assert "condition is 'joined-devices', allowed are" in Path("report.json").read_text()
-    words = ["--coupling", "joined.json", "--duration", ".1", "--no-plot", "--no-alternatives", *JSON]
+    words = ["--coupling", "joined.json", "--duration", ".1", "--no-plot", *JSON]
     assert import_module("haptic_loop.cli.run").main(words) == 0
     report = json.loads(Path("report.json").read_text())
     assert report["certificate"]["condition"] == "this-environment"
@@ -160,7 +160,7 @@ class Never(Condition):
     ("command", "words", "code"),
     [
         ("audit", [], 1),
-        ("run", ["--duration", ".1", "--no-plot", "--no-alternatives"], 0),
+        ("run", ["--duration", ".1", "--no-plot"], 0),
         ("validate", ["--humans", "2", "--duration", "0", "--no-plot"], 1),
         ("compare", ["--no-plot"], 0),
         ("zwidth", ["--grid", "4", "--points", "0", "--humans", "2", "--no-plot", "--K-range", "9e3,1e4"], 0),

@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
-from haptic_loop.controller.budget import EnergyBounding, EnergyBudget, Packets, PassivityControl, Shell
+from haptic_loop.controller.budget import EnergyBudget, Packets, Shell
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.environment import Network, Networks, Spring, environment
 from haptic_loop.controller.lti import Lti
@@ -426,48 +426,3 @@ def test_the_shell_leaves_a_passive_implicit_environment_as_it_is():
     assert shell.limited.max() == 0
     with pytest.raises(ValueError, match="not passive"):
         Shell(Lti.constant([[-1.0]], T))
-
-
-# ---- the baselines
-
-
-def test_energy_bounding_is_the_published_interval_and_the_budget_that_saves_nothing():
-    rng = np.random.default_rng(15)
-    bounding, c1, before = EnergyBounding([1.2], T), 2 * 1.2 / T, 0.0
-    for k in range(500):
-        dx, wanted = (0.0 if k % 7 == 0 else 1e-4 * rng.normal()), 3 * rng.normal()
-        force = bounding.limit(np.array([[wanted]]), np.array([[dx]])).item()
-        if dx == 0:
-            assert force == before
-        else:
-            b = np.sort([c1, -c1 - 2 * before / dx])
-            assert force == pytest.approx(before + np.clip((wanted - before) / dx, *b) * dx, abs=1e-12)
-        assert T * force**2 / 4.8 <= T * before**2 / 4.8 + before * dx + 1.2 * dx**2 / T + 1e-15
-        before = force
-    assert 0 < bounding.limited[0] < 500
-
-
-def test_the_passivity_controller_returns_what_its_observer_misses():
-    rng = np.random.default_rng(16)
-    control, observed = PassivityControl(2, T, nsim=5), np.zeros((2, 5))
-    for _ in range(300):
-        dx, wanted = 1e-4 * rng.normal(size=(2, 5)), rng.normal(size=(2, 5))
-        force = control.limit(wanted, dx)
-        observed += force * dx
-        assert observed.min() > -1e-12
-    assert control.limited.max() > 0
-
-
-def test_the_passivity_controller_is_the_published_one_step_by_step():
-    """The series controller in velocities: W += f v + alpha_- v_-^2, alpha = -W/v^2 where W < 0, force f + alpha v."""
-    rng, control = np.random.default_rng(17), PassivityControl(1, T)
-    W = alpha = before = acted = 0.0
-    for _ in range(500):
-        v = rng.normal()
-        wanted = rng.normal() - 0.5 * v
-        W += wanted * v + alpha * before**2
-        alpha, before = (-W / v**2 if W < 0 else 0.0), v
-        acted += alpha > 0
-        force = control.limit(np.array([[wanted]]), np.array([[T * v]]))
-        assert force == pytest.approx(wanted + alpha * v, rel=1e-9, abs=1e-9)
-    assert acted > 100

@@ -232,7 +232,7 @@ def test_both_engines_see_the_same_contacts():
 def test_a_run_reports_the_contact_and_who_covers_it(tmp_path):
     def run(*options):
         main(["--scenario", "one-wall", "--duration", "3", "--engine", "exact", "--no-plot", *options,
-              "--no-alternatives", "--out", str(tmp_path), "--json", str(tmp_path / "r.json")])  # fmt: skip
+              "--out", str(tmp_path), "--json", str(tmp_path / "r.json")])  # fmt: skip
         return json.loads((tmp_path / "r.json").read_text())
 
     soft, bare = run(), run("--case", "none")

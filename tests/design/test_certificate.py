@@ -468,7 +468,7 @@ def test_a_body_that_only_dampers_drag_is_proved(network):
 
 
 def test_the_proof_succeeds_exactly_where_the_sweep_says_so_on_any_network():
-    """`python -m sim.suite --only proofs` does so for 500."""
+    """`make validate` does so for 500."""
     found = list(proofs(11, 60))
     assert [row for row in found if not row.holds] == []
     assert 18 < sum(row.proved for row in found) < 42

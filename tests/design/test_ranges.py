@@ -339,7 +339,6 @@ def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, 
         "--duration",
         "1",
         "--no-plot",
-        "--no-alternatives",
     ]
     code, run = told(run_main, *at_vertex, *out)
     assert (code, run["guarantee"]) == (0, "these ranges")

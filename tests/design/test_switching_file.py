@@ -225,7 +225,7 @@ def test_check_names_the_guarantee_and_the_proof(stored, file, tmp_path, capsys)
 
 @pytest.fixture
 def run(tmp_path, capsys):
-    quick = ["--engine", "exact", "--duration", "0.1", "--no-plot", "--no-alternatives", "--out", str(tmp_path / "out")]
+    quick = ["--engine", "exact", "--duration", "0.1", "--no-plot", "--out", str(tmp_path / "out")]
 
     def report(coupling: str, *options: str) -> dict:
         code, outcome = told(capsys, run_main, "--coupling", coupling, *options, *quick)

@@ -117,7 +117,7 @@ def test_simulate_is_the_commands_run(tmp_path):
     result = simulate(SHORT)
     assert isinstance(result, Trace)
     assert isinstance(SHORT, Scenario)
-    options = ["--case", "none", "--duration", "0.3", "--no-plot", "--no-alternatives", "--out", str(tmp_path)]
+    options = ["--case", "none", "--duration", "0.3", "--no-plot", "--out", str(tmp_path)]
     assert run_command([*options, "--json", str(tmp_path / "r.json")]) == 0
     command = Trace.load_npz(tmp_path / "trace.npz")
     for name in ("t", "x", "f", "x_handle", "v_handle", "w"):

@@ -104,7 +104,7 @@ device = [{ kind = "rigid", damping = 1.37 }, { kind = "rigid", damping = 1.37 }
 [environment]
 """
 HARD = 'elements = [{ type = "mine:Hardening", between = ["left", "right"], stiffness = 300.0, step = 0.002 }]'
-RUN = "python -m sim.run --case I --duration 0.3 --no-alternatives --no-plot"
+RUN = "python -m sim.run --case I --duration 0.3 --no-plot"
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Guarantees beyond the linear loop, at their edge: a short form of `sim.suite --only guarantees`."""
+"""Guarantees beyond the linear loop, at their edge: a short form of `make validate`."""
 
 import pytest
 

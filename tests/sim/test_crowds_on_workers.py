@@ -112,7 +112,6 @@ def children(pid: int) -> list[int]:
     [
         (signal.SIGTERM, ["sim.validate", "--humans", "100000", "--shards", "2"], 3),
         (signal.SIGKILL, ["sim.validate", "--humans", "100000", "--shards", "2"], 3),
-        (signal.SIGKILL, ["sim.suite", "--only", "endurance"], 2),
     ],
 )
 def test_workers_end_with_the_process_that_started_them(tmp_path, end, words, workers_and_their_clerk):

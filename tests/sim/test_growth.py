@@ -96,7 +96,6 @@ def test_the_command_reads_what_sim_run_writes(tmp_path, capsys):
         "--duration",
         "9",
         "--no-plot",
-        "--no-alternatives",
         "--out",
         str(tmp_path),
     ]
@@ -190,7 +189,7 @@ def ran(scenario, engine):
 def test_no_trace_of_a_random_loop_says_the_opposite_of_its_eigenvalues():
     """Number 11 is of two devices that nothing joins: one would buzz, only the other is moved.
 
-    `python -m sim.suite --only traces` does so for 460.
+    `make validate` does so for 460.
     """
     found = list(traces(1, 40))
     assert [row for row in found if not row.holds] == []

@@ -95,7 +95,6 @@ def test_the_command_ranks_the_designs(tmp_path):
                 [
                     *options,
                     "--no-plot",
-                    "--no-alternatives",
                     "--duration",
                     "4",
                     "--out",

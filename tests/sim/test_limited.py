@@ -110,7 +110,6 @@ def test_the_report_says_which_guarantee_holds(tmp_path):
     def report(*options) -> dict:
         where = [
             "--no-plot",
-            "--no-alternatives",
             "--duration",
             "1",
             "--out",

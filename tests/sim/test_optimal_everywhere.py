@@ -82,7 +82,7 @@ def test_its_file_is_proved_again_and_drives_the_process(files, form):
 def test_it_runs_by_command_alone_and_in_a_batch(files, form, tmp_path):
     _, name, path = files[form]
     common = ["--scenario", name, "--coupling", str(path), "--no-plot", "--json", str(tmp_path / "r.json")]
-    asked = [*common, "--duration", "0.2", "--no-alternatives", "--out", str(tmp_path)]
+    asked = [*common, "--duration", "0.2", "--out", str(tmp_path)]
     assert run.main(asked) == 0
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["guarantee"] == "this environment"

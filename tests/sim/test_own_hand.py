@@ -263,7 +263,7 @@ def test_the_command_takes_hands_from_a_python_file(tmp_path, capsys):
         "    def voluntary_force(self, t): return 0 * t\n"
         "humans = (Soft(), Soft())\n"
     )
-    words = ("--case", "none", "--duration", "0.2", "--no-plot", "--no-alternatives", "--out", str(tmp_path / "out"))
+    words = ("--case", "none", "--duration", "0.2", "--no-plot", "--out", str(tmp_path / "out"))
     assert main([*words, "--human", str(hands)]) == 0
     assert "unstable" in capsys.readouterr().out
     hands.write_text("humans = ()")

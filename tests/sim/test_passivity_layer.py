@@ -1,4 +1,4 @@
-"""Nets in the simulated loop: the energy budget and the shell end to end, and the classics beside them."""
+"""Nets in the simulated loop: the energy budget and the shell end to end."""
 
 import json
 from dataclasses import replace
@@ -6,11 +6,10 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from haptic_loop.cli.compare import main as compare
 from haptic_loop.cli.run import main as run_command
 from haptic_loop.controller.coupling import NoCoupling
 from haptic_loop.controller.delay import packet_delays
-from haptic_loop.sim.passivity_layer import BASELINES, Classic, EnergyNet, Plugged, netted
+from haptic_loop.sim.passivity_layer import EnergyNet, Plugged, netted
 from haptic_loop.sim.run import assemble, run
 
 from haptic_loop import design_coupling, load, simulate
@@ -112,39 +111,6 @@ def test_the_shell_bounds_what_an_environment_of_ones_own_gives():
         netted(assemble(SHORT, NoCoupling()), Plugged(lambda u: u))
 
 
-@pytest.mark.parametrize("name", BASELINES)
-def test_a_classic_acts_in_the_loop_and_is_marked_as_a_baseline(name, tmp_path):
-    options = [
-        "--coupling",
-        name,
-        "--duration",
-        "1",
-        "--no-plot",
-        "--no-alternatives",
-        "--out",
-        str(tmp_path),
-        "--engine",
-        "exact",
-    ]
-    assert run_command([*options, "--json", str(tmp_path / "r.json")]) == 0
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert report["baseline"]["name"] == name
-    assert report["baseline"]["limited_ticks"] > 0
-    assert report["energy_budget"] is report["baseline"]["guarantee"] is None
-    assert any("baseline" in line and "(20" in line for line in report["remarks"])
-
-
-def test_energy_bounding_sends_what_its_law_says():
-    simulation = assemble(SHORT, NoCoupling())
-    trace = run(netted(simulation, Classic("eba")), "exact")
-    sent = np.stack([trace.f[n : len(trace.f) - 2 + n, i] for i, n in enumerate((1, 2))], axis=1)
-    dx = np.diff(trace.x, axis=0)
-    c1 = 2 * np.array(SHORT.delta) / SHORT.T
-    k = np.arange(1, len(sent))
-    most = np.abs(sent[k - 1] + c1 * dx[k - 1])
-    assert (np.abs(sent[k]) <= np.where(dx[k - 1] == 0, np.abs(sent[k - 1]), most) + 1e-12).all()
-
-
 def test_the_report_of_a_run_says_what_the_budget_did(tmp_path):
     options = [
         "--energy-budget",
@@ -152,7 +118,6 @@ def test_the_report_of_a_run_says_what_the_budget_did(tmp_path):
         "--duration",
         "1.5",
         "--no-plot",
-        "--no-alternatives",
         "--out",
         str(tmp_path),
     ]
@@ -161,20 +126,6 @@ def test_the_report_of_a_run_says_what_the_budget_did(tmp_path):
     assert (part["start_J"], part["cap_J"], part["idle"]) == (0, 0.0005, None)
     assert part["limited_ticks"] > 100
     assert part["guarantee"].startswith("no passive hand is given any energy beyond")
-
-
-def test_baselines_are_compared_in_one_table_and_one_picture(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("haptic_loop.sim.baselines.SECONDS", 3.0)
-    monkeypatch.setattr("haptic_loop.sim.baselines.PAIRS", 20)
-    monkeypatch.setattr("haptic_loop.cli.compare.options.scenario_from", lambda args: load().replace(duration=3.0))
-    assert compare(["--baselines", "--out", str(tmp_path / "out"), "--json", str(tmp_path / "r.json")]) == 0
-    rows = {row["name"]: row for row in json.loads((tmp_path / "r.json").read_text())["rows"]}
-    assert [name for name, row in rows.items() if row["baseline"]] == list(BASELINES)
-    assert rows["eba"]["acted_percent"] > 10
-    assert rows["optimal, this environment"]["error_percent"] < 2
-    assert rows["energy budget"]["fastest_m_s"] < rows["none, clipped"]["fastest_m_s"]
-    assert (tmp_path / "out/baselines.png").is_file()
-    assert "baseline po-pc" in capsys.readouterr().out
 
 
 def test_no_hand_is_given_more_than_the_budget_in_uneven_periods():

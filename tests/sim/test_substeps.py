@@ -125,7 +125,6 @@ def test_run_uses_and_reports_the_rule(tmp_path):
         "--duration",
         "0.3",
         "--no-plot",
-        "--no-alternatives",
     ]
     options += ["--out", str(tmp_path / "o"), "--json", str(tmp_path / "r.json")]
     stepped = [*options, "--integrator", "RK4"]

@@ -132,7 +132,7 @@ def test_a_run_says_what_its_ticks_were(tmp_path, capsys):
     file = tmp_path / "r.json"
     recorded = tmp_path / "ticks.txt"
     recorded.write_text("# s\n1.1e-3\n0.8e-3\n\n1.4e-3\n")
-    options = ["--case", "I", "--no-plot", "--no-alternatives", "--duration", "1", "--out", str(tmp_path)]
+    options = ["--case", "I", "--no-plot", "--duration", "1", "--out", str(tmp_path)]
     assert main([*options, "--coupling", "spring-damper", "--period", str(recorded), "--json", str(file)]) == 0
     report = json.loads(file.read_text())
     assert report["run"]["timing"]["period_s"] == pytest.approx({"least": 0.8e-3, "mean": 1.1e-3, "largest": 1.4e-3})

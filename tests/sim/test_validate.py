@@ -114,7 +114,7 @@ def test_a_scenario_with_a_person_is_validated_with_random_people(tmp_path):
     assert main([*options, "--humans", "30"]) == 0
     worst = json.loads((tmp_path / "r.json").read_text())["worst"]
     assert worst["person"][0]["holds"] == [1, 2]
-    assert run_command.main([*options, "--no-alternatives", "--human", str(tmp_path / "worst-human.toml")]) == 0
+    assert run_command.main([*options, "--human", str(tmp_path / "worst-human.toml")]) == 0
     stability = json.loads((tmp_path / "r.json").read_text())["stability"]
     assert stability["spectral_radius"] == pytest.approx(worst["spectral_radius"], abs=1e-12)
 
@@ -225,10 +225,7 @@ def test_the_command_and_the_replay_of_its_worst_human(tmp_path):
     assert not report["certified"]
     assert (out / "population.png").is_file()
     replay = ["--case", "none", "--engine", "exact", "--duration", "0.5", "--no-plot", "--out", str(out)]
-    assert (
-        run_command.main([*replay, "--no-alternatives", "--human", str(out / "worst-human.toml"), "--json", str(file)])
-        == 0
-    )
+    assert run_command.main([*replay, "--human", str(out / "worst-human.toml"), "--json", str(file)]) == 0
     stability = json.loads(file.read_text())["stability"]
     assert stability["spectral_radius"] == pytest.approx(report["worst"]["spectral_radius"], abs=1e-12)
     assert stability["exact_verdict"] == "unstable"

@@ -1,0 +1,52 @@
+"""What every coupling costs and gives the same devices and hands."""
+
+import json
+
+import pytest
+from haptic_loop.cli.compare import main
+from haptic_loop.cli.run import main as run_once
+from haptic_loop.sim.scenario import InputError
+
+
+def compare(tmp_path, *options):
+    assert main([*options, "--out", str(tmp_path / "out"), "--json", str(tmp_path / "r.json")]) == 0
+    return json.loads((tmp_path / "r.json").read_text())["alternatives"]
+
+
+def test_each_coupling_has_its_price_and_error(tmp_path):
+    rows = {(row["coupling"], row["condition"]): row for row in compare(tmp_path, "--case", "I")}
+    assert list(rows)[:2] == [("none", None), ("published", None)]
+    none, free = rows["none", None], rows["spring-damper", "any-environment"]
+    here, best = rows["spring-damper", "this-environment"], rows["optimal", "this-environment"]
+    assert none["growth_rate_per_s"] == pytest.approx(1.481, abs=1e-3)
+    assert (none["guarantee"], none["force_error_percent"]) == (None, None)
+    assert none["required_damping"]["this-environment"] == pytest.approx([1.7229] * 2, rel=1e-4)
+    assert free["guarantee"] == "any passive environment"
+    assert [row["dc_ratio"] for row in (free, here, best)] == pytest.approx([0.476, 0.850, 1.0], abs=1e-3)
+    # over the band 1.8 %, every octave alike; less for the slow motion of this run
+    assert best["force_error_percent"] == pytest.approx(0.58, abs=0.1)
+    assert here["force_error_percent"] < free["force_error_percent"]
+    assert best["rms_mismatch_db"] == pytest.approx(-34.87, abs=0.3)
+    assert (tmp_path / "out" / "couplings.png").stat().st_size > 50_000
+
+
+def test_a_row_is_the_run_of_that_coupling(tmp_path):
+    """The run uses the other engine."""
+    rows = {(row["coupling"], row["condition"]): row for row in compare(tmp_path, "--no-plot")}
+    assert run_once(["--no-plot", "--out", str(tmp_path), "--json", str(tmp_path / "run.json")]) == 0
+    error = json.loads((tmp_path / "run.json").read_text())["ideal_force"]["error_percent"]
+    assert rows["spring-damper", "this-environment"]["force_error_percent"] == pytest.approx(error, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "kinds"),
+    [("one-wall", ["none", "spring-damper", "spring-damper"]), ("omega-pair-ranges", ["none", "spring-damper"])],
+)
+def test_walls_and_ranges_leave_out_other_couplings(tmp_path, name, kinds):
+    rows = compare(tmp_path, "--scenario", name)
+    assert [row["coupling"] for row in rows] == kinds
+
+
+def test_conditions_need_named_couplings(tmp_path):
+    with pytest.raises(InputError, match="--condition"):
+        main(["--condition", "any-environment", "--out", str(tmp_path)])

@@ -1,0 +1,77 @@
+"""The laws of the classics in examples/classics.py, and the example's figures."""
+
+import numpy as np
+import pytest
+from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.sim.passivity_layer import netted
+from haptic_loop.sim.run import assemble, run
+
+from examples.classics import ROWS, Classic, EnergyBounding, PassivityControl, row
+from haptic_loop import load
+
+T = 1e-3
+
+
+def test_energy_bounding_is_the_published_interval():
+    rng = np.random.default_rng(15)
+    bounding, c1, before = EnergyBounding(1, T, 1.2), 2 * 1.2 / T, 0.0
+    for k in range(500):
+        dx, wanted = (0.0 if k % 7 == 0 else 1e-4 * rng.normal()), 3 * rng.normal()
+        force = bounding.limit(np.array([[wanted]]), np.array([[dx]])).item()
+        if dx == 0:
+            assert force == before
+        else:
+            b = np.sort([c1, -c1 - 2 * before / dx])
+            assert force == pytest.approx(before + np.clip((wanted - before) / dx, *b) * dx, abs=1e-12)
+        assert T * force**2 / 4.8 <= T * before**2 / 4.8 + before * dx + 1.2 * dx**2 / T + 1e-15
+        before = force
+
+
+def test_the_passivity_controller_returns_what_its_observer_misses():
+    rng = np.random.default_rng(16)
+    control, observed = PassivityControl(2, T, nsim=5), np.zeros((2, 5))
+    for _ in range(300):
+        dx, wanted = 1e-4 * rng.normal(size=(2, 5)), rng.normal(size=(2, 5))
+        force = control.limit(wanted, dx)
+        observed += force * dx
+        assert observed.min() > -1e-12
+
+
+def test_the_passivity_controller_is_the_published_one():
+    """The series controller in velocities: W += f v + alpha_- v_-^2, alpha = -W/v^2 where W < 0, force f + alpha v."""
+    rng, control = np.random.default_rng(17), PassivityControl(1, T)
+    W = alpha = before = acted = 0.0
+    for _ in range(500):
+        v = rng.normal()
+        wanted = rng.normal() - 0.5 * v
+        W += wanted * v + alpha * before**2
+        alpha, before = (-W / v**2 if W < 0 else 0.0), v
+        acted += alpha > 0
+        force = control.limit(np.array([[wanted]]), np.array([[T * v]]))
+        assert force == pytest.approx(wanted + alpha * v, rel=1e-9, abs=1e-9)
+    assert acted > 100
+
+
+def test_energy_bounding_sends_what_its_law_says():
+    scenario = load().replace(duration=1.5)
+    trace = run(netted(assemble(scenario, NoCoupling()), Classic(EnergyBounding)), "exact")
+    sent = np.stack([trace.f[n : len(trace.f) - 2 + n, i] for i, n in enumerate((1, 2))], axis=1)
+    dx = np.diff(trace.x, axis=0)
+    c1 = 2 * np.array(scenario.delta) / scenario.T
+    k = np.arange(1, len(sent))
+    most = np.abs(sent[k - 1] + c1 * dx[k - 1])
+    assert (np.abs(sent[k]) <= np.where(dx[k - 1] == 0, np.abs(sent[k - 1]), most) + 1e-12).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "figures"),
+    [
+        ("PO/PC", (66.59, 0.310, 2.3, 90, 6, 0.118)),
+        ("energy bounding", (18.74, 5.675, 12.0, 96, 100, 8.915)),
+        ("energy budget", (14.40, 0.216, 1.6, 35, 7, 0.131)),
+    ],
+)
+def test_the_figures_of_the_classics(name, figures):
+    """Last digits as printed in docs/energy-budget.md."""
+    digits = (2, 3, 1, 0, 0, 3)
+    assert tuple(round(value, n) for value, n in zip(row(ROWS[name]), digits, strict=True)) == pytest.approx(figures)
