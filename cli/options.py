@@ -20,8 +20,8 @@ from haptic_loop.controller.delay import LOST, Periods, VaryingDelay
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.design.files import check_file, folder, read_text
 from haptic_loop.design.own import called, named, place_of
-from haptic_loop.design.result import CONDITIONS, DesignFailed
-from haptic_loop.models.device import MOST_DAMPING
+from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, DesignFailed
+from haptic_loop.models.device import MOST_DAMPING, Device, Guaranteed
 from haptic_loop.sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
 
 if TYPE_CHECKING:
@@ -89,6 +89,16 @@ class Parser(argparse.ArgumentParser):
         loop.add_argument("--T", type=number(), metavar="SECONDS", help="sampling period [s]")
         longest = "longest period [s], where it varies from tick to tick: certificates then are for any up to it"
         loop.add_argument("--T-max", type=number(), metavar="SECONDS", help=longest)
+        known = (
+            "guaranteed motor mass [kg], largest stiffness [N/m], least and largest damping [N s/m] of the transmission"
+        )
+        loop.add_argument(
+            "--known-device",
+            type=_known_device,
+            action="append",
+            metavar="MASS,K_MAX,B_MIN,B_MAX",
+            help=f"{known}; once for all channels, or once per channel",
+        )
         late = "how late after a tick forces latch [s], less than T: at most S, or LO:HI; one is for all"
         loop.add_argument("--latency", type=_latency_ranges, metavar="S", help=late)
 
@@ -100,7 +110,8 @@ class Parser(argparse.ArgumentParser):
 
     def add_condition(self, what: str = "the condition of the certificate", to: _Group | None = None) -> None:
         """--condition."""
-        help_ = f"{what}: {', '.join(CONDITIONS)} or FILE.py:NAME of your own (default: the coupling's)"
+        names = ", ".join((*CONDITIONS, *KNOWN_CONDITIONS))
+        help_ = f"{what}: {names} or FILE.py:NAME of your own (default: the coupling's)"
         (to or self).add_argument("--condition", type=condition, metavar="NAME|FILE.py:NAME", help=help_)
 
     def add_limiter(self, what: str = "clip forces at the devices' limits", to: _Group | None = None) -> None:
@@ -253,8 +264,9 @@ def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 def condition(text: str) -> str:
     """The name of a condition, or FILE.py:NAME of a user's own."""
-    if text not in CONDITIONS and ":" not in text:
-        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)} and FILE.py:NAME")
+    names = (*CONDITIONS, *KNOWN_CONDITIONS)
+    if text not in names and ":" not in text:
+        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(names)} and FILE.py:NAME")
     return text
 
 
@@ -346,7 +358,26 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
         name: value if name in ("T", "T_max") else per_channel(f"--{name}", value, scenario.channels)
         for name, value in said.items()
     }
+    if args.known_device:
+        bounds = per_channel("--known-device", args.known_device, scenario.channels)
+        with refused("--known-device: "):
+            changes["device"] = tuple(map(_with_bounds, scenario.device, bounds))
     return scenario.replace(**changes) if changes else scenario
+
+
+def _known_device(text: str) -> Guaranteed:
+    """MASS,K_MAX,B_MIN,B_MAX. Raises ArgumentTypeError."""
+    values = several(float)(text)
+    if len(values) != 4:
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected MASS,K_MAX,B_MIN,B_MAX")
+    try:
+        return Guaranteed(*values)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _with_bounds(device: Device, bounds: Guaranteed) -> Device:
+    return msgspec.structs.replace(device, guaranteed=bounds)
 
 
 def own_or(option: str, text: str, names: Collection[str]) -> Any:

@@ -26,7 +26,7 @@ from haptic_loop.design.files import InputError, off_table
 from haptic_loop.design.frequency import sweeping, too_long
 from haptic_loop.design.guarantees import ANY, CAVEATS, guarantee_of
 from haptic_loop.design.own import place_of
-from haptic_loop.design.result import CONDITIONS, ConditionName, Requirement, listed, refusal
+from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, ConditionName, Requirement, listed, refusal
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling in its loop, judged by either condition.
@@ -64,8 +64,8 @@ def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any
 
 def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -> Requirement:
     """The same with the gains, or coefficients, and the delays in samples at another T [s]."""
-    longest = loop.T_max and loop.T_max * (T / loop.T)  # periods vary in proportion
-    return _varied(loop, coupling.at_period(T), condition, T=T, T_max=longest)
+    longest, shortest = (bound and bound * (T / loop.T) for bound in (loop.T_max, loop.T_min))  # in proportion
+    return _varied(loop, coupling.at_period(T), condition, T=T, T_max=longest, T_min=shortest)
 
 
 def check_loop(loop: Loop) -> None:
@@ -127,6 +127,8 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Asked) -> _Stiffest:
     if asked.separable:
         reason = asked.not_varied(loop) or asked.beyond(loop)
         return _Stiffest(unknown, reason) if reason else _stiffest_of_each(loop, gains["B"], asked)
+    if reason := asked.not_varied(loop):
+        return _Stiffest(unknown, reason)
     K = np.array(gains["K"])
 
     @cache
@@ -369,8 +371,9 @@ def audit(
     """
     loop = loop.at(loop.environment).switching(None)
     check_loop(loop)
-    asked = asked or THIS_ENVIRONMENT
-    conditions = {each.name: each for each in (*map(named, reversed(CONDITIONS)), asked)}
+    known = [named(name) for name in KNOWN_CONDITIONS] if loop.known_devices else []
+    asked = asked or (known[0] if known else THIS_ENVIRONMENT)
+    conditions = {each.name: each for each in (*map(named, reversed(CONDITIONS)), *known, asked)}
     requirements = {name: requirement(loop, coupling, each) for name, each in conditions.items()}
     here = requirements[asked.name].certified
     fails = next((each for name, each in conditions.items() if here and not requirements[name].certified), asked)

@@ -49,6 +49,7 @@ from haptic_loop.design.exact import (
     rows_of,
 )
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
+from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import NotProved, Requirement, refusal
 from haptic_loop.design.worst_member import Progress, Searched, search_ranges
@@ -403,7 +404,9 @@ def _fractions(name: str, rows: Rows | None) -> Sequence[Fraction]:
     return found
 
 
-_NAMED: dict[str, Condition] = {each.name: each for each in (ANY_ENVIRONMENT, THIS_ENVIRONMENT)}
+_NAMED: dict[str, Condition] = {
+    each.name: each for each in (ANY_ENVIRONMENT, THIS_ENVIRONMENT, KNOWN_DEVICE, KNOWN_DEVICE_ANY)
+}
 _PARTS = SwitchingDelays, LimitedForces  # of a certificate, beside its condition
 
 
@@ -474,7 +477,8 @@ def assess(
     certificate just made, proves is not proved again; without `more` nothing else is proved beside it.
     """
     loop = loop.at(loop.environment).switching(None)
-    conditions = (*_NAMED.values(), *([named(own)] if own else []))
+    known_only = () if loop.known_devices else (KNOWN_DEVICE, KNOWN_DEVICE_ANY)
+    conditions = (*(each for each in _NAMED.values() if each not in known_only), *([named(own)] if own else []))
     proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
 
     asked = [(each, each.judge(loop, coupling)) for each in conditions]

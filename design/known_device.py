@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any, NamedTuple
 
@@ -24,12 +25,17 @@ import flint
 import numpy as np
 import scipy  # its parts load when they are used
 from haptic_loop.controller.arithmetic import Number, numbers, rational
+from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Complex, Lti, hstack, taps, vstack
-from haptic_loop.design.conditions import even_damping, v_hat
-from haptic_loop.design.frequency import frequencies, hermitian, largest_eigenvalue, on_circle, supremum
-from haptic_loop.design.result import NotProved
+from haptic_loop.controller.ranges import Member
+from haptic_loop.design.conditions import Condition, Demand, even_damping, v_hat
+from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.design.exact import require_size
+from haptic_loop.design.frequency import Response, frequencies, hermitian, largest_eigenvalue, on_circle, supremum
+from haptic_loop.design.lmi import ANY_ENVIRONMENT
+from haptic_loop.design.result import Guarantee, NotProved, Requirement, from_ratio, refusal
 
 # ----------------------------------------------------------------------------------------------------
 # The least cost of a period.
@@ -104,28 +110,30 @@ def period_cost(loop: Loop, share: Any, beta: Array) -> PeriodCost:
 
 
 _BITS = 320  # of the balls in which q is enclosed
-_FINER = 60  # bits of q beyond those that T - q has lost
+_MOST_ULPS = 8  # between q and its bounds: the midpoint of a ball is rounded once
 
 
-def q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[Fraction, ...], tuple[Fraction, ...]]:
-    """Rational bounds [s] below q of the shortest and above q of the longest period, channel by channel.
+def q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Decimals [s] below q of the shortest and above q of the longest period, channel by channel.
 
     q = T tanh(y)/y with y^2 = c0 T^2/(4 c2) at the damping of the loop. Raises NotProved for a beta that is too large.
     """
     below, above = [], []
     with flint.ctx.workprec(_BITS):
         for short, long in _enclosed(loop, beta):
-            digits = _FINER - 2 * min(int(np.floor(np.log2(max(float(1 - short[0] / short[1]), 2.0**-80)))), 0)
-            units = []
-            for q, T in (short, long):
-                scale = digits - int(np.floor(np.log2(float(T))))
-                found = (q * flint.arb(2) ** scale).floor().unique_fmpz()
-                if found is None:
-                    raise NotProved("q of the known device lies too near to a binary fraction to be enclosed")
-                units.append((int(found), 1 << scale))
-            below.append(Fraction(*units[0]))
-            above.append(Fraction(units[1][0] + 1, units[1][1]))
+            below.append(_beside(short, -np.inf, lambda value, ball: value < ball))
+            above.append(_beside(long, np.inf, lambda value, ball: value > ball))
     return tuple(below), tuple(above)
+
+
+def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> float:
+    """The nearest double whose shortest decimal lies beyond the ball."""
+    value = float(ball.mid())
+    for _ in range(_MOST_ULPS):
+        if beyond(flint.arb(_fmpq(rational(value))), ball):
+            return value
+        value = float(np.nextafter(value, towards))
+    raise NotProved("q of the known device could not be enclosed")
 
 
 def check_q(loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], above: Sequence[Fraction]) -> None:
@@ -134,28 +142,24 @@ def check_q(loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], abo
     if not len(beta) == len(below) == len(above) == m:
         raise NotProved(f"q has {len(below)} and {len(above)} bounds, expected {m} each")
     with flint.ctx.workprec(_BITS):
-        for i, ((short, _), (long, _)) in enumerate(_enclosed(loop, beta)):
+        for i, (short, long) in enumerate(_enclosed(loop, beta)):
             least, most = (flint.arb(_fmpq(value[i])) for value in (below, above))
             if not (below[i] > 0 and least < short and long < most):
-                raise NotProved(
-                    f"q #{i + 1} lies outside of its bounds on file, {float(below[i]):g} to {float(above[i]):g}"
-                )
+                between = f"{float(below[i])!r} to {float(above[i])!r}"
+                raise NotProved(f"q #{i + 1} lies outside of its bounds on file, {between} s")
 
 
-def _enclosed(loop: Loop, beta: Sequence[Fraction]) -> list[tuple[tuple[Any, Any], tuple[Any, Any]]]:
-    """(q, T) as balls for the shortest and for the longest period, channel by channel. Raises NotProved."""
+def _enclosed(loop: Loop, beta: Sequence[Fraction]) -> list[tuple[Any, Any]]:
+    """q of the shortest and of the longest period as balls, channel by channel. Raises NotProved."""
     exact = loop.period(True)
+    short, long = (rational(T) for T in (shortest_period(loop) or exact, loop.T_max or exact))
+
+    def q(T: Fraction, ratio: Fraction) -> Any:
+        y = flint.arb(_fmpq(ratio * T * T / 4)).sqrt()
+        return flint.arb(_fmpq(T)) * y.tanh() / y
+
     c0, c2 = _checked_rates(loop, beta)
-    periods = [rational(T) for T in (shortest_period(loop) or exact, loop.T_max or exact)]
-    found = []
-    for spread, inertia in zip(c0, c2, strict=True):
-        pair = []
-        for T in periods:
-            y = flint.arb(_fmpq(spread * T * T / (4 * inertia))).sqrt()
-            ball = flint.arb(_fmpq(T))
-            pair.append((ball * y.tanh() / y, ball))
-        found.append((pair[0], pair[1]))
-    return found
+    return [(q(short, spread / inertia), q(long, spread / inertia)) for spread, inertia in zip(c0, c2, strict=True)]
 
 
 def _checked_rates(loop: Loop, beta: Sequence[Fraction]) -> tuple[Any, Any]:
@@ -428,6 +432,172 @@ def chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Arra
     last, cross = beta * z[:, None] ** n, cross / 2
     both = speed * np.abs(window) ** 2 + own * beta**2 - 2 * (last * cross * np.conj(window)).real
     return both / (4 * (own * speed - np.abs(cross) ** 2))
+
+
+# ----------------------------------------------------------------------------------------------------
+# The conditions.
+
+_NONE = "the devices have no guaranteed bounds: declare [device.guaranteed] of every device, or give --known-device"
+_NO_SHORTEST = "periods up to T_max need a shortest one, T_min, for a known device"
+_MOST_SHARE = 1e3  # of the damping, up to which a beta on file is swept
+
+
+class KnownDevice(Condition):
+    """Safe in the environment of the loop for every passive hand, on devices within their guaranteed bounds.
+
+    The multiplier holds beta, and bounds of q below and above, one number each per channel; all are 0 where the
+    condition that knows nothing of the device asks less.
+    """
+
+    name, source, covers = "known-device", "Theorem B, docs/theory.md", ("psi", "T_max", "ranges")
+    plain: Condition = THIS_ENVIRONMENT  # as beta -> 0
+
+    def beyond(self, loop: Loop) -> str | None:
+        if not loop.known_devices:
+            return _NONE
+        return _NO_SHORTEST if shortest_period(loop) is None else super().beyond(loop)
+
+    def without(self, coupling: Coupling) -> str | None:
+        """Return why the condition says nothing of this coupling, or None."""
+        return None
+
+    def sweep(self, loop: Loop, coupling: Coupling) -> Sweep:
+        """Return the sweep in a loop without ranges. Raises SingularLoop."""
+        return ThisEnvironmentSweep(loop.F(coupling), loop)
+
+    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
+        """Return the block at the loop's own damping, which does not scale it."""
+        if multiplier is None:
+            multiplier = self.required(loop, coupling).multiplier or (0.0,) * 3 * loop.channels
+        m = loop.channels
+        beta, below, above = (multiplier[i : i + m] for i in (0, m, 2 * m))
+        if not any(beta):
+            return self.plain.demand(loop, coupling, exact)
+        if not exact:
+            return self._block(loop, coupling, period_cost(loop, 1.0, np.array(beta, dtype=float)), beta, exact)
+        rationals = [[rational(v) for v in part] for part in (beta, below, above)]
+        check_q(loop, *rationals)
+        return self._block(loop, coupling, exact_cost(loop, *rationals), rationals[0], exact)
+
+    def _block(self, loop: Loop, coupling: Coupling, cost: PeriodCost, beta: Any, exact: bool) -> Demand[Lti]:
+        F = loop.F(coupling, exact)
+        if exact:
+            require_size(F.order + loop.channels)
+        static, block = known_device_block(F, cost, beta)
+        return Demand(block, _zero(block), {"F(1)": static}, ("F(1)",))
+
+    def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
+        """Return the least damping over beta, or that of the beta given, the most of all members of the ranges.
+
+        Of several members one beta serves all: the best in the environment in which the plain condition asks most.
+        """
+        if reason := self.without(coupling):
+            return refusal(self.name, loop.delta, reason)
+        loops, m = self._loops(loop), loop.channels
+        plain = [self.plain.required(each, coupling) for each in loops]
+        hardest = max(range(len(loops)), key=lambda i: plain[i].ratio)
+        most = plain[hardest]
+        if most.reason and not self._may_help(most):
+            return refusal(self.name, loop.delta, most.reason)
+        high = min(most.ratio, _MOST_SHARE)
+        if multiplier is not None:
+            beta, high = tuple(float(b) for b in multiplier[:m]), _MOST_SHARE
+        else:
+            beta = self.sweep(loops[hardest], coupling).best(high).beta
+        if not any(beta):
+            return replace(most, condition=self.name, multiplier=(0.0,) * 3 * m)
+        found = [self.sweep(each, coupling).required(np.array(beta), high) for each in loops]
+        share, w = max(found)
+        if not np.isfinite(share) and multiplier is None:
+            return replace(most, condition=self.name, multiplier=(0.0,) * 3 * m)
+        if not np.isfinite(share):
+            reason = f"beta = {list(beta)} s proves nothing for these devices, whatever the damping"
+            return replace(refusal(self.name, loop.delta, reason), multiplier=(*beta, *(0.0,) * 2 * m))
+        bounds = (0.0,) * 2 * m
+        if multiplier is not None:
+            bounds = tuple(multiplier[m:])
+        elif share < 1:
+            below, above = q_bounds(loop, [rational(b) for b in beta])
+            bounds = below + above
+        requirement = from_ratio(self.name, share, loop.delta, w / (2 * np.pi * loop.T))
+        return replace(requirement, multiplier=(*beta, *bounds))
+
+    def _may_help(self, plain: Requirement) -> bool:
+        """Whether the condition may hold where the plain one is refused."""
+        return False
+
+    def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
+        if multiplier is None:
+            multiplier = self.required(loop, coupling).multiplier
+        beta = np.array((multiplier or (0.0,))[: loop.channels], dtype=float)
+        if not beta.any():
+            return self.plain.over_frequency(loop, coupling)
+        sweep = self.sweep(loop, coupling)
+        low = sweep.floor(beta)
+        return lambda w: sweep.shares(sweep.sampled(w), beta, low, max(_MOST_SHARE, 2 * low))
+
+    def not_varied(self, loop: Loop) -> str | None:
+        return "every variation would need a search for its own beta: not searched"
+
+    def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
+        return dict.fromkeys(("beta", "q_below", "q_above"), loop.channels)
+
+    def multiplier_name(self, loop: Loop) -> str | None:
+        return "beta, q"
+
+    def words(self, loop: Loop) -> str:
+        return f"{super().words(loop)}; every passive hand, on {described(loop)}"
+
+
+class KnownDeviceAny(KnownDevice):
+    """Safe around every passive environment for every passive hand, on devices within their guaranteed bounds."""
+
+    name, covers = "known-device-any", ("T_max", "walls", "ranges")
+    plain: Condition = ANY_ENVIRONMENT
+
+    def without(self, coupling: Coupling) -> str | None:
+        if coupling.compliance(1.0) is None:
+            return "the coupling has no compliance V(z) that knows nothing of the environment"
+        return None
+
+    def sweep(self, loop: Loop, coupling: Coupling) -> Sweep:
+        V = coupling.compliance(loop.T)
+        assert V is not None  # `without` refuses
+        return AnyEnvironmentSweep(V, loop)
+
+    def _block(self, loop: Loop, coupling: Coupling, cost: PeriodCost, beta: Any, exact: bool) -> Demand[Lti]:
+        V = coupling.compliance(loop.period(exact))
+        assert V is not None
+        if exact:
+            require_size(V.order + sum(loop.theta) + 2 * loop.channels)
+        static, block = known_device_any_block(V, loop.theta, cost, beta)
+        return Demand(block, _zero(block), {"V(1)": static})
+
+    def members(self, loop: Loop) -> tuple[Member, ...]:
+        return ()
+
+    def lag(self, loop: Loop) -> tuple[float, ...] | None:
+        return (0.0,) * loop.channels
+
+    def guarantee(self, loop: Loop) -> Guarantee:
+        return "any passive environment"
+
+
+def _zero(block: Lti) -> Lti:
+    return Lti.constant(np.zeros(block.D.shape, dtype=int), block.T)
+
+
+def described(loop: Loop) -> str:
+    """The devices of a loop in words: 'devices with at least 60 g behind at most 14500 N/m and 0.5 to 0.5 N s/m'."""
+    said = []
+    for device in dict.fromkeys(loop.known_devices or ()):
+        mass, k = f"{1e3 * device.motor_mass_min:.4g} g", f"{device.transmission_stiffness_max:.6g} N/m"
+        least, most = device.transmission_damping_min, device.transmission_damping_max
+        said.append(f"at least {mass} behind at most {k} and {least:.4g} to {most:.4g} N s/m")
+    return f"devices with {' or '.join(said)}"
+
+
+KNOWN_DEVICE, KNOWN_DEVICE_ANY = KnownDevice(), KnownDeviceAny()
 
 
 # ----------------------------------------------------------------------------------------------------

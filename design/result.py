@@ -12,7 +12,7 @@ from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Array
 
-ConditionName = Literal["this-environment", "any-environment"]
+ConditionName = Literal["this-environment", "any-environment", "known-device", "known-device-any"]
 #: for which environments a certificate holds
 Guarantee = Literal["any passive environment", "these ranges", "this environment"]
 
@@ -20,6 +20,11 @@ Guarantee = Literal["any passive environment", "these ranges", "this environment
 CONDITIONS: dict[str, str] = {
     "this-environment": "this environment",
     "any-environment": "any passive environment",
+}
+#: the conditions that also need guaranteed bounds of the devices' motors and transmissions
+KNOWN_CONDITIONS: dict[str, str] = {
+    "known-device": "this environment",
+    "known-device-any": "any passive environment",
 }
 
 

@@ -25,6 +25,30 @@ def require(field: str, value: float, low: float, high: float, unit: str) -> Non
 MOST_DAMPING = 1e4  # [N s/m]
 
 
+class Guaranteed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is guaranteed of a device's motor and transmission, `[device.guaranteed]` of a scenario.
+
+    The bounds hold for the real device; what is simulated must lie within them. The known-device conditions rest on
+    them: everything but the motor is reached through a spring and a damper in parallel.
+    """
+
+    motor_mass_min: float  # [kg] of all that moves rigidly with the motor's shaft
+    transmission_stiffness_max: float  # [N/m]
+    transmission_damping_min: float  # [N s/m]
+    transmission_damping_max: float  # [N s/m]
+
+    def __post_init__(self) -> None:
+        require("guaranteed.motor_mass_min", self.motor_mass_min, 1e-6, 1e3, "kg")
+        require("guaranteed.transmission_stiffness_max", self.transmission_stiffness_max, 1.0, 1e9, "N/m")
+        if self.transmission_damping_min == 0:
+            raise ValueError(
+                "guaranteed.transmission_damping_min is 0 N s/m: a lossless transmission guarantees nothing"
+            )
+        require("guaranteed.transmission_damping_min", self.transmission_damping_min, 1e-6, 1e5, "N s/m")
+        least = self.transmission_damping_min
+        require("guaranteed.transmission_damping_max", self.transmission_damping_max, least, 1e5, "N s/m")
+
+
 class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What both kinds of a device, which declare the fields, have."""
 
@@ -57,6 +81,7 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     credible_force: float | None = None  # [N] in the transmission: more is the model's alone, see `most_credible_force`
     credible_speed: float = 2.0  # [m/s] likewise; assumed: three times the 0.7 m/s that teleoperation masters exceed
     # in a fifth of the fast part of a tapping task (the abstract of such a study says so; not a figure of this device)
+    guaranteed: Guaranteed | None = None  # bounds of motor and transmission that the known-device conditions rest on
 
     file: ClassVar[str] = "compliant"  # .xml, its MJCF
 
@@ -85,6 +110,12 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
         require("transmission_damping", self.transmission_damping, 0.0, 1e5, "N s/m")
         if self.credible_force is not None:
             require("credible_force", self.credible_force, 1e-3, 1e6, "N")
+        if known := self.guaranteed:
+            require("motor_mass", self.motor_mass, known.motor_mass_min, 1e3, "kg (guaranteed)")
+            stiffest = known.transmission_stiffness_max
+            require("transmission_stiffness", self.transmission_stiffness, 1.0, stiffest, "N/m (guaranteed)")
+            least, most = known.transmission_damping_min, known.transmission_damping_max
+            require("transmission_damping", self.transmission_damping, least, most, "N s/m (guaranteed)")
 
 
 class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid", tag_field="kind"):
@@ -97,6 +128,7 @@ class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid",
     friction: float = 0.0  # [N] Coulomb friction, assumed 0; only MuJoCo models it
     delta: float | None = None  # [N s/m] guaranteed damping
     credible_speed: float = 2.0  # [m/s] as of a compliant device
+    guaranteed: Guaranteed | None = None  # refused: there is no transmission to guarantee
 
     file: ClassVar[str] = "rigid"
     transmission: ClassVar[None] = None
@@ -109,6 +141,8 @@ class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid",
 
     def __post_init__(self) -> None:
         _check_common(self, ("mass",))
+        if self.guaranteed is not None:
+            raise ValueError("guaranteed: a rigid device has no transmission; known-device needs kind = 'compliant'")
 
 
 Device = CompliantDevice | RigidDevice

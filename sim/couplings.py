@@ -20,7 +20,15 @@ from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import guarantee_of
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.own import called, place_of
-from haptic_loop.design.result import CONDITIONS, Chosen, Design, DesignFailed, Requirement, switching_guarantee
+from haptic_loop.design.result import (
+    CONDITIONS,
+    KNOWN_CONDITIONS,
+    Chosen,
+    Design,
+    DesignFailed,
+    Requirement,
+    switching_guarantee,
+)
 from haptic_loop.sim.scenario import InputError, Scenario
 
 NAMES = ("none", "published", *KINDS)
@@ -89,7 +97,7 @@ def _choose(
     coupling = fitted(stored, name, scenario.channels, scenario.T)
     made_for = stored.certificate.condition if stored.certificate else THIS_ENVIRONMENT.name
     checked = check_stored(stored, scenario.loop(case), own)
-    if made_for not in CONDITIONS:  # one of the user's own, which has to be named again
+    if made_for not in (*CONDITIONS, *KNOWN_CONDITIONS):  # one of the user's own, which has to be named again
         made_for = THIS_ENVIRONMENT.name
     proof = (stored.certificate and stored.certificate.limiter) or None
     how = {"notes": checked.notes, "switching": checked.switching, "limiter": proof}

@@ -30,7 +30,7 @@ from haptic_loop.controller.environment import (
     environment,
     parts_of,
 )
-from haptic_loop.controller.loop import MOST_SAMPLES, DelayRange, Loop
+from haptic_loop.controller.loop import MOST_SAMPLES, DelayRange, DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.design.files import InputError, counted, printable, read_text, toml, write
@@ -87,6 +87,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     population: Population = Population()  # who `validate` draws
     varying_delay: VaryingDelay | None = None  # of the forces, around theta; None where delays are constant
     T_max: float | None = None  # [s] the longest period, where it varies from tick to tick; certificates are for it
+    T_min: float | None = None  # [s] the shortest period, where T_max is given; only known-device asks for it
     period: Periods | None = None  # the periods that are simulated; T is what the computer's filters are made for
     latency: tuple[tuple[float, float], ...] | None = None  # [s] least and most by which a channel's force latches late
 
@@ -127,6 +128,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def _check_timing(self) -> None:
         if self.period and self.T_max is not None and self.period.longest > self.T_max:
             raise ValueError(f"period is up to {self.period.longest:g} s, above T_max = {self.T_max:g} s")
+        if self.period and self.T_min is not None and self.period.shortest < self.T_min:
+            raise ValueError(f"period is from {self.period.shortest:g} s, below T_min = {self.T_min:g} s")
         shortest = self.period.shortest if self.period else self.T
         for i, (_, most) in enumerate(self.latency or (), start=1):
             if most >= shortest:
@@ -177,6 +180,19 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return max(self.period.longest, self.T)
 
     @property
+    def shortest_period(self) -> float | None:
+        """The shortest period that certificates must cover: T_min, or the shortest simulated one; None if unknown."""
+        if self.T_min is not None or self.period is None:
+            return self.T_min
+        return min(self.period.shortest, self.T)
+
+    @property
+    def known_devices(self) -> tuple[DeviceBounds, ...] | None:
+        """The guaranteed bounds of every device, None unless all devices have some."""
+        known = [device.guaranteed for device in self.device]
+        return None if None in known else tuple(DeviceBounds(**msgspec.structs.asdict(each)) for each in known if each)
+
+    @property
     def usual_latency(self) -> list[float] | None:
         """The middle of each channel's range [s]; None where forces latch at ticks."""
         return None if self.latency is None else [sum(span) / 2 for span in self.latency]
@@ -194,8 +210,14 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     @property
     def digest(self) -> str:
         """SHA-256 over the scenario's contents."""
-        newer = {"T_max", "latency", "period"}  # left out where they are not given: scenarios keep their digest
+        newer = {
+            "T_max",
+            "T_min",
+            "latency",
+            "period",
+        }  # left out where they are not given: scenarios keep their digest
         contents = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in newer or value}
+        contents["device"] = [_without_guaranteed(device) for device in self.device]
         content = msgspec.json.encode(contents, order="sorted", enc_hook=_contents)
         return hashlib.sha256(content).hexdigest()
 
@@ -224,13 +246,21 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         varying = span if self.switches and span.lo != span.hi else None
         delays = (self.theta, self.psi, self.reference_delays(case))
         rest = (self.delta, self.environment, self.ranges, varying)
-        return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency)
+        return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency, **self._known())
+
+    def _known(self, channels: int | None = None) -> dict[str, Any]:
+        """The fields of a loop on known devices, those of its first channels; none where a device is not known.
+
+        The shortest period belongs to them, so that other loops keep their digest.
+        """
+        known = self.known_devices
+        return {"known_devices": known[:channels], "T_min": self.shortest_period} if known else {}
 
     def before_a_rigid_wall(self, psi: tuple[int, ...] = (0,)) -> Loop:
         """The loop of the first channel alone, a rigid wall in the place of the environment. Raises ValueError."""
         theta, late = self.theta[:1], self.latency and self.latency[:1]
-        rest = {"T_max": self.longest_period, "latency": late}
-        return Loop(self.T, theta, psi, theta, self.delta[:1], RIGID_WALL, **rest)
+        rest: dict[str, Any] = {"T_max": self.longest_period, **self._known(1)}
+        return Loop(self.T, theta, psi, theta, self.delta[:1], RIGID_WALL, latency=late, **rest)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping [N s/m].
@@ -563,6 +593,14 @@ def _kept(value: Any) -> Any:
         if force.shape != _TIMES.shape or force.dtype.kind not in "fiu" or not np.isfinite(force).all():
             raise ValueError(f"human #{i}.voluntary_force(t) is {force!r} for two times, expected as many forces in N")
     return tuple(value)
+
+
+def _without_guaranteed(device: Device) -> dict[str, Any]:
+    """The fields of a device, `guaranteed` only where there is something: other devices keep their digest."""
+    fields = msgspec.to_builtins(device)
+    if fields["guaranteed"] is None:
+        del fields["guaranteed"]
+    return fields
 
 
 def _contents(part: Any) -> Any:

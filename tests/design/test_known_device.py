@@ -9,9 +9,14 @@ import pytest
 from asked import loop as loop_of
 from asked import this_environment
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.controller.loop import DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti, taps
+from haptic_loop.controller.ranges import Ranges, UncertainSpring
+from haptic_loop.design.certificate import prove, required_damping, verify
+from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.exact import find_storage, prove_positive_real
+from haptic_loop.design.files import InputError
 from haptic_loop.design.known_device import (
     AnyEnvironmentSweep,
     Best,
@@ -26,6 +31,7 @@ from haptic_loop.design.known_device import (
     q_bounds,
 )
 from haptic_loop.design.result import NotProved
+from haptic_loop.sim.scenario import load
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import minimize
@@ -396,8 +402,13 @@ def test_uneven_periods_need_more():
 # Exact proofs.
 
 
-def exactly(loop, block_of, beta, *q):
-    return block_of(exact_cost(loop, beta, *(q or q_bounds(loop, beta))))
+def enclosed(loop, beta):
+    """The bounds of q as the exact proof takes them."""
+    return [[Fraction(repr(v)) for v in part] for part in q_bounds(loop, beta)]
+
+
+def exactly(loop, block_of, beta):
+    return block_of(exact_cost(loop, beta, *enclosed(loop, beta)))
 
 
 def test_the_paper_loop_is_proved_exactly():
@@ -444,7 +455,7 @@ def test_a_sweep_sees_what_the_block_is():
 
 def test_bounds_of_q_enclose_it_and_are_checked():
     beta = (Fraction(33, 10**6),) * 2
-    below, above = q_bounds(KNOWN, beta)
+    below, above = enclosed(KNOWN, beta)
     check_q(KNOWN, beta, below, above)
     for spoiled in (
         ((below[0] + Fraction(1, 10**15), below[1]), above),
@@ -456,3 +467,100 @@ def test_bounds_of_q_enclose_it_and_are_checked():
             check_q(KNOWN, beta, *spoiled)
     with pytest.raises(NotProved, match="beta"):
         q_bounds(KNOWN, (Fraction(1, 1000),) * 2)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Certificates, files, ranges and refusals.
+
+SPRING = Network(("tip",), (Spring(("tip", GROUND), 1000.0),))
+
+
+def test_a_file_proves_it_again_and_forgeries_are_refused():
+    coupling = PUBLISHED["I"]
+    assert not required_damping(KNOWN, coupling, "this-environment").certified
+    certificate = prove(KNOWN, coupling, "known-device")
+    stored = Stored.of(KNOWN, coupling, certificate)
+    back = msgspec.json.decode(msgspec.json.encode(stored), type=Stored)
+    assert verify(back).proved
+
+    def forged(**changes):
+        return verify(msgspec.structs.replace(back, certificate=sealed(change(certificate, **changes))))
+
+    name = next(n for n in certificate.matrices if n.startswith("beta"))
+    (row,) = certificate.matrices[name]
+    for at, factor in ((0, Fraction(3)), (2, Fraction(1001, 1000)), (4, Fraction(999, 1000))):
+        value = str(Fraction(row[at]) * factor)  # another beta, q below that is too large, q above that is too small
+        rows = ((*row[:at], value, *row[at + 1 :]),)
+        assert not forged(matrices=dict(certificate.matrices) | {name: rows}).proved
+    assert not forged(required=(0.5, 0.5), margin=2.74).proved
+    assert not forged(condition="this-environment", matrices={"P": certificate.matrices["P"]}).proved
+    lighter = change(DEVICE, motor_mass_min=0.05)
+    assert "digest" in verify(msgspec.structs.replace(back, loop=change(KNOWN, known_devices=(lighter,) * 2))).reason
+
+
+def test_the_smaller_requirement_is_taken():
+    """Where nothing is gained the plain condition is proved, with beta = 0."""
+    loop, coupling = one(1e-3, 1.0, environment=SPRING), NoCoupling()
+    plain, known = (required_damping(loop, coupling, name) for name in ("this-environment", "known-device"))
+    assert known.required == pytest.approx(plain.required, rel=1e-9)
+    assert not any(known.multiplier)
+    assert verify(Stored.of(loop, coupling, prove(loop, coupling, "known-device"))).proved
+
+
+def test_one_beta_serves_all_environments_of_ranges():
+    k = [(s.between, (0.9 * s.stiffness, 1.1 * s.stiffness)) for s in PAIR.environment.springs]
+    ranges = Ranges(springs=tuple(UncertainSpring(*each) for each in k))
+    loop = change(KNOWN, ranges=ranges)
+    certificate = prove(loop, PUBLISHED["I"], "known-device")
+    assert certificate.guarantee == "these ranges"
+    assert {name for name in certificate.matrices if name[0] == "P"} == {f"P{i or ''}" for i in range(5)}
+    assert verify(Stored.of(loop, PUBLISHED["I"], certificate)).proved
+    each = [ThisEnvironmentSweep(loop.at(m.network).F(PUBLISHED["I"]), KNOWN).best(2.0).share for m in loop.members()]
+    assert certificate.required[0] == pytest.approx(1.37 * max(each), rel=2e-3)
+
+
+def test_a_coupling_for_any_environment_is_proved_from_its_file():
+    loop, coupling = change(KNOWN, theta=(0, 1), lam=(0, 1)), SpringDamper([4000.0, 1300.0], [6.0, 2.5])
+    assert not required_damping(loop, coupling, "any-environment").certified
+    certificate = prove(loop, coupling, "known-device-any")
+    assert certificate.guarantee == "any passive environment"
+    assert verify(Stored.of(loop, coupling, certificate)).proved
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"known_devices": None}, "no guaranteed bounds"),
+        ({"T_max": 1.3e-3}, "T_min"),
+        ({"latency": ((0.0, 1e-4),) * 2}, "latency"),
+    ],
+)
+def test_loops_that_are_not_covered_are_refused(changes, said):
+    assert said in required_damping(change(KNOWN, **changes), PUBLISHED["I"], "known-device").reason
+
+
+def test_a_loop_without_known_devices_keeps_its_digest():
+    """The digest of the default loop with the published gains, as it was before devices could be known."""
+    content = msgspec.to_builtins(PAIR)
+    assert not {"known_devices", "T_min"} & set(content)
+    assert load("omega-pair").digest.startswith("5e87cc8624324c7d")
+    assert load("omega-pair-known").loop("I") == change(KNOWN, lam=(1, 2))
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"kind": "rigid", "guaranteed": (0.06, 14500.0, 0.5, 0.5)}, "rigid"),
+        ({"transmission_damping": 0.5, "guaranteed": (0.06, 14500.0, 0.0, 0.5)}, "transmission_damping_min"),
+        ({"transmission_damping": 0.4, "guaranteed": (0.06, 14500.0, 0.5, 0.5)}, "transmission_damping is 0.4"),
+        ({"transmission_damping": 0.5, "guaranteed": (0.07, 14500.0, 0.5, 0.5)}, "motor_mass is 0.06"),
+        ({"transmission_damping": 0.5, "guaranteed": (0.06, 14000.0, 0.5, 0.5)}, "transmission_stiffness is 14500"),
+    ],
+)
+def test_impossible_bounds_are_refused_in_one_line(fields, said):
+    names = ("motor_mass_min", "transmission_stiffness_max", "transmission_damping_min", "transmission_damping_max")
+    bounds = dict(zip(names, fields.pop("guaranteed"), strict=True))
+    scenario = load("omega-pair")
+    with pytest.raises(InputError, match=said) as refused:
+        scenario.replace(device=[{"kind": "compliant"} | fields | {"guaranteed": bounds}] * 2)
+    assert "\n" not in str(refused.value)
