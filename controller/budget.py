@@ -291,11 +291,22 @@ class Shell(_Net):
         self._V = V
         self._state = np.zeros((V.order, nsim))
         self._before = self._free = np.zeros((V.outputs, nsim))
+        self._released = np.zeros(nsim)  # [J] that was credited
 
     def free(self, x: ArrayLike) -> Array:
         """u0, (m, nsim) [m]: where the port would be at device positions x (m, nsim) if f were zero in this tick."""
         self._free = np.asarray(x, dtype=float) - self._V.C @ self._state
         return self._free.copy()
+
+    def credit(self, released: ArrayLike) -> None:
+        """Count what gravity and springs of the environment have released so far, (nsim,) [J]; only increases count.
+
+        Then sum f'(u - u_-) >= -(W0 + released) at every tick, with the largest `released` up to that tick: s = 0 is
+        admissible as before, since neither term falls.
+        """
+        rise = np.maximum(np.asarray(released, dtype=float) - self._released, 0.0)
+        self._released = self._released + rise
+        self._earn(rise)
 
     def limit(self, wanted: ArrayLike) -> tuple[Array, Array]:
         """f = s f_wanted [N] and the port's displacement u [m] with it, (m, nsim) each; ends the tick."""

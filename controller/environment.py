@@ -15,18 +15,20 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-from haptic_loop.controller.arithmetic import Number, inverse, numbers, rational, times
+from haptic_loop.controller.arithmetic import Number, SingularLoop, inverse, numbers, rational, times
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.lti import Array, Complex, Lti, Sampled, as_like
 from numpy.typing import NDArray
 
 GROUND = "ground"
+NO_MODEL = "a MuJoCo world has no linear model E(z): any-environment needs none; linearise(world, pose) gives one"
 
 
 #: largest amounts, far from where arithmetic ends and beyond what anybody renders
 MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
 _MOST_WALLS = 6
+_MOST_TICKS = 100  # between two steps of a world
 _MOST_NODES, _MOST_PARTS = 200, 2000  # a mass is two states, and a proof has at most a few hundred
 
 
@@ -226,6 +228,26 @@ class RigidWall(Environment, enum.Enum):
 RIGID_WALL = RigidWall.RIGID_WALL
 
 
+class NoModel(SingularLoop):
+    """An environment of which no E(z) is known, so that no condition on this environment says anything."""
+
+    def __init__(self) -> None:
+        super().__init__(NO_MODEL)
+
+
+class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A MuJoCo scene in place of a network: no E(z) is known, so only any-environment can be certified."""
+
+    file: str  # MJCF
+    digest: str  # SHA-256 over the contents of the scene's files
+    along: tuple[tuple[tuple[float, float, float], ...], ...]  # for each contact the directions in which it slides
+    every: int = 1  # the scene steps once in so many ticks
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.every <= _MOST_TICKS:
+            raise ValueError(f"every is {self.every}, allowed are 1 to {_MOST_TICKS} ticks")
+
+
 class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A passive mechanical network seen at its contacts, in the order of the channels."""
 
@@ -235,8 +257,12 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
     walls: Annotated[tuple[Wall, ...], msgspec.Meta(max_length=_MOST_WALLS)] = ()  # 2^6 contact states
     block: Block | None = None  # beside all these, of E(z) what is known by its numbers alone
     elements: tuple[Any, ...] = ()  # of one's own: their parts are put among springs and walls
+    world: World | None = None  # in place of everything else
 
     def __post_init__(self) -> None:
+        if self.world:
+            self._check_world(self.world)
+            return
         for part in [part for element in self.elements for part in parts_of(element)]:
             name = "springs" if isinstance(part, Spring) else "walls"
             msgspec.structs.force_setattr(self, name, (*getattr(self, name), part))
@@ -260,17 +286,37 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         if loose:
             raise ValueError(f"contact {loose[0]!r} has neither spring nor mass nor wall, so it can render no force")
 
+    def _check_world(self, world: World) -> None:
+        beside = [name for name in ("springs", "masses", "walls", "block", "elements") if getattr(self, name)]
+        if beside:
+            raise ValueError(f"world and {beside[0]}: a world is the whole environment, give one of them")
+        if len(world.along) != len(self.contacts):
+            raise ValueError(f"along has {len(world.along)} directions for {len(self.contacts)} contacts")
+        if len(set(self.contacts)) < len(self.contacts):
+            raise ValueError(f"contacts must be different bodies, got {list(self.contacts)}")
+
+    @property
+    def here(self) -> str:
+        return "this world" if self.world else "this environment"
+
     def as_network(self) -> Network:
+        if self.world:
+            raise NoModel
         return self
 
     def check(self, psi: Sequence[int], T: float) -> None:
-        environment(self, T)
+        if not self.world:
+            environment(self, T)
+        elif any(psi):
+            raise ValueError(f"psi is {list(psi)}: a world answers within the tick, so psi must be 0")
 
     @property
     def one_period(self) -> bool:
         return self.block is not None
 
     def E(self, T: Number) -> Lti:
+        if self.world:
+            raise NoModel
         return environment(held(self), T)
 
     def frozen(self) -> Sequence[Network]:

@@ -10,6 +10,7 @@ guarantee(loop, requirements)       Return the environments for which the coupli
 transparency_of(loop, coupling)     Return a Transparency: how close the felt force is to the environment's.
 simulate(scenario, coupling)        Return a Trace: a run with the people of the scenario, tick by tick.
 validate(scenario, coupling)        Return Findings: the growth of the loop with many random people.
+linearise(world, pose)              Return the Network that a MuJoCo scene is near a pose.
 rehearse(scenario)                  Return a Rehearsed: a whole session with an emulated device, in virtual time.
 plot_run(trace, path)               Write a picture of a Trace.
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from haptic_loop.sim.plots import plot_run
     from haptic_loop.sim.scenario import InputError, Scenario, load, parse
     from haptic_loop.sim.trace import Trace
+    from haptic_loop.sim.world import linearise
 
 _HOMES = {
     "RIGID_WALL": "controller.environment",
@@ -64,6 +66,7 @@ _HOMES = {
     "certify": "design.api",
     "design_coupling": "design.api",
     "guarantee": "design.api",
+    "linearise": "sim.world",
     "load": "sim.scenario",
     "parse": "sim.scenario",
     "plot_run": "sim.plots",

@@ -32,6 +32,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, require_linear
 from haptic_loop.sim.stability import stability_of
 from haptic_loop.sim.switching import Period, switching
 from haptic_loop.sim.trace import Trace
+from haptic_loop.sim.world import START_J, Claim, Touched, WorldFigures, WorldRecord, is_world, world_requirements
 
 if TYPE_CHECKING:
     from haptic_loop.sim import crowds
@@ -137,14 +138,19 @@ def simulate(
         one_of("integrator", integrator, tuple(INTEGRATORS))
     if substeps is not None:
         substeps = whole("substeps", substeps, 1, MOST)
-    limits = limits_of(scenario, chosen, limiter=limiter and environment is None)
+    if environment is not None and is_world(scenario):
+        raise InputError("environment= with a scenario that has environment.world: give one of them")
+    limits = limits_of(scenario, chosen, limiter=limiter and environment is None and not is_world(scenario))
     net: Wanted | None = None
-    if environment is not None:
+    if is_world(scenario):
+        net = Touched(START_J if energy_budget is None else energy_budget)
+    elif environment is not None:
         net = Plugged(environment, energy_budget or 0.0)
     elif energy_budget is not None:
         net = EnergyNet(energy_budget)
     done = run_scenario(scenario, chosen.coupling, limits.rho, EngineSettings(engine, integrator, substeps), seed, net)
     trace = done.trace
+    linear = not (scenario.switches or environment or is_world(scenario))
     meta = {
         "scenario": scenario.name,
         "scenario_digest": scenario.digest,
@@ -152,11 +158,14 @@ def simulate(
         "integrator": done.settings.integrator,
         "substeps": done.settings.substeps,
         "seed": seed,
-        "limiter": plain(limits),
-        "stability": None if scenario.switches or environment else plain(stability_of(done.simulation, trace)),
+        "limiter": None if is_world(scenario) else plain(limits),
+        "stability": plain(stability_of(done.simulation, trace)) if linear else None,
         "remarks": done.remarks,
         "energy_budget": plain(trace.net.figures()) if trace.net else None,
     }
+    if trace.net and (figures := trace.net.figures()) and isinstance(figures, WorldFigures):
+        claim = Claim.of(scenario, world_requirements(scenario, chosen.coupling), figures.start_J)
+        meta |= {"world": plain(WorldRecord.of(figures)), "guarantee": claim.words, "guaranteed": claim.guaranteed}
     return replace(trace, meta=meta)
 
 

@@ -21,6 +21,7 @@ import msgspec
 import numpy as np
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import Timing
+from haptic_loop.controller.law import Law
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import Net, Process, StepBuffer
@@ -138,7 +139,11 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
     if scenario.environment.walls and coupling.holds_model:
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
     limits, steps = (np.array([getattr(d, of) for d in scenario.device]) for of in ("force_limit", "encoder_step"))
-    process = Process(scenario.loop("I").law(coupling, limits, lag), limits, steps)
+    if scenario.environment.world:  # the scene's forces come from a net (sim.world), and no linear law is known
+        law = Law(Lti.constant(np.zeros((scenario.channels,) * 2), scenario.T), scenario.theta)
+    else:
+        law = scenario.loop("I").law(coupling, limits, lag)
+    process = Process(law, limits, steps)
     scene = build(scenario.device, scenario.human, scenario.person)
     plant = hold(scene.plant, scenario.T, scenario.usual_latency)
     return Simulation(scenario, coupling, process, scene, plant, scenario.timing(seed, scenario.samples))

@@ -27,7 +27,6 @@ from haptic_loop.controller.environment import (
     Network,
     Spring,
     Wall,
-    environment,
     parts_of,
 )
 from haptic_loop.controller.loop import MOST_SAMPLES, DelayRange, DeviceBounds, Loop
@@ -218,6 +217,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         }  # left out where they are not given: scenarios keep their digest
         contents = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in newer or value}
         contents["device"] = [_without_guaranteed(device) for device in self.device]
+        if self.environment.world:  # the contents of its files count, not where they are
+            contents["environment"] = _nowhere(self.environment)
         content = msgspec.json.encode(contents, order="sorted", enc_hook=_contents)
         return hashlib.sha256(content).hexdigest()
 
@@ -245,7 +246,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         span = self.delay_range
         varying = span if self.switches and span.lo != span.hi else None
         delays = (self.theta, self.psi, self.reference_delays(case))
-        rest = (self.delta, self.environment, self.ranges, varying)
+        rest = (self.delta, _nowhere(self.environment), self.ranges, varying)
         return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency, **self._known())
 
     def _known(self, channels: int | None = None) -> dict[str, Any]:
@@ -297,16 +298,19 @@ def load(source: str | Path = DEFAULT) -> Scenario:
         raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
     path = SCENARIOS / f"{source}.toml" if str(source) in built_in() else Path(source)
     text = read_text(path, f"scenario {source}", f"; give a TOML file or one of: {', '.join(built_in())}")
-    return parse(text, str(source))
+    return parse(text, str(source), path.parent)
 
 
-def parse(text: str, source: str = "scenario") -> Scenario:
-    """A scenario from TOML text. Raises InputError, with the path of the field and the value that came."""
+def parse(text: str, source: str = "scenario", folder: Path = Path()) -> Scenario:
+    """A scenario from TOML text. Raises InputError, with the path of the field and the value that came.
+
+    The file of a world is looked for in `folder`.
+    """
     if not isinstance(text, str):
         raise TypeError(f"text is of type {type(text).__name__}, expected a str: the scenario itself, in TOML")
-    scenario: Scenario = _converted(text, Scenario, source)
+    scenario: Scenario = _converted(text, Scenario, source, folder)
     try:
-        environment(scenario.environment, scenario.T)
+        scenario.environment.check(scenario.psi, scenario.T)
     except ValueError as error:
         raise InputError(f"{source}: environment: {error}") from None
     return scenario
@@ -444,12 +448,12 @@ def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple
 _NEEDED = ("name", "T", "theta", "device", "environment")
 
 
-def _converted(text: str, kind: Any, source: str) -> Any:
+def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
     """TOML text as `kind`. Raises InputError with the path of the field and the value that came."""
     raw = toml(text, source)
     try:
         raw = _whole(raw) if kind is Scenario else raw
-        return msgspec.convert(_with_own(_with_catalogue(raw)), kind)
+        return msgspec.convert(_with_own(_with_world(_with_catalogue(raw), folder)), kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
     except ValueError as error:
@@ -484,6 +488,56 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
                 raise InputError(f"device #{i}: {error}") from None
         made.append(given)
     return raw | {"device": made}
+
+
+_ALONG = [1.0, 0.0, 0.0]  # x, unless a scenario says otherwise
+
+
+def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The file with the MJCF file of a world, its path and its digest, and with a direction for each contact."""
+    given = raw.get("environment")
+    if not isinstance(given, dict) or "world" not in given:
+        return _without_along(raw, given)
+    from haptic_loop.models.world import check_contacts, digest_of  # MuJoCo, which other scenarios do without
+
+    name, contacts = given["world"], given.get("contacts", [])
+    if not isinstance(name, str) or not isinstance(contacts, list) or not all(isinstance(c, str) for c in contacts):
+        raise ValueError("environment.world: expected world = 'FILE.xml' and contacts, names of bodies in that file")
+    along = [[_direction(i, row)] for i, row in enumerate(given.get("along", [_ALONG] * len(contacts)), start=1)]
+    path = (folder / name).resolve()
+    try:
+        world = {"file": str(path), "digest": digest_of(path), "along": along, "every": given.get("every", 1)}
+        check_contacts(path, contacts)
+    except ValueError as error:
+        raise ValueError(f"environment.{error}") from None
+    rest = {key: value for key, value in given.items() if key not in ("along", "every")}
+    return raw | {"environment": rest | {"world": world}}
+
+
+def _without_along(raw: dict[str, Any], given: Any) -> dict[str, Any]:
+    """The file, if it does not speak of a world's steps and directions. Raises ValueError."""
+    beside = [key for key in ("along", "every") if isinstance(given, dict) and key in given]
+    if beside:
+        raise ValueError(f"environment.{beside[0]} is only with environment.world")
+    return raw
+
+
+def _direction(number: int, row: Any) -> list[float]:
+    """A direction x, y, z of unit length. Raises ValueError."""
+    length = 0.0
+    if isinstance(row, list) and len(row) == 3 and all(type(c) in (int, float) for c in row):
+        length = float(np.linalg.norm(row))
+    if not 1e-6 < length < 1e6:
+        raise ValueError(f"environment.along #{number} is {row!r}, expected a direction [x, y, z], not all zero")
+    return [c / length for c in row]
+
+
+def _nowhere(environment: Network) -> Network:
+    """The environment, with the name of a world's file in place of its path."""
+    if not environment.world:
+        return environment
+    world = msgspec.structs.replace(environment.world, file=Path(environment.world.file).name)
+    return msgspec.structs.replace(environment, world=world)
 
 
 def _with_own(raw: dict[str, Any]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
+from hands import Hands
 from haptic_loop.controller.budget import EnergyBudget, Packets, Shell
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.environment import Network, Networks, Spring, environment
@@ -10,49 +11,12 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.models.hold import hold as hold_input
 from haptic_loop.models.scene import Crowd, variants
 from haptic_loop.sim.scenario import load
-from scipy.linalg import expm
 from worlds import FIGURE_4
 
 from haptic_loop import design_coupling
 
 T = 1.2e-3
 DELTA = np.array([1.37, 0.9])
-
-
-class Hands:
-    """Two devices in random passive hands, integrated by the matrix exponential; the energy is the textbook's."""
-
-    def __init__(self, rng, nsim, lossless, start=0.0, masses=4):
-        n = self.n = masses
-        root = rng.normal(size=(nsim, n, n))
-        self.M = np.zeros((nsim, n, n))
-        self.M[:, range(n), range(n)] = np.exp(rng.uniform(np.log(0.02), np.log(2.0), (nsim, n)))
-        self.K = root @ root.transpose(0, 2, 1) * np.exp(rng.uniform(0, np.log(2000), (nsim, 1, 1)))
-        loss = rng.normal(size=(nsim, n, n)) * (0 if lossless else 1)
-        damping = loss @ loss.transpose(0, 2, 1)
-        damping[:, [0, 1], [0, 1]] += DELTA
-        inverse = np.linalg.inv(self.M)
-        generator = np.zeros((nsim, 2 * n + 2, 2 * n + 2))
-        generator[:, :n, n : 2 * n] = np.eye(n)
-        generator[:, n : 2 * n, :n], generator[:, n : 2 * n, n : 2 * n] = -inverse @ self.K, -inverse @ damping
-        generator[:, n : 2 * n, 2 * n :] = -inverse[:, :, :2]
-        self.step = expm(generator * T)[:, : 2 * n]
-        self.s = np.concatenate([np.zeros((nsim, n)), start * rng.normal(size=(nsim, n))], axis=1)
-
-    @property
-    def x(self):
-        return self.s[:, :2].T.copy()
-
-    @property
-    def v(self):
-        return self.s[:, self.n : self.n + 2].T
-
-    def energy(self):
-        q, v = self.s[:, : self.n], self.s[:, self.n :]
-        return (np.einsum("ki,kij,kj->k", q, self.K, q) + np.einsum("ki,kij,kj->k", v, self.M, v)) / 2
-
-    def hold(self, f):
-        self.s = np.einsum("kij,kj->ki", self.step, np.concatenate([self.s, f.T], axis=1))
 
 
 def springs(hands, rng):

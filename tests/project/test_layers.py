@@ -22,7 +22,7 @@ MAY_IMPORT = {
 #: the only files that may import a package
 HOMES = {
     # the view only shows what runs without it: shapes and arrows, the window, pictures without a window
-    "mujoco": {"models/scene.py", "sim/engines.py", "sim/view/"},
+    "mujoco": {"models/scene.py", "models/world.py", "sim/engines.py", "sim/view/"},
     "cvxpy": {"design/lmi.py"},  # the lemmas, for who gives expressions
     "clarabel": {"design/cone.py"},
     "distributed": {"sim/crowds.py"},

@@ -1,0 +1,582 @@
+"""MuJoCo scenes as environments: devices touch bodies of a scene, and scene and coupling are solved in one step.
+
+A device touches a contact: a body of the scene that is a child of the world body and has no joint. Any coupling with
+the direct part D_V answers within the tick, u = u0 - D_V f, where u0 is where the contact would be without force. So
+all that the scene feels of device, delays and coupling is one spring G = D_V^-1 from the contact to the point u0. The
+program gives the contact slides along its directions and this spring, and steps with MuJoCo's `discrete` integrator,
+which solves
+
+    f = G (u0 - u),   M (v+ - v)/h = f + all other forces at the end of the step,   u = displacement after the step.
+
+This file knows no coupling and no device: it takes G and u0 as numbers. What a scene may give is counted elsewhere
+(controller.budget.Shell); docs/theory.md, "MuJoCo worlds", proves why an ordinary scene gives nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating[Any]]
+
+PROXY_MASS = 0.03  # [kg] of a contact for which the scene gives no mass
+ITERATIONS, TOLERANCE = 100, 1e-10  # of the Newton solver
+MOST_REPETITIONS = 8  # of a step whose forces are limited
+_LIMIT_SLACK = 1e-9  # of a limit, relatively: a force that is this near counts as limited by it
+_TOO_LARGE = 50_000_000  # [bytes] of one file of a scene
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A body that a device touches, and the directions in which it slides: (axes, 3), orthonormal."""
+
+    body: str
+    along: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0),)
+
+    def __post_init__(self) -> None:
+        rows = np.array(self.along, dtype=float)
+        if rows.ndim != 2 or rows.shape[1] != 3 or not 1 <= len(rows) <= 3 or not np.isfinite(rows).all():
+            raise ValueError(
+                f"along of contact {self.body!r} is {self.along}, expected one to three directions x, y, z"
+            )
+        if np.abs(rows @ rows.T - np.eye(len(rows))).max() > 1e-9:
+            raise ValueError(f"along of contact {self.body!r} is {self.along}, expected orthonormal directions")
+
+
+@dataclass(frozen=True)
+class Part:
+    """One kind of part of a scene, and what is known of the energy that it gives at the contacts."""
+
+    what: str
+    count: int
+    at_the_port: str
+
+
+# ----------------------------------------------------------------------------------------------------
+# Files
+
+
+def files_of(path: Path) -> list[Path]:
+    """The MJCF file, all files that it includes, and the meshes, height fields and textures that these name.
+
+    Raises ValueError where a file cannot be read or is no XML.
+    """
+    found: dict[Path, None] = {}
+    folders = [""]
+    assets: list[str] = []
+
+    def visit(file: Path) -> None:
+        if file in found:
+            raise ValueError(f"world {path}: {file.name} is included twice")
+        found[file] = None
+        for node in _xml(file, path).iter():
+            name = node.get("file")
+            if node.tag == "include" and name:
+                visit(path.parent / name)
+            elif node.tag == "compiler":
+                folders.extend(folder for key in ("assetdir", "meshdir", "texturedir") if (folder := node.get(key)))
+            elif name:
+                assets.append(name)
+
+    visit(path)
+    for name in assets:
+        places = [path.parent / folder / name for folder in folders]
+        found.update(dict.fromkeys([place for place in places if place.is_file()][:1]))
+    return list(found)
+
+
+def _xml(file: Path, world: Path) -> ElementTree.Element:
+    try:
+        if file.stat().st_size > _TOO_LARGE:
+            raise ValueError(f"world {world}: {file.name} is larger than {_TOO_LARGE // 1_000_000} MB")
+        return ElementTree.fromstring(file.read_bytes())
+    except OSError as error:
+        raise ValueError(f"world {file}: {error.strerror or error}") from None
+    except ElementTree.ParseError as error:
+        raise ValueError(f"world {file}: not a valid XML file: {error}") from None
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 over the contents of all files of a scene, whatever their folder. Raises ValueError."""
+    total = hashlib.sha256()
+    for file in files_of(path):
+        content = file.read_bytes()
+        total.update(f"{file.name}\0{len(content)}\0".encode() + content)
+    return total.hexdigest()
+
+
+def check_contacts(path: Path, bodies: Sequence[str]) -> None:
+    """Raises ValueError, in one line, for a file that MuJoCo refuses, or a body that cannot be a contact."""
+    World(path, [Contact(body) for body in bodies], [np.eye(1)] * len(bodies), 1e-3)
+
+
+# ----------------------------------------------------------------------------------------------------
+# The scene with its contacts
+
+
+class World:
+    """A scene with slides and springs at its contacts, compiled with the settings that the port needs.
+
+    One world serves any number of ports (simulations), one after the other on one thread.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        contacts: Sequence[Contact],
+        stiffness: Sequence[Array],
+        T: float,
+        every: int = 1,
+        gravity: bool = True,
+    ) -> None:
+        """Compile the scene.
+
+        Args:
+            path: MJCF file.
+            contacts: one per device.
+            stiffness: G of each device, (axes, axes), symmetric and positive definite [N/m].
+            T: period of the loop [s].
+            every: the scene steps at every so many ticks, by as many periods.
+            gravity: False switches the scene's gravity off.
+
+        Raises:
+            ValueError: in one line, for a file that MuJoCo refuses, or a contact that cannot be one.
+        """
+        self.path, self.contacts, self.T, self.every = Path(path), tuple(contacts), T, every
+        if every < 1:
+            raise ValueError(f"every is {every}, expected a whole number of ticks, 1 or more")
+        spec = _spec(self.path)
+        base = _compiled(spec, self.path)
+        self._keys = {base.key(i).name: base.key(i).qpos.copy() for i in range(base.nkey)}
+        rotations, springs = [], []
+        for contact, G in zip(self.contacts, stiffness, strict=True):
+            body = _touchable(spec, contact.body, [c.body for c in self.contacts])
+            values, Q = _principal(np.atleast_2d(np.asarray(G, dtype=float)), contact)
+            _slide(body, contact, Q, values, base.body(contact.body).quat)
+            rotations.append(Q)
+            springs.append(values)
+        for key in list(spec.keys):
+            spec.delete(key)
+        _force_settings(spec, T * every, gravity)
+        self.model = _compiled(spec, self.path)
+        _off_rest(self.model)
+        self.xml = spec.to_xml()
+        self._Q, self._g = _blockdiag(rotations), np.concatenate(springs)  # u = Q q
+        joints = [self.model.joint(_name(c, a)) for c in self.contacts for a in range(len(c.along))]
+        self._qpos = np.array([joint.qposadr[0] for joint in joints])
+        self._dof = np.array([joint.dofadr[0] for joint in joints])
+        self._joint = np.array([joint.id for joint in joints])
+        self._afloat = self.model.body_gravcomp * self.model.body_mass  # (nbody,) [kg] without weight
+
+    @property
+    def channels(self) -> int:
+        return self._g.size
+
+    @property
+    def h(self) -> float:
+        """[s] of one step of the scene."""
+        return self.model.opt.timestep
+
+    def port(self, force_limit: Sequence[float] | Array | None = None) -> Port:
+        """A simulation of the scene from its initial pose, whose contacts feel at most these forces (m,) [N]."""
+        return Port(self, np.full(self.channels, np.inf) if force_limit is None else np.array(force_limit, float))
+
+    def linear(self, pose: Array | str | None = None, step: float = 1e-6) -> tuple[Array, Array, Array, Array]:
+        """The scene near a pose, without the springs G: A, B, C, D from forces on the contacts [N] to u [m].
+
+        Centred differences of one step of the scene. A is over (q, h v). What it
+        neglects: everything that is not linear, above all contacts that open or close and joints that turn far.
+
+        Args:
+            pose: positions (nq,) of this model, the name of a keyframe of the MJCF file, or None for the initial pose.
+            step: by how much each position is moved [m, rad]; speeds and forces move it as much within one step.
+
+        Raises:
+            ValueError: for an unknown keyframe, or a pose of another length.
+        """
+        model, data = self.model, mujoco.MjData(self.model)
+        q0, nv = self._pose(pose), model.nv
+        stiffness = model.jnt_stiffness[self._joint].copy()
+
+        def after(move: Array) -> Array:
+            mujoco.mj_resetData(model, data)
+            data.qpos[:] = q0
+            mujoco.mj_integratePos(model, data.qpos, move[:nv], 1.0)
+            data.qvel[:] = move[nv : 2 * nv]
+            data.qfrc_applied[self._dof] = self._Q.T @ move[2 * nv :]
+            mujoco.mj_step(model, data)
+            moved = np.empty(nv)
+            mujoco.mj_differentiatePos(model, moved, 1.0, q0, data.qpos)
+            return np.concatenate([moved, data.qvel])
+
+        model.jnt_stiffness[self._joint] = 0.0
+        try:
+            push = np.full(self.channels, step / self.h**2 * model.body_mass[model.jnt_bodyid[self._joint]].min())
+            moves = np.concatenate([np.full(nv, step), np.full(nv, step / self.h), push])
+            columns = [(after(row) - after(-row)) / (2 * move) for row, move in zip(np.diag(moves), moves, strict=True)]
+        finally:
+            model.jnt_stiffness[self._joint] = stiffness
+        scale = np.repeat([1.0, self.h], nv)  # of the states, so that all are lengths: inverses lose fewer digits
+        A, B = np.hsplit(scale[:, None] * np.array(columns).T, [2 * nv])
+        A = A / scale
+        rows = self._Q @ np.eye(2 * nv)[self._dof]
+        return A, B, rows @ A, rows @ B
+
+    def _pose(self, pose: Array | str | None) -> Array:
+        if isinstance(pose, str):
+            if pose not in self._keys:
+                named = ", ".join(name for name in self._keys if name) or "none"
+                raise ValueError(f"pose is {pose!r}, keyframes of {self.path.name}: {named}")
+            whole = self.model.qpos0.copy()
+            whole[np.setdiff1d(np.arange(self.model.nq), self._qpos)] = self._keys[pose]
+            return whole
+        whole = self.model.qpos0.copy() if pose is None else np.array(pose, dtype=float)
+        if whole.shape != (self.model.nq,):
+            raise ValueError(f"pose has the shape {whole.shape}, expected ({self.model.nq},) positions")
+        return whole
+
+    # -------------------------------------------------------------------------------------------- what is in it
+
+    def settings(self) -> str:
+        """The settings that the program forces on the scene, in one line."""
+        slow = f" = {self.every} ticks" if self.every > 1 else ""
+        solver = f"Newton, {ITERATIONS} iterations, tolerance {TOLERANCE:g}, no noslip"
+        return f"integrator discrete, timestep {self.h:g} s{slow}, elliptic cones, {solver}"
+
+    def outside_the_lemma(self) -> list[str]:
+        """Actuators, plugins and callbacks of the scene, which only the energy account covers; one text for each."""
+        m = self.model
+        listed = [f"actuator {m.actuator(i).name or i}" for i in range(m.nu)]
+        listed += [f"plugin {i}" for i in range(m.nplugin)]
+        callbacks = ("passive", "control", "act_dyn", "act_gain", "act_bias", "contactfilter")
+        for name in callbacks:
+            get = getattr(mujoco, f"get_mjcb_{name}", None)
+            if get is not None and get() is not None:
+                listed.append(f"callback mjcb_{name}")
+        return listed
+
+    def parts(self) -> list[Part]:
+        """What is in the scene, and what is known of each kind of part at the contacts (docs/worlds.md)."""
+        return list(_parts(self.model, set(self._joint.tolist())))
+
+
+def _spec(path: Path) -> Any:
+    files_of(path)  # raises ValueError with the name of a file that is missing
+    try:
+        return mujoco.MjSpec.from_file(str(path))
+    except (ValueError, mujoco.FatalError) as error:
+        raise ValueError(f"world {path}: {_one_line(error)}") from None
+
+
+def _compiled(spec: Any, path: Path) -> mujoco.MjModel:
+    try:
+        return spec.compile()
+    except (ValueError, mujoco.FatalError) as error:
+        raise ValueError(f"world {path}: {_one_line(error)}") from None
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _touchable(spec: Any, name: str, contacts: Sequence[str]) -> Any:
+    """The body of a contact. Raises ValueError for a body that cannot be one."""
+    body = spec.body(name)
+    free = [b.name for b in spec.worldbody.bodies if b.name and not b.joints and not b.mocap]
+    if body is None:
+        raise ValueError(f"contact {name!r}: the world has no such body; bodies without a joint: {', '.join(free)}")
+    if body.parent.name != "world":
+        raise ValueError(f"contact {name!r} is a child of body {body.parent.name!r}, expected a child of the world")
+    if body.joints:
+        raise ValueError(f"contact {name!r} has a joint ({body.joints[0].name or 'unnamed'}), expected a body without")
+    if body.mocap:
+        raise ValueError(f"contact {name!r} is a mocap body, expected an ordinary body without joints")
+    if list(contacts).count(name) > 1:
+        raise ValueError(f"contact {name!r} is named twice; each device touches a body of its own")
+    for equality in spec.equalities:
+        if equality.type == mujoco.mjtEq.mjEQ_WELD and name in (equality.name1, equality.name2):
+            raise ValueError(f"contact {name!r} is welded ({equality.name or 'unnamed weld'}); remove the weld")
+    return body
+
+
+def _principal(G: Array, contact: Contact) -> tuple[Array, Array]:
+    """Spring stiffnesses (axes,) and principal directions Q (axes, axes) of G = Q diag Q'. Raises ValueError."""
+    axes = len(contact.along)
+    if G.shape != (axes, axes):
+        raise ValueError(f"contact {contact.body!r} has {axes} directions, its spring is {G.shape[0]} x {G.shape[1]}")
+    if axes == 1:
+        values, Q = G[0], np.eye(1)
+    else:
+        if np.abs(G - G.T).max() > 1e-9 * np.abs(G).max():
+            raise ValueError(f"contact {contact.body!r}: its spring {G.tolist()} is not symmetric")
+        values, Q = np.linalg.eigh((G + G.T) / 2)
+    if not ((values > 0) & (values < np.inf)).all():
+        raise ValueError(f"contact {contact.body!r}: its spring has the stiffness {values.min():g} N/m, expected > 0")
+    return np.array(values, dtype=float), Q
+
+
+def _name(contact: Contact, axis: int) -> str:
+    return f"{contact.body}, slide {axis + 1}"
+
+
+def _slide(body: Any, contact: Contact, Q: Array, stiffness: Array, turn: Array) -> None:
+    """Give a body its slides, springs, mass and no weight; no default of the scene reaches them."""
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, np.asarray(turn, dtype=float))
+    directions = Q.T @ np.array(contact.along) @ rotation.reshape(3, 3)  # in the frame of the body
+    for axis, (direction, k) in enumerate(zip(directions, stiffness, strict=True)):
+        joint = body.add_joint(name=_name(contact, axis), type=mujoco.mjtJoint.mjJNT_SLIDE, axis=direction)
+        joint.stiffness = [k, 0.0, 0.0]
+        joint.damping = [0.0, 0.0, 0.0]
+        joint.armature = joint.frictionloss = joint.ref = joint.springref = joint.springyield = 0.0
+        joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+    if not body.explicitinertial and all(np.isnan(geom.mass) for geom in body.geoms):
+        body.explicitinertial, body.mass, body.inertia = True, PROXY_MASS, [1e-5] * 3
+        body.ipos = [0.0, 0.0, 0.0]
+    _take_weight(body)
+
+
+def _take_weight(body: Any) -> None:
+    body.gravcomp = 1.0
+    for child in body.bodies:
+        if not child.joints:
+            _take_weight(child)
+
+
+def _force_settings(spec: Any, h: float, gravity: bool) -> None:
+    option, enable, disable = spec.option, mujoco.mjtEnableBit, mujoco.mjtDisableBit
+    if option.disableflags & disable.mjDSBL_SPRING:
+        raise ValueError("option flag spring is disabled: the scene's contacts need springs, remove the flag")
+    option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    option.timestep = h
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.iterations, option.tolerance, option.noslip_iterations = ITERATIONS, TOLERANCE, 0
+    option.enableflags = (option.enableflags | enable.mjENBL_ENERGY) & ~(
+        enable.mjENBL_SLEEP | enable.mjENBL_IPC | enable.mjENBL_FWDINV | enable.mjENBL_SPECULATIVE
+    )
+    option.disableflags |= disable.mjDSBL_AUTORESET
+    spec.compiler.inertiafromgeom = 2  # automatic, so that a mass that the program gives stays
+    if not gravity:
+        option.gravity = [0.0, 0.0, 0.0]
+
+
+def _off_rest(model: mujoco.MjModel) -> None:
+    """Lengthen tendon springs by 1e-12, since MuJoCo steps one that is exactly at rest as if it had no stiffness."""
+    if not model.ntendon:
+        return
+    exact = (model.tendon_stiffness.reshape(model.ntendon, -1) != 0).any(axis=1)
+    exact &= model.tendon_lengthspring[:, 0] == model.tendon_lengthspring[:, 1]
+    model.tendon_lengthspring[exact] *= 1 + 1e-12
+
+
+def _blockdiag(blocks: Sequence[Array]) -> Array:
+    size = sum(len(block) for block in blocks)
+    whole, at = np.zeros((size, size)), 0
+    for block in blocks:
+        whole[at : at + len(block), at : at + len(block)] = block
+        at += len(block)
+    return whole
+
+
+# ----------------------------------------------------------------------------------------------------
+# A simulation of it
+
+
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+_TWO_SIDED = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON)  # rows of equalities and friction are not above it
+
+
+class Port:
+    """One simulation of a world, a tick at a time, and what it has given so far."""
+
+    def __init__(self, world: World, force_limit: Array) -> None:
+        """`force_limit` (m,) [N], inf where there is none. Raises ValueError for a limit on slides that are turned."""
+        if force_limit.shape != (world.channels,) or not (force_limit > 0).all():
+            raise ValueError(f"force_limit is {force_limit.tolist()}, expected {world.channels} positive forces in N")
+        self.world, self.data = world, mujoco.MjData(world.model)
+        self._limits, self._any_limit = force_limit, bool((force_limit < np.inf).any())
+        if self._any_limit and any(len(contact.along) > 1 for contact in world.contacts):
+            raise ValueError("force_limit: limited forces are only known for contacts with one direction")
+        self._saved = np.zeros(mujoco.mj_stateSize(world.model, _STATE)) if self._any_limit else None
+        self.ticks = 0
+        self.created = 0.0  # [J] what contacts have created, D2 of the lemma
+        self.unsettled = 0  # ticks in which the limited channels still changed after MOST_REPETITIONS
+        self._at_first = self._potential()
+        self.released = 0.0  # [J] the most that gravity and the scene's springs have given up so far
+
+    def step(self, u0: Array) -> Array:
+        """The forces of the contacts on the devices, (m,) [N], where u0 (m,) [m] is their place without force.
+
+        Forces are within the limits. They are not finite where MuJoCo's numbers are not.
+        """
+        world = self.world
+        goal = world._Q.T @ u0
+        if not self.ticks % world.every:
+            force = self._stepped(goal)
+        else:  # the scene stands still and does no work
+            force = np.clip(world._g * (goal - self.data.qpos[world._qpos]), -self._limits, self._limits)
+        self.ticks += 1
+        return world._Q @ force
+
+    @property
+    def u(self) -> Array:
+        """Displacements of the contacts along their directions, (m,) [m]."""
+        return self.world._Q @ self.data.qpos[self.world._qpos]
+
+    def _stepped(self, goal: Array) -> Array:
+        model, data, world = self.world.model, self.data, self.world
+        model.qpos_spring[world._qpos] = goal
+        if self._saved is None:
+            mujoco.mj_step(model, data)
+            force = world._g * (goal - data.qpos[world._qpos])
+        else:
+            force = self._limited(goal, self._saved)
+        if data.nefc:
+            self.created += self._creates()
+        self.released = max(self.released, self._at_first - self._potential())
+        return force
+
+    def _limited(self, goal: Array, saved: Array) -> Array:
+        """Step until the channels that are limited agree with the forces; in these the limit acts, not the spring."""
+        model, data, world, limits = self.world.model, self.data, self.world, self._limits
+        mujoco.mj_getState(model, data, saved, _STATE)
+        pushed = np.zeros(world.channels)  # +-1 where the limit acts in place of the spring
+        repetition = 0
+        while True:
+            spring, push = np.where(pushed == 0, world._g, 0.0), pushed * np.where(pushed == 0, 0.0, limits)
+            model.jnt_stiffness[world._joint], data.qfrc_applied[world._dof] = spring, push
+            mujoco.mj_step(model, data)
+            free = world._g * (goal - data.qpos[world._qpos])
+            starts = np.where(np.abs(free) > limits * (1 + _LIMIT_SLACK), np.sign(free), 0.0)
+            stays = (pushed != 0) & (pushed * free >= limits * (1 - _LIMIT_SLACK))
+            wanted = np.where(stays, pushed, starts)
+            if settled := bool((wanted == pushed).all()):
+                break
+            if repetition == MOST_REPETITIONS:
+                break
+            repetition, pushed = repetition + 1, wanted
+            mujoco.mj_setState(model, data, saved, _STATE)
+        self.unsettled += not settled
+        model.jnt_stiffness[world._joint], data.qfrc_applied[world._dof] = world._g, 0.0
+        return np.clip(np.where(pushed == 0, free, push), -limits, limits)
+
+    def _potential(self) -> float:
+        """U [J] of gravity and the scene's own springs at the present positions, without the springs G."""
+        model, data, world = self.world.model, self.data, self.world
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        if model.nflex:
+            mujoco.mj_flex(model, data)
+        if model.ntendon:
+            mujoco.mj_tendon(model, data)
+        at = data.qpos[world._qpos]
+        model.qpos_spring[world._qpos] = at  # so that the springs G hold no energy
+        mujoco.mj_energyPos(model, data)
+        return float(data.energy[0] + (world._afloat @ data.xipos) @ model.opt.gravity)
+
+    def _creates(self) -> float:
+        """[J] by which the contacts of the step that was just made exceed what they stored: the lemma's left side."""
+        rows = Rows.of(self.world.model, self.data)
+        return float(np.maximum(rows.excess(self.world.h), 0.0).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The constraint rows of the step that was just made, and to which contact or other constraint each belongs."""
+
+    force: Array  # (rows,) [N]
+    before: Array  # (rows,) w, the speed before the step [m/s]
+    after: Array  # (rows,) w+
+    depth: Array  # (rows,) r, negative inside [m]
+    D: Array  # (rows,) inverse regularisation of the row's law f = -D ((w+ - w)/h + b w+ + K (r + h w+)) [kg]
+    K: Array  # (rows,) reference stiffness [1/s^2]
+    b: Array  # (rows,) reference damping [1/s]
+    first: NDArray[np.intp]  # the first row of each contact or other constraint
+    one_sided: NDArray[np.bool_]  # (rows,) whether phi is that of a contact or limit; equalities store on both sides
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, data: mujoco.MjData) -> Rows:
+        """Read them from a step of the discrete integrator, whose efc_D is D (1 + b h + K h^2)."""
+        n, h = data.nefc, model.opt.timestep
+        after = np.empty(n)
+        mujoco.mj_mulJacVec(model, data, after, data.qvel)
+        KBIP = data.efc_KBIP.reshape(n, 4)
+        K, b = KBIP[:, 0] * KBIP[:, 2], KBIP[:, 1]
+        D = data.efc_D / (1 + b * h + K * h**2)
+        kind, number = data.efc_type, data.efc_id
+        new = np.ones(n, dtype=bool)
+        new[1:] = (kind[1:] != kind[:-1]) | (number[1:] != number[:-1])
+        one_sided = kind > _TWO_SIDED
+        depth = data.efc_pos - data.efc_margin
+        return cls(data.efc_force, data.efc_vel, after, depth, D, K, b, np.flatnonzero(new), one_sided)
+
+    def _stored(self, depth: Array) -> Array:
+        inside = np.where(self.one_sided, np.minimum(depth, 0.0), depth)
+        return self.D * self.K * inside**2 / 2
+
+    def excess(self, h: float) -> Array:
+        """h f'w+ + phi(r + h w+) - phi(r) [J] of each contact or other constraint: the energy that it creates."""
+        rows = h * self.force * self.after + self._stored(self.depth + h * self.after) - self._stored(self.depth)
+        return np.add.reduceat(rows, self.first)
+
+    def bound(self, h: float) -> Array:
+        """The lemma's bound on it, the sum of D w^2/(4 (1 + b h)) over its rows [J]."""
+        return np.add.reduceat(self.D * self.before**2 / (4 * (1 + self.b * h)), self.first)
+
+
+# ----------------------------------------------------------------------------------------------------
+# What a scene is made of
+
+
+_NONE = "no energy (lemma)"
+_BOUNDED = "lemma, up to what contacts create (printed by a run)"
+_ROW = "lemma with the row term: may create energy, the shell acts"
+_SMALL = "measured: small"
+_TURNING = "measured: small for slow motion; the shell"
+_SHELL = "the shell only"
+
+
+def _parts(m: mujoco.MjModel, slides: set[int]) -> Iterator[Part]:
+    joints = [i for i in range(m.njnt) if i not in slides]
+    turning = sum(m.jnt_type[i] != mujoco.mjtJoint.mjJNT_SLIDE for i in joints)
+    if joints:
+        yield Part("bodies that translate", len(joints) - turning, _NONE)
+    if turning:
+        yield Part("joints that turn", turning, _TURNING)
+    stiff = m.jnt_stiffness.reshape(m.njnt, -1)
+    springs = sum(bool(np.any(stiff[i] != 0)) for i in joints)
+    if springs:
+        yield Part("joint springs", springs, _NONE)
+    negative = sum(bool(np.any(stiff[i] < 0)) for i in joints) + int((m.tendon_stiffness < 0).sum())
+    if negative:
+        yield Part("springs of negative stiffness", negative, _SHELL)
+    if m.ntendon:
+        yield Part("tendons", m.ntendon, _SMALL)
+    rubbing = int((m.dof_frictionloss > 0).sum() + (m.tendon_frictionloss > 0).sum())
+    if rubbing:
+        yield Part("friction losses", rubbing, _ROW)
+    limited = [i for i in joints if m.jnt_limited[i]]
+    if limited:
+        constant = all(m.jnt_solimp[i, 0] == m.jnt_solimp[i, 1] for i in limited)
+        yield Part("joint limits", len(limited), _BOUNDED if constant else _SMALL)
+    solid = (m.geom_contype != 0) | (m.geom_conaffinity != 0)
+    if solid.any():
+        constant = bool((m.geom_solimp[solid, 0] == m.geom_solimp[solid, 1]).all() and not m.geom_margin[solid].any())
+        constant &= bool((m.pair_solimp[:, 0] == m.pair_solimp[:, 1]).all()) if m.npair else True
+        name = "geoms in contact, " + ("constant impedance" if constant else "impedance varies with depth")
+        yield Part(name, int(solid.sum()), _BOUNDED if constant else _SMALL)
+    if m.neq:
+        yield Part("equality constraints", m.neq, _SMALL)
+    if m.nflex:
+        yield Part("soft bodies", m.nflex, _SMALL)
+    active = {"actuators": m.nu, "motion capture": m.nmocap, "plugins": m.nplugin}
+    yield from (Part(what, count, _SHELL) for what, count in active.items() if count)

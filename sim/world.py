@@ -1,0 +1,274 @@
+"""A MuJoCo scene as the environment of a scenario: the scene behind a coupling, its energy account, and its claim.
+
+    trace = simulate(scenario, design).meta["world"]
+
+The scene is solved together with the coupling (models.world). Behind it stands the energy shell (controller.budget):
+whatever the scene does, it lets no more energy out of the port than W0 and what gravity and springs released.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from haptic_loop.controller.budget import Shell, ShellFigures
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.environment import Block, Network
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.controller.tick import Net, Process
+from haptic_loop.design.certificate import assess
+from haptic_loop.design.files import InputError
+from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.result import Requirement
+from haptic_loop.sim.run import Simulation
+from haptic_loop.sim.scenario import Scenario
+
+if TYPE_CHECKING:  # MuJoCo, for which no other scenario and no help has to wait
+    from haptic_loop.models.world import Contact, Port, World
+
+START_J = 2e-3  # W0, unless a run says otherwise
+_APART = 1e-12  # of D_V relatively: a smaller entry between two devices is rounding
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldFigures(ShellFigures):
+    """What happened at the port of a world."""
+
+    given_J: float  # the most that hands and devices were given, beyond what the devices' damping dissipates
+    port_least_J: float  # the least sum of f'(u - u_-) at the contacts
+    released_J: float  # the most that gravity and springs of the scene have given up
+    created_J: float  # by contacts, as the lemma counts it
+    unsettled_ticks: int  # in which the limited channels still changed after the last repetition of the step
+
+
+@dataclass(frozen=True)
+class WorldRecord:
+    """The entry `world` of a report."""
+
+    ticks: int
+    ticks_acted: int
+    given_J: float
+    port_least_J: float
+    released_J: float
+    created_J: float
+
+    @classmethod
+    def of(cls, figures: WorldFigures) -> WorldRecord:
+        shared = {name: getattr(figures, name) for name in cls.__dataclass_fields__ if name != "ticks_acted"}
+        return cls(ticks_acted=figures.limited_ticks, **shared)
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What is proved of a run in a world, or why nothing is."""
+
+    guaranteed: bool
+    words: str
+
+    @classmethod
+    def of(cls, scenario: Scenario, requirements: Sequence[Requirement], start: float) -> Claim:
+        """The claim of a coupling with these requirements, in this scenario, with W0 = `start` [J]."""
+        reason = _uncovered(scenario)
+        if reason is None:
+            anywhere = [need for need in requirements if need.guarantee == ANY]
+            if not anywhere:
+                reason = "the coupling is not judged for any environment"
+            elif not any(need.certified for need in anywhere):
+                reason = f"the coupling is not certified for any environment: {anywhere[0].shortfall}"
+        if reason:
+            return cls(False, f"No guarantee: {reason}.")
+        energy = f"W0 = {_energy(start)}"
+        return cls(
+            True,
+            f"Whatever this scene does, no passive hand is given more than {energy} beyond what gravity and springs "
+            "released.",
+        )
+
+
+def _energy(joules: float) -> str:
+    return f"{1e3 * joules:g} mJ"
+
+
+def _uncovered(scenario: Scenario) -> str | None:
+    """Why the account proves nothing in this scenario, whatever the coupling."""
+    if any(device.encoder_step for device in scenario.device):
+        return "the devices have encoder steps, and the account needs exact positions"
+    if scenario.switches:
+        return "the delays of the forces vary, and the certificate is for constant delays"
+    if any(scenario.psi):
+        return "psi is not 0"
+    return None
+
+
+# ----------------------------------------------------------------------------------------------------
+# The scene behind a coupling
+
+
+def is_world(scenario: Scenario) -> bool:
+    """Whether the scenario's environment is a MuJoCo scene."""
+    return scenario.environment.world is not None
+
+
+def world_requirements(scenario: Scenario, coupling: Coupling) -> list[Requirement]:
+    """What each condition asks of the devices; those on this environment say nothing of a world."""
+    return list(assess(scenario.loop("I"), coupling).values())
+
+
+def require_no_world(scenario: Scenario, what: str) -> None:
+    """Raises InputError for commands that need an E(z)."""
+    if is_world(scenario):
+        raise InputError(f"environment.world: {what} needs a linear model E(z); linearise(world, pose) gives one")
+
+
+def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> World:
+    """The compiled scene with a spring G = D_V^-1 at each contact.
+
+    Raises InputError for a coupling whose direct part D_V is not positive definite, or couples devices.
+    """
+    world = scenario.environment.world
+    assert world is not None
+    V = coupling.compliance(scenario.T)
+    if V is None:
+        raise InputError(f"environment.world: a {coupling.kind} coupling has no compliance V; a world needs one")
+    from haptic_loop.models.world import World
+
+    contacts = contacts_of(scenario.environment)
+    try:
+        return World(world.file, contacts, _springs(V, contacts), scenario.T, world.every, gravity)
+    except ValueError as error:
+        raise InputError(f"environment.world: {error}") from None
+
+
+def contacts_of(environment: Network) -> list[Contact]:
+    """The bodies that the devices touch, with the directions in which they slide."""
+    from haptic_loop.models.world import Contact
+
+    world = environment.world
+    assert world is not None
+    return [Contact(body, along) for body, along in zip(environment.contacts, world.along, strict=True)]
+
+
+def _springs(V: Lti, contacts: Sequence[Contact]) -> list[Array]:
+    """G = D_V^-1 of each device. Raises ValueError."""
+    ends = np.cumsum([0, *(len(contact.along) for contact in contacts)])
+    if V.D.shape != (ends[-1], ends[-1]):
+        raise ValueError(f"the coupling has {len(V.D)} channels, the world has {ends[-1]}")
+    within = [V.D[a:b, a:b] for a, b in pairwise(ends)]
+    between = V.D.copy()
+    for a, b in pairwise(ends):
+        between[a:b, a:b] = 0.0
+    if np.abs(between).max() > _APART * np.abs(V.D).max():
+        raise ValueError("the coupling's direct part couples devices; a world needs one spring per device")
+    for contact, D in zip(contacts, within, strict=True):
+        asymmetric = np.abs(D - D.T).max() > _APART * np.abs(D).max()
+        if asymmetric or not np.linalg.eigvalsh((D + D.T) / 2).min() > 0:
+            what = f"the coupling's direct part {D.tolist()} at {contact.body!r}"
+            raise ValueError(f"{what} is not symmetric and positive definite; a world needs a spring there")
+    return [np.linalg.inv((D + D.T) / 2) for D in within]
+
+
+# ----------------------------------------------------------------------------------------------------
+# The net of a run
+
+
+@dataclass(frozen=True, eq=False)
+class Touched:
+    """The scenario's world in the loop, behind the coupling and the energy shell."""
+
+    start: float = START_J  # W0 [J]
+    gravity: bool = True  # False switches the scene's gravity off
+
+    def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
+        """A fresh one. Raises InputError."""
+        V = simulation.coupling.compliance(simulation.loop.T)
+        if V is None or not V.D.any():
+            raise InputError("environment.world needs a coupling: with --coupling none the devices touch nothing")
+        if any(simulation.scenario.psi):
+            raise InputError("psi: a world answers within the tick, so psi must be 0")
+        scene = scene_of(simulation.scenario, simulation.coupling, self.gravity)
+        try:
+            shell = Shell(V, start=self.start, nsim=nsim)
+        except ValueError as error:
+            raise InputError(f"energy budget: {error}") from None
+        damping = np.array(simulation.loop.delta)[:, None] / (simulation.loop.T_max or simulation.loop.T)
+        return InWorld(shell, [scene.port(process.force_limit) for _ in range(nsim)], damping)
+
+
+class InWorld:
+    """A world, its shell, and what hands and devices were given."""
+
+    def __init__(self, shell: Shell, ports: list[Port], damping: Array) -> None:
+        """`damping` (m, 1) [N s/m / s]: delta/T, what a device dissipates per squared displacement."""
+        self.ports, self._shell, self._damping = ports, shell, damping
+        m, nsim = len(damping), len(ports)
+        self._x: Array | None = None
+        self._acting = self._u = np.zeros((m, nsim))
+        self._at_port, self._given = np.zeros(nsim), np.zeros(nsim)
+        self._least, self._most = np.zeros(nsim), np.zeros(nsim)
+
+    def send(self, x: Array, force: Array, /) -> None:
+        if self._x is not None:
+            dx = x - self._x
+            self._given += (-self._acting * dx - self._damping * dx**2).sum(axis=0)
+            np.maximum(self._most, self._given, out=self._most)
+        self._x = x.copy()
+        free = self._shell.free(x)
+        wanted = np.stack([port.step(u0) for port, u0 in zip(self.ports, free.T, strict=True)], axis=1)
+        self._shell.credit([port.released for port in self.ports])
+        force[...], u = self._shell.limit(wanted)
+        self._at_port += (force * (u - self._u)).sum(axis=0)
+        self._u = u
+        np.minimum(self._least, self._at_port, out=self._least)
+
+    def apply(self, k: int, force: Array, /) -> None:
+        self._acting = force.copy()
+
+    def figures(self) -> WorldFigures:
+        return WorldFigures(
+            **vars(self._shell.figures(None)),
+            given_J=float(self._most.max()),
+            port_least_J=float(self._least.min()),
+            released_J=max(port.released for port in self.ports),
+            created_J=max(port.created for port in self.ports),
+            unsettled_ticks=max(port.unsettled for port in self.ports),
+        )
+
+
+# ----------------------------------------------------------------------------------------------------
+# A linear model
+
+
+def linearise(world: Scenario | str | Path, pose: Any = None, contacts: Sequence[str] = (), T: float = 1e-3) -> Network:
+    """Return the network that a scene is near a pose, for designs that need an environment.
+
+    It neglects all that is not linear: contacts are open or closed as in the pose, and joints turn little. A coupling
+    that is designed for it is certified for this network, not for the scene.
+
+    Args:
+        world: a scenario with a world, whose contacts and T are then taken, or an MJCF file.
+        pose: positions (nq,) of the scene with its slides, the name of a keyframe, or None for the initial pose.
+        contacts: names of the bodies, of an MJCF file; they slide along x.
+        T: period [s], of an MJCF file.
+
+    Raises:
+        InputError: for a scene or pose that cannot be, or a model that is not a passive environment.
+    """
+    from haptic_loop.models.world import Contact, World
+
+    if isinstance(world, Scenario):
+        file = world.environment.world
+        if file is None:
+            raise InputError("linearise: the scenario has no environment.world")
+        path, touched, T = file.file, contacts_of(world.environment), world.T
+    else:
+        path, touched = str(world), [Contact(name) for name in contacts]
+    unit = [np.eye(len(contact.along)) for contact in touched]
+    try:
+        E = Lti(*World(path, touched, unit, T).linear(pose), T).inverse()
+        return Network(tuple(contact.body for contact in touched), block=Block.of(E))
+    except ValueError as error:
+        raise InputError(f"linearise: {error}") from None

@@ -1,0 +1,312 @@
+"""MuJoCo scenes as environments: the step at the contacts, the lemma, linear scenes, and what is refused."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from haptic_loop.controller.coupling import MovingAverage, SpringDamper
+from haptic_loop.controller.environment import Network, Spring
+from haptic_loop.controller.lti import Lti
+from haptic_loop.models.world import Contact, Rows, World, digest_of, files_of
+from worlds import environment_by_hand
+
+T = 1e-3
+FREE = '<geom type="sphere" size="0.005" contype="0" conaffinity="0"/>'
+#: contact - 800 N/m - 1 kg - 700 N/m - contact, all along x and without gravity
+LINE = f"""<mujoco><option gravity="0 0 0"/><worldbody>
+<body name="left" pos="-0.1 0 0">{FREE}<site name="l"/></body>
+<body name="right" pos="0.1 0 0">{FREE}<site name="r"/></body>
+<body name="block"><joint type="slide" axis="1 0 0"/>
+<geom type="box" size="0.01 0.01 0.01" mass="1"/><site name="b"/></body>
+</worldbody><tendon>
+<spatial stiffness="800" damping="1"><site site="l"/><site site="b"/></spatial>
+<spatial stiffness="700" damping="2"><site site="b"/><site site="r"/></spatial></tendon></mujoco>"""
+#: the same network; a contact weighs 30 g, as the program makes it
+NETWORK = Network(
+    ("left", "right"),
+    (Spring(("left", "block"), 800.0, 1.0), Spring(("block", "right"), 700.0, 2.0)),
+    {"block": 1.0, "left": 0.03, "right": 0.03},
+)
+COUPLINGS = (
+    SpringDamper([1500.0, 900.0], [0.5, 0.8]),
+    SpringDamper([1500.0, 900.0], [0.5, 0.8], cutoff=30.0),
+    MovingAverage([1e-4, 2e-4], (2, 3), [1e-4, 1e-4]),
+)
+
+
+def world(folder: Path, text: str, contacts=("left", "right"), G=(1500.0, 900.0), **options) -> World:
+    path = folder / "scene.xml"
+    path.write_text(text)
+    along = options.pop("along", ((1.0, 0.0, 0.0),))
+    springs = [np.atleast_2d(g) for g in G]
+    return World(path, [Contact(name, along) for name in contacts], springs, options.pop("T", T), **options)
+
+
+# ---- the step
+
+
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_a_linear_scene_is_the_network(tmp_path, coupling):
+    """Three seconds behind a coupling: the forces of our own network, and u = x - V f.
+
+    Tendon springs are longer by 1e-12, 8e-11 N; rounding of lengths of 0.1 m adds 1e-14 N a tick.
+    """
+    V = coupling.compliance(T)
+    port = world(tmp_path, LINE, G=1 / np.diag(V.D)).port()
+    F = coupling.around(NETWORK.E(T))
+    state, inner = np.zeros(F.order), np.zeros(V.order)
+    for k in range(3000):
+        x = 0.01 * np.sin(2 * np.pi * np.array([1.0, 1.7]) * k * T) + 0.001 * (k > 500)
+        force = port.step(x - V.C @ inner)
+        u = x - (V.C @ inner + V.D @ force)
+        assert np.abs(port.u - u).max() < 1e-12
+        assert np.abs(force - (F.C @ state + F.D @ x)).max() < 1e-9
+        inner, state = V.A @ inner + V.B @ force, F.A @ state + F.B @ x
+
+
+def test_limited_forces_are_felt_by_the_scene(tmp_path):
+    """Free contacts: v+ = v + h f/m with f = G (u0 - u), or the limit where that is more."""
+    text = f'<mujoco><worldbody><body name="left">{FREE}</body><body name="right">{FREE}</body></worldbody></mujoco>'
+    port, limit = world(tmp_path, text).port([3.0, 5.0]), np.array([3.0, 5.0])
+    v, u, hit = np.zeros(2), np.zeros(2), np.zeros(2, int)
+    for k in range(2000):
+        goal = 0.02 * np.sin(2 * np.pi * np.array([20.0, 30.0]) * k * T)
+        force = port.step(goal)
+        stiff = np.array([1500.0, 900.0])
+        free = stiff * (goal - u - T * v) / (1 + stiff * T**2 / 0.03)  # solved for the end of the step
+        expected = np.clip(free, -limit, limit)
+        assert np.abs(force - expected).max() < 1e-9
+        hit += np.abs(expected) == limit
+        v = v + T * expected / 0.03
+        u = u + T * v
+        assert np.abs(port.u - u).max() < 1e-11
+    assert hit.min() > 100
+    assert port.unsettled == 0
+
+
+def test_a_slow_scene_stands_still_between_its_steps(tmp_path):
+    port = world(tmp_path, LINE, every=4).port()
+    assert port.world.h == 4 * T
+    before = port.u
+    for k in range(100):
+        goal = 0.01 * np.sin(2 * np.pi * np.array([1.0, 1.7]) * k * T)
+        force = port.step(goal)
+        moved = np.abs(port.u - before).max() > 0
+        assert not moved or k % 4 == 0
+        np.testing.assert_allclose(force, [1500.0, 900.0] * (goal - port.u), rtol=0, atol=1e-12)
+        before = port.u
+
+
+def test_two_axes_of_a_contact_take_a_full_spring(tmp_path):
+    """G = Q diag Q': a free contact obeys m (v+ - v)/h = G (u0 - u) in both directions."""
+    text = f'<mujoco><worldbody><body name="tip" euler="20 30 40">{FREE}</body></worldbody></mujoco>'
+    G = np.array([[900.0, 300.0], [300.0, 400.0]])
+    port = world(tmp_path, text, ["tip"], [G], along=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))).port()
+    v, u = np.zeros(2), np.zeros(2)
+    for k in range(500):
+        goal = 0.01 * np.sin(2 * np.pi * np.array([1.0, 1.7]) * k * T)
+        force = port.step(goal)
+        v = np.linalg.solve(np.eye(2) + T**2 / 0.03 * G, v + T / 0.03 * G @ (goal - u))
+        u = u + T * v
+        np.testing.assert_allclose(port.u, u, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(force, G @ (goal - u), rtol=0, atol=1e-10)
+        tip = port.data.body("tip").xpos
+        np.testing.assert_allclose(tip, [u[0], 0.0, u[1]], rtol=0, atol=1e-13)
+
+
+def test_released_energy_is_that_of_gravity_and_springs(tmp_path):
+    """A body on a spring falls; the contact beside it has no weight, and its spring G does not count."""
+    text = f"""<mujoco><worldbody><body name="left">{FREE}</body><body name="right">{FREE}</body>
+    <body name="load" pos="0.5 0 0"><joint type="slide" axis="0 0 1" stiffness="20"/>
+    <geom type="sphere" size="0.01" mass="0.5"/></body></worldbody></mujoco>"""
+    port = world(tmp_path, text, along=((0.0, 0.0, 1.0),)).port()
+    most = 0.0
+    for _ in range(300):
+        port.step(np.array([0.3, -0.2]))
+        z = port.data.qpos[port.world.model.joint(2).qposadr[0]]
+        most = max(most, -(0.5 * 9.81 * z + 20 * z**2 / 2))
+        assert port.released == pytest.approx(most, abs=1e-12)
+    assert most > 0.2
+
+
+# ---- the lemma
+
+#: condim, impratio, d, solref, solreffriction of all contacts
+SCENES = (
+    (1, 1, 0.9, "0.01 1", None),
+    (3, 1, 0.01, "0.01 1", None),
+    (3, 10, 0.9, "0.02 1", None),
+    (4, 1, 0.99, "0.005 1", None),
+    (6, 10, 0.5, "0.01 0.5", None),
+    (6, 1, 0.95, "-2000 -100", "-100 -3000"),
+)
+PAIRS = (("floor", "cube"), ("f1", "cube"), ("f2", "cube"), ("f1", "floor"), ("f2", "floor"), ("f1", "f2"))
+
+
+def scene_of_the_lemma(condim, impratio, d, solref, friction) -> str:
+    more = f'solreffriction="{friction}"' if friction else ""
+    how = f'condim="{condim}" friction="0.6 0.5 0.02 0.001 0.001" solimp="{d} {d} 0.001" solref="{solref}" {more}'
+    pairs = "".join(f'<pair geom1="{one}" geom2="{other}" {how}/>' for one, other in PAIRS)
+    return f"""<mujoco><option impratio="{impratio}"/><worldbody><geom name="floor" type="plane" size="1 1 .1"/>
+<body name="left" pos="-0.05 0 0.02"><geom name="f1" type="sphere" size="0.01"/></body>
+<body name="right" pos="0.05 0 0.03"><geom name="f2" type="capsule" size="0.01 0.01"/></body>
+<body name="cube" pos="0 0 0.03"><joint type="slide" axis="1 0 0"/>
+<joint type="slide" axis="0 1 0" stiffness="50" damping="0.2" frictionloss="0.3" solimpfriction="0.9 0.9"/>
+<joint type="slide" axis="0 0 1"/><geom name="cube" type="box" size="0.03 0.03 0.03" mass="0.3"/></body>
+</worldbody><contact>{pairs}</contact></mujoco>"""
+
+
+def count_of_the_lemma(folder: Path, scene, ticks: int) -> int:
+    """Push two contacts at random for so many ticks; compare every constraint of every tick with its bound."""
+    along = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    G = ([[800.0, 100.0], [100.0, 300.0]], [[700.0, 0.0], [0.0, 500.0]])
+    port = world(folder, scene_of_the_lemma(*scene), G=G, along=along).port()
+    rng, u0, v, count, created = np.random.default_rng(1), np.zeros(4), np.zeros(4), 0, 0.0
+    for _ in range(ticks):
+        v = 0.98 * v + 0.1 * rng.normal(size=4) - 0.1 * u0
+        u0 = u0 + T * v
+        force = port.step(u0 + np.array([0.015, 0.0, -0.015, 0.0]))
+        data = port.data
+        if not data.nefc:
+            continue
+        rows = Rows.of(port.world.model, data)
+        excess, bound = rows.excess(T), rows.bound(T)
+        assert (excess <= bound + 1e-15).all()  # of terms up to 1 J
+        created += np.maximum(excess, 0.0).sum()
+        count += len(excess)
+    assert port.created == pytest.approx(created, rel=1e-9)
+    assert np.isfinite(force).all()
+    return count
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_contact_creates_no_more_than_the_lemma(tmp_path, scene):
+    """`python -m tests.models.test_world` counts 120,000 and more of them."""
+    assert count_of_the_lemma(tmp_path, scene, 600) > 1000
+
+
+@pytest.mark.parametrize("scene", SCENES[:5])
+def test_rows_follow_the_law_of_the_lemma(tmp_path, scene):
+    """f = -D ((w+ - w)/h + b w+ + K (r + h w+)) wherever a one-sided row presses and no cone cuts it."""
+    port = world(tmp_path, scene_of_the_lemma(1, *scene[1:])).port()
+    pressed = 0
+    for k in range(300):
+        port.step(np.array([0.03, -0.03]) * np.sin(0.02 * k))
+        r = Rows.of(port.world.model, port.data) if port.data.nefc else None
+        if r is None:
+            continue
+        law = -r.D * ((r.after - r.before) / T + r.b * r.after + r.K * (r.depth + T * r.after))
+        inside = r.one_sided & (r.force > 0)
+        np.testing.assert_allclose(r.force[inside], law[inside], rtol=1e-6, atol=1e-6)  # the solver's tolerance
+        assert (law[r.one_sided & (r.force == 0)] <= 1e-6).all()
+        pressed += inside.sum()
+    assert pressed > 100
+
+
+# ---- a linear model
+
+
+def test_the_linear_model_of_a_linear_scene_is_its_network(tmp_path):
+    """From 0.1 to 100 Hz, relative to the largest E: rounding of positions over the step of the differences."""
+    scene, z = world(tmp_path, LINE), np.exp(2j * np.pi * np.geomspace(0.1, 100, 60) * T)
+    E = environment_by_hand(NETWORK, z, T)
+    for step in (1e-4, 1e-2):
+        ours = Lti(*scene.linear(step=step), T).inverse().at(z[None])[0]
+        assert np.abs(ours - E).max() < 1e-12 * np.abs(E).max()
+
+
+def test_the_linear_model_is_mujocos_own_derivative(tmp_path):
+    """mjd_transitionFD of the same step, without the springs G, at a pose in contact."""
+    scene = world(tmp_path, scene_of_the_lemma(1, 1, 0.9, "0.01 1", None))
+    pose = scene.model.qpos0.copy()
+    pose[-1] = -2e-4
+    A, B, _, _ = scene.linear(pose, 1e-7)
+    model, data = scene.model, mujoco.MjData(scene.model)
+    model.jnt_stiffness[:2] = 0.0
+    data.qpos[:] = pose
+    n = 2 * model.nv
+    theirs = np.zeros((n, n))
+    mujoco.mjd_transitionFD(model, data, 1e-7, True, theirs, None, None, None)
+    unit = np.repeat([1.0, T], model.nv)  # ours is over (q, h v)
+    assert np.abs(A - unit[:, None] * theirs / unit).max() < 1e-7  # rounding of 0.1 m over differences of 1e-7
+    assert B.shape == (n, 2)
+
+
+# ---- refusals
+
+
+def with_body(body: str, more: str = "") -> str:
+    return f'<mujoco><worldbody><body name="right">{FREE}</body>{body}</worldbody>{more}</mujoco>'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (with_body(""), "contact 'left': the world has no such body; bodies without a joint: right"),
+        (with_body(f'<body name="left"><joint name="j"/>{FREE}</body>'), "contact 'left' has a joint (j)"),
+        (with_body(f'<body name="left" mocap="true">{FREE}</body>'), "contact 'left' is a mocap body"),
+        (with_body(f'<body name="arm"><body name="left">{FREE}</body></body>'), "is a child of body 'arm'"),
+        (
+            with_body(
+                f'<body name="left">{FREE}</body><body name="box"><freejoint/><geom size="0.1"/></body>',
+                '<equality><weld name="w" body1="box" body2="left"/></equality>',
+            ),
+            "contact 'left' is welded (w)",
+        ),
+        (with_body(f'<body name="left">{FREE}</body>', '<option><flag spring="disable"/></option>'), "flag spring"),
+        ("<mujoco><worldbody>", "not a valid XML file"),
+        ("<mujoco><nonsense/></mujoco>", "nonsense"),
+        ('<mujoco><include file="missing.xml"/></mujoco>', "missing.xml: No such file"),
+    ],
+)
+def test_what_is_no_contact_is_refused(tmp_path, text, message):
+    with pytest.raises(ValueError, match=r".*") as caught:
+        world(tmp_path, text)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_defaults_of_a_scene_do_not_reach_the_slides(tmp_path):
+    plain = world(tmp_path, with_body(f'<body name="left">{FREE}</body>'))
+    joint = '<default><joint damping="3" armature="1" frictionloss="2" range="-1 1" limited="true"/></default>'
+    dressed = world(
+        tmp_path, with_body(f'<body name="left">{FREE}</body>').replace("<worldbody>", joint + "<worldbody>")
+    )
+    for scene in (plain, dressed):
+        model = scene.model
+        for part in (model.dof_damping, model.dof_armature, model.dof_frictionloss, model.jnt_limited):
+            assert not part.any()
+        assert model.body("left").mass == model.body("right").mass == 0.03
+
+
+def test_the_digest_covers_what_a_scene_includes(tmp_path):
+    main, part = tmp_path / "main.xml", tmp_path / "part.xml"
+    main.write_text('<mujoco><include file="part.xml"/></mujoco>')
+    part.write_text("<mujocoinclude><worldbody/></mujocoinclude>")
+    first = digest_of(main)
+    assert [file.name for file in files_of(main)] == ["main.xml", "part.xml"]
+    part.write_text('<mujocoinclude><worldbody><body name="b"/></worldbody></mujocoinclude>')
+    assert digest_of(main) != first
+    elsewhere = tmp_path / "copy"
+    elsewhere.mkdir()
+    for file in (main, part):
+        (elsewhere / file.name).write_text(file.read_text())
+    assert digest_of(elsewhere / "main.xml") == digest_of(main)
+
+
+def test_an_active_scene_is_listed(tmp_path):
+    text = with_body(
+        f'<body name="left">{FREE}</body><body name="box"><joint name="j"/><geom size="0.1"/></body>',
+        '<actuator><motor name="drive" joint="j"/></actuator>',
+    )
+    scene = world(tmp_path, text)
+    assert scene.outside_the_lemma() == ["actuator drive"]
+    assert {part.what: part.at_the_port for part in scene.parts()}["actuators"] == "the shell only"
+
+
+if __name__ == "__main__":
+    from tempfile import TemporaryDirectory
+
+    with TemporaryDirectory() as place:
+        print(sum(count_of_the_lemma(Path(place), scene, 6000) for scene in SCENES), "constraints within their bounds")

@@ -1,0 +1,281 @@
+"""MuJoCo worlds in a loop: the energy account, what it proves of hands, and what a scenario may say."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hands import Hands
+from haptic_loop.controller.budget import Shell
+from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
+from haptic_loop.controller.environment import Network, Spring
+from haptic_loop.controller.lti import Lti
+from haptic_loop.design.designs import design_by_kind
+from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.sim.scenario import InputError, Scenario, load, parse
+from haptic_loop.sim.world import START_J, contacts_of, linearise, scene_of
+
+from haptic_loop import simulate
+
+T = 1e-3
+NAMES = ("cube", "ball", "peg", "door", "stack")
+LIMIT = (12.0, 12.0)
+TIP = '<geom type="sphere" size="0.01"/>'
+
+
+def scenario(folder: Path, text: str, contacts: str = '["left", "right"]', more: str = "", **changes) -> Scenario:
+    (folder / "scene.xml").write_text(text)
+    (folder / "loop.toml").write_text(
+        f"""name = "test"
+T = 1e-3
+theta = [1, 2]
+device = [{{ kind = "rigid", mass = 0.2, damping = 1.37, force_limit = 12.0 }},
+          {{ kind = "rigid", mass = 0.2, damping = 0.9, force_limit = 12.0 }}]
+[environment]
+world = "scene.xml"
+contacts = {contacts}
+{more}
+"""
+    )
+    loaded = load(folder / "loop.toml")
+    return loaded.replace(**changes) if changes else loaded
+
+
+def certified(loop: Scenario):
+    """The stiffest coupling for any environment, at the loop's delays."""
+    return design_by_kind(loop.loop("I"), "moving-average")
+
+
+class Touch:
+    """Passive hands on a world through its shell; the energy is that of the hands, by the textbook."""
+
+    def __init__(self, loop: Scenario, hands: Hands, start: float = START_J, gravity: bool = True, credit: bool = True):
+        coupling = certified(loop).coupling
+        self.V, self.theta, self.hands, self.credit = coupling.compliance(T), loop.theta, hands, credit
+        self.port = scene_of(loop, coupling, gravity).port(LIMIT)
+        self.shell = Shell(self.V, start=start)
+        self.line = [np.zeros((2, 1))] * (max(loop.theta) + 1)
+        self.start = float(hands.energy()[0])
+
+    def tick(self) -> float:
+        """The energy that hands and devices have beyond their first one [J]."""
+        free = self.shell.free(self.hands.x)
+        wanted = self.port.step(free[:, 0])[:, None]
+        if self.credit:
+            self.shell.credit([self.port.released])
+        force, _ = self.shell.limit(wanted)
+        self.line = [force, *self.line[:-1]]
+        self.hands.hold(np.array([self.line[n][i] for i, n in enumerate(self.theta)]))
+        return float(self.hands.energy()[0]) - self.start
+
+
+# ---- the packaged worlds
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_no_hand_is_given_more_than_the_account(name, lossless):
+    """Hands thrown at each scene, delays 0 to 3; the shell acts on no tick with random hands."""
+    rng, acted, ticks = np.random.default_rng(3), 0, 0
+    for run in range(4):
+        loop = load(f"world-{name}").replace(theta=(run, (run + 2) % 4))
+        touch = Touch(loop, Hands(rng, 1, lossless, 0.3, T=T, delta=loop.delta))
+        for _ in range(500):
+            assert touch.tick() <= START_J + touch.port.released + 1e-12
+        acted, ticks = acted + int(touch.shell.limited[0]), ticks + 500
+    assert acted <= (ticks // 1000 if lossless else 0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_without_gravity_energy_never_rises(name):
+    """Kinetic energy of the scene and energy of the hands, against what they began with and W0."""
+    loop = load(f"world-{name}").replace(theta=(0, 3))
+    touch = Touch(loop, Hands(np.random.default_rng(5), 1, True, 0.3, T=T, delta=loop.delta), gravity=False)
+    model, data = touch.port.world.model, touch.port.data
+    mass = np.diag(model.dof_M0)
+    for _ in range(500):
+        risen = touch.tick()
+        kinetic = data.qvel @ mass @ data.qvel / 2  # bodies here translate, or turn about one fixed hinge
+        assert risen + kinetic <= START_J + touch.port.released + 1e-9
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_packaged_world_runs_and_is_guaranteed(name):
+    loop = load(f"world-{name}").replace(duration=0.5)
+    trace = simulate(loop, certified(loop), engine="exact")
+    world, again = trace.meta["world"], simulate(loop, certified(loop), engine="exact")
+    assert trace.meta["guaranteed"]
+    assert (
+        "no passive hand is given more than W0 = 2 mJ beyond what gravity and springs released"
+        in (trace.meta["guarantee"])
+    )
+    assert set(world) == {"ticks", "ticks_acted", "given_J", "port_least_J", "released_J", "created_J"}
+    assert (world["ticks"], world["ticks_acted"]) == (500, 0)
+    np.testing.assert_array_equal(trace.f, again.f)
+    dx, delta = np.diff(trace.x, axis=0), np.array(loop.delta)
+    given = np.cumsum((-trace.f[:-1] * dx - delta / T * dx**2).sum(axis=1)).max()
+    assert world["given_J"] == pytest.approx(max(given, 0.0), abs=1e-12)
+
+
+def test_the_plate_lifts_the_cube():
+    """Friction at the plate carries 0.1 kg by more than a centimetre."""
+    loop = load("world-cube")
+    coupling = certified(loop).coupling
+    port, shell = scene_of(loop, coupling).port(LIMIT), Shell(coupling.compliance(T), start=START_J)
+    for k in range(1500):
+        squeeze, lift = 0.02 * min(1.0, k / 500), 0.03 * min(1.0, max(0, k - 500) / 500)
+        force = port.step(shell.free(np.array([[squeeze], [lift]]))[:, 0])
+        shell.limit(force[:, None])
+    height = port.data.body("cube").xpos[2]
+    assert 0.04 < height < 0.061
+
+
+# ---- gravity and active scenes
+
+TRAY = f"""<mujoco><worldbody><body name="left" pos="-0.05 0 0">{TIP}</body><body name="right" pos="0.05 0 0">{TIP}
+</body><body name="tray" pos="0 0 0.02"><joint type="slide" axis="0 0 1"/>
+<geom type="box" size="0.1 0.05 0.01" mass="0.3" solimp="0.9 0.9"/></body></worldbody></mujoco>"""
+UP = "along = [[0, 0, 1], [0, 0, 1]]"
+
+
+def test_what_gravity_releases_is_no_reason_to_act(tmp_path):
+    """Hands carry a tray of 0.3 kg. Without the credit and without W0 the shell holds every force back."""
+    loop = scenario(tmp_path, TRAY, more=UP)
+    acted = {}
+    for credit in (True, False):
+        hands = Hands(np.random.default_rng(1), 1, False, 0.0, T=T, delta=loop.delta)
+        touch = Touch(loop, hands, start=START_J if credit else 0.0, credit=credit)
+        risen = max(touch.tick() for _ in range(1500))
+        acted[credit] = int(touch.shell.limited[0])
+        if credit:
+            assert START_J < risen <= START_J + touch.port.released
+            assert touch.port.data.body("tray").xpos[2] < 0.02
+        else:
+            assert risen <= 1e-12
+    assert acted[True] == 0
+    assert acted[False] > 1400
+
+
+def test_an_active_scene_is_held_back(tmp_path):
+    """A motor with negative damping drives a body against the contacts: neither gravity nor a spring gives that."""
+    text = f"""<mujoco><option gravity="0 0 0"/><worldbody><body name="left" pos="-0.03 0 0">{TIP}</body>
+    <body name="right" pos="0.08 0 0">{TIP}</body><body name="load"><joint name="j" type="slide" axis="1 0 0"/>
+    <geom type="box" size="0.019 0.05 0.05" mass="0.3" solimp="0.9 0.9"/></body></worldbody>
+    <actuator><velocity joint="j" kv="-60"/></actuator></mujoco>"""
+    loop = scenario(tmp_path, text)
+    worst = acted = 0
+    for seed in range(4):
+        hands = Hands(np.random.default_rng(seed), 1, True, 0.1, T=T, delta=loop.delta)
+        touch = Touch(loop, hands)
+        for _ in range(1500):
+            worst = max(worst, touch.tick() - START_J - touch.port.released)
+        acted += int(touch.shell.limited[0])
+    assert worst <= 1e-12
+    assert acted > 0
+
+
+# ---- what is claimed
+
+
+def test_only_a_certified_coupling_is_guaranteed(tmp_path):
+    loop = load("world-peg").replace(duration=0.05)
+    stiff = simulate(loop, SpringDamper([50000.0, 50000.0], [0.0, 0.0]), engine="exact")
+    assert not stiff.meta["guaranteed"]
+    assert stiff.meta["guarantee"].startswith("No guarantee: the coupling is not certified for any environment")
+    coarse = loop.replace(
+        device=[{**d, "encoder_step": 1e-5} for d in [{"kind": "rigid", "mass": 0.25, "damping": 1.37}] * 2]
+    )
+    assert "encoder steps" in simulate(coarse, certified(coarse), engine="exact").meta["guarantee"]
+
+
+def test_this_environment_says_nothing_of_a_world():
+    loop = load("world-ball").loop("I")
+    needs = THIS_ENVIRONMENT.judge(loop, certified(load("world-ball")).coupling)
+    assert not needs.certified
+    assert "no linear model" in needs.reason
+
+
+@pytest.mark.parametrize(
+    ("coupling", "message"),
+    [
+        (NoCoupling(), "environment.world needs a coupling"),
+        (Compliance(Lti.constant([[1e-3, 1e-4], [1e-4, 1e-3]], T)), "couples devices"),
+        (Compliance(Lti.constant([[1e-3, 0.0], [0.0, 0.0]], T)), "is not symmetric and positive definite"),
+    ],
+)
+def test_a_coupling_that_no_world_can_use_is_one_line(coupling, message):
+    with pytest.raises(InputError, match=message) as caught:
+        simulate(load("world-peg"), coupling)
+    assert "\n" not in str(caught.value)
+
+
+# ---- scenarios
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('"scene.xml"', '"other.xml"'), "other.xml: No such file"),
+        (('["left", "right"]', '["left", "middle"]'), "contact 'middle': the world has no such body"),
+        (('["left", "right"]', '["left", "left"]'), "contact 'left' is named twice"),
+        (("contacts", "springs = []\ncontacts"), None),
+        (("contacts", "masses = { a = 1.0 }\ncontacts"), "world and masses"),
+        (("contacts", "along = [[1, 0, 0]]\ncontacts"), "along has 1 directions for 2 contacts"),
+        (("contacts", "along = [[1, 0, 0], [0, 0, 0]]\ncontacts"), "expected a direction"),
+        (("contacts", "every = 0\ncontacts"), "every is 0, allowed are 1 to 100 ticks"),
+        (("theta =", "psi = [0, 1]\ntheta ="), "psi must be 0"),
+        (("world =", "wrld ="), "unknown field `wrld`"),
+    ],
+)
+def test_a_world_is_read_strictly(tmp_path, change, message):
+    scenario(tmp_path, TRAY)
+    text = (tmp_path / "loop.toml").read_text().replace(*change)
+    if message is None:
+        parse(text, folder=tmp_path)
+        return
+    with pytest.raises(InputError, match=r".*") as caught:
+        parse(text, folder=tmp_path)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_digest_is_of_contents_not_of_places(tmp_path):
+    first = scenario(tmp_path, TRAY)
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    assert scenario(moved, TRAY).digest == first.digest
+    assert scenario(moved, TRAY.replace("0.3", "0.4")).digest != first.digest
+    assert scenario(moved, TRAY, more=UP).digest != first.digest
+    assert first.replace(name="test") == first
+
+
+# ---- a linear model
+
+
+def test_a_world_becomes_a_network_for_a_design(tmp_path):
+    """A body on a spring and a damper beside each contact: E(z) of the pair, masses of contacts included."""
+    text = f"""<mujoco><option gravity="0 0 0"/><worldbody>
+    <body name="left"><site name="l"/>{TIP}</body><body name="right" pos="1 0 0"><site name="r"/>{TIP}</body>
+    <site name="wall" pos="0.5 0 0"/></worldbody><tendon>
+    <spatial stiffness="300" damping="2"><site site="l"/><site site="wall"/></spatial>
+    <spatial stiffness="500" damping="1"><site site="r"/><site site="wall"/></spatial></tendon></mujoco>"""
+    loop = scenario(tmp_path, text)
+    network = linearise(loop)
+    springs = (Spring(("left", "ground"), 300.0, 2.0), Spring(("right", "ground"), 500.0, 1.0))
+    expected = Network(("left", "right"), springs, {"left": 0.03, "right": 0.03})
+    z = np.exp(2j * np.pi * np.geomspace(0.1, 100, 30) * T)
+    theirs = expected.E(T).at(z[None])[0]
+    assert np.abs(network.E(T).at(z[None])[0] - theirs).max() < 1e-7 * np.abs(theirs).max()
+    linear = loop.replace(environment=network)
+    assert THIS_ENVIRONMENT.judge(linear.loop("I"), certified(linear).coupling).reason is None
+    assert [contact.body for contact in contacts_of(loop.environment)] == ["left", "right"]
+
+
+def test_a_slow_world_keeps_the_account(tmp_path):
+    for every in (2, 4):
+        loop = scenario(tmp_path, TRAY, more=f"{UP}\nevery = {every}")
+        hands = Hands(np.random.default_rng(1), 1, True, 0.1, T=T, delta=loop.delta)
+        touch = Touch(loop, hands)
+        assert touch.port.world.h == every * T
+        for _ in range(1000):
+            assert touch.tick() <= START_J + touch.port.released + 1e-12
+        assert not touch.shell.limited[0]
