@@ -15,6 +15,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT
 from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, KnownDevice
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.own import called, named
 from haptic_loop.design.result import Design, DesignFailed
@@ -35,7 +36,7 @@ class Kind(NamedTuple):
 
 KINDS = {
     "spring-damper": Kind(
-        (THIS_ENVIRONMENT, ANY_ENVIRONMENT),
+        (THIS_ENVIRONMENT, KNOWN_DEVICE, KNOWN_DEVICE_ANY, ANY_ENVIRONMENT),
         "spring_damper",
         "design_with",
         ("condition",),
@@ -43,7 +44,9 @@ KINDS = {
         limited=True,
         softened=True,
     ),
-    "moving-average": Kind((ANY_ENVIRONMENT,), "spring_damper", "moving_average", softened=True),
+    "moving-average": Kind(
+        (ANY_ENVIRONMENT, KNOWN_DEVICE_ANY), "spring_damper", "moving_average", ("condition",), softened=True
+    ),
     "ccl": Kind((ANY_ENVIRONMENT,), "fixed_order", "design", options=("order", "method", "diagonal")),
     "optimal": Kind(
         (THIS_ENVIRONMENT,),
@@ -72,14 +75,18 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """
     less = loop.environment.walls or loop.ranges or loop.varying_delay
     conditions = kind_of(kind).conditions
-    return (conditions[-1] if less and not loop.latency else conditions[0]).name  # the last is for more environments
+    if loop.known_devices and KNOWN_DEVICE in conditions and not (less or loop.latency):
+        return KNOWN_DEVICE.name  # it is never worse than this-environment, which it falls back on
+    plain = [each for each in conditions if not isinstance(each, KnownDevice)]
+    return (plain[-1] if less and not loop.latency else plain[0]).name  # the last is for more environments
 
 
 def name_and_own(condition: str | Condition | None) -> tuple[str | None, Condition | None]:
     """The condition's name, and itself where it is one of the user's own."""
     if condition is None or isinstance(condition, str):
         return condition, None
-    return condition.name, None if condition in _OWN.conditions else condition
+    ours = (*_OWN.conditions, KNOWN_DEVICE, KNOWN_DEVICE_ANY)
+    return condition.name, None if condition in ours else condition
 
 
 def design_by_kind(

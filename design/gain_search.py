@@ -22,6 +22,7 @@ from haptic_loop.controller.lti import Array, Complex, Sampled
 from haptic_loop.design.conditions import Demand, even_damping, this_environment, this_environment_demand
 from haptic_loop.design.environments import LIMITER, SWITCHING
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle
+from haptic_loop.design.known_device import KNOWN_DEVICE, device_rows, largest_beta, period_cost
 from haptic_loop.design.lmi import RESERVE
 from haptic_loop.design.result import Requirement
 from haptic_loop.design.transparency import BAND_HZ, transparency
@@ -306,6 +307,74 @@ class LimiterLoop(SampledLoop):
 
     def multiplier(self, x: Array) -> Sequence[Sequence[float]]:
         return np.round(self.mu(x)[0][:, None], 6).tolist()
+
+
+class KnownDeviceLoop(SampledLoop):
+    """Safe on known devices: x = (log K, B/delta, log of beta as a share of the largest one of each channel).
+
+    The condition is the Schur complement of the row of v, with M = -beta F/z + l21: He[F/(z-1)] + l11 - M*M/(4 l22).
+    """
+
+    bounds = (np.log(1e-3), np.log(0.999))
+    _first = 0.35  # the share that a search begins with: the optimum of the default loops lies at 0.29 to 0.47
+
+    def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
+        self.active, self.share = np.arange(loop.channels), 1 - _SAMPLED_RESERVE
+        self.largest = largest_beta(loop, self.share)
+        super().__init__(loop, band_hz)
+
+    def point(self, coupling: SpringDamper) -> Array:
+        return np.append(super().point(coupling), np.full(self.loop.channels, np.log(self._first)))
+
+    def beta(self, x: Array) -> Array:
+        """beta (m,) [s] in x."""
+        return np.exp(x[2 * self.loop.channels :]) * self.largest
+
+    def judged(self, x: Array) -> Requirement:
+        bounds = (0.0,) * (2 * self.loop.channels)
+        return KNOWN_DEVICE.required(self.loop, self.coupling(x), (*self.beta(x).tolist(), *bounds))
+
+    def _impose(self, w: Array) -> None:
+        self.conditions = w
+        self._delayed["conditions"] = self._responses(w)
+        self._known.clear()
+        z, m = on_circle(w), self.loop.channels
+        one = Sampled(z[None], np.broadcast_to(np.eye(m, dtype=np.complex128), (1, w.size, m, m)), self.loop.T)
+        self._lines = np.diagonal(self.loop.late(one).G[0], axis1=1, axis2=2)[:, :, None]  # Theta
+        self._z = z
+
+    def _complement(self, x: Array) -> tuple[Array, Complex, Complex]:
+        """The least eigenvalue (k,) in units of Delta_D/T, its v (k, m), and M v/(4 l22) (k, m)."""
+        beta, z = self.beta(x), self._z
+        F = self._lines * self._around(x, "conditions").G
+        cost = period_cost(self.loop, np.full(z.size, self.share), beta)
+        own, cross, speed = device_rows(z, cost)
+        one = np.eye(beta.size)
+        M = -beta[:, None] * F / z[:, None, None] + cross[..., None] * one
+        schur = hermitian(F / (z - 1)[:, None, None]) + own[..., None] * one
+        schur = schur - np.conj(np.swapaxes(M, 1, 2)) @ (M / (4 * speed[..., None]))
+        values, vectors = np.linalg.eigh(self.root[:, None] * schur * self.root)
+        v = vectors[:, :, 0] * self.root
+        return values[:, 0].astype(float), v, np.einsum("kij,kj->ki", M, v) / (4 * speed)
+
+    def room(self, x: Array) -> Array:
+        room = self._complement(x)[0]
+        return np.append(room, self.stability(x)) if any(self.loop.psi) else room
+
+    def room_slope(self, x: Array) -> Array:
+        """The gradient of `room`, in beta and in the poles by differences."""
+        room, v, below = self._complement(x)
+        around, z, m = self._around(x, "conditions"), self._z, self.loop.channels
+        left = v.conj() / (z - 1)[:, None] + 2 * below.conj() * self.beta(x) / z[:, None]
+        sent = np.einsum("kij,kj->ki", around.G, v)
+        turned = np.einsum("ki,kij->kj", left * self._lines[:, :, 0], around.G) * sent
+        slope = [*(turned * around.by).real]
+        for i in range(m):
+            step = x.copy()
+            step[2 * m + i] += _DIFFERENCE
+            slope.append(((self._complement(step)[0] - room) / _DIFFERENCE)[:, None])
+        slope = np.concatenate(slope, axis=1)
+        return np.vstack([slope, self._stability_slope(x)]) if any(self.loop.psi) else slope
 
 
 # ----------------------------------------------------------------------------------------------------

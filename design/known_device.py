@@ -83,6 +83,12 @@ def _rates(known: _Known, delta: Any, beta: Any) -> tuple[Any, Any]:
     return delta - beta**2 * known.P / 4, beta * known.mass - beta**2 * known.damping / 4
 
 
+def largest_beta(loop: Loop, share: float = 1.0) -> Array:
+    """The beta (m,) [s] at which c0 or c2 vanishes for devices of damping `share` Delta."""
+    known = _known(loop, loop.T)
+    return np.minimum(2 * np.sqrt(share * np.array(loop.delta) / known.P), 4 * known.mass / known.damping)
+
+
 def _shortfall(y: Array) -> Array:
     """1 - tanh(y)/y, (m,), to full relative precision also for small y."""
     small = np.minimum(y, _SERIES) ** 2
@@ -331,7 +337,7 @@ class Sweep(ABC):
 
     def best(self, high: float) -> Best:
         """Return the least share below `high` over all beta that were tried."""
-        scale = np.minimum(2 * np.sqrt(high * np.array(self.loop.delta) / self._P), self._highest)
+        scale = largest_beta(self.loop, high)
 
         def along(logarithm: float) -> float:
             return self.least(np.exp(logarithm) * scale, high)
@@ -383,7 +389,7 @@ def _golden(value: Callable[[float], float], left: float, right: float) -> float
     return inner[int(np.argmin(found))]
 
 
-def _device_rows(z: Complex, cost: PeriodCost) -> tuple[Array, Complex, Array]:
+def device_rows(z: Complex, cost: PeriodCost) -> tuple[Array, Complex, Array]:
     """Return the entries 11, 21 (twice the Hermitian one) and 22 of L on (dx, v) at z (k,), shapes (k, m)."""
     turn, cosine = 1 + 1 / z[:, None], z.real[:, None]
     return cost.move, -cost.cross * turn, cost.mean * (1 + cosine) / 2 + 2 * cost.step * (1 - cosine)
@@ -402,7 +408,7 @@ class ThisEnvironmentSweep(Sweep):
 
     def room(self, here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
         """He[F/(z-1)] + l11 - M*M/(4 l22) with M = -beta F/z + l21: the Schur complement of the row of v."""
-        own, cross, speed = _device_rows(here.z, cost)
+        own, cross, speed = device_rows(here.z, cost)
         one = np.eye(beta.size)
         M = -beta[:, None] * here.forces / here.z[:, None, None] + cross[..., None] * one
         return here.own + own[..., None] * one - np.conj(np.swapaxes(M, 1, 2)) @ (M / (4 * speed[..., None]))
@@ -426,7 +432,7 @@ class AnyEnvironmentSweep(Sweep):
 
 def chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Array:
     """l Lam^-1 l*/4 with l = [(z^n - 1)/(z - 1), beta z^n], n = theta + 1: what V must exceed, (k, m) [m/N]."""
-    own, cross, speed = _device_rows(z, cost)
+    own, cross, speed = device_rows(z, cost)
     n = np.array(theta) + 1
     window = np.stack([sum(z**i for i in range(each)) for each in n], axis=1)
     last, cross = beta * z[:, None] ** n, cross / 2

@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from haptic_loop.controller.coupling import Coupling, MovingAverage, SpringDamper
+from haptic_loop.controller.coupling import Compliance, Coupling, MovingAverage, SpringDamper
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti, hstack, taps, vstack
 from haptic_loop.design.certificate import named
@@ -24,6 +24,7 @@ from haptic_loop.design.environments import LIMITER
 from haptic_loop.design.frequency import on_circle, peaks, too_long
 from haptic_loop.design.gain_search import (
     FEW,
+    KnownDeviceLoop,
     LimiterLoop,
     SampledLoop,
     SwitchingLoop,
@@ -31,6 +32,7 @@ from haptic_loop.design.gain_search import (
     least_rms,
     likeliest_first,
 )
+from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, chi, largest_beta, period_cost
 from haptic_loop.design.lmi import (
     ANY_ENVIRONMENT,
     RESERVE,
@@ -44,7 +46,7 @@ from haptic_loop.design.lmi import (
     usable,
 )
 from haptic_loop.design.result import Design, DesignFailed, Infeasible
-from haptic_loop.design.transparency import BAND_HZ, transparency
+from haptic_loop.design.transparency import BAND_HZ, decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------
 # The convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
@@ -210,6 +212,10 @@ def design(
 
     Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for this-environment.
     """
+    if named(condition) in (KNOWN_DEVICE, KNOWN_DEVICE_ANY):
+        if switching or limiter:
+            raise ValueError(f"{condition}: neither limited forces nor delays that vary are covered")
+        return _for_known_devices(loop, starts, band_hz) if condition == KNOWN_DEVICE.name else stiffest_known(loop)
     if named(condition).extensible:
         if switching and limiter:
             raise ValueError("limiter and switching: limited forces are proved for constant delays, ask for one")
@@ -237,6 +243,8 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
     Raises DesignFailed at once for so many devices that the search would take minutes.
     """
     if not named(condition).extensible:  # with rho = 0 it covers limited forces anyway
+        if limiter and named(condition) is KNOWN_DEVICE:
+            raise ValueError("limiter: forces that are limited are not covered by known-device, ask this-environment")
         _require_few(
             loop, _MOST_ANY, "any-environment: use a moving average, which needs no search, or this-environment"
         )
@@ -331,6 +339,146 @@ def _for_this_environment(
     return Design(coupling, "this-environment", "rms", rms, requirement, searches, wall_s, c=c if many else None)
 
 
+def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tuple[float, float] | None) -> Design:
+    """The spring-damper of least rms mismatch under known-device; that of this-environment where it is no worse.
+
+    Raises DesignFailed where neither certifies one, or the condition says nothing of the loop.
+    """
+    if reason := KNOWN_DEVICE.beyond(loop):
+        raise DesignFailed(None, (), f"{KNOWN_DEVICE.name}: {reason}")
+    started, band = time.perf_counter(), band_hz or BAND_HZ
+    plain = least_rms(partial(SampledLoop, loop, band), starts or _default_starts(loop), band)
+    first = [plain[0]] if plain[0] else []
+    coupling, rms, searches, _ = least_rms(
+        partial(KnownDeviceLoop, loop, band), [*first, *(starts or _default_starts(loop))], band
+    )
+    searches += plain[2]
+    if plain[0] and not rms < plain[1]:
+        coupling, rms = plain[0], plain[1]
+    if coupling is None:
+        line = f"no spring-damper was found that {KNOWN_DEVICE.name} certifies for theta = {loop.theta}"
+        raise DesignFailed(None, (), f"{line}, psi = {loop.psi}, delta = {loop.delta}")
+    coupling = _short(SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B)))
+    requirement, wall_s = KNOWN_DEVICE.judge(loop, coupling), time.perf_counter() - started
+    beside = f"{decibels(plain[1]):.2f} dB rms" if plain[0] else "no spring-damper"
+    note = f"known-device, {decibels(rms):.2f} dB rms; this-environment, for devices of which less is known: {beside}"
+    return Design(coupling, KNOWN_DEVICE.name, "rms", rms, requirement, searches, wall_s, notes=(note,))
+
+
+_ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4, 12)])  # shares of the largest beta
+_ON_CIRCLE = 721  # frequencies at which the set of gains is imposed, from 0 to pi
+
+
+def stiffest_known(loop: Loop) -> Design:
+    """The stiffest spring-damper that known-device-any certifies, channel by channel; objective in N/m, all together.
+
+    He[V/(1-z)] > chi is Re W > chi |W|^2 |1 - 1/z|^2/T with W = K/D + B and Re W = K T/2 + B: a convex set of (K, B)
+    for each beta, on which the largest K for a given B is the least root of a quadratic over frequency. B and beta are
+    searched.
+    """
+    if reason := KNOWN_DEVICE_ANY.beyond(loop):
+        raise DesignFailed(None, (), f"{KNOWN_DEVICE_ANY.name}: {reason}")
+    started, gains = time.perf_counter(), []
+    for i in range(loop.channels):
+        gains.append(_stiffest_channel(loop.channel(i)))
+    K, B = zip(*gains, strict=True)
+    coupling = SpringDamper(K, B)
+    requirement = KNOWN_DEVICE_ANY.judge(loop, coupling)
+    if not requirement.certified:
+        why = requirement.shortfall
+        raise DesignFailed(None, (), f"the designed coupling is not certified by {KNOWN_DEVICE_ANY.name}: {why}")
+    wall_s = time.perf_counter() - started
+    return Design(coupling, KNOWN_DEVICE_ANY.name, "stiffness", float(sum(K)), requirement, 0, wall_s)
+
+
+def _stiffest_channel(loop: Loop) -> tuple[float, float]:
+    """K [N/m] and B [N s/m] of the stiffest spring-damper before any environment, with the reserve of a design."""
+    from scipy.optimize import minimize_scalar  # slow to load
+
+    z = on_circle(np.linspace(1e-6, np.pi, _ON_CIRCLE))
+    steps = np.abs(1 - 1 / z) ** 2 / loop.T
+
+    def stiffest(B: float, limits: Array) -> float:
+        """The largest K with K T/2 + B >= limits steps |K/D + B|^2 at all frequencies, 0 where there is none.
+
+        |1/D|^2 steps = T, and the real part of 1/D is T/2.
+        """
+        a, b = limits * loop.T, (limits * steps * B - 0.5) * loop.T
+        c = limits * steps * B**2 - B
+        room = b**2 - 4 * a * c
+        if (room < 0).any():
+            return 0.0
+        root = np.sqrt(room)
+        high, low = ((-b + sign * root) / (2 * a) for sign in (1, -1))
+        return float(high.min()) if low.max() <= high.min() else 0.0
+
+    def at(eta: float) -> tuple[float, float]:
+        """(-K, B) of the best B for this share of the largest beta."""
+        beta = eta * largest_beta(loop, 1 - _STIFF_RESERVE)
+        cost = period_cost(loop, np.full(z.size, 1 - _STIFF_RESERVE), beta)
+        limits = chi(z, loop.theta, cost, beta)[:, 0]
+        most = 1 / (limits * steps).max()
+        found = minimize_scalar(lambda B: -stiffest(B, limits), bounds=(0.0, most), method="bounded")
+        return float(found.fun), float(found.x)
+
+    tried = [at(eta) for eta in _ETAS]
+    best = int(np.argmin([value for value, _ in tried]))
+    ends = _ETAS[max(best - 1, 0)], _ETAS[min(best + 1, _ETAS.size - 1)]
+    eta = minimize_scalar(lambda eta: at(eta)[0], bounds=ends, method="bounded", options={"xatol": 1e-6}).x
+    K, B = min(at(float(eta)), tried[best])
+    return float(f"{-K:.{_STIFF_DIGITS}g}"), float(f"{B:.{_STIFF_DIGITS}g}")
+
+
+_TAPS = 4096  # frequencies from which the Fourier coefficients of chi are taken
+_SLACK = 2e-4  # of the largest chi: what a coupling has above it, half of which may be lost to the truncation
+
+
+def stiffest_linear(loop: Loop) -> Design:
+    """The stiffest linear coupling that known-device-any certifies, channel by channel; objective in N/m, all together.
+
+    V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k has He[V/(1-z)] = chi, with the Fourier coefficients chi_k of chi and
+    V(1) = 2 chi_0; no linear coupling is stiffer, since V(1)/2 is the mean of He[V/(1-z)]. The series ends where what
+    is left is below half of the constant that is added.
+    """
+    from scipy.optimize import minimize_scalar  # slow to load
+
+    if reason := KNOWN_DEVICE_ANY.beyond(loop):
+        raise DesignFailed(None, (), f"{KNOWN_DEVICE_ANY.name}: {reason}")
+    started, channels = time.perf_counter(), []
+    z = on_circle(np.linspace(0, 2 * np.pi, _TAPS, endpoint=False))
+    for i in range(loop.channels):
+        one = loop.channel(i)
+
+        def needed(eta: float, one: Loop = one) -> Array:
+            beta = eta * largest_beta(one, 1 - RESERVE)
+            return chi(z, one.theta, period_cost(one, np.full(z.size, 1 - RESERVE), beta), beta)[:, 0]
+
+        best = int(np.argmin([needed(eta).mean() for eta in _ETAS]))
+        ends = _ETAS[max(best - 1, 0)], _ETAS[min(best + 1, _ETAS.size - 1)]
+        eta = float(minimize_scalar(lambda eta: needed(eta).mean(), bounds=ends, method="bounded").x)
+        limits = needed(eta)
+        series = np.fft.rfft(limits).real / _TAPS
+        left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # of the terms from each on
+        count = int(np.argmax(left < _SLACK / 2 * limits.max()))
+        kept = series[1:count]
+        weights = -2 * np.diff(np.append(kept, 0.0), prepend=0.0)
+        weights[0] += 2 * series[0] + 2 * _SLACK * limits.max()
+        channels.append(taps([float(f"{v:.{_TAP_DIGITS}g}") for v in weights], loop.T))
+    V = Lti.diag(*channels)
+    coupling = Compliance(V)
+    requirement = KNOWN_DEVICE_ANY.judge(loop, coupling)
+    if not requirement.certified:
+        why = requirement.shortfall
+        raise DesignFailed(None, (), f"the designed coupling is not certified by {KNOWN_DEVICE_ANY.name}: {why}")
+    stiffness, wall_s = float((1 / np.diag(V.dc())).sum()), time.perf_counter() - started
+    return Design(coupling, KNOWN_DEVICE_ANY.name, "stiffness", stiffness, requirement, 0, wall_s)
+
+
+_TAP_DIGITS = 12  # of a coefficient: the error is far below the slack, and the exact proof stays short
+_STIFF_RESERVE = 1e-3  # of the damping: gains are rounded to six digits, and frequencies lie between those imposed
+_STIFF_DIGITS = 6
+
+
 def _default_starts(loop: Loop) -> list[SpringDamper]:
     """Around 2 d/(n T), the stiffness that no linear coupling exceeds for any passive environment.
 
@@ -346,12 +494,16 @@ def _default_starts(loop: Loop) -> list[SpringDamper]:
     return starts
 
 
-def moving_average(loop: Loop) -> Design:
+def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
     """The stiffest linear coupling that Theorem 4 admits; objective in N/m, of all channels together.
+
+    With the condition known-device-any the stiffest that it admits, `stiffest_linear`.
 
     V = T/(2 delta) (1 + ... + z^-theta) needs exactly delta at every frequency. With the constant e n^2 T/(2 delta)
     beside it, n = theta + 1, it needs delta/(1 + e) where the sum is largest, and less elsewhere.
     """
+    if condition == KNOWN_DEVICE_ANY.name:
+        return stiffest_linear(loop)
     started = time.perf_counter()
     phi = least_phi(loop)
     weight, terms = loop.T / (2 * even_damping(loop)), np.array(loop.theta) + 1

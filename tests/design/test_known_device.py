@@ -13,10 +13,12 @@ from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.controller.loop import DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
+from haptic_loop.design.api import design_coupling
 from haptic_loop.design.certificate import prove, required_damping, verify
 from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.exact import find_storage, prove_positive_real
 from haptic_loop.design.files import InputError
+from haptic_loop.design.gain_search import KnownDeviceLoop
 from haptic_loop.design.known_device import (
     AnyEnvironmentSweep,
     Best,
@@ -31,6 +33,7 @@ from haptic_loop.design.known_device import (
     q_bounds,
 )
 from haptic_loop.design.result import NotProved
+from haptic_loop.design.spring_damper import design
 from haptic_loop.sim.scenario import load
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
@@ -564,3 +567,59 @@ def test_impossible_bounds_are_refused_in_one_line(fields, said):
     with pytest.raises(InputError, match=said) as refused:
         scenario.replace(device=[{"kind": "compliant"} | fields | {"guaranteed": bounds}] * 2)
     assert "\n" not in str(refused.value)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Designs.
+
+
+def test_the_slope_of_the_sampled_condition():
+    """Against central differences, in gains and in beta."""
+    sampled = KnownDeviceLoop(KNOWN)
+    x = sampled.point(SpringDamper([3000.0, 2500.0], [0.2, 0.3])) + np.array([0, 0, 0, 0, 0.1, -0.2])
+    steps = 1e-6 * np.eye(x.size)
+    slope = np.array([(sampled.room(x + d) - sampled.room(x - d)) / 2e-6 for d in steps]).T
+    assert np.abs(sampled.room_slope(x) - slope).max() < 1e-5 * np.abs(slope).max()  # of one-sided differences in beta
+
+
+def test_a_spring_damper_on_known_devices_feels_stiffer():
+    """The default loop is certified without a coupling, so the design makes its coupling next to rigid."""
+    plain = design(KNOWN, "this-environment")
+    assert required_damping(KNOWN, plain.coupling, "known-device").required[0] == pytest.approx(1.10, abs=0.02)
+    known = design_coupling(KNOWN)
+    assert known.condition == "known-device"
+    assert known.requirement.certified
+    assert known.objective < 0.05 * plain.objective
+    assert "this-environment" in known.notes[0]
+    assert verify(Stored.of(KNOWN, known.coupling, prove(KNOWN, known.coupling, "known-device"))).proved
+
+
+def test_the_stiffest_spring_damper_for_any_environment():
+    """5223.8 N/m with 7.352 N s/m without reserve; a coupling that is half a percent stiffer satisfies it nowhere."""
+    loop = one(1.2e-3, 1.37)
+    found = design_coupling(loop, "spring-damper", "known-device-any")
+    assert found.coupling.K[0] == pytest.approx(5223.8, rel=1.5e-3)  # the design keeps a thousandth of the damping
+    assert found.coupling.B[0] == pytest.approx(7.352, rel=1e-2)
+    assert prove(loop, found.coupling, "known-device-any").proof == "rational"
+    z = np.exp(1j * np.linspace(1e-3, np.pi, 500))
+    top = 2 * np.sqrt(1.37 * 0.5) / 14500
+    for eta in np.linspace(0.3, 0.999, 60):
+        limit = chi_by_hand(z, 1, loop, eta * top)
+        for B in np.linspace(0.0, 15.0, 121):
+            W = 1.005 * 5223.8 * loop.T / (1 - 1 / z) + B
+            assert ((1 / W).real < limit * np.abs(1 - 1 / z) ** 2 / loop.T).any()
+
+
+@pytest.mark.parametrize(("theta", "stiffness"), [(0, 5913.6), (2, 1029.7)])
+def test_the_stiffest_linear_coupling_is_attained(theta, stiffness):
+    loop = one(1.2e-3, 1.37, theta)
+    found = design_coupling(loop, "moving-average", "known-device-any")
+    assert stiffness * 0.998 < found.objective < stiffness
+    assert prove(loop, found.coupling, "known-device-any").proof == "rational"
+
+
+def test_what_known_devices_do_not_cover_is_refused_by_designs():
+    with pytest.raises(ValueError, match="not covered"):
+        design_coupling(KNOWN, "spring-damper", "known-device", limiter=True)
+    with pytest.raises(ValueError, match="no guaranteed bounds"):
+        design_coupling(PAIR, "spring-damper", "known-device")
