@@ -87,8 +87,7 @@ def add_optimal_options(parser: options.Parser, title: str) -> None:
     parser.add_band(to=group)
     gain = "limit of |F|/|E| above 100 Hz (default none: the force there is kept low, not limited)"
     group.add_argument("--high-gain", type=options.number(), metavar="G", help=gain)
-    limit = "bounds the growth of the basis [s] (default 60), not its first, proofs, the bound or the price of 10 %%; "
-    limit += "ranges are searched for what is left, a fifth of it at least, for each of up to three bases"
+    limit = "end the growth of the basis after S seconds, and the search of ranges with it (default: no clock ends it)"
     group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
 
 

@@ -242,3 +242,8 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
 
 #: What was built last over Fractions, and of what: a proof asks for it three times, and it is most of its work.
 _exactly: list[Any] = [(None,) * 4, None]
+
+
+def forget_exact() -> None:
+    """Forget what an earlier proof has built, so that the counted work of a proof does not depend on it."""
+    _exactly[:] = (None,) * 4, None

@@ -28,8 +28,8 @@ from haptic_loop.controller.arithmetic import (
     fractions,
     inverse,
     numbers,
-    on_time,
     solve,
+    spend,
     times,
 )
 from numpy.typing import ArrayLike, NDArray
@@ -66,6 +66,11 @@ class ReadOnly:
 
 
 _ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # sizes of the parts of a response, so that they stay in the cache
+
+
+def _response_cost(states: int, inputs: int, points: int) -> float:
+    """The counted work of a response; measured with up to 200 states, 8 inputs and 2000 points, to a factor of 2.5."""
+    return 4e-5 + 2e-6 * states + points * inputs * (4e-8 + 6e-9 * states + 2e-10 * states**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +183,7 @@ class Lti(ReadOnly):
         if self.A.ndim > 2 or self.B.ndim > 2 or self.C.ndim > 2 or self.D.ndim > 2:
             one = np.eye(self.order)
             A, B, C, D = (getattr(self, name)[..., None, :, :] for name in "ABCD")
+            spend(self.count * z.shape[-1] * (1e-6 + 1e-10 * self.order**3))
             return C @ np.linalg.solve(z[..., None, None] * one - A, B + 0j) + D
         points = z.ravel()
         step = min(_POINTS, max(_CELLS // max(self.inner_order * self.inputs, 1), 64))
@@ -190,9 +196,9 @@ class Lti(ReadOnly):
 
         Delay lines at the outputs are not part of the substitution: their states are core states times powers of 1/z.
         """
-        on_time()
         S, U = self._schur
         core, lines = self._lines
+        spend(_response_cost(core.size, self.inputs, points.size))
         at, X = np.tile(points, self.inputs), np.repeat(U.conj().T @ self.B[core], points.size, axis=1)
         for end in range(core.size, 0, -_ROWS):
             first = max(end - _ROWS, 0)

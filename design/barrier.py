@@ -16,12 +16,14 @@ from functools import cached_property
 
 import numpy as np
 import scipy  # its parts load when they are used
+from haptic_loop.controller.arithmetic import spend
 from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design.frequency import hermitian
 from numpy.typing import NDArray
 
 _CENTRED = 0.5  # Newton decrement squared at which a point counts as central: 0.05/t above the best value
 _MOST_STEPS = 60
+_STEP, _PRODUCT = 3e-4, 1e-10  # units of counted work of a Newton step, and of each of its products
 _KEPT = 0.3  # of an eigenvalue, at least, after a step
 _LONGEST = 1e3  # times the Newton step
 _RIDGE = 1e-9  # of its column: what a direction that neither objective nor inequalities see is charged
@@ -42,6 +44,12 @@ class MatrixInequality:
     @property
     def degree(self) -> int:
         return len(self.constant) * math.isqrt(self.constant.shape[1])
+
+    @property
+    def products(self) -> int:
+        """The products of a Newton step, about."""
+        k, square, n = self.slope.shape
+        return k * square * n * (square + n)
 
     def at(self, x: Array) -> Complex:
         """S(x), shape (k, r, r)."""
@@ -85,6 +93,12 @@ class EntryInequality:
     @property
     def degree(self) -> int:
         return len(self.functions) * self.left.shape[-1]
+
+    @property
+    def products(self) -> int:
+        """The products of a Newton step, about."""
+        (k, n), square, own = self.functions.shape, self.left.shape[-1] ** 2, self.slope.shape[2]
+        return k * (n**2 * square**2 + square * own * (square + n * square + own))
 
     def at(self, x: Array) -> Complex:
         """S(x), shape (k, r, r)."""
@@ -163,6 +177,12 @@ class Program:
     def degree(self) -> int:
         return sum(block.degree for block in self.blocks)
 
+    @property
+    def step_cost(self) -> float:
+        """The counted work of a Newton step."""
+        products = self.b.size * self.c.size + self.c.size**3 // 3 + sum(block.products for block in self.blocks)
+        return _STEP + _PRODUCT * products
+
     def value(self, x: Array) -> float:
         """|A x - b|^2 + c'x."""
         residual = self.A @ x - self.b
@@ -192,7 +212,9 @@ class Program:
 
 def centre(program: Program, x: Array, t: float) -> Array:
     """The minimiser of t (|A x - b|^2 + c'x) - sum log det S, from a strictly feasible x."""
+    cost = program.step_cost
     for _ in range(_MOST_STEPS):
+        spend(cost)
         gradient = t * (2 * program.A.T @ (program.A @ x - program.b) + program.c)
         hessian = 2 * t * program.square
         for block in program.blocks:

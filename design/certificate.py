@@ -14,9 +14,10 @@ import numpy as np
 import scipy
 from haptic_loop.controller.arithmetic import SingularLoop, TooLong, rational, within
 from haptic_loop.controller.coupling import Coupling
-from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.loop import Loop, forget_exact
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.ranges import Member, inside, number_of_vertices
+from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Condition, Demand
 from haptic_loop.design.coupling_file import (
     Certificate,
@@ -55,14 +56,14 @@ from haptic_loop.design.result import NotProved, Requirement, refusal
 from haptic_loop.design.worst_member import Progress, Searched, search_ranges
 
 _CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
-_LONGEST = 60.0  # [s] of exact arithmetic for one coupling: what fits into the limits on states takes less
 
 
 @contextmanager
 def _in_time() -> Iterator[None]:
-    """Raises NotProved where exact arithmetic takes too long, however few states and digits there seem to be."""
+    """Raise NotProved if exact arithmetic takes too much work, however few states and digits there seem to be."""
+    forget_exact()
     try:
-        with within(_LONGEST):
+        with within(budgets.EXACT):
             yield
     except TooLong as error:
         raise NotProved(str(error)) from None
@@ -488,7 +489,7 @@ def assess(
             return replace(needs, proof="rational")
         return _with_proof(loop, filed(loop, coupling), each, needs) if more or not proved else needs
 
-    with within(_LONGEST):  # all proofs together
+    with within(budgets.EXACT):  # all proofs together
         return {each.name: judged(each, needs) for each, needs in asked}
 
 

@@ -231,7 +231,7 @@ class SearchFigures:
     def __str__(self) -> str:
         found = "[red]violated[/]" if self.violated else "no violation found"
         ratio = f"worst ratio {self.worst_ratio:.4f}" if math.isfinite(self.worst_ratio) else _NEVER
-        ended = ", until its time was over" if self.ended_by_clock else ""
+        ended = ", until its budget was spent" if self.ended_by_clock else ""
         return f"searched, not proved: {found}, {ratio} in {self.environments} points{ended}, at {self.worst}"
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import flint
 import numpy as np
 import scipy  # its parts load when they are used
-from haptic_loop.controller.arithmetic import on_time, rational
+from haptic_loop.controller.arithmetic import rational, spend
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, supremum
 from haptic_loop.design.result import NotProved, Requirement
@@ -78,13 +78,17 @@ class Matrix:
         return self.shape == other.shape and bool((self.num * other.den == other.num * self.den).all())
 
 
+_LIMBS, _BIT = 5e-9, 3e-11  # units of counted work of a product of integers, and for each of their bits
+
+
 def _congruence(X: _Integers, M: _Integers) -> _Integers:
     """Multiply X' M X exactly. This is the one place that converts to FLINT's matrices and back.
 
-    Args: X (n, m), M (n, n), Python integers. Returns (m, m). Raises TooLong where the time of `within` is over.
+    Args: X (n, m), M (n, n), Python integers. Returns (m, m). Raises TooLong if the budget of `within` is spent.
     """
-    on_time()
     (n, m) = X.shape
+    bits = sum(max((int(v).bit_length() for v in part.flat), default=0) for part in (X, M))
+    spend(n * m * (n + m) * (_LIMBS + _BIT * bits))
     product = np.zeros(m * m, dtype=object)
     if X.size:
         right = flint.fmpz_mat(n, m, X.ravel().tolist())

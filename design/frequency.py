@@ -6,8 +6,9 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 
 import numpy as np
-from haptic_loop.controller.arithmetic import within
+from haptic_loop.controller.arithmetic import spend, within
 from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.design import budgets
 from numpy.typing import NDArray
 
 # ----------------------------------------------------------------------------------------------------
@@ -122,29 +123,30 @@ def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Arra
 
 _POINTS_SWEPT = 3000  # in the grid and its refinement, about
 _RESPONSE, _SCHUR = 0.4e-9, 3e-9  # [s] measured: a point's response per inputs x states^2, a Schur form per states^3
-#: [s] that one sweep, or a search by many of them, may take
-MOST_SECONDS = 60.0
+_POINT = 1.5e-6  # [s] measured: the eigenvalues at a point of a sweep, beside its response
 
 
-def _sweep_seconds(G: Lti) -> float:
-    """About how long a sweep of G takes [s], to a factor of three; delays at its outputs cost nothing."""
+def _sweep_cost(G: Lti) -> float:
+    """The work of a sweep of G [s], to a factor of three; delays at its outputs cost nothing."""
     n, m = G.inner_order, G.inputs
     return _POINTS_SWEPT * m * (n**2 + m**2) * _RESPONSE + n**3 * _SCHUR
 
 
 def too_long(G: Lti, sweeps: int = 1) -> str | None:
-    """Why this many sweeps of G, or of a system of its size, are refused; None where they are not."""
-    seconds, how = sweeps * _sweep_seconds(G), f"some {sweeps} sweeps" if sweeps > 1 else "a sweep"
-    if seconds <= MOST_SECONDS:
+    """Return why this many sweeps of G, or of a system of its size, are refused, or None."""
+    seconds, how = sweeps * _sweep_cost(G), f"some {sweeps} sweeps" if sweeps > 1 else "a sweep"
+    if seconds <= budgets.SWEEPS:
         return None
     states = f"{G.inner_order} states and {G.inputs} channels"
     fewer = "a smaller psi, or fewer channels or masses"
-    return f"{how} over {states} would take about {seconds:.0f} s, allowed are {MOST_SECONDS:g}: what helps is {fewer}"
+    return (
+        f"{how} over {states} would take about {seconds:.0f} s, allowed are {budgets.SWEEPS:g}: what helps is {fewer}"
+    )
 
 
 def sweeping() -> AbstractContextManager[None]:
-    """The clock of a search by sweeps: TooLong after MOST_SECONDS."""
-    return within(MOST_SECONDS, "a search by sweeps", "many states or channels")
+    """Return the budget of a search by sweeps, within which TooLong is raised once it is spent."""
+    return within(budgets.SWEEPS, "a search by sweeps", "many states or channels")
 
 
 Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
@@ -204,6 +206,7 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
     neighbours, and the brackets narrowed by a factor of 8, ten times or until two rounds gain nothing: a smooth peak is
     located to rounding. A bracket whose peak cannot reach the largest any more is left.
     """
+    spend(_POINT * grid.size)
     values = response(grid)
     if not np.isfinite(values).all():
         worst = int(np.flatnonzero(~np.isfinite(values))[0])
@@ -228,6 +231,7 @@ def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -
 
     Of those only that come as `near` to the highest, relatively.
     """
+    spend(_POINT * grid.size)
     values = response(grid)
     top = float(values.max())
     least = top - near * abs(top) if np.isfinite(top) and near < np.inf else -np.inf
@@ -252,6 +256,7 @@ def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Arr
     that are allowed.
     """
     trial = np.linspace(left, right, 17)
+    spend(_POINT * trial.size)
     found = response(trial.ravel()).reshape(trial.shape)
     at, column = np.argmax(found, axis=0), np.arange(left.size)
     below, above, best = np.maximum(at - 1, 0), np.minimum(at + 1, 16), found[at, column]

@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from haptic_loop.controller.arithmetic import TooLong, within
+from haptic_loop.controller.arithmetic import TooLong, spent, spent_after, units_since, within
 from haptic_loop.controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
-from haptic_loop.design import program
+from haptic_loop.design import budgets, program
 from haptic_loop.design.certificate import prove, prove_limiter, required_damping
 from haptic_loop.design.conditions import Condition, ratio_in
 from haptic_loop.design.conditions import this_environment as requirement_of
@@ -30,8 +30,10 @@ from haptic_loop.design.spring_damper import design as design_spring_damper
 from haptic_loop.design.transparency import Transparency, decibels, transparency
 from haptic_loop.design.worst_member import Searched, search_ranges
 
-#: [s] of the processor, up to so many devices: what the price of a range may take, a third of it for proofs
-_PRICED = {2: 3.0, 4: 6.0, 10**3: 12.0}
+_PROVING, _PROOF = (
+    1 / 3,
+    1.2e-6,
+)  # of the price's budget, the part for proofs; units of a proof per states^2.7: 0.3 at 100
 _PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
 _FIRST = 3  # of the environments: those that the nominal design misses most are imposed first
 _SETTLED_DB = 0.05  # a rung that gains less ends the climb
@@ -46,7 +48,7 @@ _HOPELESS = 0.9  # relative mismatch from which on the climb is compared with ot
 _TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
 _MOST_STATES = 270  # of the loop, up to which a rung is tried
 _MOST_PROOFS = 30 * 112**2.7  # and (environments) states^2.7: a minute
-_SEARCHED = 0.2  # of the time limit, at least: what the search between the vertices of ranges may take
+_SEARCHED = 0.2  # of --seconds, at least: the time of the search between the vertices of ranges
 _TRIED = 3  # rungs, the best first, until one is proved at every vertex of ranges
 _MOST_UNKNOWNS = 1600  # up to which a rung is tried: ten seconds
 _MOST_BESIDE = 3500  # unknowns by channels, the same where more than this-environment is asked, and no large rung
@@ -141,11 +143,11 @@ def design(
         if rungs and not climb.room(taps, poles, max((r.states for r in rungs if r.reason is None), default=0)):
             continue
         try:
-            with within(max(options.seconds - climb.elapsed, 0.0) if rungs else np.inf, "a larger basis"):
+            with within(climb.left if rungs else np.inf, "a larger basis", clock=climb.over if rungs else None):
                 least = _SETTLED_DB if taps > _LARGE else -np.inf
                 found, rung = climb.rung(taps, poles, best, floor, least)
         except TooLong:
-            hurried = True
+            hurried = climb.over()
             break
         gained = np.inf if rung.reason else climb.gained(best, found)
         if best and found.g < floor and rung.proved:
@@ -158,14 +160,14 @@ def design(
         if rung.taken:
             best, floor = found, max(floor if best else 0.0, _felt(_KEPT_STIFFNESS * found.g))
             better.append(found)
-        hurried = not settled and climb.elapsed > options.seconds
+        hurried = not settled and climb.over()
         hopeless = len(rungs) >= _MOST_REFUSED and not any(each.proved for each in rungs[-_MOST_REFUSED:])
         if settled or hurried or (hopeless and not loop.ranges):
             break
     if loop.ranges:
         for found in better[: -_TRIED - 1 : -1]:
             best = climb.between(found)
-            hurried |= best.searched is not None and best.searched.ended
+            hurried |= best.searched is not None and best.searched.ended and climb.over()
             if best.proved:
                 break
     if best is None or not best.proved or climb.mismatch(best) > _HOPELESS:
@@ -176,13 +178,14 @@ def design(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The loop and what is asked of it, with the clock."""
+    """The loop and what is asked of it."""
 
     loop: Loop
     options: program.Options
     cases: tuple[program.Case, ...]  # the loop's own environment first, then the vertices of its ranges
     bare: float  # damping that the environments themselves need, the most
-    started: float
+    started: float  # [s] of the clock, for the report and for --seconds
+    spent: int  # work counted before
 
     @classmethod
     def of(cls, loop: Loop, options: program.Options) -> _Search:
@@ -206,11 +209,20 @@ class _Search:
         needs = in_each(loop, NoCoupling(), loop.members())
         if not np.isfinite(bare := max(each.ratio for each in needs)):
             raise ValueError(f"the loop without a coupling: {next(each.reason for each in needs if each.reason)}")
-        return cls(loop, options, tuple(cases), bare, started)
+        return cls(loop, options, tuple(cases), bare, started, spent())
 
     @property
     def elapsed(self) -> float:
         return time.perf_counter() - self.started
+
+    def over(self, share: float = 1.0) -> bool:
+        """Whether the time that the user allowed, or this share of it, is over. It never is without --seconds."""
+        return self.options.seconds is not None and self.elapsed > share * self.options.seconds
+
+    @property
+    def left(self) -> float:
+        """The counted work that is left for larger bases."""
+        return max(budgets.CLIMB - units_since(self.spent), 0.0)
 
     @property
     def constrained(self) -> bool:
@@ -337,16 +349,16 @@ class _Search:
     def kept_in_all(
         self, problem: program.Problem, active: list[int], until: float = np.inf, **how: Any
     ) -> tuple[ForceFilter, list[float]]:
-        """The optimum where the environments `active` are imposed, and those that turn out to be missed.
+        """Find the optimum where the environments `active` are imposed, and those that turn out to be missed.
 
-        Beside it what each of all needs.
+        It ends when the work counted so far (`spent`) exceeds `until`. Returns what each of all needs, too.
         """
         while True:
             some = replace(problem, cases=tuple(problem.cases[i] for i in active))
             coupling = problem.span.filter(some.solve(self._start(some), until=until, **how))
             needs = [ratio_in(case.loop, coupling) for case in self.cases]
             missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + _TOLERATED and i not in active]
-            if not missed or time.thread_time() > until:
+            if not missed or spent() > until:
                 return coupling, needs
             active = active + missed[:2]
 
@@ -360,15 +372,18 @@ class _Search:
         return self._assessed(scaled, scaled.g), [scale * need for need in needs]
 
     def proofs(
-        self, found: Optimal, needs: Sequence[float], slip: program.Slip | None, until: float
+        self, found: Optimal, needs: Sequence[float], slip: program.Slip | None, work: float
     ) -> tuple[int, str | None]:
-        """In how many environments it is proved until this time, the worst first, and why it is not in the next."""
+        """In how many environments it is proved, the worst first, and why it is not in the next.
+
+        Proofs end before they exceed `work`, which their number of states foretells.
+        """
         here = self._proved(found, slip)
         if not here.proved:
             return 0, str(here.reason)
         worst_first = sorted(range(1, len(needs)), key=lambda i: -needs[i])
         for done, i in enumerate(worst_first, start=1):
-            if time.thread_time() > until:
+            if done * _PROOF * found.states**2.7 > work:
                 return done, None
             swept = from_ratio("this-environment", needs[i], self.loop.delta, 0.0)
             try:
@@ -384,8 +399,8 @@ class _Search:
         """
         whole = found.coupling
         assert isinstance(whole, ForceFilter)
-        left = max(self.options.seconds - self.elapsed, _SEARCHED * self.options.seconds)
-        searched = search_ranges(self.loop, whole, seconds=left)
+        begun = self.elapsed / self.options.seconds if self.options.seconds else 0.0
+        searched = search_ranges(self.loop, whole, over=lambda: self.over(max(1.0, begun + _SEARCHED)))
         ratio, last = searched.worst[0].ratio, found
         for limit in (1 - program.MARGIN / 2, 1 - 2.5 * program.MARGIN):
             share = min(1.0, limit / ratio)
@@ -488,15 +503,15 @@ def spread(
     nominal: ForceFilter | NoCoupling,
     options: program.Options = program.DEFAULT,
     percent: float = 10.0,
-    seconds: float | None = None,
+    work: float | None = None,
 ) -> Spread:
     """The better of a design over a small basis and the nominal one scaled down, both safe over `vertices`.
 
     Each rung's own frequencies are those of the nominal environment; the vertices are imposed at few, and where sweeps
     find that they are missed.
     """
-    seconds = seconds or next(each for most, each in _PRICED.items() if loop.channels <= most)
-    until = time.thread_time() + seconds
+    work = work or budgets.of_channels(budgets.PRICE, loop.channels)
+    until = spent_after(work * (1 - _PROVING))
     climb = _Search.of(loop.at(loop.environment), options)
     if isinstance(nominal, NoCoupling):
         nominal = ForceFilter([], [], [np.eye(loop.channels).tolist()])
@@ -504,16 +519,16 @@ def spread(
     others = [at(loop, network) for network in vertices(loop.network, percent).values()]
     more = tuple(program.Case(there, there.E(), (program.this_environment(there),), 0.0) for there in others)
     climb, slip = replace(climb, cases=climb.cases + more), climb.slip_of(nominal)
-    taps, poles = next(basis for most, basis in _PRICED_BY.items() if loop.channels <= most)
+    taps, poles = budgets.of_channels(_PRICED_BY, loop.channels)
     problem = program.Problem(
         climb.span(taps, poles), climb.asked(slip), options, program.SOFT[0] * program.SOFT[1], sparse=True
     )
     hardest = np.argsort([-ratio_in(case.loop, nominal) for case in climb.cases])
     active = [0, *(int(i) for i in hardest if i)][: _FIRST + 1]
-    tried = [nominal, climb.kept_in_all(problem, active, until - seconds / 3, forgiven=_TOLERATED)[0]]
+    tried = [nominal, climb.kept_in_all(problem, active, until, forgiven=_TOLERATED)[0]]
     for limit in (1 - program.MARGIN, 1 - 2.5 * program.MARGIN):
         found, needs = min((climb.fitted(one, slip, limit) for one in tried), key=lambda one: climb.merit(one[0]))
-        proved, reason = climb.proofs(found, needs, slip, max(until, time.thread_time() + seconds / 3))
+        proved, reason = climb.proofs(found, needs, slip, work * _PROVING)
         if reason is None:
             break
     db = climb.decibels(found)

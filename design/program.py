@@ -8,7 +8,6 @@ sweep adds the frequencies at which it is missed.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
@@ -16,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 import scipy  # its parts load when they are used
+from haptic_loop.controller.arithmetic import spend, spent
 from haptic_loop.controller.coupling import ForceFilter, basis
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import DelayRange, Loop
@@ -52,6 +52,7 @@ _FORGIVEN = 5e-4  # by which an inequality may fail between its frequencies: sca
 _MOST_SWEEPS = 6
 _FEW = 12  # frequencies of a sparse grid beside the modes
 _STEEPER = 3.0  # factor between one centre of the barrier and the next
+_POINT = 5e-6  # units of counted work of a constraint at a frequency
 _SMALLEST = 1e-5  # least frequency of an inequality [rad/sample]: below it nothing changes
 
 
@@ -63,12 +64,13 @@ class Options:
     band_hz: tuple[float, float] = BAND_HZ
     high_gain: float | None = None  # largest |F|/|E| above 100 Hz; None: kept low by a soft row
     limiter: bool = False  # covered also while forces are limited
-    seconds: float = 60.0  # rungs after the first are left then; the sizes of rungs end most climbs far earlier
+    seconds: float | None = None  # of a clock, after which no larger basis is tried; None: no clock ends the search
     ladder: tuple[tuple[int, int], ...] = LADDER  # (taps, real poles)
 
     def __post_init__(self) -> None:
         one_of("objective", self.objective, OBJECTIVES)
-        number("seconds", self.seconds)
+        if self.seconds is not None:
+            number("seconds", self.seconds)
         if self.high_gain is not None and not 1 <= number("high_gain", self.high_gain) < np.inf:
             raise ValueError(f"high_gain is {self.high_gain}, expected a factor of at least 1")
         if not 0 < self.band_hz[0] < self.band_hz[1]:
@@ -479,6 +481,7 @@ class Problem:
 
     def least(self, case: Case, constraint: _Constraint, own: tuple[int, int], x: Array, w: Array) -> Array:
         """The least eigenvalue of a constraint at x, (k,)."""
+        spend(_POINT * w.size)
         z = on_circle(w)
         R = self.span.matrices(x) @ self.span.sources()
         n, m, _ = R.shape
@@ -527,9 +530,9 @@ class Problem:
         return found, worst
 
     def solve(self, start: Array, forgiven: float = _FORGIVEN, until: float = math.inf) -> Array:
-        """The optimum, from a strictly feasible start: on a dense sweep it fails by no more than `forgiven`.
+        """Find the optimum, from a strictly feasible start: on a dense sweep it fails by no more than `forgiven`.
 
-        What is found at `until`, of time.thread_time, may fail by more.
+        It may fail by more if the search ends because the work counted so far (`spent`) exceeds `until`.
         """
         asked = [(case, constraint) for case in self.cases for constraint in case.constraints]
         imposed = [self.grid(case, constraint) for case, constraint in asked]
@@ -549,13 +552,13 @@ class Problem:
             inner = back(y)
             while True:
                 value = program.value(y)
-                if time.thread_time() > until or program.degree / t <= gaps[0] * max(min(value, nothing - value), 1e-9):
+                if spent() > until or program.degree / t <= gaps[0] * max(min(value, nothing - value), 1e-9):
                     break
                 t *= _STEEPER
                 y = centre(program, y, t)
             x = back(y)
             more, worst = self.missed(x)
-            if (worst < forgiven and len(gaps) == 1) or time.thread_time() > until:
+            if (worst < forgiven and len(gaps) == 1) or spent() > until:
                 break
             gaps = gaps[-1:]
             imposed = [np.union1d(w, extra) for w, extra in zip(imposed, more, strict=True)]

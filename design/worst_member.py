@@ -8,18 +8,18 @@ and from the worst points that were found a compass search goes on within the ra
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from haptic_loop.controller.arithmetic import spent, spent_after
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.ranges import Member, Region, regions
+from haptic_loop.design import budgets
 from haptic_loop.design.conditions import ratio_in
-from haptic_loop.design.frequency import MOST_SECONDS
 
 _Ratio = Callable[[Member], float]  # required over available damping
 
@@ -59,20 +59,22 @@ class Searched:
 
     worst: tuple[_Found, ...]
     tried: int
-    ended: bool = False  # by its clock, before it was done
+    ended: bool = False  # by its budget, before it was done
 
 
 def search(
     regions: Sequence[Region],
     ratio: _Ratio,
     progress: Progress = lambda done, total: None,
-    seconds: float = MOST_SECONDS,
+    work: float = budgets.RANGES,
+    over: Callable[[], bool] = lambda: False,
 ) -> Searched:
-    """Where the coupling behind `ratio` needs the most in the ranges that consist of these regions.
+    """Find where the coupling behind `ratio` needs the most in the ranges that consist of these regions.
 
-    When its time is over it returns the worst of what it has tried.
+    When this much counted work is done, or `over` says that the time that a user allowed is over, it returns the worst
+    of the points that it has tried.
     """
-    until = time.perf_counter() + seconds
+    ended, until = False, spent_after(work)
     points = [list(_points(region)) for region in regions]
     refinements = [min(_STARTS, len(some)) * 8 * region.low.size for region, some in zip(regions, points, strict=True)]
     tried, total = 0, sum(map(len, points)) + sum(refinements)
@@ -82,9 +84,9 @@ def search(
         known: dict[bytes, float] = {}
 
         def need(point: Array, region: Region = region, known: dict[bytes, float] = known) -> float:
-            nonlocal tried
+            nonlocal tried, ended
             if point.tobytes() not in known:
-                if tried and time.perf_counter() > until:
+                if ended := ended or (tried > 0 and (spent() > until or over())):
                     return -np.inf
                 tried += 1
                 progress(min(tried, total), total)
@@ -96,7 +98,7 @@ def search(
         distinct = _apart([point for point, _ in climbed], [value for _, value in climbed], _SAME)
         tops += [_Found(_member(region, point), value) for point, value in distinct if value > -np.inf]
     progress(total, total)
-    return Searched(tuple(sorted(tops, key=lambda found: -found.ratio)), tried, time.perf_counter() > until)
+    return Searched(tuple(sorted(tops, key=lambda found: -found.ratio)), tried, ended)
 
 
 def _member(region: Region, point: Array) -> Member:
@@ -158,9 +160,9 @@ def search_ranges(
     loop: Loop,
     coupling: Coupling,
     progress: Progress = lambda done, total: None,
-    seconds: float = MOST_SECONDS,
+    over: Callable[[], bool] = lambda: False,
 ) -> Searched:
-    """The worst environments of the loop's ranges that the search finds."""
+    """Find the worst environments of the loop's ranges."""
     assert loop.ranges
     parts = regions(loop.network, loop.ranges)
-    return search(parts, lambda member: ratio_in(loop.at(member.network), coupling), progress, seconds)
+    return search(parts, lambda member: ratio_in(loop.at(member.network), coupling), progress, over=over)

@@ -14,7 +14,7 @@ from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spri
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.ranges import Ranges
-from haptic_loop.design import certificate, coupling_file, frequency
+from haptic_loop.design import budgets, certificate, coupling_file
 from haptic_loop.design.api import certify
 from haptic_loop.design.audit import MOST_EXTRA_SAMPLES, audit, edge, remedies, requirement, sensitivity, stiffest
 from haptic_loop.design.files import plain
@@ -381,17 +381,17 @@ def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):
 
 def test_what_would_take_minutes_is_not_begun_and_what_does_is_given_up(monkeypatch):
     """A sweep of the pair is estimated at .16 ms, a search at sixty times that."""
-    monkeypatch.setattr(frequency, "MOST_SECONDS", 5e-3)
+    monkeypatch.setattr(budgets, "SWEEPS", 5e-3)
     part = report(PAIR, SOFT)["this-environment"]
     assert part["certified"]
     assert part["stiffest"]["reason"].startswith("not searched: some 60 sweeps over 8 states and 2 channels would take")
     assert part["sensitivity"]["least_delta"] == part["required_damping"]
     monkeypatch.setattr("haptic_loop.design.audit.too_long", lambda *_: None)
-    monkeypatch.setattr(frequency, "MOST_SECONDS", 1e-3)
+    monkeypatch.setattr(budgets, "SWEEPS", 1e-3)
     part = report(PAIR, SOFT)["this-environment"]
     assert part["stiffest"] == {
         "K": [None, None],
-        "reason": "a search by sweeps was given up after 0.001 s: these are many states or channels",
+        "reason": "a search by sweeps was given up after the work of 0.001 s: these are many states or channels",
     }
-    monkeypatch.setattr(frequency, "MOST_SECONDS", 1e-5)
+    monkeypatch.setattr(budgets, "SWEEPS", 1e-5)
     assert "a sweep over 8 states and 2 channels would take" in requirement(PAIR, SOFT, "this-environment").reason

@@ -21,8 +21,8 @@ from haptic_loop.controller.coupling import (
 from haptic_loop.controller.environment import Network, Spring, Wall
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti
+from haptic_loop.design import budgets, environments, exact, spring_damper
 from haptic_loop.design import certificate as design_certificate
-from haptic_loop.design import environments, exact, spring_damper
 from haptic_loop.design.certificate import Verdict, prove, required_damping, verify
 from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
 from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT
@@ -433,9 +433,8 @@ def test_any_environment_asks_the_same_of_a_coupling_as_its_state_space_behind_w
 
 def test_exact_arithmetic_that_takes_too_long_is_given_up_in_one_line(monkeypatch):
     stored = certified(PAIR, STIFF, "this-environment")
-    monkeypatch.setattr(design_certificate, "_LONGEST", 0.0)
-    monkeypatch.setattr("haptic_loop.controller.loop._exactly", [(None,) * 4, None])  # what an earlier proof has built
-    words = "exact arithmetic was given up after 0 s: these are too many digits over many states"
+    monkeypatch.setattr(budgets, "EXACT", 0.0)
+    words = "exact arithmetic was given up after the work of 0 s: these are too many digits over many states"
     with pytest.raises(NotProved, match=words):
         prove(PAIR, STIFF, "this-environment")
     assert verify(stored) == Verdict(False, words)

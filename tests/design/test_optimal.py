@@ -401,7 +401,7 @@ def test_the_price_of_a_range_is_that_of_the_limiter_that_covers_the_nominal_des
     springs = [Spring(("a", "m"), 300.0, 0.1), Spring(("m", "b"), 500.0, 0.2), Spring(("m", "ground"), 30.0)]
     network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.2})
     loop = Loop(0.002, (1, 2), (1, 1), (0, 0), (0.3, 0.6), network)
-    found = spread(loop, ForceFilter([], [], [(0.1 * np.eye(2)).tolist()]), Options(limiter=True), seconds=0.1)
+    found = spread(loop, ForceFilter([], [], [(0.1 * np.eye(2)).tolist()]), Options(limiter=True), work=0.1)
     assert (found.g, found.price_db, found.reason) == (0.1, 0.0, None)
     assert found.proved >= 1
 

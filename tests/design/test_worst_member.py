@@ -115,7 +115,7 @@ def test_a_peak_is_found_wherever_it_lies(top):
     assert found.worst[0].ratio > 0.99
 
 
-def test_of_many_parameters_the_worst_vertex_is_found_and_the_clock_ends_the_search():
+def test_of_many_parameters_the_worst_vertex_is_found_and_a_budget_ends_the_search():
     """A need that is most where odd parameters are at their upper ends, the others at their lower."""
     region = cube(10)
     signs = np.array([1, -1] * 5)
@@ -126,7 +126,7 @@ def test_of_many_parameters_the_worst_vertex_is_found_and_the_clock_ends_the_sea
     found = search([region], need)
     np.testing.assert_array_equal((point_of(found.worst[0].member) - region.low) / 10, signs > 0)
     assert not found.ended
-    short = search([region], need, seconds=0.0)
+    short = search([region], need, work=-1.0)
     assert short.ended
     assert short.tried == 1
     assert len(short.worst) == 1

@@ -1,0 +1,57 @@
+"""Counted work: it depends on sizes and numbers only, and a budget ends it."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from haptic_loop.controller.arithmetic import TooLong, solve, spend, spent, times, within
+from haptic_loop.controller.lti import Lti
+
+Z = np.exp(1j * np.linspace(0.01, 3, 50))
+
+
+def exact(rows: int) -> np.ndarray:
+    return np.array([[Fraction(1, 1 + i + j) for j in range(rows)] for i in range(rows)])
+
+
+def response(states: int) -> None:
+    one = np.ones((states, 1))
+    Lti(np.diag(np.linspace(0.1, 0.9, states)), one, one.T, np.eye(1), 1e-3).at(Z)
+
+
+def counted(work) -> int:
+    before = spent()
+    work()
+    return spent() - before
+
+
+@pytest.mark.parametrize(
+    "work", [lambda n: times(exact(n), exact(n)), lambda n: solve(exact(n), exact(n)), lambda n: response(n)]
+)
+def test_work_repeats_and_grows_with_size(work):
+    first, again, larger = (counted(lambda n=n: work(n)) for n in (8, 8, 12))
+    assert first == again
+    assert 0 < 1.1 * first < larger
+
+
+def test_a_spent_budget_raises_and_is_restored():
+    with within(0.5, "a search", "too many"):
+        spend(0.4)
+        with pytest.raises(TooLong, match=r"a search was given up after the work of 0\.5 s: these are too many"):
+            spend(0.2)
+    spend(1.0)
+
+
+def test_an_inner_budget_never_exceeds_the_outer_one():
+    with pytest.raises(TooLong, match="outer"), within(1.0, "outer"), within(5.0, "inner"):
+        spend(2.0)
+    with within(5.0, "outer"):
+        with pytest.raises(TooLong, match="inner"), within(1.0, "inner"):
+            spend(2.0)
+        spend(2.0)
+
+
+def test_a_clock_ends_work_only_if_it_is_given():
+    with pytest.raises(TooLong), within(np.inf, clock=lambda: True):
+        spend(0.0)
+    spend(0.0)
