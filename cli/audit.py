@@ -189,7 +189,7 @@ def _coupling(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> Coupl
         raise InputError(f"--{gains[0]} without --{missing}: a spring-damper has both (--B 0 is a spring alone)")
     if not gains:
         raise InputError(
-            "nothing to audit: give --K and --B, --coupling FILE.json or module:function, --device NAME or --case none"
+            "nothing to audit: give --K and --B, --coupling FILE.json or FILE.py:NAME, --device NAME or --case none"
         )
     K, B = (options.per_channel(f"--{name}", getattr(args, name), loop.channels) for name in "KB")
     return SpringDamper(K, B)

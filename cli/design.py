@@ -56,7 +56,7 @@ def _parser() -> options.Parser:
     parser = options.Parser("design", "Design a coupling, prove its certificate and store both.", example)
     parser.add_loop()
     kind = parser.add_mutually_exclusive_group()
-    kinds = f"{', '.join(KINDS)}, or package.module:function of your own (default spring-damper)"
+    kinds = f"{', '.join(KINDS)}, or FILE.py:NAME of your own (default spring-damper)"
     kind.add_argument("--coupling", metavar="NAME", default="spring-damper", help=kinds)
     best = "the coupling of the least transparency error: --coupling optimal"
     kind.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)

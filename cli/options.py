@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from haptic_loop.design.files import check_file, folder, read_text
 from haptic_loop.design.own import called, named, place_of
 from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, DesignFailed
 from haptic_loop.models.device import MOST_DAMPING, Device, Guaranteed
-from haptic_loop.sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load
+from haptic_loop.sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load, with_environment
 
 if TYPE_CHECKING:
     from haptic_loop.design.conditions import Condition
@@ -81,6 +81,8 @@ class Parser(argparse.ArgumentParser):
         loop.add_argument("--case", choices=CASES, default="I", help="none, I (Lambda = Theta Psi) or II (Lambda = I)")
         names = ", ".join(built_in())
         loop.add_argument("--scenario", default=DEFAULT, metavar="FILE.toml", help=f"or one of: {names}")
+        own = "your own environment in place of the scenario's: a Network, or a class with contacts and E(T) or parts()"
+        loop.add_argument("--environment", metavar="FILE.py:NAME", help=own)
         for name, what in (("theta", "transmission"), ("psi", "environment"), ("lam", "reference")):
             what = f"{what} delay per channel [samples]; one is for all"
             loop.add_argument(f"--{name}", type=several(int), metavar="N,N,..", help=what)
@@ -104,7 +106,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_coupling(self, names: str) -> None:
         """Which coupling, and the condition that it is designed for or judged by."""
-        what = f"{names}, FILE.json or package.module:function (default spring-damper)"
+        what = f"{names}, FILE.json or FILE.py:NAME of a function of the loop (default spring-damper)"
         self.add_argument("--coupling", metavar="NAME|FILE", help=what)
         self.add_condition()
 
@@ -126,8 +128,8 @@ class Parser(argparse.ArgumentParser):
 
     def add_human(self, more: str = "") -> None:
         """--human."""
-        who = f"other humans: [[human]] per channel in a .toml, or `humans`{more} in a .py"
-        self.add_argument("--human", metavar="FILE", help=who)
+        who = f"other humans: [[human]] per channel in a .toml, or a list of hands{more or ' in a .py'}"
+        self.add_argument("--human", metavar="FILE.toml|FILE.py:NAME", help=who)
 
     def add_energy_budget(self) -> None:
         """--energy-budget."""
@@ -271,7 +273,7 @@ def condition(text: str) -> str:
 
 
 def own_condition(text: str) -> Condition:
-    """The user's own condition that `package.module:Name` or `FILE.py:NAME` names. Raises InputError."""
+    """The user's own condition that FILE.py:NAME names. Raises InputError."""
     from haptic_loop.design.certificate import named as checked
     from haptic_loop.design.conditions import Condition
 
@@ -352,6 +354,8 @@ def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) 
 def scenario_from(args: argparse.Namespace) -> Scenario:
     """The scenario that the loop options describe. Raises InputError."""
     scenario = load(args.scenario)
+    if args.environment is not None:
+        scenario = with_environment(scenario, args.environment)
     names = ("theta", "psi", "lam", "latency", "delta", "T", "T_max")
     said = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     changes: dict[str, Any] = {
@@ -378,13 +382,6 @@ def _known_device(text: str) -> Guaranteed:
 
 def _with_bounds(device: Device, bounds: Guaranteed) -> Device:
     return msgspec.structs.replace(device, guaranteed=bounds)
-
-
-def own_or(option: str, text: str, names: Collection[str]) -> Any:
-    """One of these names as it is, or what `package.module:Name` names. Raises InputError."""
-    if text in names or ":" in text:
-        return text if text in names else named(option, text)
-    raise InputError(f"{option} is {text!r}, allowed are {', '.join(names)} and package.module:Name")
 
 
 def with_humans(args: argparse.Namespace, scenario: Scenario) -> Scenario:

@@ -28,7 +28,7 @@ from haptic_loop.sim.couplings import NAMES, Judged
 from haptic_loop.sim.engines import INTEGRATORS
 from haptic_loop.sim.passivity_layer import EnergyNet
 from haptic_loop.sim.report import PaperRow, beside_the_paper
-from haptic_loop.sim.run import ENGINES, AnyEngine, EngineSettings
+from haptic_loop.sim.run import ENGINES, EngineSettings
 from haptic_loop.sim.run_report import Ran, RunReport, run_report
 from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.stability import ExactVerdict
@@ -37,14 +37,13 @@ from haptic_loop.sim.stability import ExactVerdict
 def main(argv: list[str]) -> int:
     """Simulate and report. 0: the run was completed, stable or not; 130: interrupted."""
     args = _parser().parse_args(argv)
-    engine = options.own_or("--engine", args.engine, ENGINES)
-    if args.error is not None and (engine != "mujoco" or args.integrator or args.substeps):
+    if args.error is not None and (args.engine != "mujoco" or args.integrator or args.substeps):
         raise InputError("--error chooses integrator and substeps of MuJoCo: give no other --engine, --integrator, ..")
     scenario, out = _scenario(args), options.out_folder(args, "run")
     environment, simulated = _environment(args, scenario)
     chosen = chosen_by(args, scenario)  # V, Q or R
     judged = judge(args, scenario, chosen, simulated)  # what each condition asks of the devices, and what is proved
-    done = _run(args, simulated, judged, engine)  # sample, compute, limit, hold, advance
+    done = _run(args, simulated, judged)  # sample, compute, limit, hold, advance
     report = run_report(scenario, args.case, judged, done, environment, args.band_hz or BAND_HZ, args.cross_check)
     report = replace(report, nearby=_nearby(scenario.loop(args.case), judged))
     if args.paper:
@@ -63,8 +62,7 @@ def _parser() -> options.Parser:
     parser.add_varying_delays()
     parser.add_coupling(", ".join(NAMES))
     parser.add_energy_budget()
-    engines = "mujoco (default), exact, or package.module:Class of your own"
-    add("--engine", default="mujoco", metavar="NAME|MODULE:CLASS", help=engines)
+    add("--engine", choices=ENGINES, default="mujoco", help="(default mujoco)")
     steppers = "integrator of MuJoCo (default exponential, RK4 where devices rub)"
     add("--integrator", choices=tuple(INTEGRATORS), help=steppers)
     steps = "MuJoCo steps per period (default: what the plant asks)"
@@ -105,10 +103,10 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
 # The run and what it came to.
 
 
-def _run(args: argparse.Namespace, scenario: Scenario, judged: Judged, engine: AnyEngine) -> ScenarioRun:
+def _run(args: argparse.Namespace, scenario: Scenario, judged: Judged) -> ScenarioRun:
     """Close the loop as the options say. Raises InputError for settings that cannot be."""
     net = EnergyNet(*args.energy_budget) if args.energy_budget else None
-    settings = EngineSettings(engine, args.integrator, args.substeps, args.error)
+    settings = EngineSettings(args.engine, args.integrator, args.substeps, args.error)
     coupling, lag = judged.chosen.coupling, judged.limiter.rho
     with render.progress("simulating") as move:
         return run_scenario(scenario, coupling, lag, settings, args.seed, net, move)

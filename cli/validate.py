@@ -67,12 +67,11 @@ def _parser() -> options.Parser:
     parser.add_loop()
     parser.add_varying_delays()
     parser.add_coupling(", ".join(NAMES))
-    parser.add_human(" and `population`, whose draw(rng, n) gives n hands,")
+    parser.add_human(", or a population with draw(rng, n), in a .py")
     parser.add_limiter()
     add("--humans", type=whole(1, 1_000_000), default=1000, metavar="N", help="random humans per device (default 1000)")
     add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
-    who = f"who decides: {', '.join(ENGINES)} (default both), or package.module:Class, beside the exact one"
-    add("--engine", default="both", metavar="NAME", help=who)
+    add("--engine", choices=ENGINES, default="both", help="who decides (default both)")
     seconds = "length of the traces (default 2; 0 for none)"
     add("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
     add("--shards", type=whole(1, 256), default=1, metavar="K", help="local processes, for the same result (default 1)")
@@ -115,8 +114,7 @@ def _environments(args: argparse.Namespace, whole: RangesCheck | None) -> tuple[
 def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, judged: Judged) -> Validation:
     """The loop, the humans that are to hold it, and the engines that decide. Raises InputError."""
     links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
-    engine = options.own_or("--engine", args.engine, ENGINES)
-    work, met = (args.humans, links, engine, args.duration), _environments(args, judged.whole)
+    work, met = (args.humans, links, args.engine, args.duration), _environments(args, judged.whole)
     return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=judged.limiter.rho)
 
 

@@ -117,7 +117,7 @@ def design_by_kind(
             raise ValueError(f"condition is {condition!r}, but {kind} is designed for {found.condition}")
         return found
     if kind not in KINDS:
-        raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)} and package.module:function")
+        raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)} and FILE.py:NAME of your own")
     chosen = KINDS[kind]
     if own and not chosen.softened:
         able = ", ".join(other for other in KINDS if KINDS[other].softened)
@@ -169,7 +169,7 @@ def _before_walls(loop: Loop) -> str:
 
 
 def own_coupling(name: str, loop: Loop) -> Any:
-    """What a user's own function, named as `package.module:function`, makes of a loop. Raises InputError."""
+    """What a user's own function, named as FILE.py:NAME, makes of a loop. Raises InputError."""
     return called(f"--coupling {name}", named("--coupling", name), loop)
 
 

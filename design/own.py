@@ -1,4 +1,4 @@
-"""A user's own classes, named as `package.module:Name` on the command line and in scenarios."""
+"""A user's own classes and functions, named as FILE.py:NAME on the command line."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import os
 import sys
 import traceback
 from collections.abc import Callable
-from importlib import import_module
+from contextlib import redirect_stdout
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar
 
 from haptic_loop.design.files import InputError
@@ -19,36 +21,62 @@ _OTHERS = ("<", f"{sys.prefix}{os.sep}", f"{sys.base_prefix}{os.sep}", *_OURS)
 
 
 def named(option: str, text: str) -> Any:
-    """What `text` names, in a module of the working directory or an installed one. Raises InputError."""
-    module, _, name = text.rpartition(":")
-    file = Path(module).resolve() if module.endswith(".py") else None
-    if file:
-        module = file.stem
-    if not all(part.isidentifier() for part in (*module.split("."), name)):
-        raise InputError(f"{option} is {text!r}, expected package.module:Name or FILE.py:Name")
-    place = reach_working_directory(str(file.parent) if file else None)
+    """Return the object that FILE.py:NAME names: the one place where a user's own code is loaded.
+
+    What the file prints goes to standard error, since a report may go to standard output. The file's folder joins
+    sys.path, for modules beside it and for worker processes.
+
+    Raises:
+        InputError: `text` names no file or no object in it, or the file is no valid Python.
+    """
+    place, _, name = text.rpartition(":")
+    file = Path(place)
+    if file.suffix != ".py" or not (file.stem.isidentifier() and name.isidentifier()):
+        raise InputError(f"{option} is {text!r}, expected FILE.py:NAME")
+    if not file.is_file():
+        raise InputError(f"{option} is {text!r}: there is no file {place}")
+    with redirect_stdout(sys.stderr):
+        module = _loaded(option, text, file.resolve())
+    if not hasattr(module, name):
+        there = ", ".join(n for n, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__)
+        raise InputError(f"{option} is {text!r}: {place} has no {name}, but {there or 'no class and no function'}")
+    return getattr(module, name)
+
+
+_LOADED: dict[Path, ModuleType] = {}
+
+
+def _loaded(option: str, text: str, file: Path) -> ModuleType:
+    """Run the file once, as the module of its name, by which worker processes find its classes again."""
+    if file in _LOADED:
+        return _LOADED[file]
+    other = sys.modules.get(file.stem)
+    if other is not None and Path(getattr(other, "__file__", None) or ".").resolve() == file:
+        return other
+    if other is not None and other not in _LOADED.values():
+        raise InputError(f"{option} is {text!r}: another module of the name {file.stem} is loaded, rename the file")
+    reach(str(file.parent))
+    spec = spec_from_file_location(file.stem, file)
+    assert spec
+    assert spec.loader
+    sys.modules[file.stem] = module = module_from_spec(spec)
     try:
-        found = import_module(module)
-    except ModuleNotFoundError as error:
-        if not f"{module}.".startswith(f"{error.name}."):
-            raise  # the module is there, and imports what is not
-        absent = f"there is no module {error.name!r} in {place}, nor an installed one"
-        raise InputError(f"{option} is {text!r}: {absent}") from None
-    except SyntaxError as error:
-        raise InputError(f"{option} is {text!r}: {error.filename}, line {error.lineno}: {error.msg}") from None
-    if file and Path(str(found.__file__)).resolve() != file:
-        raise InputError(f"{option} is {text!r}: another module of the name {module} is loaded, rename the file")
-    if not hasattr(found, name):
-        there = ", ".join(n for n, value in vars(found).items() if getattr(value, "__module__", "") == module)
-        raise InputError(f"{option} is {text!r}: {module} has no {name}, but {there or 'no class and no function'}")
-    return getattr(found, name)
+        spec.loader.exec_module(module)
+    except BaseException as error:
+        del sys.modules[file.stem]
+        if isinstance(error, SyntaxError):
+            raise InputError(f"{option} is {text!r}: {error.filename}, line {error.lineno}: {error.msg}") from None
+        if isinstance(error, SystemExit | UnicodeDecodeError):
+            raise InputError(f"{option} is {text!r}: {type(error).__name__}: {error}") from None
+        raise
+    _LOADED[file] = module
+    return module
 
 
-def reach_working_directory(instead: str | None = None) -> str:
-    """Let modules be found in it, or in another folder, as under `python -m`, and as a console script does not."""
-    if (place := instead or os.getcwd()) not in sys.path:
-        sys.path.insert(0, place)
-    return place
+def reach(folder: str) -> None:
+    """Let modules in this folder be imported."""
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
 
 
 def called(what: str, make: Callable[..., _Made], *given: Any, **named: Any) -> _Made:

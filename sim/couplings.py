@@ -90,9 +90,7 @@ def _choose(
         asked: dict[str, Any] = {"limiter": limiter} if limiter is not None and KINDS[name].limited else {}
         return replace(design_by_kind(loop, name, own or condition, progress, **asked), kind=name)
     if Path(name).suffix != ".json":
-        raise InputError(
-            f"--coupling is {name!r}, allowed are {', '.join(NAMES)}, a FILE.json or package.module:function"
-        )
+        raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)}, a FILE.json or FILE.py:NAME")
     stored = read_coupling(name)
     coupling = fitted(stored, name, scenario.channels, scenario.T)
     made_for = stored.certificate.condition if stored.certificate else THIS_ENVIRONMENT.name

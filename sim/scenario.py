@@ -9,11 +9,8 @@ from __future__ import annotations
 import difflib
 import hashlib
 import re
-import runpy
-import sys
 from collections.abc import Sequence
-from contextlib import redirect_stdout
-from io import StringIO
+from inspect import isfunction
 from pathlib import Path
 from typing import Any, Self, get_args
 
@@ -27,13 +24,12 @@ from haptic_loop.controller.environment import (
     Network,
     Spring,
     Wall,
-    parts_of,
 )
 from haptic_loop.controller.loop import MOST_SAMPLES, DelayRange, DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
-from haptic_loop.design.files import InputError, counted, printable, read_text, toml, write
-from haptic_loop.design.own import called, named, place_of, reach_working_directory
+from haptic_loop.design.files import InputError, counted, read_text, toml, write
+from haptic_loop.design.own import called, named, place_of
 from haptic_loop.models.device import MOST_DAMPING, Device, fields_of, require
 from haptic_loop.models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
@@ -291,6 +287,16 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise InputError(str(error)) from None
 
 
+def with_environment(scenario: Scenario, text: str) -> Scenario:
+    """The scenario with the environment of FILE.py:NAME: a Network, or what has contacts and E(T) or parts().
+
+    A class or a function is called without arguments. Raises InputError.
+    """
+    own = named("--environment", text)
+    own = called(f"--environment {text}", own) if callable(own) else own
+    return scenario.replace(environment=own)
+
+
 def load(source: str | Path = DEFAULT) -> Scenario:
     """A scenario from a TOML file, or one of the built-in ones by name. Raises InputError."""
     if not isinstance(source, str | Path):
@@ -353,35 +359,36 @@ class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     human: tuple[Any, ...]  # Human, MeasuredHand, or a user's own
     person: tuple[Person, ...] = ()
-    population: Any = None  # of a Python file: who else is drawn, what has draw(rng, n)
+    population: Any = None  # of a user's own: it has draw(rng, n)
 
 
-def held_by(scenario: Scenario, path: str | Path) -> Scenario:
-    """The scenario in the hands, or of the population, that a file names. Raises InputError as `_load_humans` does."""
-    people = _load_humans(path, scenario.channels)
+def held_by(scenario: Scenario, text: str) -> Scenario:
+    """The scenario with the hands, or the population, of a TOML file or of FILE.py:NAME. Raises InputError."""
+    people = _load_humans(text, scenario.channels)
     who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
     if people.population is not None:
         who["population"] = people.population
     return scenario.replace(**who)
 
 
-def _load_humans(path: str | Path, channels: int) -> _HumanFile:
-    """The humans of a file, one per channel, and who holds several devices.
+def _load_humans(text: str, channels: int) -> _HumanFile:
+    """The humans of a TOML file or of FILE.py:NAME, one per channel, and who holds several devices.
 
-    A Python file is run, and says who they are: `humans`, and `persons` if it likes, of any class (models.human.Hand).
     Raises InputError with one line that names the file and the field.
     """
-    what = "[[human]] tables"
-    if Path(path).suffix == ".py":
-        people, what = _run_file(path), "`humans`"
-    else:
-        people = _humans_of(read_text(path, f"--human {path}"), f"--human {path}")
-    if len(people.human) != channels and not (people.population and not people.human):
-        raise InputError(f"--human {path} has {len(people.human)} {what}, expected {channels} (one per channel)")
     try:
+        own = ".py" in text
+        people = _own_humans(text) if own else _humans_of(read_text(text, f"--human {text}"), f"--human {text}")
+        if len(people.human) != channels and not people.population:
+            what = "hands" if own else "[[human]] tables"
+            raise InputError(f"--human {text} has {len(people.human)} {what}, expected {channels} (one per channel)")
         check_holds([person.holds for person in people.person], channels)
+    except InputError:
+        raise
     except ValueError as error:
-        raise InputError(f"--human {path}: {error}") from None
+        if place_of(error):  # in a class of the user's own
+            raise
+        raise InputError(f"--human {text}: {error}") from None
     return people
 
 
@@ -402,26 +409,21 @@ def _humans_of(text: str, source: str) -> _HumanFile:
     return _HumanFile(tuple(made), people.person)
 
 
-def _run_file(path: str | Path) -> _HumanFile:
-    """The people that a Python file defines. Raises InputError where it cannot be read or run, or they hold nothing."""
-    read_text(path, f"--human {path}")
-    heard: Any = StringIO()
-    heard.close = lambda: None
-    try:
-        reach_working_directory()
-        with redirect_stdout(heard):  # where a report may be written to
-            names = runpy.run_path(str(path))
-        sys.stderr.write(printable(heard.getvalue()))
-        hands, persons = _kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ()))
-        for i, person in enumerate(persons, start=1):
-            if not isinstance(person, Person):
-                raise ValueError(f"persons #{i} is {person!r}, expected a models.human.Person")
-        population = names.get("population")
-        if population is not None and len(_kept(tuple(population.draw(np.random.default_rng(0), 2)))) != 2:
-            raise ValueError("population.draw(rng, 2) gives not two humans")
-        return _HumanFile(hands, persons, population)
-    except (Exception, SystemExit) as error:
-        raise InputError(f"--human {path}: {type(error).__name__}: {error}") from None
+def _own_humans(text: str) -> _HumanFile:
+    """The people that FILE.py:NAME names: hands and persons, a population with draw(rng, n), or a function of them."""
+    people: Any = named("--human", text)
+    if isinstance(people, type) or isfunction(people):
+        made: Any = called(f"--human {text}", people)
+    else:
+        made = people
+    if callable(getattr(made, "draw", None)):
+        if len(_kept(tuple(made.draw(np.random.default_rng(0), 2)))) != 2:
+            raise ValueError("draw(rng, 2) gives not two humans")
+        return _HumanFile((), (), made)
+    if not isinstance(made, list | tuple):
+        raise ValueError(f"it is {made!r}, expected a list of hands, or a population with draw(rng, n)")
+    persons = tuple(person for person in made if isinstance(person, Person))
+    return _HumanFile(_kept(tuple(hand for hand in made if not isinstance(hand, Person))), persons)
 
 
 def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
@@ -453,7 +455,7 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
     raw = toml(text, source)
     try:
         raw = _whole(raw) if kind is Scenario else raw
-        return msgspec.convert(_with_own(_with_world(_with_catalogue(raw), folder)), kind)
+        return msgspec.convert(_with_world(_with_catalogue(raw), folder), kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
     except ValueError as error:
@@ -538,39 +540,6 @@ def _nowhere(environment: Network) -> Network:
         return environment
     world = msgspec.structs.replace(environment.world, file=Path(environment.world.file).name)
     return msgspec.structs.replace(environment, world=world)
-
-
-def _with_own(raw: dict[str, Any]) -> dict[str, Any]:
-    """The file with environments and elements of a user's own classes written out as what they are made of."""
-    found = raw.get("environment")
-    if not isinstance(found, dict):
-        return raw
-    if "type" in found:
-        return raw | {"environment": msgspec.to_builtins(_network(_own("environment", found), raw.get("T")))}
-    elements = found.get("elements")
-    if not isinstance(elements, list):
-        return raw
-    parts = {name: found.get(name, []) for name in ("springs", "walls")}
-    for i, table in enumerate(elements, start=1):
-        what = f"environment.elements #{i}"
-        for part in called(what, parts_of, _own(what, table)):
-            name = "springs" if isinstance(part, Spring) else "walls"
-            parts[name] = [*parts[name], _plain(what, part)]
-    rest = {name: value for name, value in found.items() if name != "elements"}
-    return raw | {"environment": rest | {name: some for name, some in parts.items() if some}}
-
-
-def _own(what: str, table: Any) -> Any:
-    """What the class that a table names makes of its other keys. Raises InputError."""
-    if not isinstance(table, dict) or not isinstance(table.get("type"), str):
-        raise InputError(f"{what} is {table!r}, expected a table with type = 'package.module:Class'")
-    kind, given = named(f"{what}.type", table["type"]), {key: v for key, v in table.items() if key != "type"}
-    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
-        try:
-            return msgspec.convert(given, kind)
-        except msgspec.ValidationError as error:
-            raise InputError(f"{what}.{_located(str(error), given)}") from None
-    return called(what, kind, **given) if callable(kind) else kind
 
 
 def _network(own: Any, T: Any) -> Network:

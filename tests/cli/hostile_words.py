@@ -255,7 +255,7 @@ REFUSED = {
         --varying-delay 1.5,2 | --playout | --pattern random | --vertex 1 | --vertex -1 | --band 5,1 | --band 0,0
         --band nan,5 | --theta 1,2,3 | --theta 1.5 | --psi -1,0 | --delta -1 | --T 1e-7 | --T 1 | --theta 1001,0
         --theta 1000,1000 | --case none --lam 0,0,0 | --condition any-environment --case III
-        --no-limiter --energy-budget x | --human h.py --vertex 3""",
+        --no-limiter --energy-budget x | --human h.py:humans --vertex 3""",
     "validate": """--resume | --environments ranges | --dask x
         --dask h:1 --shards 2 | --generations 5 | --links 3 | --humans 0 | --humans 1e3 | --shards 0
         --duration 1e-9 | --duration -1 | --latency 2e-3 | --T-max 1e-4 | --period 1e-3""",
@@ -326,7 +326,8 @@ def combined() -> Iterator[Case]:
     ]
     for name, text in PEOPLE.items():
         asked += [
-            (command, f"--human h.py --seed {len(name)}", (0, 1, 2, 130), text) for command in ("run", "validate")
+            (command, f"--human h.py:humans --seed {len(name)}", (0, 1, 2, 130), text)
+            for command in ("run", "validate")
         ]
     for command, words, codes, people in asked:
         quick = QUICK[command] if command != "audit" else ()

@@ -1,5 +1,7 @@
 """Classes of a user's own, in one file outside of the repository, through the commands."""
 
+import json
+
 import pytest
 from forked import run
 
@@ -9,24 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from haptic_loop.controller.coupling import Compliance, Coupling
-from haptic_loop.controller.environment import Spring, Wall
+from haptic_loop.controller.environment import Network, Spring, Wall
 from haptic_loop.controller.lti import Lti, numbers, taps
-
-
-class Trapezoidal:
-    def __init__(self, simulation):
-        P, T = simulation.scene.plant, simulation.scenario.T
-        left = np.linalg.inv(np.eye(len(P.A)) - T / 2 * P.A)
-        self.step = np.hstack([left @ (np.eye(len(P.A)) + T / 2 * P.A), left @ P.B * T])
-
-    def start(self, buffer):
-        self.rows, self.states = buffer.plant_row, buffer.plant_state
-
-    def advance(self, k):
-        self.states[k + 1][...] = self.step @ self.rows[k]
-
-    def troubled(self):
-        return False
 
 
 @dataclass
@@ -51,15 +37,6 @@ def duck(loop):
 
 def weighted(loop):
     return Weighted(900.0, loop.T)
-
-
-class Untroubled(Trapezoidal):
-    troubled = None
-
-
-class Short(Trapezoidal):
-    def advance(self, k):
-        self.states[k + 1][...] = np.zeros(7)
 
 
 @dataclass
@@ -95,15 +72,27 @@ class Active(Gel):
 class Broken(Gel):
     def E(self, T):
         return 1 / 0
+
+
+def gel():
+    return Gel(600.0)
+
+
+def hard(kind=Hardening, **changes):
+    return Network(("left", "right"), elements=(kind(**{**USUAL, **changes}),))
+
+
+USUAL = {"between": ["left", "right"], "stiffness": 300.0, "step": 0.002}
+active, broken = Active(6.0), Broken(6.0)
+
+
+def soft():
+    return hard(stiffness=-5.0)
+
+
+def negative():
+    return hard(Negative)
 """
-SCENARIO = """
-name = "own"
-T = 1e-3
-theta = [1, 1]
-device = [{ kind = "rigid", damping = 1.37 }, { kind = "rigid", damping = 1.37 }]
-[environment]
-"""
-HARD = 'elements = [{ type = "mine:Hardening", between = ["left", "right"], stiffness = 300.0, step = 0.002 }]'
 RUN = "python -m sim.run --case I --duration 0.3 --no-plot"
 
 
@@ -111,48 +100,63 @@ RUN = "python -m sim.run --case I --duration 0.3 --no-plot"
 def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("own")
     (folder / "mine.py").write_text(MINE)
-    (folder / "hard.toml").write_text(f'{SCENARIO}contacts = ["left", "right"]\n{HARD}\n')
-    (folder / "gel.toml").write_text(f'{SCENARIO}type = "mine:Gel"\nstiffness = 600.0\n')
+    (folder / "loud.py").write_text("print('something')\nfrom mine import gel\n")
+    (folder / "ends.py").write_text("raise SystemExit(7)\n")
     return folder
 
 
-@pytest.mark.parametrize(("scenario", "covered"), [("hard", "any-environment"), ("gel", "this-environment")])
-def test_an_element_and_an_environment_in_a_scenario(scenario, covered, place):
-    """Designed, proved and stored, and proved again from the file alone, which asks for no class."""
-    done = run(f"python -m design --scenario {scenario}.toml --condition {covered} --out {scenario}.json", place)
+@pytest.mark.parametrize(("name", "covered"), [("hard", "any-environment"), ("gel", "this-environment")])
+def test_an_own_environment_is_proved_and_stored(name, covered, place):
+    """The proof is repeated from the file alone, which asks for no class."""
+    words = f"--environment mine.py:{name} --condition {covered} --out {name}.json"
+    done = run(f"python -m design {words}", place)
     assert done.returncode == 0, done.stderr
     (place / "elsewhere").mkdir(exist_ok=True)
-    done = run(f"python -m design.check ../{scenario}.json", place / "elsewhere")
+    done = run(f"python -m design.check ../{name}.json", place / "elsewhere")
     assert "proved, in exact arithmetic" in done.stdout
 
 
 @pytest.mark.parametrize(
-    ("environment", "message"),
+    ("words", "message"),
     [
-        ('type = "mine:Active"\nstiffness = 6', "environment Active: block: not passive"),
-        ('type = "mine:Gel"\nstifness = 6', "environment: TypeError: Gel.__init__() got an unexpected keyword arg"),
-        ('type = "mine:Trapezoidal"', "environment: TypeError: Trapezoidal.__init__() missing 1 required"),
-        (f'contacts = ["left", "right"]\n{HARD.replace("mine", "yours")}', "environment.elements #1.type is 'yours:H"),
-        (
-            f'contacts = ["left", "right"]\n{HARD.replace("300.0", "-5.0")}',
-            "mine.py, line 68: stiffness between left",
-        ),
-        (f'contacts = ["left", "right"]\n{HARD.replace("type", "kind")}', "environment.elements #1 is {'kind': 'mine"),
-        (f'contacts = ["left", "up"]\n{HARD}', "contact 'up' has neither spring"),
-        ('type = "mine:Broken"\nstiffness = 6', "which is your own: ZeroDivisionError: division by zero"),
-        (
-            f'contacts = ["left", "right"]\n{HARD.replace("Hardening", "Negative")}',
-            "mine.py, line 73: stiffness between",
-        ),
+        ("mine.py:active", "environment Active: block: not passive"),
+        ("mine.py:Gel", "--environment mine.py:Gel: TypeError: Gel.__init__() missing 1 required"),
+        ("mine.py:np", "environment module: expected a class with contacts"),
+        ("mine.py:soft", "stiffness between left"),
+        ("mine.py:negative", "stiffness between left"),
+        ("mine.py:broken", "which is your own: ZeroDivisionError: division by zero"),
+        ("mine.py:nobody", "mine.py has no nobody, but Weighted, Duck, "),
+        ("yours.py:X", "there is no file yours.py"),
+        ("mine:Gel", "expected FILE.py:NAME"),
+        ("ends.py:X", "SystemExit: 7"),
     ],
 )
-def test_what_is_wrong_with_them_is_said_in_a_line(environment, message, place):
-    (place / "wrong.toml").write_text(SCENARIO + environment)
-    done = run(f"{RUN} --scenario wrong.toml", place)
+def test_a_wrong_environment_is_one_line(words, message, place):
+    done = run(f"{RUN} --environment {words}", place)
     *before, last = done.stderr.splitlines()
     assert done.returncode == 2
     assert message in last
     assert bool(before) == ("your own" in last), "only an error within their code has a traceback"
+
+
+def test_an_own_file_prints_to_standard_error(place):
+    done = run(f"{RUN} --environment loud.py:gel --json -", place)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["case"] == "I"
+    assert "something" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "line", ['type = "mine:Gel"', 'elements = [{ type = "mine:Hardening", between = ["left", "right"] }]']
+)
+def test_a_scenario_file_executes_nothing(line, place):
+    scenario = 'name = "own"\nT = 1e-3\ntheta = [1, 1]\ndevice = ["omega.3", "omega.3"]\n[environment]\n'
+    (place / "code.toml").write_text(f'{scenario}contacts = ["left", "right"]\n{line}\n')
+    (place / "mine.pth").touch()
+    done = run(f"{RUN} --scenario code.toml", place)
+    assert done.returncode == 2
+    assert "environment" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
@@ -175,35 +179,23 @@ def test_a_hand_that_fails_after_a_while(force, message, place):
     hand += f"    def voluntary_force(self, t):\n        return {force}\n"
     (place / "friends.py").write_text(hand)
     (place / "held.py").write_text("from friends import Hand\n\nhumans = (Hand(), Hand())\n")
-    done = run(f"{RUN} --human held.py", place)
+    done = run(f"{RUN} --human held.py:humans", place)
     assert done.returncode == 2
     assert message in done.stderr.splitlines()[-1]
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--coupling mine:duck", "coupling is a Duck, which is not derived from controller.coupling.Coupling"),
-        ("--engine mine:Untroubled", "engine mine:Untroubled has no troubled: expected what has start(buffer), adv"),
-        ("--engine mine:Nobody", "--engine is 'mine:Nobody': mine has no Nobody, but Trapezoidal, Weighted, Duck, "),
-        ("--engine yours:X", "--engine is 'yours:X': there is no module 'yours' in"),
-        ("--engine mine:1", "--engine is 'mine:1', expected package.module:Name"),
-        ("--engine euler", "--engine is 'euler', allowed are mujoco, exact and package.module:Name"),
-        ("--engine os:getcwd", "engine posix:getcwd: TypeError: "),
-        ("--engine mine:Short", ", which is your own: ValueError: could not broadcast"),
-    ],
-)
-def test_what_is_wrong_with_it_is_said_in_a_line(options, message, place):
-    done = run(f"{RUN} {options}", place)
-    *before, last = done.stderr.splitlines()
+def test_a_coupling_must_be_derived_from_ours(place):
+    done = run(f"{RUN} --coupling mine.py:duck", place)
     assert done.returncode == 2
-    assert message in last
-    assert bool(before) == ("your own" in last), "only an error within their code has a traceback"
+    message = "coupling is a Duck, which is not derived from controller.coupling.Coupling"
+    assert message in done.stderr.splitlines()[-1]
 
 
-@pytest.mark.parametrize("command", [f"{RUN} --scenario hard.toml --coupling", "python -m design.audit --coupling"])
+@pytest.mark.parametrize(
+    "command", [f"{RUN} --environment mine.py:hard --coupling", "python -m design.audit --coupling"]
+)
 def test_a_coupling_that_is_its_compliance(command, place):
-    """Behind it walls, and an audit, which takes the same words."""
-    done = run(f"{command} mine:weighted", place)
+    """Behind it are walls in a run, and an audit takes the same words."""
+    done = run(f"{command} mine.py:weighted", place)
     assert done.returncode == 0, done.stderr
     assert not done.stderr

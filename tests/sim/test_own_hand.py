@@ -207,7 +207,7 @@ def test_the_command_s_adversary_takes_a_population_from_a_file(tmp_path):
         "--case",
         "none",
         "--human",
-        str(file),
+        f"{file}:population",
         "--humans",
         "5",
         "--duration",
@@ -261,14 +261,13 @@ def test_the_command_takes_hands_from_a_python_file(tmp_path, capsys):
         "class Soft:\n"
         "    def port(self): return Port([0.2], [[-1, 1]], [2.0], [90.0])\n"
         "    def voluntary_force(self, t): return 0 * t\n"
-        "humans = (Soft(), Soft())\n"
+        "humans = (Soft(), Soft())\none = (Soft(),)\n"
     )
     words = ("--case", "none", "--duration", "0.2", "--no-plot", "--out", str(tmp_path / "out"))
-    assert main([*words, "--human", str(hands)]) == 0
+    assert main([*words, "--human", f"{hands}:humans"]) == 0
     assert "unstable" in capsys.readouterr().out
-    hands.write_text("humans = ()")
-    with pytest.raises(InputError, match="has 0 `humans`, expected 2"):
-        main([*words, "--human", str(hands)])
+    with pytest.raises(InputError, match="has 1 hands, expected 2"):
+        main([*words, "--human", f"{hands}:one"])
 
 
 def test_a_measured_hand_and_a_population_from_files(tmp_path):
@@ -277,7 +276,7 @@ def test_a_measured_hand_and_a_population_from_files(tmp_path):
     space = "[[human]]\nmass = 0.2\nA = [[-30.0]]\nB = [[1.0]]\nC = [[{C}]]\nD = [[2.0]]\n"
     chain = "[[human]]\nlinks = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]\n"
     file.write_text(space.format(C=200.0) + chain)
-    people = _load_humans(file, 2).human
+    people = _load_humans(str(file), 2).human
     assert people[0].port().impedance.order == 1
     run = simulate(SCENARIO.replace(human=people, duration=0.5), PUBLISHED["I"], engine="exact")
     assert run.meta["stability"]["exact_verdict"] == "stable"
@@ -288,21 +287,24 @@ def test_a_measured_hand_and_a_population_from_files(tmp_path):
     ]:
         file.write_text(text)
         with pytest.raises(InputError) as caught:
-            _load_humans(file, 2)
+            _load_humans(str(file), 2)
         assert message in str(caught.value)
-    python = tmp_path / "who.py"
-    drawn = "from haptic_loop.models.human import Human, Link\n"
-    drawn += "class Draw:\n    def draw(self, rng, n):\n        return {}\n"
-    python.write_text(drawn.format("[Human((Link(0.3, 3.0, 200.0),))] * n") + "population = Draw()\n")
-    assert len(_load_humans(python, 2).population.draw(None, 3)) == 3
-    for text, message in [
-        (drawn.format("[]") + "population = Draw()\n", "population.draw(rng, 2) gives not two humans"),
-        (drawn.format("[1] * n") + "population = Draw()\n", "human #1 is 1, expected a Human"),
-        ("humans, persons = [], [1]\n", "persons #1 is 1, expected a models.human.Person"),
+    python = tmp_path / "drawn.py"
+    python.write_text(
+        "from haptic_loop.models.human import Human, Link\n"
+        "class Draw:\n    def __init__(self, drawn): self.drawn = drawn\n"
+        "    def draw(self, rng, n): return self.drawn[:n]\n"
+        "good, none, wrong = Draw([Human((Link(0.3, 3.0, 200.0),))] * 3), Draw([]), Draw([1, 1])\n"
+        "number = 1\n"
+    )
+    assert len(_load_humans(f"{python}:good", 2).population.draw(None, 3)) == 3
+    for name, message in [
+        ("none", "draw(rng, 2) gives not two humans"),
+        ("wrong", "human #1 is 1, expected a Human"),
+        ("number", "it is 1, expected a list of hands"),
     ]:
-        python.write_text(text)
         with pytest.raises(InputError) as caught:
-            _load_humans(python, 2)
+            _load_humans(f"{python}:{name}", 2)
         assert message in str(caught.value)
 
 
