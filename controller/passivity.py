@@ -1,0 +1,141 @@
+"""A lower bound of the least eigenvalue of He G over the whole unit circle, between the points of any grid, too."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+from haptic_loop.controller.lti import Array, Lti
+from numpy.typing import NDArray
+
+_FIRST = 64  # intervals of [0, pi]
+_EVALUATIONS = 1 << 15  # for up to 8 states, about half a second; fewer for more states
+_REACH = 0.5  # an interval is bounded only if its half-width is at most this part of the distance that R0 gives
+_UNIT = 2.0**-53
+_NOISE = 1e-4  # in every state, beside the noise at the inputs
+_INFLATED = 1.001  # covers the rounding of norms
+
+
+def hermitian_floor(G: Lti, enough: float, unwanted: float) -> tuple[float, float, float]:
+    """Bound the least eigenvalue of He G(e^jw) from below over all w, by intervals that are halved where it is needed.
+
+    With R = (zI - A)^-1, |G'| and |G''| on an interval follow from R at its middle, so that a narrow resonance cannot
+    hide: |R| is large around it, and the intervals there become short. On an interval of half-width h around w0,
+    He G >= He [G(w0) + t G'(w0)] - h^2 M/2 for |t| <= h, M >= |G''|, and its least eigenvalue is concave in t, so
+    that both ends decide. An a-priori bound of the rounding error of R and of the products is subtracted.
+
+    Args:
+        G: A stable block of floats; it is real, so that [0, pi] is enough.
+        enough: A lower bound of at least this is not refined.
+        unwanted: The search ends at a frequency with a least eigenvalue below this.
+
+    Returns:
+        (the lower bound, the least eigenvalue that was evaluated, its frequency [rad/sample]).
+    """
+    G, lost = _without_idle_directions(_balanced(G))
+    norms = _norms(G)
+    left = np.linspace(0, np.pi, _FIRST + 1)[:-1]
+    half = np.full(_FIRST, np.pi / _FIRST / 2)
+    middle = left + half
+    floor, least, where = np.inf, np.inf, 0.0
+    budget = int(_EVALUATIONS / max(1.0, G.order / 8) ** 1.5)
+    while middle.size:
+        lower, here = _bounded(G, norms, lost, middle, half)
+        worst = int(np.argmin(here))
+        if here[worst] < least:
+            least, where = float(here[worst]), float(middle[worst])
+        budget -= 2 * middle.size
+        settled = lower >= enough
+        if least < unwanted or budget < 2 * (~settled).sum():
+            settled[:] = True
+        floor = min(floor, float(lower[settled].min(initial=np.inf)))
+        half = np.repeat(half[~settled] / 2, 2)
+        middle = np.repeat(middle[~settled], 2) + half * np.tile([-1.0, 1.0], half.size // 2)
+    return floor, least, where
+
+
+def _balanced(G: Lti) -> Lti:
+    """The same block with states scaled by powers of two, which is exact."""
+    if not G.order:
+        return G
+    A, scale = scipy.linalg.matrix_balance(G.A, permute=False)
+    size = np.diag(scale)
+    return Lti(A, G.B / size[:, None], G.C * size, G.D, G.T)
+
+
+_IDLE = 1e-13  # singular value, beside the largest, of a direction of the inputs that counts as idle
+_Lost = tuple[float, float, float]
+
+
+def _without_idle_directions(G: Lti) -> tuple[Lti, _Lost | None]:
+    """Q'GQ, where an orthonormal Q leaves out the directions in which nothing goes in or comes out at any frequency.
+
+    He G is zero in such a direction, as that of two contacts that move alike, which no finite number of intervals
+    would decide. The second value holds the norms of what Q leaves out of B, C and D, or None where that is nothing.
+    """
+    rows = [part / max(float(np.linalg.norm(part)), 1e-300) for part in (G.B, G.C.T, G.D, G.D.T)]
+    _, sizes, V = np.linalg.svd(np.vstack(rows))
+    count = int((sizes > _IDLE * sizes[0]).sum())
+    if count in (0, G.inputs):
+        return G, None
+    Q = V[:count].T
+    project = Q @ Q.T
+    parts = (G.B - G.B @ project, G.C - project @ G.C, G.D - project @ G.D @ project)
+    lost = [float(np.linalg.norm(part)) for part in parts]
+    return Lti(G.A, G.B @ Q, Q.T @ G.C, Q.T @ G.D @ Q, G.T), (lost[0], lost[1], lost[2])
+
+
+def _norms(G: Lti) -> list[tuple[Array, Array]]:
+    """(L, L^-1), (n, n) each, of states L^-1 x in which the resolvent's norm tells how far the poles are.
+
+    Any L gives a valid bound, and the better one counts: the states as they are, and states that are even under noise.
+    """
+    one = np.eye(G.order)
+    if not G.order:
+        return [(one, one)]
+    noise = G.B @ G.B.T + _NOISE * np.linalg.norm(G.B) ** 2 * one
+    try:
+        L = np.linalg.cholesky(scipy.linalg.solve_discrete_lyapunov(G.A, noise))
+        return [(one, one), (L, np.linalg.inv(L))]
+    except np.linalg.LinAlgError:
+        return [(one, one)]
+
+
+def _bounded(
+    G: Lti, norms: list[tuple[Array, Array]], lost: _Lost | None, w: Array, half: Array
+) -> tuple[Array, Array]:
+    """(lower bounds over |w' - w| <= half, least eigenvalues at w), (k,) each."""
+    A, B, C, D = G.A, G.B, G.C, G.D
+    n, m = B.shape
+    if not n:
+        here = np.full(w.shape, np.linalg.eigvalsh((D + D.T) / 2)[0])
+        lower = here - 8 * m * _UNIT * np.linalg.norm(D)
+        return (np.minimum(lower, 0) - lost[2] if lost else lower), here
+    z = np.exp(1j * w)[:, None, None]
+    R = np.linalg.inv(z * np.eye(n) - A)
+    CR, RB = C @ R, R @ B
+    value, slope = CR @ B + D, -1j * z * (CR @ RB)
+    tilt = half[:, None, None] * _hermitian(slope)
+    here = np.linalg.eigvalsh(_hermitian(value))[:, 0]
+    ends = np.minimum(*(np.linalg.eigvalsh(_hermitian(value) + sign * tilt)[:, 0] for sign in (-1, 1)))
+    error = (1 + np.linalg.norm(A)) * _size(CR) * _size(RB) * (1 + half * _size(R)) + _size(value)
+    lower = np.full(w.shape, -np.inf)
+    for L, back in norms:
+        reach, left, right = (_INFLATED * _size(part) for part in (back @ R @ L, CR @ L, back @ RB))
+        growth = 1 / np.maximum(1 - half * reach, 1 - _REACH)
+        curvature = growth**2 * left * right * (1 + 2 * growth * reach)
+        lower = np.maximum(lower, np.where(half * reach <= _REACH, ends - half**2 * curvature / 2, -np.inf))
+    lower -= 16 * (n + m) * _UNIT * error
+    if lost:  # |R| grows at most twofold on an interval
+        lower = np.minimum(lower, 0) - 2 * (_size(CR) * lost[0] + _size(RB) * lost[1]) - lost[2]
+    return lower, here
+
+
+def _size(M: NDArray[np.inexact[Any]]) -> Array:
+    """The Frobenius norm of each matrix."""
+    return np.linalg.norm(M, axis=(1, 2))
+
+
+def _hermitian(M: Any) -> Any:
+    return (M + M.conj().swapaxes(1, 2)) / 2
