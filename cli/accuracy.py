@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from haptic_loop.cli import options, render
-from haptic_loop.cli.judged import chosen_by
+from haptic_loop.cli.verdict import chosen_by
 from haptic_loop.controller.coupling import NoCoupling
 from haptic_loop.sim.accuracy import Row, default_substeps, measure_all
-from haptic_loop.sim.couplings import NAMES, limits_of
+from haptic_loop.sim.couplings import NAMES, assessed
 from haptic_loop.sim.engines import EXPONENTIAL
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import InputError, require_even_ticks, require_linear
@@ -46,7 +46,7 @@ def main(argv: list[str]) -> int:
         scenario = scenario.replace(duration=args.duration)
     out = options.out_folder(args, "accuracy")
     chosen = chosen_by(args, scenario)
-    lag = limits_of(scenario, chosen, limiter=args.limiter).rho
+    lag = assessed(scenario, args.case, chosen, limiter=args.limiter).force_limits.rho
     coupled, uncoupled = assemble(scenario, chosen.coupling, lag), assemble(scenario, NoCoupling())
     default = max(default_substeps(loop, "RK4") for loop in (coupled, uncoupled))
     if scenario.samples * default > _MOST_STEPS:

@@ -11,17 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from haptic_loop.cli import options, render
+from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
 from haptic_loop.controller.loop import DelayRange, Loop
-from haptic_loop.design.audit import LONGEST_DELAY, Audit, ConditionAudit, Help, audit
-from haptic_loop.design.certificate import check_ranges, named
+from haptic_loop.design.audit import LONGEST_DELAY, Audit, Help, Margins, audit
+from haptic_loop.design.certificate import named
 from haptic_loop.design.coverage import Switching
 from haptic_loop.design.designs import KINDS, name_and_own
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import EncoderSteps
-from haptic_loop.design.result import listed
+from haptic_loop.design.result import Requirement, listed
 from haptic_loop.models.device import CATALOGUE, Listed, listed_device
-from haptic_loop.sim.couplings import check_stored, fitted, own_of, read_coupling
+from haptic_loop.sim.couplings import fitted, from_file, own_of, read_coupling
 from haptic_loop.sim.report import encoder_steps
 from haptic_loop.sim.scenario import InputError, Scenario
 from rich.table import Table
@@ -67,19 +68,21 @@ def main(argv: list[str]) -> int:
     scenario = options.scenario_from(args)
     loop = options.rigid_loop(args, scenario) if args.rigid else scenario.loop(args.case)
     coupling = _coupling(args, loop, scenario)
-    switching, asked = _switching(args, loop), named(args.condition) if args.condition else None
+    asked = named(args.condition) if args.condition else None
+    with options.refused("--varying-delay: "):
+        loop = loop.switching(_switching(args, loop))
     out = options.out_folder(args, "audit")
 
     begin = time.perf_counter()
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
-        whole = check_ranges(loop, coupling, args.seed, progress=move)
-    with options.refused():
-        found = audit(loop, coupling, switching, whole, asked)
+        limits = () if args.rigid else [device.force_limit for device in scenario.device]
+        with options.refused():
+            found = audit(loop, coupling, asked, args.seed, limits, move)
     notes = ()
     if args.coupling and not _is_own(args):  # what its file is worth in the loop that is audited
-        notes = check_stored(read_coupling(args.coupling), scenario.loop(args.case).switching(switching), asked).notes
+        notes = from_file(read_coupling(args.coupling), loop, own=asked).notes
     _, own = name_and_own(asked)
-    notes = (*notes, own.said(found.parts[own.name].requirement)) if own else notes
+    notes = (*notes, own.said(found.assessment.requirements[own.name])) if own else notes
     report = _Report(
         args.case,
         None if args.rigid else scenario.name,
@@ -90,8 +93,10 @@ def main(argv: list[str]) -> int:
         notes,
         time.perf_counter() - begin,
     )
-    render.publish(args, report, _tables(found), _remarks(report), out)
-    return options.exit_code(found.certified and (found.switching is None or found.switching.requirement.certified))
+    said = verdicts.verdict(found.assessment, encoder=report.encoder)
+    caveats = [found.not_covered, *([found.switching.not_covered or ""] if found.switching else [])]
+    render.publish(args, report, _tables(found), _remarks(report), out, verdict=said, details=caveats)
+    return options.exit_code(found.assessment.holds)
 
 
 def _parser() -> options.Parser:
@@ -112,6 +117,7 @@ def _parser() -> options.Parser:
     parser.add_rigid()
     switching = "also any switching of the forces' delays in this range [samples]; or LO-HI,LO-HI,.. per channel"
     parser.add_varying_delay(switching)
+    parser.add_details()
     parser.add_output()
     return parser
 
@@ -210,22 +216,16 @@ def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
 
 
 def _tables(found: Audit) -> list[Table]:
-    parts = found.parts
-    table = Table("", *parts, title=_verdict(found), title_justify="left")
+    assessment, needs = found.assessment, found.assessment.requirements
+    gains = assessment.gains
+    title = f" K {listed(gains['K'])} N/m, B {listed(gains['B'])} N s/m" if "K" in gains else ""
+    table = Table("", *found.margins, title=f"{assessment.coupling.kind}{title}", title_justify="left")
     for name, cell in _ROWS.items():
-        table.add_row(name, *map(cell, parts.values()))
-    if not found.ranges:
+        table.add_row(name, *(cell(needs[condition], part) for condition, part in found.margins.items()))
+    if not assessment.ranges:
         return [table]
-    return [table, render.facts("the ranges around the environment", found.ranges.rows(), left=True)]
-
-
-def _verdict(found: Audit) -> str:
-    coupling, guarantee = found.coupling, found.guarantee
-    gains = f" K {listed(coupling.K)} N/m, B {listed(coupling.B or ())} N s/m" if coupling.K else ""
-    verdict = f"[green]certified[/] for {guarantee}" if found.certified else "[red]not certified[/]"
-    if guarantee and not found.certified:
-        verdict += f"{' for the ranges' if found.ranges else ''}, only for {guarantee}"
-    return f"{coupling.kind}{gains}: {verdict}"
+    rows = verdicts.range_rows(assessment.ranges)
+    return [table, render.facts("the ranges around the environment", rows, left=True)]
 
 
 def _percent(error: float | None) -> str:
@@ -241,36 +241,37 @@ def _stiffest(K: Sequence[float | None]) -> str:
     return ", ".join(f"{math.floor(k / unit) * unit:.5g}" for k, unit in units) + " N/m"
 
 
-#: name of a row -> what stands in it, given what one condition says
-_ROWS: dict[str, Callable[[ConditionAudit], str]] = {
-    "needs damping": lambda c: f"{render.needs(c.requirement)}: {render.certified(c.requirement, proof=False)}",
-    "margin": lambda c: render.optional(c.requirement.margin, "{:.5g}"),
-    "binds at": lambda c: render.optional(c.requirement.frequency_hz, "{:.5g} Hz"),
-    "stiffest K here": lambda c: _stiffest(c.stiffest.K),
-    "delta less by": lambda c: _percent(c.sensitivity.delta_error),
-    "T longer by": lambda c: _percent(c.sensitivity.T_error),
-    "delay longer by": lambda c: render.optional(c.sensitivity.extra_samples, "{:.5g} samples"),
+#: name of a row -> its cell, of the requirement and the margins of one condition
+_ROWS: dict[str, Callable[[Requirement, Margins], str]] = {
+    "needs damping": lambda r, _: f"{render.needs(r)}: {render.certified(r, proof=False)}",
+    "margin": lambda r, _: render.optional(r.margin, "{:.5g}"),
+    "binds at": lambda r, _: render.optional(r.frequency_hz, "{:.5g} Hz"),
+    "stiffest K here": lambda _, m: _stiffest(m.stiffest.K),
+    "delta less by": lambda _, m: _percent(m.sensitivity.delta_error),
+    "T longer by": lambda _, m: _percent(m.sensitivity.T_error),
+    "delay longer by": lambda _, m: render.optional(m.sensitivity.extra_samples, "{:.5g} samples"),
 }
 
 
 def _remarks(report: _Report) -> Iterator[str]:
     found = report.audit
     yield from (f"{note}." for note in report.notes)
-    for condition, part in found.parts.items():
-        sensitivity = part.sensitivity.reason if part.requirement.certified else None
+    requirements = found.assessment.requirements
+    for condition, part in found.margins.items():
+        needs = requirements[condition]
+        sensitivity = part.sensitivity.reason if needs.certified else None
         reasons = {
-            "": part.requirement.reason,
+            "": needs.reason,
             ", stiffest K": part.stiffest.reason,
             ", sensitivity": sensitivity,
         }
         yield from (f"{condition}{of}: {reason}." for of, reason in reasons.items() if reason)
-    if not found.certified:
+    if not found.assessment.holds:
         yield from _proposed(found.helps)
     if found.switching:
         yield from _switching_remarks(found.switching)
     if part := report.encoder:
         yield f"{part.words[0].upper()}{part.words[1:]}."
-    yield found.not_covered
 
 
 def _proposed(helps: Sequence[Help]) -> Iterator[str]:
@@ -293,4 +294,3 @@ def _switching_remarks(found: Switching) -> Iterator[str]:
     enough = "certified" if buffered.certified else "not certified"
     asked = listed(buffered.required_damping)
     yield f"A playout buffer to the constant {listed(found.hi)} needs {asked} N s/m: {enough}."
-    yield found.not_covered or ""

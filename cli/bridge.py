@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
     live = session_cli.hold_session(args, session, plan, seconds, out)
     report = outcome(args.case, session, recorder, live.dropped, args.pace)
     try:  # first, for a disk may be full
-        _print_session(report, render.console(args))
+        _print_session(report, render.console(args), args.details)
     except OSError:
         if signal.SIGHUP not in live.signals:
             raise
@@ -94,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_limiter()
     seconds, most = "of forces at full gain (default: the scenario's)", options.number(0.1, _LONGEST)
     parser.add_argument("--duration", type=most, metavar="SECONDS", help=seconds)
+    parser.add_details()
     parser.add_output(picture=True)
     return parser
 
@@ -109,27 +110,28 @@ def _print_certificate(
     )
     console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)
     heads = ("coupling", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee")
-    title = "certified for the delay measured, and softer in reserve"
-    console.print(render.grid(title, heads, [_certified(program, caps) for program in programs], left=range(6)))
+    title = "certified for the delay measured, and in reserve for longer ones"
+    console.print(render.grid(title, heads, [_certified(program) for program in programs], left=range(6)))
     for program in programs:
-        for remark in (program.limits.within(caps).words, *program.remarks()):
+        for remark in (program.assessment.force_limits.within(caps).words, *program.remarks()):
             console.print(f"[dim]·[/] theta = {list(program.scenario.theta)}: {remark}", highlight=False)
     if len(programs) == 1:
-        console.print("no reserve: nothing softer is certified, so late answers end the session")
+        console.print(
+            "no reserve: nothing that is no stiffer is certified for a longer delay, so late answers end the session"
+        )
 
 
-def _certified(program: CertifiedCoupling, caps: Sequence[float]) -> tuple[str, ...]:
+def _certified(program: CertifiedCoupling) -> tuple[str, ...]:
     """A row: the coupling, and the first condition that certifies it."""
-    part = program.figures(caps)
-    coupling, asked = part.coupling, (part.certificate, *(part.certificates or {}).values())
-    found = next(need for need in asked if need and need.certified)
-    assert coupling
+    assessment = program.assessment
+    gains, asked = assessment.gains, (assessment.decisive, *assessment.requirements.values())
+    found = next(need for need in asked if need.certified)
     return (
-        f"{coupling.kind}, theta = {', '.join(map(str, program.scenario.theta))}",
-        *("-" if gains is None else listed(gains, 5) for gains in (coupling.K, coupling.B)),
+        f"{program.chosen.kind}, theta = {', '.join(map(str, program.scenario.theta))}",
+        *(listed(gains[name], 5) if name in gains else "-" for name in "KB"),
         f"{listed(found.required, 5)} ({found.condition}, {found.proof})",
         listed(found.available, 5),
-        part.guarantee or "none",
+        assessment.guarantee.words if assessment.guarantee else "none",
     )
 
 
@@ -157,7 +159,7 @@ def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
     return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
 
 
-def _print_session(report: SessionReport, console: Console) -> None:
+def _print_session(report: SessionReport, console: Console, details: bool) -> None:
     """The log, then what the link did."""
     cells = {"after": "{r.t_s:.3f} s", "stage": lambda r: _colour(r.stage), "cause": "{r.cause}"}
     console.print(render.columns(f"case {report.case} · {report.scenario}", cells, report.session.log, left=(1, 2)))
@@ -172,7 +174,8 @@ def _print_session(report: SessionReport, console: Console) -> None:
         console.print(f"  {part.guarantee}")
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link.counters.items() if n)
     console.print(f"counted: {counted or 'nothing'}")
-    console.print(f"[dim]·[/] {CAVEATS}")
+    if details:
+        console.print(f"[dim]·[/] {CAVEATS}")
 
 
 def _colour(stage: str) -> str:

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from haptic_loop.cli import options, render
+from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.ranges import regions
+from haptic_loop.design.assessment import Assessment, SearchFigures, assess, violated_between
 from haptic_loop.design.certificate import (
     NotProved,
     Verdict,
@@ -17,11 +19,9 @@ from haptic_loop.design.certificate import (
     prove,
     required_damping,
     verify,
-    violated_between,
 )
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Stored, SwitchingProof
-from haptic_loop.design.coverage import SearchFigures
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import HERE, RANGES
 from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, listed, switching_guarantee
@@ -60,6 +60,7 @@ class _Checked:
     wall_s: float = render.figure("seconds", "{:.6g}")
     switching: _Switching | None = field(default=None)
     claim: str | None = render.figure("claim", default=None, json="if given")  # of a condition of the user's own
+    assessment: Assessment | None = off_table(default=None)  # in the loop of the file, where that is proved
     anew: bool = off_table(default=False)  # by another condition than the file's, whose certificate says nothing here
 
 
@@ -78,8 +79,10 @@ def main(argv: list[str]) -> int:
     checked = _checked(stored, own, verdict, searched, time.perf_counter() - begin)
     if own and verdict.proved and own.name not in (*CONDITIONS, *KNOWN_CONDITIONS):
         checked = replace(checked, claim=own.claim)
-    checked = replace(checked, anew=anew)
-    render.publish(args, checked, [_table(checked)])
+    assessment = _assessed(stored, own, searched) if verdict.proved else None
+    checked = replace(checked, anew=anew, assessment=assessment)
+    said = verdicts.verdict(assessment) if assessment else f"[red]Not proved[/]: {verdict.reason}"
+    render.publish(args, checked, [_table(checked)], verdict=said)
     return options.exit_code(verdict.proved)
 
 
@@ -100,6 +103,16 @@ def _anew(stored: Stored, condition: Condition) -> tuple[Stored, Verdict]:
     except NotProved as error:
         return Stored.of(stored.loop, coupling), Verdict(False, f"{condition.name}: {error}")
     return proved, verify(proved, condition)
+
+
+def _assessed(stored: Stored, own: Condition | None, searched: Searched | None) -> Assessment | None:
+    """Assess the coupling in the loop of its file, with the certificate that was just verified."""
+    claim = stored.certificate
+    assert claim
+    condition = own or claim.condition
+    found = searched if stored.loop.ranges else None
+    built = stored.built()
+    return assess(stored.loop, built, certificate=claim, condition=condition, ranges_samples=0, searched=found)
 
 
 def _searched(stored: Stored, condition: Condition | None) -> Searched | None:

@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import msgspec
 from haptic_loop.cli import options, render
+from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design import coverage
 from haptic_loop.design.api import Filed, proved, store
+from haptic_loop.design.assessment import SAMPLES, Assessment, assess
 from haptic_loop.design.audit import LONGEST_DELAY
 from haptic_loop.design.bound import BoundBeside
-from haptic_loop.design.certificate import SAMPLES, assess, check_ranges, named
+from haptic_loop.design.certificate import named
 from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from haptic_loop.design.files import out_file
-from haptic_loop.design.gain_search import STIFFEST
-from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.gain_search import SOFTEST, STIFFEST
 from haptic_loop.design.optimal import Optimal
 from haptic_loop.design.optimal import nearby as nearby_of
 from haptic_loop.design.program import DEFAULT, OBJECTIVES, Options
-from haptic_loop.design.result import Design, Requirement, finite, listed
+from haptic_loop.design.result import Design, finite, listed
 from haptic_loop.design.robustness import Nearby, ranges_around
-from haptic_loop.design.transparency import BAND_HZ, Transparency, transparency
-from haptic_loop.sim.couplings import Judged
+from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim.scenario import InputError, Scenario
 from rich.table import Table
 
@@ -42,13 +42,11 @@ def main(argv: list[str]) -> int:
     if args.samples is not None and loop.ranges is None:
         raise InputError("--samples is only with ranges: give --ranges, or a scenario with [ranges]")
     design = _design(args, loop)
-    judged = _judged(args, scenario, loop, design)
-    stored = store(loop, design, out, judged.whole, judged.limiter.certificate)
-    report = _reported(args, loop, design, judged, stored)
-    render.publish(args, report, _tables(scenario, report))
-    holds = report.certificate.certified and (judged.guarantee == ANY or not judged.whole or judged.proved)
-    switching = report.switching.requirement if report.switching else report.certificate
-    return options.exit_code(holds and switching.certified)
+    assessment = _assessment(args, scenario, loop, design)
+    stored = store(loop, design, out, assessment)
+    report = _reported(args, loop, design, assessment, stored)
+    render.publish(args, report, _tables(scenario, report), verdict=verdicts.verdict(assessment, report.nearby))
+    return options.exit_code(assessment.holds)
 
 
 def _parser() -> options.Parser:
@@ -154,23 +152,28 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
 # What was designed: its figures, its file.
 
 
-def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Judged:
-    """What each condition asks of the coupling, by a sweep and an exact proof, and the limiter that it may have."""
-    held = design.certificate
-    requirements = assess(loop, design.coupling, held, own=design.own)
-    samples = SAMPLES if args.samples is None else args.samples
-    with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
-        whole = check_ranges(loop, design.coupling, args.seed, samples, move, design.searched, held)
-    limits = coverage.Limits(None, "as asked")
-    if args.limiter is not False:
-        limits = coverage.covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None, held)
-    limits = limits.within([device.force_limit for device in scenario.device])
-    return Judged.of(replace(design, kind=args.coupling), loop, requirements, whole, limits)
+def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Assessment:
+    """Assess the design in its loop, with the search between the vertices and the proof that it has made."""
+    with render.progress("searching the ranges" if loop.ranges else "assessing the coupling") as move:
+        return assess(
+            loop,
+            design.coupling,
+            certificate=design.certificate,
+            condition=design.asked,
+            ranges_seed=args.seed,
+            ranges_samples=SAMPLES if args.samples is None else args.samples,
+            searched=design.searched,
+            limiter=args.limiter,
+            force_limit=tuple(device.force_limit for device in scenario.device),
+            band_hz=args.band_hz or BAND_HZ,
+            progress=move,
+        )
 
 
-def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judged, stored: Filed) -> _Report:
+def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: Assessment, stored: Filed) -> _Report:
     band, best = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None
-    switching = coverage.Switching.of(loop, design.coupling) if loop.varying_delay else None
+    known = assessment.requirements.get("switching")
+    switching = coverage.Switching.of(loop, design.coupling, known) if loop.varying_delay else None
     asked = Options(**asked_of(args, "optimal")) if best else DEFAULT
     with render.progress("working out robustness and its price, and the bound"):
         nearby = nearby_of(loop, design.coupling, asked, named(design.asked))
@@ -184,17 +187,16 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         objective=design.objective,
         objective_name=design.figure,
         wall_s=design.wall_s,
-        certificate=judged.certificates[design.condition],
-        price=coverage.price(loop, design, args.coupling, nominal) if judged.whole else None,
-        judged=judged,
+        price=coverage.price(loop, design, args.coupling, nominal) if assessment.ranges else None,
+        kind=args.coupling,
+        assessment=assessment,
         switching=switching,
         delays=stored.switching.guarantee if stored.switching and stored.switching.proof else None,
-        transparency=transparency(loop.F(design.coupling), loop.E(), loop.lam, band),
         nearby=nearby,
         best=best and _Best(limit, best.g, best.ladder),
         sdps=design.sdps,
         stored=stored,
-        claim=design.own and design.own.said(judged.certificates[design.condition]),
+        claim=design.own and design.own.said(assessment.requirements[design.condition]),
     )
 
 
@@ -202,17 +204,23 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
 # The report as tables.
 
 
-def _judged_rows(judged: Judged) -> render.Rows:
-    coupling, end = judged.coupling, f"{STIFFEST:g} N/m is where the search ends, no optimum of its own"
-    if coupling.K and coupling.B:
-        yield "K [N/m]", listed(coupling.K)
-        yield "", end if max(coupling.K) > 0.999 * STIFFEST else None
-        yield "B [N s/m]", listed(coupling.B)
-    yield "stiffness, static [N/m]", listed(coupling.stiffness) if coupling.stiffness else None
-    yield from render.certificate_rows(judged.certificates, proof=False)
-    yield from judged.ranges.rows() if judged.ranges else ()
-    yield "guarantee", judged.guarantee or "none"
-    yield "guarantee, forces", judged.limiter.words
+_USELESS = f"useless: {SOFTEST:g} N/m is the softest that the search tries, and it renders next to nothing"
+
+
+def _assessment_rows(assessment: Assessment) -> render.Rows:
+    gains, end = assessment.gains, f"{STIFFEST:g} N/m is where the search ends, no optimum of its own"
+    if "K" in gains:
+        yield "K [N/m]", listed(gains["K"])
+        yield "", end if max(gains["K"]) > 0.999 * STIFFEST else None
+        yield "", _USELESS if max(gains["K"]) < 1.001 * SOFTEST else None
+        yield "B [N s/m]", listed(gains["B"])
+    yield "stiffness, static [N/m]", listed(gains["stiffness"]) if "stiffness" in gains else None
+    yield from render.certificate_rows(assessment.requirements, proof=False)
+    yield from verdicts.range_rows(assessment.ranges) if assessment.ranges else ()
+    guarantee, felt = assessment.guarantee, assessment.transparency
+    yield "guarantee", guarantee.words if guarantee else f"none ({assessment.reason})"
+    yield "guarantee, forces", assessment.force_limits.words
+    yield "transparency error", felt and render.transparency_error(felt)
 
 
 #: what a design minimised or maximised -> in words
@@ -267,13 +275,12 @@ class _Report:
     seed: int
     objective: float
     wall_s: float
-    certificate: Requirement
     price: list[coverage.OverRanges] | None
-    judged: Judged = render.several(_judged_rows, "inlined")
+    kind: str  # of the coupling
+    assessment: Assessment = render.several(_assessment_rows)
     switching: coverage.Switching | None = render.figure("damping, any switching", _switching_words)
     delays: str | None = render.figure("guarantee, delays", json="left out")
     objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
-    transparency: Transparency = render.figure("transparency error", render.transparency_error)
     nearby: Nearby = render.several(render.robustness_rows, "inlined")
     best: _Best | None = render.several(_Best.rows, "inlined")
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
@@ -286,7 +293,7 @@ class _Report:
 
 
 def _tables(scenario: Scenario, report: _Report) -> list[Table]:
-    title = f"{scenario.title(report.case)}: {report.judged.coupling.kind} for {report.certificate.condition}"
+    title = f"{scenario.title(report.case)}: {report.kind} for {report.assessment.condition}"
     rows = [render.channel_row(scenario.environment.contacts), *render.rows_of(report)]
     shown = [render.facts(title, rows)]
     if report.price:

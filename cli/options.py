@@ -173,6 +173,11 @@ class Parser(argparse.ArgumentParser):
         seed = "for random draws; recorded (default 0)"
         output.add_argument("--seed", type=whole(0), metavar="N", default=0, help=seed)
 
+    def add_details(self) -> None:
+        """--details."""
+        what = "also print what no certificate covers, and how the computation went"
+        self.add_argument("--details", action="store_true", help=what)
+
     def add_json(self, to: _Group | None = None) -> None:
         """--json."""
         (to or self).add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")

@@ -133,10 +133,12 @@ def publish(
     lines: Iterable[str] = (),
     folder: Path | None = None,
     files: Iterable[Path] = (),
+    verdict: str | None = None,
+    details: Iterable[str] = (),
 ) -> None:
-    """Keep a report as report.json in the folder, print tables and lines, and write what --json asks for.
+    """Keep a report as report.json in the folder, print verdict, tables and lines, and write what --json asks for.
 
-    `files` are those written before; the report names them and its own.
+    `files` are those written before; the report names them and its own. Lines in `details` are printed with --details.
     """
     outcome = plain(report)
     if folder:
@@ -144,9 +146,11 @@ def publish(
         outcome["files"] = [*map(str, files), str(kept)]
         write_json(kept, outcome)
     screen = console(args)
+    if verdict:
+        screen.print(verdict, soft_wrap=True)
     for table in shown:
         screen.print(table)
-    for line in lines:
+    for line in (*lines, *(details if getattr(args, "details", False) else ())):
         screen.print(f"[dim]·[/] {line}")
     if folder:
         screen.print("files: " + ", ".join(outcome["files"]), soft_wrap=True)

@@ -9,24 +9,24 @@ from pathlib import Path
 from typing import Any
 
 from haptic_loop.cli import options, render
-from haptic_loop.cli.judged import chosen_by, judge
-from haptic_loop.cli.judged import rows as judged_rows
+from haptic_loop.cli import verdict as verdicts
+from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.budget import BudgetFigures
 from haptic_loop.controller.environment import GROUND
 from haptic_loop.controller.loop import Loop
+from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.certificate import named
 from haptic_loop.design.files import write
-from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.guarantees import CAVEATS
 from haptic_loop.design.optimal import nearby
-from haptic_loop.design.result import finite, listed
+from haptic_loop.design.result import Chosen, finite
 from haptic_loop.design.robustness import Nearby
-from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim import accuracy
 from haptic_loop.sim.accuracy import MOST
 from haptic_loop.sim.api import ScenarioRun, run_scenario
-from haptic_loop.sim.couplings import NAMES, Judged
+from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.engines import INTEGRATORS
-from haptic_loop.sim.passivity_layer import EnergyNet
+from haptic_loop.sim.passivity_layer import EnergyNet, claim
 from haptic_loop.sim.report import PaperRow, beside_the_paper
 from haptic_loop.sim.run import ENGINES, EngineSettings
 from haptic_loop.sim.run_report import Ran, RunReport, run_report
@@ -42,14 +42,17 @@ def main(argv: list[str]) -> int:
     scenario, out = _scenario(args), options.out_folder(args, "run")
     environment, simulated = _environment(args, scenario)
     chosen = chosen_by(args, scenario)  # V, Q or R
-    judged = judge(args, scenario, chosen, simulated)  # what each condition asks of the devices, and what is proved
-    done = _run(args, simulated, judged)  # sample, compute, limit, hold, advance
-    report = run_report(scenario, args.case, judged, done, environment, args.band_hz or BAND_HZ, args.cross_check)
-    report = replace(report, nearby=_nearby(scenario.loop(args.case), judged))
+    budget = args.energy_budget[0] if args.energy_budget else None
+    assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
+    done = _run(args, simulated, assessment)  # sample, compute, limit, hold, advance
+    nearby = _nearby(scenario.loop(args.case), chosen, assessment)
+    report = run_report(scenario, args.case, chosen, assessment, done, environment, args.cross_check)
+    report = replace(report, nearby=nearby)
     if args.paper:
         report = replace(report, paper=_paper(args, simulated, report))
     files = _save(args, out, done, report)
-    render.publish(args, report, _tables(scenario, report), report.remarks, out, files)
+    said = verdicts.verdict(assessment, nearby, report.ideal_force.error_percent, report.encoder)
+    render.publish(args, report, _tables(scenario, report), report.remarks, out, files, said, _details(report))
     return options.exit_code(True, done.trace.interrupted)
 
 
@@ -77,6 +80,7 @@ def _parser() -> options.Parser:
     parser.add_limiter()
     vertex = "simulate at this vertex of the scenario's ranges (default 0: nominal)"
     add("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
+    parser.add_details()
     parser.add_output(picture=True)
     add("--paper", action="store_true", help="a table of the figures that the paper prints, beside those of this run")
     return parser
@@ -103,27 +107,27 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
 # The run and what it came to.
 
 
-def _run(args: argparse.Namespace, scenario: Scenario, judged: Judged) -> ScenarioRun:
+def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -> ScenarioRun:
     """Close the loop as the options say. Raises InputError for settings that cannot be."""
-    net = EnergyNet(*args.energy_budget) if args.energy_budget else None
+    net = EnergyNet(*args.energy_budget, guarantee=claim(assessment)) if args.energy_budget else None
     settings = EngineSettings(args.engine, args.integrator, args.substeps, args.error)
-    coupling, lag = judged.chosen.coupling, judged.limiter.rho
+    coupling, lag = assessment.coupling, assessment.force_limits.rho
     with render.progress("simulating") as move:
         return run_scenario(scenario, coupling, lag, settings, args.seed, net, move)
 
 
 def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> tuple[PaperRow, ...]:
     """The figures of the paper beside those of this run. Raises InputError for a loop that is not the paper's."""
-    rows = beside_the_paper(scenario, args.case, report.stability, report.judged.coupling)
+    rows = beside_the_paper(scenario, args.case, report.stability, report.assessment.coupling)
     if not rows:
         raise InputError("--paper: the paper prints figures of its own two cases only; leave the loop as it is")
     return rows
 
 
-def _nearby(loop: Loop, judged: Judged) -> Nearby:
+def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Nearby:
     """The damping needed where the environment is not as modelled; empty where no guarantee depends on that."""
-    chosen = judged.chosen
-    if not judged.certificates[chosen.condition].certified or judged.guarantee == ANY:
+    guarantee = assessment.guarantee
+    if guarantee is None or guarantee.energy_J is not None or guarantee.any_environment:
         return Nearby()
     with render.progress("working out robustness and its price"):
         return nearby(loop, chosen.coupling, condition=named(chosen.asked))
@@ -166,10 +170,11 @@ def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
 
 def _title(what: str, report: RunReport) -> str:
     """The title of the picture."""
-    stability, kind = report.stability, report.judged.coupling.kind
+    stability, kind = report.stability, report.kind
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
-    if kind != "none" and report.judged.guarantee:
-        coupling += f" for {report.judged.guarantee}"
+    guarantee = report.assessment.guarantee
+    if kind != "none" and guarantee and guarantee.energy_J is None:
+        coupling += f" for {guarantee.words}"
     rate, hertz = stability.exact_growth_rate_per_s, stability.exact_frequency_hz
     growth = f"grows by {rate:.3f} 1/s at {hertz:.1f} Hz" if rate > 0 else f"slowest motion decays by {-rate:.3f} 1/s"
     if report.varying_delay and report.switched:
@@ -182,7 +187,7 @@ def _title(what: str, report: RunReport) -> str:
 
 
 def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
-    title = f"{scenario.title(report.case)}: coupling {report.judged.coupling.kind}"
+    title = f"{scenario.title(report.case)}: coupling {report.kind}"
     shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(report)])]
     if report.run.engines:
         shown.append(_speed_against_error(report.run, report.run.engines))
@@ -194,22 +199,16 @@ def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
 
 def _rows(report: RunReport) -> render.Rows:
     """The rows of the table."""
-    coupling, stability, run, ratio = (
-        report.judged.coupling,
-        report.stability,
-        report.run,
-        finite(report.transparency.dc_ratio),
-    )
+    stability, run, assessment = report.stability, report.run, report.assessment
+    felt = assessment.transparency
+    ratio = felt and finite(felt.dc_ratio)
     how = "switching" if report.switched else "simulated trace"
     if run.timing and "impulse" in (stability.reason or ""):
         how = "uneven ticks"
     measured = render.optional(stability.growth_rate_per_s, "{:+.4f} 1/s")
-    if coupling.K and coupling.B:
-        yield "coupling K / B", f"{listed(coupling.K, 5)} N/m / {listed(coupling.B, 5)} N s/m"
-    if coupling.stiffness:
-        yield "coupling, static", f"{listed(coupling.stiffness, 5)} N/m"
-    yield from judged_rows(report.judged)
-    yield "transparency error", render.transparency_error(report.transparency)
+    yield from verdicts.gain_rows(assessment)
+    yield from verdicts.rows(assessment)
+    yield "transparency error", felt and render.transparency_error(felt)
     yield from render.robustness_rows(report.nearby)
     apart = render.optional(report.ideal_force.error_percent, "{:.3g} % rms of the ideal force", "")
     yield "force error", f"{apart}, before the force limits" if apart else f"- ({report.ideal_force.reason})"
@@ -224,13 +223,16 @@ def _rows(report: RunReport) -> render.Rows:
         for state in contact.frozen:
             name = f"wall{'s' * (len(state.touching) > 1)} {', '.join(map(str, state.touching))}"
             yield f"growth, {name if state.touching else 'no wall'} touching", _growth(state)
-    yield "simulated in", run.environment if report.judged.ranges else None
-    yield "force limits", report.judged.limiter.words
+    yield "simulated in", run.environment if assessment.ranges else None
     yield "limited ticks", f"{stability.clipped_ticks} of {run.samples}"
-    yield "speed", _speed(run)
-    size = render.optional(report.error.position_max_m, "{:.1e} m at most")
-    yield "position error", render.optional(report.error.position_relative_rms, "{:.1e} relative rms, " + size)
     yield "cross-check", run.cross_check and _crossed(run.cross_check)
+
+
+def _details(report: RunReport) -> list[str]:
+    """What --details adds: speed and accuracy of the simulation, and what no certificate covers."""
+    size = render.optional(report.error.position_max_m, "{:.1e} m at most")
+    error = render.optional(report.error.position_relative_rms, "{:.1e} relative rms, " + size)
+    return [f"speed: {_speed(report.run)}", f"position error: {error}", CAVEATS]
 
 
 def _speed(run: Ran) -> str:

@@ -10,18 +10,19 @@ from pathlib import Path
 
 import numpy as np
 from haptic_loop.cli import options, render
-from haptic_loop.cli.judged import chosen_by, judge
+from haptic_loop.cli import verdict as verdicts_of
+from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.ranges import Member
-from haptic_loop.design.certificate import RangesCheck
+from haptic_loop.design.assessment import Assessment, RangesResult
 from haptic_loop.design.conditions import this_environment
 from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import ANY
-from haptic_loop.design.result import Chosen
+from haptic_loop.design.guarantees import ANY, RANGES
+from haptic_loop.design.result import CONDITIONS, Chosen
 from haptic_loop.models.human import Human, Population
 from haptic_loop.models.scene import MIXED
 from haptic_loop.sim import verdicts
 from haptic_loop.sim.adversary import Worst, search, search_population
-from haptic_loop.sim.couplings import NAMES, Judged
+from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.crowds import ENGINES, Findings, Table, Validation, validate, validate_on_cluster
 from haptic_loop.sim.report import DelaySpan, UnevenTicks, VaryingDelays
 from haptic_loop.sim.run import assemble, engine_name
@@ -38,20 +39,21 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
     chosen = chosen_by(args, scenario)
-    judged = judge(args, scenario, chosen)
-    question = _question(args, scenario, chosen, judged)
+    assessment = assessment_of(args, scenario, chosen)
+    question = _question(args, scenario, chosen, assessment)
     findings, wall = _findings(args, question, Table(question, out, args.resume))
     searched = _Searched()
     if args.adversary and not (findings.interrupted or findings.lost):
-        searched = _searched(args, question, chosen, judged)
-    report = _reported(args, chosen, judged, question, findings, wall, searched)
+        searched = _searched(args, question, chosen, assessment)
+    report = _reported(args, chosen, assessment, question, findings, wall, searched)
     files = _save(args, out, question, findings, searched.worst, chosen.kind)
     title = f"{scenario.title(args.case)}: coupling {chosen.kind}"
     lines = [
         *([f"Delays that vary: {report.switching.met.certified.covers}."] if report.switching else []),
         *report.remarks,
     ]
-    render.publish(args, report, [render.facts(title, render.rows_of(report))], lines, out, files)
+    shown = [render.facts(title, render.rows_of(report))]
+    render.publish(args, report, shown, lines, out, files, verdicts_of.verdict(assessment))
     if report.unfinished and not report.interrupted:
         return options.UNFINISHED
     return options.exit_code(bool(report.holds), report.interrupted)
@@ -98,7 +100,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     return scenario
 
 
-def _environments(args: argparse.Namespace, whole: RangesCheck | None) -> tuple[Member, ...]:
+def _environments(args: argparse.Namespace, whole: RangesResult | None) -> tuple[Member, ...]:
     """The vertices of the ranges, and as many other points of them, the worst one found first. Raises InputError.
 
     Without --environments ranges there are none: every loop has the nominal environment.
@@ -111,11 +113,11 @@ def _environments(args: argparse.Namespace, whole: RangesCheck | None) -> tuple[
     return (*whole.members, *others[: len(whole.members)])
 
 
-def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, judged: Judged) -> Validation:
+def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, assessment: Assessment) -> Validation:
     """The loop, the humans that are to hold it, and the engines that decide. Raises InputError."""
     links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
-    work, met = (args.humans, links, args.engine, args.duration), _environments(args, judged.whole)
-    return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=judged.limiter.rho)
+    work, met = (args.humans, links, args.engine, args.duration), _environments(args, assessment.ranges)
+    return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=assessment.force_limits.rho)
 
 
 def _findings(args: argparse.Namespace, question: Validation, table: Table) -> tuple[Findings, float]:
@@ -139,11 +141,11 @@ class _Searched:
     interrupted: bool = False
 
 
-def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, judged: Judged) -> _Searched:
+def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, assessment: Assessment) -> _Searched:
     """The worst humans, in the environment that needs the most damping; what was found before Ctrl-C is kept."""
-    scenario, ratio = question.scenario, judged.certificates["this-environment"].ratio
-    if question.environments and judged.whole:
-        member, requirement = judged.whole.worst_found
+    scenario, ratio = question.scenario, assessment.requirements["this-environment"].ratio
+    if question.environments and assessment.ranges:
+        member, requirement = assessment.ranges.worst_found
         scenario, ratio = scenario.replace(environment=member.network, ranges=None), requirement.ratio
     found: list[Worst] = []
     try:
@@ -205,10 +207,10 @@ class _Own:
         yield f"hands of {self.from_}", f"{growth}: {self.exact.exact_verdict}"
 
 
-def _judged_rows(judged: Judged) -> render.Rows:
-    if own := judged.chosen.own:
-        yield from render.certificate_rows({own.name: judged.certificates[own.name]}, 5)
-    yield "force limits", judged.limiter.words
+def _assessment_rows(assessment: Assessment) -> render.Rows:
+    if assessment.condition not in CONDITIONS:
+        yield from render.certificate_rows({assessment.condition: assessment.decisive}, 5)
+    yield "force limits", assessment.force_limits.words
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,7 +232,7 @@ class _Report:
     own_humans: _Own = render.several(_Own.rows)
     largest_difference_per_s: float | None = render.figure("growth rates apart", "{:.1e} 1/s at most")
     traces: verdicts.Traces | None = render.several(verdicts.Traces.rows)
-    judged: Judged = render.several(_judged_rows, "inlined")
+    assessment: Assessment = render.several(_assessment_rows)
     settled: str | None = render.figure("handles come to rest", json="left out")
     energy_audit: verdicts.EnergyAudit | None = render.figure("energy audit W >= 0", json="if given")
     switching: verdicts.Growing[VaryingDelays] | None = render.several(
@@ -254,12 +256,12 @@ class _Report:
 
 
 def _varying(
-    question: Validation, chosen: Chosen, findings: Findings, certified: bool
+    question: Validation, chosen: Chosen, assessment: Assessment, findings: Findings, certified: bool
 ) -> tuple[verdicts.Growing[VaryingDelays] | None, verdicts.Growing[UnevenTicks] | None]:
     """How many hands grow while delays vary, and while ticks do; None where they do not vary."""
     scenario, switching, timing = question.scenario, None, None
     if scenario.varying_delay:
-        covered = DelaysCovered.of(scenario, chosen, certified)
+        covered = DelaysCovered.of(scenario, assessment, chosen.switching)
         met = VaryingDelays(DelaySpan.of(scenario.varying_delay), None, covered)
         switching = verdicts.Growing.of(question, findings, met, covered.covered)
     if scenario.uneven and (ticks := scenario.timing(question.seed, max(1, question.ticks))):
@@ -270,7 +272,7 @@ def _varying(
 def _reported(
     args: argparse.Namespace,
     chosen: Chosen,
-    judged: Judged,
+    assessment: Assessment,
     question: Validation,
     findings: Findings,
     wall: float,
@@ -278,15 +280,17 @@ def _reported(
 ) -> _Report:
     """Everything that was found, and whether all of it holds."""
     scenario, any_done = question.scenario, bool(findings.index.size)
-    guarantee = judged.guarantee
-    certified = guarantee is not None and (not question.environments or guarantee == ANY or judged.proved)
+    guarantee = assessment.guarantee
+    certified = guarantee is not None
+    if question.environments:  # of the ranges
+        certified = guarantee is not None and guarantee.environments in (ANY, RANGES)
     mode = worst_mode(assemble(scenario, chosen.coupling))
     own = _Own(args.human or scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
     energy = verdicts.EnergyAudit.of(question, findings) if certified and question.ticks else None
-    switching, timing = _varying(question, chosen, findings, certified)
+    switching, timing = _varying(question, chosen, assessment, findings, certified)
     worst, drawn = (w and verdicts.Attacked.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))
     also = all(part.holds for part in (own, energy, switching, timing, worst, drawn) if part)
-    also = also and not chosen.fails(judged.certificates)
+    also = also and not chosen.fails(assessment.requirements)
     traces = verdicts.Traces.of(question, findings) if question.ticks and any_done else None
     both, bad, grows = question.engine != "exact", unstable(findings.exact), unstable(findings.mujoco)
     disagreements, wrong = int(findings.disagreements.sum()), bad | (both & grows & (findings.mujoco > 1e-3))
@@ -308,7 +312,7 @@ def _reported(
         own_humans=own,
         largest_difference_per_s=verdicts.largest(np.abs(findings.mujoco - findings.exact)),
         traces=traces,
-        judged=judged,
+        assessment=assessment,
         settled=traces and traces.settled(),
         energy_audit=energy,
         switching=switching,
@@ -324,5 +328,5 @@ def _reported(
         unfinished=findings.lost or None,
         wall_s=wall,
         simulated_s_per_s=findings.simulated / wall,
-        remarks=chosen.remarks(judged.certificates),
+        remarks=chosen.remarks(assessment.requirements),
     )

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from math import inf, isfinite
 from pathlib import Path
 
 from haptic_loop.cli import options, render
-from haptic_loop.design.coverage import Limits
+from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table, write_json
-from haptic_loop.design.result import Requirement
 from haptic_loop.sim.scenario import InputError, require_even_ticks
 from haptic_loop.sim.view.session import (
     COUPLINGS,
@@ -84,18 +83,17 @@ class _Event:
     psi: tuple[int, ...]
     exact_growth_rate_per_s: float  # null in JSON where there is none
     exact_frequency_hz: float
-    certificates: Mapping[str, Requirement]
-    guarantee: str | None = off_table()
-    limiter: Limits = off_table()
+    assessment: Assessment
 
     @classmethod
     def of(cls, t: float, what: str, prepared: PreparedLoop) -> _Event:
         scenario, mode = prepared.scenario, prepared.mode
         loop = prepared.label, scenario.theta, scenario.psi, float(mode.growth), float(mode.frequency_hz)
-        return cls(t, what, *loop, prepared.requirements, prepared.guarantee, prepared.limits)
+        return cls(t, what, *loop, prepared.assessment)
 
     def line(self) -> str:
-        held = [name for name, need in self.certificates.items() if need.certified]
+        guarantee = self.assessment.guarantee
+        held = [name for name, need in self.assessment.requirements.items() if need.certified] if guarantee else []
         growth = f"{self.exact_growth_rate_per_s:+.3g} 1/s at {self.exact_frequency_hz:.1f} Hz"
         grows = growth if isfinite(self.exact_growth_rate_per_s) else "no growth"
         proved = f"certified ({', '.join(held)})" if held else "NOT certified"

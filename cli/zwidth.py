@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import msgspec
 from haptic_loop.cli import options, render
-from haptic_loop.cli.judged import chosen_by, judge
+from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.designs import name_and_own
 from haptic_loop.design.result import Chosen, Requirement
@@ -44,10 +44,11 @@ def main(argv: list[str]) -> int:
     chosen = chosen_by(args, scenario) if args.coupling else None  # over the whole map the same
     sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
-        judged = judge(args, scenario, chosen)
-        notes = chosen.remarks(judged.certificates) if chosen.fails(judged.certificates) else chosen.notes
-        fixed = FixedCoupling.of(judged, scenario.loop(args.case).network, notes)
-        sweep = replace(sweep, lag=fixed.limiter.rho)
+        assessment = assessment_of(args, scenario, chosen)
+        needs = assessment.requirements
+        notes = chosen.remarks(needs) if chosen.fails(needs) else chosen.notes
+        fixed = FixedCoupling.of(chosen, assessment, scenario.loop(args.case).network, notes)
+        sweep = replace(sweep, lag=assessment.force_limits.rho)
     marks = tuple(args.mark)
     grid = zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, marks)
     plan, out = _plan(args, sweep), options.out_folder(args, "zwidth")
@@ -185,18 +186,17 @@ def _share(count: int, report: MapReport) -> str:
 
 def _designed_rows(fixed: FixedCoupling, limited: bool) -> render.Rows:
     """The fixed coupling in the environment that it was designed for."""
-    there = fixed.designed_for
-    asked = [*there.certificates.items()]
+    asked, guarantee = [*fixed.assessment.requirements.items()], fixed.assessment.guarantee
     needs = "; ".join(
         f"{name} needs {100 / need.margin:.4g} % of the damping ({need.proof})" for name, need in asked if need.margin
     )
-    yield "coupling", f"{fixed.coupling.kind}, fixed"
+    yield "coupling", f"{fixed.kind}, fixed"
     yield (
         "designed for",
-        ", ".join(f"{' - '.join(s.between)} {s.K:g} N/m, {s.B:g} N s/m" for s in there.contact_springs),
+        ", ".join(f"{' - '.join(s.between)} {s.K:g} N/m, {s.B:g} N s/m" for s in fixed.contact_springs),
     )
-    yield "there", f"guarantee: {there.guarantee or 'none'}; {needs or 'no damping is enough'}"
-    yield "force limits there", fixed.limiter.words if limited else None
+    yield "there", f"guarantee: {guarantee.words if guarantee else 'none'}; {needs or 'no damping is enough'}"
+    yield "force limits there", fixed.assessment.force_limits.words if limited else None
 
 
 def _effects(effects: Shown) -> str:

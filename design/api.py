@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypedDict, Unpack
@@ -12,13 +12,14 @@ from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design.arguments import known, of_kind, one_of, shown
-from haptic_loop.design.certificate import RangesCheck, assess, check_ranges, judged, lag, named, prove, prove_limiter
+from haptic_loop.design.assessment import Assessment, check_ranges
+from haptic_loop.design.certificate import judged, lag, named, prove, prove_limiter, requirements_of
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save, sealed
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, usual_condition
 from haptic_loop.design.environments import SWITCHING
 from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import ANY, HERE, RANGES, guarantee_of
+from haptic_loop.design.guarantees import ANY, HERE, RANGES
 from haptic_loop.design.result import ConditionName, Design, NotProved, Requirement, switching_guarantee
 from haptic_loop.design.transparency import BAND_HZ, Transparency, decibels, transparency
 
@@ -94,7 +95,7 @@ def instead(loop: Loop, kind: str, condition: str | Condition | None = None) -> 
             needs = certify(loop, made)
         except (ValueError, ArithmeticError):
             continue
-        if needs[target].certified and guarantee(loop, needs):
+        if needs[target].certified:
             error = decibels(transparency_of(loop, made).rms_mismatch)
             found.append((error, f"--coupling {other} --condition {target} ({error:.2f} dB rms)"))
     return "certified instead: " + ", ".join(words for _, words in sorted(found)) if found else ""
@@ -121,7 +122,7 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     own = coupling.own if isinstance(coupling, Design) else None
     alone = fitting(loop, coupling)
     _, asked = name_and_own(condition)
-    requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, own=asked or own))
+    requirements: dict[str, Requirement[str]] = dict(requirements_of(loop, alone, own=asked or own))
     if whole := check_ranges(loop, alone, samples=0):
         _, worst = whole.worst if whole.proved else whole.worst_found
         here = requirements[worst.condition].guarantee
@@ -130,19 +131,6 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     if loop.varying_delay:
         requirements["switching"] = judged(loop, alone, SWITCHING)
     return requirements
-
-
-def guarantee(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str | None:
-    """For which environments `certify(loop, coupling)` says that a coupling is safe, in words; None where for none.
-
-    "any passive environment", "these ranges" (of the loop's environment), "this environment", or each contact state
-    of an environment with walls. Raises TypeError for an argument of another type, ValueError for other requirements.
-    """
-    of_kind("loop", loop, Loop, _LOOP)
-    of_kind("requirements", requirements, Mapping, "what certify returned")
-    if not any(isinstance(each, Requirement) and each.guarantee for each in requirements.values()):
-        raise ValueError(f"requirements has {', '.join(requirements) or 'nothing'}, expected what certify returned")
-    return guarantee_of(requirements, loop)
 
 
 def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
@@ -193,14 +181,15 @@ def store(
     loop: Loop,
     design: Design,
     path: Path,
-    whole: RangesCheck | None = None,
-    limiter: LimiterCertificate | None = None,
+    assessment: Assessment | None = None,
 ) -> Filed:
-    """Save the coupling with the proof of its condition, and that of limited forces, or without a proof.
+    """Save the coupling with the proof of its condition, and that of limited forces in `assessment`, or without one.
 
     What is not proved for whole ranges, or for switching delays, is kept as what it is: a coupling for the nominal
     environment, or for constant delays. Raises InputError where the file cannot be written.
     """
+    whole = assessment and assessment.ranges
+    limiter = assessment and assessment.force_limits.certificate
     if whole and whole.proved and whole.certificate and whole.certificate.condition == design.condition:
         certificate, reason = whole.certificate, None
     else:

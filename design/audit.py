@@ -16,17 +16,17 @@ from haptic_loop.controller.coupling import (
     Coupling,
     SpringDamper,
 )
-from haptic_loop.controller.environment import RIGID_WALL
-from haptic_loop.controller.loop import DelayRange, Loop
-from haptic_loop.design.certificate import RangesCheck, named
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.assessment import Assessment, assess
+from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.coverage import RangesFigures, Switching
-from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.design.coverage import Switching
 from haptic_loop.design.files import InputError, off_table
 from haptic_loop.design.frequency import sweeping, too_long
-from haptic_loop.design.guarantees import ANY, CAVEATS, guarantee_of
+from haptic_loop.design.guarantees import CAVEATS
 from haptic_loop.design.own import place_of
-from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, ConditionName, Requirement, listed, refusal
+from haptic_loop.design.result import ConditionName, Requirement, listed, refusal
+from haptic_loop.design.worst_member import Progress
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling in its loop, judged by either condition.
@@ -297,39 +297,16 @@ def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], s
 
 
 @dataclass(frozen=True)
-class _Coupling:
-    """The coupling that is audited; gains are those of a spring-damper."""
+class Margins:
+    """How far a coupling is from the edge of one condition."""
 
-    kind: str
-    K: Sequence[float] | None
-    B: Sequence[float] | None
-
-
-@dataclass(frozen=True)
-class _Loop:
-    """The loop that it is audited in."""
-
-    T_s: float
-    T_max_s: float | None
-    latency_s: Sequence[tuple[float, float]] | None
-    theta: tuple[int, ...]
-    psi: tuple[int, ...]
-    delta: tuple[float, ...]
-    rigid: bool
-
-
-@dataclass(frozen=True)
-class ConditionAudit:
-    """What one condition says, and how far the coupling is from its edge."""
-
-    requirement: Requirement = off_table("inlined")
-    stiffest: _Stiffest = off_table()
-    sensitivity: _Sensitivity = off_table()
+    stiffest: _Stiffest
+    sensitivity: _Sensitivity
 
 
 @dataclass(frozen=True)
 class Help:
-    """A change that was tried, and what the condition asks after it."""
+    """A change that was tried, and the requirement after it."""
 
     change: str
     condition: str
@@ -339,56 +316,47 @@ class Help:
 
 @dataclass(frozen=True)
 class Audit:
-    """Both conditions with what surrounds them; SI units, null with a "reason" where a figure does not exist."""
+    """The assessment of a coupling with its margins, and the changes that help where it fails."""
 
-    coupling: _Coupling
-    loop: _Loop
-    conditions: dict[str, ConditionAudit] = off_table("inlined")  # also under the names that they had before
-    switching: Switching | None = off_table()
-    ranges: RangesFigures | None = off_table()
-    certified: bool = off_table()
-    guarantee: str | None = off_table()
-    helps: list[Help] = off_table()
+    assessment: Assessment
+    margins: dict[str, Margins]  # by condition, in the loop's own environment at the constant delays
+    switching: Switching | None
+    helps: list[Help]
     not_covered: str = CAVEATS
-
-    @property
-    def parts(self) -> dict[str, ConditionAudit]:
-        """By today's names, in the order of a table: those with names, then the user's own."""
-        return {name: self.conditions[name] for name in {**CONDITIONS, **self.conditions}}
 
 
 def audit(
     loop: Loop,
     coupling: Coupling,
-    switching: DelayRange | None = None,
-    whole: RangesCheck | None = None,
     asked: Condition | None = None,
+    seed: int = 0,
+    force_limit: Sequence[float] = (),
+    progress: Progress = lambda done, total: None,
 ) -> Audit:
-    """What both conditions say of the loop's own environment and constant delays, and the one that is asked for.
+    """Assess a coupling and measure how far it is from the edge of each condition.
 
-    With a range of delays also the damping that any switching within it asks; `whole` is the same coupling over the
-    ranges around the environment, if there is one. Raises ValueError naming the field of the loop that is wrong.
+    Args:
+        loop: With the range of delays that may switch, if any.
+        coupling: The coupling to audit.
+        asked: The condition that must hold, this-environment if None.
+        seed: Of the environments that are drawn from inside the loop's ranges.
+        force_limit: (m,) [N], for the report.
+        progress: Called with (points done, points in all) of the search over ranges.
+
+    Raises:
+        ValueError: Naming the field of the loop that is wrong.
     """
-    loop = loop.at(loop.environment).switching(None)
     check_loop(loop)
-    known = [named(name) for name in KNOWN_CONDITIONS] if loop.known_devices else []
-    asked = asked or (known[0] if known else THIS_ENVIRONMENT)
-    conditions = {each.name: each for each in (*map(named, reversed(CONDITIONS)), *known, asked)}
-    requirements = {name: requirement(loop, coupling, each) for name, each in conditions.items()}
-    here = requirements[asked.name].certified
-    fails = next((each for name, each in conditions.items() if here and not requirements[name].certified), asked)
-    proved = bool(whole and whole.proved)
-    guaranteed = guarantee_of(requirements, loop, proved)
-    figures, rigid = coupling.figures(loop.T), loop.environment is RIGID_WALL
+    assessment = assess(loop, coupling, condition=asked, ranges_seed=seed, force_limit=force_limit, progress=progress)
+    constant, needs = loop.at(loop.environment).switching(None), assessment.requirements
+    conditions = {name: asked if asked and name == asked.name else named(name) for name in needs if name != "switching"}
+    decisive = assessment.condition
+    fails = next((name for name in conditions if needs[decisive].certified and not needs[name].certified), decisive)
     return Audit(
-        _Coupling(coupling.kind, figures.get("K"), figures.get("B")),
-        _Loop(loop.T, loop.T_max, loop.latency, loop.theta, loop.psi, loop.delta, rigid),
-        {name: _judged(loop, coupling, conditions[name], r) for name, r in requirements.items()},
-        _switching(loop, coupling, switching) if switching else None,
-        whole and RangesFigures.of(whole),
-        here and (whole is None or proved or guaranteed == ANY),
-        guaranteed,
-        _helps(loop, coupling, fails),
+        assessment,
+        {name: _margins(constant, coupling, each, needs[name]) for name, each in conditions.items()},
+        Switching.of(loop, coupling, needs["switching"]) if loop.varying_delay else None,
+        _helps(constant, coupling, conditions[fails]),
     )
 
 
@@ -410,19 +378,12 @@ def _in_time(loop: Loop, coupling: Coupling, search: Callable[[], _Found], witho
         return search()
 
 
-def _judged(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> ConditionAudit:
+def _margins(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> Margins:
     unknown = (None,) * loop.channels
-    return ConditionAudit(
-        needs,
+    return Margins(
         _in_time(loop, coupling, lambda: stiffest(loop, coupling, condition), lambda why: _Stiffest(unknown, why)),
         _in_time(loop, coupling, lambda: sensitivity(loop, coupling, condition), lambda why: _of_delta(needs, why)),
     )
-
-
-def _switching(loop: Loop, coupling: Coupling, span: DelayRange) -> Switching:
-    """Of an environment with walls, while all of them touch."""
-    touching = msgspec.structs.replace(loop.at(loop.environment.frozen()[-1]), latency=None).switching(span)
-    return Switching.of(touching, coupling)
 
 
 def _helps(loop: Loop, coupling: Coupling, condition: Condition) -> list[Help]:

@@ -1,4 +1,4 @@
-"""A coupling judged (`assess`), proved over the rationals (`prove`), and its stored proof checked again (`verify`)."""
+"""Judge a coupling (`requirements_of`), prove it over the rationals (`prove`), check a stored proof (`verify`)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from haptic_loop.controller.arithmetic import SingularLoop, TooLong, rational, w
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop, forget_exact
 from haptic_loop.controller.lti import Lti
-from haptic_loop.controller.ranges import Member, inside, number_of_vertices
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Condition, Demand
 from haptic_loop.design.coupling_file import (
@@ -36,7 +35,6 @@ from haptic_loop.design.environments import (
     THIS_ENVIRONMENT,
     LimitedForces,
     SwitchingDelays,
-    in_each,
     worst,
 )
 from haptic_loop.design.exact import (
@@ -53,7 +51,6 @@ from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import NotProved, Requirement, refusal
-from haptic_loop.design.worst_member import Progress, Searched, search_ranges
 
 _CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
@@ -118,7 +115,7 @@ def prove(
     if loop.varying_delay:
         found, P = _proof(SWITCHING, loop, coupling)
         switching = SwitchingProof(found.required, _margin(found), found.multiplier or (), P["P"])
-    return sealed(
+    certificate = sealed(
         Certificate(
             condition=asked.name,
             required=requirement.required,
@@ -133,6 +130,12 @@ def prove(
             limiter=limiter if limiter and asked.extensible else msgspec.UNSET,
         )
     )
+    if _is_ours(asked):
+        _made.add(certificate.seal)
+    return certificate
+
+
+_made: set[str] = set()  # seals of the certificates that this process has proved, by conditions that have a name
 
 
 @_in_time()
@@ -282,6 +285,18 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
     return known.lag(loop) if known else None
 
 
+def proves(loop: Loop, coupling: Coupling, certificate: Certificate, condition: Condition | None = None) -> bool:
+    """Whether the certificate is one of exactly this loop and coupling and holds.
+
+    It is verified, unless this process has made it. `condition` is the user's own, if the certificate is of one.
+    """
+    if certificate.scenario != digest(loop, coupling.form()):
+        return False
+    if certificate.seal in _made and sealed(certificate).seal == certificate.seal:
+        return True
+    return verify(Stored(loop, coupling.form(), certificate), condition).proved
+
+
 def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
     """Prove the stored certificate again: its bookkeeping, its figures, then its matrices in exact arithmetic.
 
@@ -304,6 +319,8 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
             _check(loop, coupling, asked, certificate)
     except ValueError as refused:  # NotProved, or a user's own condition
         return Verdict(False, str(refused))
+    if _is_ours(asked):
+        _made.add(certificate.seal)
     return Verdict(True)
 
 
@@ -464,7 +481,7 @@ def _block(demand: Demand[Lti]) -> Lti:
     return demand.gain + demand.free
 
 
-def assess(
+def requirements_of(
     loop: Loop,
     coupling: Coupling,
     known: Certificate | None = None,
@@ -473,9 +490,9 @@ def assess(
 ) -> dict[str, Requirement]:
     """Required damping by each condition that has a name, and by the user's `own`, if there is one.
 
-    this-environment is about the nominal environment alone (design.coverage.RangesFigures asks for the rest of its
-    ranges) and the constant theta (sim.switching.DelaysCovered asks for the rest of its range). What `known`, a
-    certificate just made, proves is not proved again; without `more` nothing else is proved beside it.
+    this-environment is about the nominal environment alone and the constant theta; design.assessment asks for
+    the rest. What `known`, a certificate that is known to hold, proves is not proved again; without `more` nothing else
+    is proved beside it.
     """
     loop = loop.at(loop.environment).switching(None)
     known_only = () if loop.known_devices else (KNOWN_DEVICE, KNOWN_DEVICE_ANY)
@@ -491,89 +508,3 @@ def assess(
 
     with within(budgets.EXACT):  # all proofs together
         return {each.name: judged(each, needs) for each, needs in asked}
-
-
-SAMPLES = 64  # environments drawn evenly from inside the ranges, beside what the search looks at
-
-
-@dataclass(frozen=True, eq=False)
-class RangesCheck:
-    """The this-environment condition over ranges. `members` and `at_members` are the environment and the vertices."""
-
-    members: tuple[Member, ...]
-    at_members: tuple[Requirement, ...]
-    samples: tuple[Member, ...]
-    at_samples: tuple[Requirement, ...]
-    vertices: int  # of the ranges: of more than 128 so many are members
-    searched: Searched
-    at_found: Requirement  # at the worst environment that the search has found
-    seed: int
-    certificate: Certificate | None  # of all members, with the guarantee "these ranges"
-    reason: str | None  # why the ranges are not guaranteed
-
-    @property
-    def proved(self) -> bool:
-        """At the environment and every vertex, in exact arithmetic, and no violation was found between them."""
-        return self.certificate is not None and self.worst_found[1].certified
-
-    @property
-    def worst(self) -> tuple[Member, Requirement]:
-        """Where among the members the most damping is asked."""
-        i = worst(self.at_members)
-        return self.members[i], self.at_members[i]
-
-    @property
-    def worst_found(self) -> tuple[Member, Requirement]:
-        """The environment that asks the most damping among members, search and samples."""
-        places = (*self.members, self.searched.worst[0].member, *self.samples)
-        requirements = (*self.at_members, self.at_found, *self.at_samples)
-        i = worst(requirements)
-        return places[i], requirements[i]
-
-
-def check_ranges(
-    loop: Loop,
-    coupling: Coupling,
-    seed: int = 0,
-    samples: int = SAMPLES,
-    progress: Progress = lambda done, total: None,
-    searched: Searched | None = None,
-    certificate: Certificate | None = None,
-) -> RangesCheck | None:
-    """The coupling over the ranges of its loop, None where it has none.
-
-    The search is the same every time; `samples` more points are drawn from inside, from the seed. `searched` and
-    `certificate` are those of a design that has made them.
-    """
-    if loop.ranges is None:
-        return None
-    searched = searched or search_ranges(loop, coupling, progress)
-    members, drawn = loop.members(), inside(loop.network, loop.ranges, samples, seed)
-    try:
-        certificate, reason = certificate or prove(loop, coupling, "this-environment"), None
-    except NotProved as error:
-        certificate, reason = None, str(error)
-    at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)
-    (at_found,) = in_each(loop, coupling, [searched.worst[0].member])
-    check = RangesCheck(
-        members,
-        tuple(at_members),
-        drawn,
-        tuple(at_samples),
-        number_of_vertices(loop.network, loop.ranges),
-        searched,
-        at_found,
-        seed,
-        certificate,
-        reason,
-    )
-    if certificate and not check.proved:
-        place, requirement = check.worst_found
-        check = replace(check, reason=violated_between(place, requirement.ratio))
-    return check
-
-
-def violated_between(place: Member, ratio: float) -> str:
-    """The reason why ranges are not guaranteed although every vertex is proved: a point between them violates."""
-    needs = f"{ratio:.4f} of the damping is needed" if np.isfinite(ratio) else "no damping is enough"
-    return f"proved at the vertices, but violated between them: {needs} at {place.name}"

@@ -52,15 +52,15 @@ class Curves:
 
 
 def judge(loop: Loop, coupling: Coupling, own: Sequence[Condition] = ()) -> Demands:
-    """Every condition of a coupling, as figures and over frequency, before walls while all touch. Raises SingularLoop.
+    """Every condition of a coupling, as figures and over frequency; F while all walls touch. Raises SingularLoop.
 
     `own` are conditions of the user's.
     """
-    F, touching = loop.F(coupling), loop.at(loop.environment.frozen()[-1])
+    F = loop.F(coupling)
+    here = loop.at(loop.environment).switching(None)
     requirements: dict[str, Requirement] = {}
     demands: dict[str, Response | None] = {}
     for each in (*map(named, CONDITIONS), *own):
-        here = loop.at(loop.environment) if each.beyond(loop.at(loop.environment)) else touching  # refused, or judged
         needs = requirements[each.name] = each.judge(here, coupling)
         curve = each.over_frequency(here, coupling, needs.multiplier) if np.isfinite(needs.ratio) else None
         demands[each.name] = curve

@@ -46,7 +46,7 @@ from haptic_loop.design.frequency import (
     supremum,
     too_long,
 )
-from haptic_loop.design.result import Guarantee, Requirement, from_ratio, refusal
+from haptic_loop.design.result import Environments, Requirement, from_ratio, refusal
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,7 +356,7 @@ class Condition(ABC):
         """The environments in which it is proved one by one; P, P1, P2, .. are of these."""
         return loop.members()
 
-    def guarantee(self, loop: Loop) -> Guarantee:
+    def guarantee(self, loop: Loop) -> Environments:
         """For which environments it holds."""
         # proved at every vertex; whether it is kept between them is searched by check_ranges and design.check
         return "these ranges" if loop.ranges else "this environment"

@@ -19,7 +19,7 @@ from haptic_loop.controller.environment import Network
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.files import InputError, counted, read, write
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
-from haptic_loop.design.result import Guarantee
+from haptic_loop.design.result import Environments
 
 _Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
 Rows = tuple[tuple[_Rational, ...], ...]  # of a matrix, rationals "p/q"
@@ -55,7 +55,7 @@ class Certificate(Strict, frozen=True):
     required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
     available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
     margin: float  # available / required
-    guarantee: Guarantee
+    guarantee: Environments
     proof: Literal["sampled", "kyp", "rational"]
     matrices: dict[str, Rows]
     scenario: str  # digest of the loop and the coupling

@@ -33,7 +33,7 @@ if TYPE_CHECKING:  # slow to load
 
 #: The sampled condition keeps half as much again as the promised reserve, for what lies between the samples.
 _SAMPLED_RESERVE = 1.5 * RESERVE
-_SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
+SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
 _CLOSEST_POLE = 1e-5  # from the unit circle
 _STUCK = 1e-3  # a search that leaves the sampled condition violated by this has no feasible point nearby
 _MOST_ROUNDS = 8
@@ -243,7 +243,7 @@ class SampledLoop:
         from scipy.optimize import minimize  # slow to load
 
         m = self.loop.channels
-        bounds = [(np.log(_SOFTEST), np.log(STIFFEST))] * m + [(0.0, 20.0)] * m + [self.bounds] * self.active.size
+        bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * m + [(0.0, 20.0)] * m + [self.bounds] * self.active.size
         condition = {"type": "ineq", "fun": self.room, "jac": self.room_slope}
         options = {"maxiter": most, "ftol": 1e-7}
         problem = {"bounds": bounds, "constraints": condition, "options": options}

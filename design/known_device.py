@@ -35,7 +35,7 @@ from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.exact import require_size
 from haptic_loop.design.frequency import Response, frequencies, hermitian, largest_eigenvalue, on_circle, supremum
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
-from haptic_loop.design.result import Guarantee, NotProved, Requirement, from_ratio, refusal
+from haptic_loop.design.result import Environments, NotProved, Requirement, from_ratio, refusal
 
 # ----------------------------------------------------------------------------------------------------
 # The least cost of a period.
@@ -585,7 +585,7 @@ class KnownDeviceAny(KnownDevice):
     def lag(self, loop: Loop) -> tuple[float, ...] | None:
         return (0.0,) * loop.channels
 
-    def guarantee(self, loop: Loop) -> Guarantee:
+    def guarantee(self, loop: Loop) -> Environments:
         return "any passive environment"
 
 

@@ -30,7 +30,7 @@ from haptic_loop.design.conditions import Condition, Demand, delayed_environment
 from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.exact import require_size
 from haptic_loop.design.frequency import Response, frequencies, on_circle, supremum
-from haptic_loop.design.result import DesignFailed, Guarantee, Infeasible, NotProved, Requirement, refusal
+from haptic_loop.design.result import DesignFailed, Environments, Infeasible, NotProved, Requirement, refusal
 from numpy.typing import NDArray
 
 #: Designs ask for (1 - RESERVE) of the available damping, so that they are certified as stored.
@@ -368,7 +368,7 @@ class _AnyEnvironment(Condition):
     def lag(self, loop: Loop) -> tuple[float, ...] | None:
         return None if any(loop.psi) or loop.varying_delay else (0.0,) * loop.channels
 
-    def guarantee(self, loop: Loop) -> Guarantee:
+    def guarantee(self, loop: Loop) -> Environments:
         return "this environment" if any(loop.psi) else "any passive environment"
 
 

@@ -14,7 +14,7 @@ from haptic_loop.controller.lti import Array
 
 ConditionName = Literal["this-environment", "any-environment", "known-device", "known-device-any"]
 #: for which environments a certificate holds
-Guarantee = Literal["any passive environment", "these ranges", "this environment"]
+Environments = Literal["any passive environment", "these ranges", "this environment"]
 
 #: the conditions in the order of tables, each with the environments for which it holds
 CONDITIONS: dict[str, str] = {
@@ -68,10 +68,10 @@ class Requirement(Generic[C]):
             "condition": self.condition,
             "required_damping": self.required,
             "available_damping": self.available,
-            "margin": self.margin,
+            "required_share": self.ratio,
             "binding_frequency_hz": self.frequency_hz,
             "certified": self.certified,
-            "proof": self.proof,
+            "proof": self.proof if self.certified else None,
         }
         return part | ({"reason": self.reason} if self.reason else {})
 

@@ -6,7 +6,7 @@ load("omega-pair"), parse(text)     Return a Scenario, from a TOML file, a packa
 Scenario.loop("I")                  Return the Loop of a scenario: all that a design may know of it.
 design_coupling(loop, kind)         Return a Design: the best coupling of a kind. DesignOptions lists the options.
 certify(loop, coupling)             Return a Requirement per condition: the damping that the coupling needs.
-guarantee(loop, requirements)       Return the environments for which the coupling is safe for every passive human.
+assess(loop, coupling)              Return an Assessment: requirements, force limits, and the guarantee or a reason.
 transparency_of(loop, coupling)     Return a Transparency: how close the felt force is to the environment's.
 simulate(scenario, coupling)        Return a Trace: a run with the people of the scenario, tick by tick.
 validate(scenario, coupling)        Return Findings: the growth of the loop with many random people.
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from haptic_loop.controller.coupling import NoCoupling, SpringDamper
     from haptic_loop.controller.environment import RIGID_WALL, Network, Spring, Wall
     from haptic_loop.controller.loop import Loop
-    from haptic_loop.design.api import DesignOptions, certify, design_coupling, guarantee, transparency_of
+    from haptic_loop.design.api import DesignOptions, certify, design_coupling, transparency_of
+    from haptic_loop.design.assessment import Assessment, Guarantee, assess
     from haptic_loop.design.result import Design, DesignFailed, Requirement
     from haptic_loop.design.transparency import Transparency
     from haptic_loop.hw.rehearsal import Rehearsed, rehearse
@@ -45,11 +46,13 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "RIGID_WALL": "controller.environment",
+    "Assessment": "design.assessment",
     "CompliantDevice": "models.device",
     "Design": "design.result",
     "DesignFailed": "design.result",
     "DesignOptions": "design.api",
     "Findings": "sim.crowds",
+    "Guarantee": "design.assessment",
     "InputError": "sim.scenario",
     "Loop": "controller.loop",
     "Network": "controller.environment",
@@ -63,9 +66,9 @@ _HOMES = {
     "Trace": "sim.trace",
     "Transparency": "design.transparency",
     "Wall": "controller.environment",
+    "assess": "design.assessment",
     "certify": "design.api",
     "design_coupling": "design.api",
-    "guarantee": "design.api",
     "linearise": "sim.world",
     "load": "sim.scenario",
     "parse": "sim.scenario",

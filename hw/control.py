@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import sub
 from typing import NamedTuple, Protocol
@@ -22,17 +22,13 @@ from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
-from haptic_loop.design.certificate import assess
+from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.coverage import Limits
-from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import guarantee_of
-from haptic_loop.design.result import Chosen, Design, DesignFailed, Requirement
+from haptic_loop.design.result import Chosen, Design, DesignFailed
 from haptic_loop.hw import monitor
 from haptic_loop.hw.limits import Gain, Heat, SafetyLimits, Units
 from haptic_loop.hw.protocol import MAX_THETA, Config, SafetyStop, State
-from haptic_loop.sim.couplings import choose, given, limits_of
-from haptic_loop.sim.report import CouplingFigures
+from haptic_loop.sim.couplings import assessed, choose, given
 from haptic_loop.sim.scenario import InputError, Scenario
 
 _SPEED_SECONDS = 0.01  # over which a speed is taken: one count of the coarsest encoder is 0.03 m/s
@@ -297,22 +293,6 @@ class Armable(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class ProgramFigures:
-    """A certified coupling as reports have it; null where a session had none."""
-
-    theta: tuple[int, ...] | None = None
-    coupling: CouplingFigures | None = None
-    certificate: Requirement | None = None
-    certificates: Mapping[str, Requirement] | None = None
-    guarantee: str | None = off_table(default=None)
-    link_delay: int | None = None
-    latency_s: tuple[tuple[float, float], ...] | None = None
-    T_max_s: float | None = None
-    limiter: Limits | None = None
-    remarks: list[str] | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class CertifiedCoupling:
     """A coupling with the delay that it is certified for."""
 
@@ -320,14 +300,12 @@ class CertifiedCoupling:
     scenario: Scenario  # with the delays of this loop
     case: str
     chosen: Chosen
-    requirements: dict[str, Requirement]
-    limits: Limits  # whether that holds for forces at the cap too
+    assessment: Assessment  # in the loop with these delays
 
     @property
     def certified(self) -> bool:
-        """By any condition, and by the user's own where there is one."""
-        held = any(requirement.certified for requirement in self.requirements.values())
-        return held and not self.chosen.fails(self.requirements)
+        """Whether there is a guarantee for this loop, and the user's own condition holds where there is one."""
+        return self.assessment.guarantee is not None and not self.chosen.fails(self.assessment.requirements)
 
     @property
     def name(self) -> str:
@@ -347,27 +325,16 @@ class CertifiedCoupling:
         return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
 
     def controller(self, cap: Sequence[float]) -> Controller:
-        return host_controller(self.scenario.loop(self.case), self.chosen.coupling, self.link, cap, self.limits.rho)
+        lag = self.assessment.force_limits.rho
+        return host_controller(self.scenario.loop(self.case), self.chosen.coupling, self.link, cap, lag)
 
-    def figures(self, cap: Sequence[float]) -> ProgramFigures:
-        """Coupling, certificates and guarantee, for forces of up to `cap` (m,) [N]."""
-        scenario, requirements = self.scenario, self.requirements
-        return ProgramFigures(
-            scenario.theta,
-            CouplingFigures.of(self.chosen.kind, self.chosen.coupling, scenario.T),
-            requirements[self.chosen.condition],
-            requirements,
-            guarantee_of(requirements, scenario.loop(self.case)),
-            self.link,
-            scenario.latency,
-            scenario.T_max,
-            self.limits.within(cap),
-            self.remarks(),
-        )
+    def capped(self, cap: Sequence[float]) -> Assessment:
+        """Return the assessment with the force cap (m,) [N] of a session in its report; no proof depends on it."""
+        return replace(self.assessment, force_limits=self.assessment.force_limits.within(cap))
 
     def remarks(self) -> list[str]:
         """What a reader should know of the coupling's file, of a condition of the user's own, and of the clock."""
-        said = [*self.chosen.remarks(self.requirements)]
+        said = [*self.chosen.remarks(self.assessment.requirements)]
         if self.scenario.latency:
             least, most = (1e6 * t for t in self.scenario.latency[0])
             kept = f"periods up to {1e6 * (self.scenario.T_max or self.scenario.T):.0f} us"
@@ -402,10 +369,10 @@ def certified_coupling(
         chosen = choose(slower, case, name, condition, limiter) if own is None else given(own)
     except DesignFailed as error:
         raise SafetyStop(f"no coupling for a link of {link} tick{'s' if link > 1 else ''}: {error}") from None
-    requirements = assess(slower.loop(case), chosen.coupling, own=chosen.own)
-    limits = limits_of(slower, chosen, requirements, limiter)
+    alone = slower.replace(ranges=None) if slower.ranges else slower  # only the nominal environment is rendered
+    assessment = assessed(alone, case, chosen, limiter=limiter)
     waits = min(MAX_THETA, *slower.theta) if link else 0  # what is longer, the host waits for
-    made = CertifiedCoupling(waits, slower, case, chosen, requirements, limits)
+    made = CertifiedCoupling(waits, slower, case, chosen, assessment)
     if not made.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
         raise SafetyStop(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(made)}")
@@ -421,26 +388,43 @@ def certified_couplings(
     spare: int = 2,
     limiter: bool | None = None,
 ) -> tuple[CertifiedCoupling, ...]:
-    """The coupling for the measured delay and up to `spare` softer ones, each for one tick more.
+    """The coupling for the measured delay and up to `spare` in reserve, each certified for one tick more.
 
-    A softer one is of the same kind or from the same file; where that is not certified for the longer delay, it is
-    the spring-damper by Theorem 4, which guarantees the most. Where no softer one is, the ladder ends. Raises
-    SafetyStop where the first coupling is not certified.
+    A reserve is on no channel stiffer than the coupling before it: it is of the same kind or from the same file, or
+    else the spring-damper by Theorem 4, which guarantees the most. Where neither is certified without being stiffer,
+    there is no further reserve. Raises SafetyStop where the first coupling is not certified.
     """
     found = [certified_coupling(scenario, case, name, condition, link, limiter=limiter)]
     wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), _FALLBACK]
     while len(found) <= spare and wanted:
         kind, by = wanted[0]
         try:
-            found.append(certified_coupling(scenario, case, kind, by, found[-1].link + 1, limiter=limiter))
+            reserve = certified_coupling(scenario, case, kind, by, found[-1].link + 1, limiter=limiter)
         except (SafetyStop, InputError):
+            wanted.pop(0)
+            continue
+        if _no_stiffer(reserve, found[-1]):
+            found.append(reserve)
+        else:
             wanted.pop(0)
     return tuple(found)
 
 
+_EQUAL = 1e-9  # relative difference of static stiffnesses that is rounding
+
+
+def _no_stiffer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
+    """Whether the coupling's own stiffness, or else the static stiffness that is felt, is higher on no channel."""
+    own, other = (made.assessment.gains for made in (reserve, than))
+    if "K" in own and "K" in other:
+        return bool((np.array(own["K"]) <= np.array(other["K"])).all())
+    felt, before = (np.diag(made.scenario.loop(made.case).F(made.chosen.coupling).dc()) for made in (reserve, than))
+    return bool((felt <= before * (1 + _EQUAL)).all())
+
+
 def _shortfall(made: CertifiedCoupling) -> str:
     needs = []
-    for name, requirement in made.requirements.items():
+    for name, requirement in made.assessment.requirements.items():
         figures = ", ".join(f"{b:.4g}" for b in requirement.required)
         needs.append(requirement.reason or f"{name} needs {figures} of {requirement.available[0]:g} N s/m")
     return "; ".join(needs)

@@ -136,7 +136,8 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """As plain data."""
         program, budget = arming.program, arming.budget
         assert isinstance(program, CertifiedCoupling)
-        rho, loop = program.limits.rho, (program.scenario, program.chosen.coupling.form(), program.link)
+        rho = program.assessment.force_limits.rho
+        loop = program.scenario, program.chosen.coupling.form(), program.link
         device = units.force_step, arming.config.cap, budget and budget.plan
         return json.loads(msgspec.json.encode(cls(*loop, limits, *device, None if rho is None else tuple(rho))))
 

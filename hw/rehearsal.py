@@ -17,8 +17,8 @@ from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.api import COUPLING, bare
 from haptic_loop.design.arguments import number, of_kind, whole
-from haptic_loop.design.guarantees import guarantee_of
-from haptic_loop.design.result import Design, Requirement
+from haptic_loop.design.assessment import Assessment
+from haptic_loop.design.result import Design
 from haptic_loop.hw.control import Armable, CertifiedCoupling, certified_coupling, certified_couplings, timed
 from haptic_loop.hw.emulator import Emulator, FaultInjection, Line
 from haptic_loop.hw.haptic_device import PortLost, SerialDevice
@@ -233,8 +233,7 @@ class Rehearsed:
     theta: tuple[int, ...] | None  # delays that the coupling is certified for [samples]; None where there is none
     latency: tuple[float, float] | None  # [s] between which forces latch after their tick; None where at ticks
     coupling: Coupling | None  # that the device was armed with, or would have been
-    requirements: dict[str, Requirement]  # of that coupling by both conditions, as `certify` gives them
-    guarantee: str | None  # for which environments they hold
+    assessment: Assessment | None  # of that coupling in the loop with the measured delay
     result: Trace | None  # t, x and f of every tick, as `simulate` gives them; handles are not measured
     zero_after: float | None  # from the wish to stop until no motor does anything [s]; None where it never ran
 
@@ -318,8 +317,7 @@ def _outcome(
         theta=first and first.scenario.theta,
         latency=first.scenario.latency[0] if first and first.scenario.latency else None,
         coupling=first and first.chosen.coupling,
-        requirements=first.requirements if first else {},
-        guarantee=guarantee_of(first.requirements, first.scenario.loop(first.case)) if first else None,
+        assessment=first and first.assessment,
         result=recorder.trace(session.units, scenario.T, meta) if ran and len(recorder) else None,
         zero_after=rehearsal.zero_after(stopped[0]) if stopped and ran else None,
     )

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 from haptic_loop.controller.budget import BudgetFigures
+from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table, plain, write_json
-from haptic_loop.hw.control import CertifiedCoupling, ProgramFigures
+from haptic_loop.hw.control import CertifiedCoupling
 from haptic_loop.hw.protocol import NO_MARGIN
 from haptic_loop.hw.recording import Recipe, Recorder
 from haptic_loop.hw.session import Session
@@ -130,7 +131,10 @@ class SessionReport:
 
     case: str
     scenario: str
-    program: ProgramFigures = off_table("inlined")
+    kind: str | None  # of the coupling; null where the session had none, as the next four
+    assessment: Assessment | None
+    link_delay: int | None = off_table()
+    remarks: list[str] | None = off_table()
     session: _Ended = off_table()
     link: _Link = off_table()
     run: _Ran = off_table()
@@ -144,7 +148,6 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     log = [_Event(1e-6 * (e.t_us - begin), str(e.stage), e.cause) for e in session.log]
     ticks, T = len(recorder), session.scenario.T
     coupled = session.program if isinstance(session.program, CertifiedCoupling) else None
-    program = coupled.figures(session.limits.cap) if coupled else ProgramFigures()
     steady = recorder.steady_ticks(session.units.force_step, session.limits.cap) if coupled and ticks else []
     step = list(session.units.encoder_step) if ticks else None
     ran = _Ran(ticks, ticks * T, T, session.scenario.digest, pace, step, steady)
@@ -152,7 +155,10 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     return SessionReport(
         case,
         session.scenario.name,
-        program,
+        coupled and coupled.chosen.kind,
+        coupled and coupled.capped(session.limits.cap),
+        coupled and coupled.link,
+        coupled and coupled.remarks(),
         _Ended(str(session.stage), session.cause, ticks > 0, log),
         _Link.of(session, recorder, dropped),
         ran,

@@ -12,14 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from haptic_loop.controller.lti import Array
-from haptic_loop.design.certificate import assess, named
+from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import guarantee_of
-from haptic_loop.design.result import Chosen, Requirement, finite
+from haptic_loop.design.result import Requirement, finite
 from haptic_loop.design.transparency import decibels, transparency
 from haptic_loop.sim.accuracy import credible, force_error
-from haptic_loop.sim.couplings import choose, limits_of
+from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import InputError, Scenario, load
 from haptic_loop.sim.stability import exact_growth, unstable
@@ -118,15 +117,16 @@ def _alternative(
         chosen = choose(scenario, case, kind, condition)
     except ValueError as error:
         return Alternative(kind, condition, reason=str(error))
-    known = chosen.certificate
-    requirements = assess(loop, chosen.coupling, known, False, also)
-    simulation = assemble(scenario, chosen.coupling, _lag(scenario, chosen, requirements))
+    alone = scenario.replace(ranges=None) if scenario.ranges else scenario
+    assessment = assessed(alone, case, replace(chosen, own=also or chosen.own))
+    requirements = assessment.requirements
+    simulation = assemble(scenario, chosen.coupling, assessment.force_limits.rho)
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
     made = Alternative(
         kind,
         condition,
-        guarantee=guarantee_of(requirements, loop, False),
+        guarantee=assessment.guarantee.words if assessment.guarantee else None,
         dc_ratio=finite(felt.dc_ratio),
         rms_mismatch_db=decibels(felt.rms_mismatch),
         growth_rate_per_s=finite(growth),
@@ -139,10 +139,3 @@ def _alternative(
     alike, until = force_error(simulation, trace, loop.lam), credible(simulation, trace).until_s
     error = None if unstable(growth) else alike.error_percent
     return replace(made, force_error_percent=error, trace=trace, ideal=alike.ideal, until_s=until)
-
-
-def _lag(scenario: Scenario, chosen: Chosen, requirements: dict[str, Requirement]) -> tuple[float, ...] | None:
-    """rho (m,) [N/m] of the limiter; None: forces are clipped, as those of a coupling just proved without a limiter."""
-    known = chosen.certificate
-    without = known and named(known.condition).extensible and not chosen.limiter
-    return None if without else limits_of(scenario, chosen, requirements).rho

@@ -14,9 +14,9 @@ from haptic_loop.design.arguments import number, of_kind, one_of, whole
 from haptic_loop.design.files import plain
 from haptic_loop.design.result import Design
 from haptic_loop.sim.accuracy import MOST, EngineChoice, compare_engines, pick, settle
-from haptic_loop.sim.couplings import given, limits_of
+from haptic_loop.sim.couplings import assessed, given
 from haptic_loop.sim.engines import INTEGRATORS, Engine
-from haptic_loop.sim.passivity_layer import EnergyNet, Plugged, Wanted, netted
+from haptic_loop.sim.passivity_layer import EnergyNet, Plugged, Wanted, claim, netted
 from haptic_loop.sim.run import (
     ENGINES,
     AnyEngine,
@@ -32,7 +32,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, require_linear
 from haptic_loop.sim.stability import stability_of
 from haptic_loop.sim.switching import Period, switching
 from haptic_loop.sim.trace import Trace
-from haptic_loop.sim.world import START_J, Claim, Touched, WorldFigures, WorldRecord, is_world, world_requirements
+from haptic_loop.sim.world import START_J, Claim, Touched, WorldFigures, WorldRecord, is_world
 
 if TYPE_CHECKING:
     from haptic_loop.sim import crowds
@@ -114,13 +114,14 @@ def simulate(
     of your own (sim.engines.Engine), as it is or as what makes it of a sim.run.Simulation;
     `integrator` of MuJoCo, None for "exponential", or "RK4" where a device has Coulomb friction; `substeps` steps per
     period, None for what the plant asks; `seed` draws delays, periods and latencies that vary.
-    Forces are limited as a guarantee covers it, where one does (`meta["limiter"]` says); elsewhere, and with
-    `limiter` False, they are clipped.
+    Forces leave through the limiter that the coupling's guarantee covers, where there is one; elsewhere, and with
+    `limiter` False, they are clipped (`meta["assessment"]["force_limits"]`).
 
     `environment` takes the place of the scenario's: anything that answers, once a tick, where its port would be if it
     gave no force, (m,) [m], with a force fed back (m,) [N]. A shell makes it passive, which may give `energy_budget`
-    [J] (default 0) in all; a coupling certified for any environment, with psi = 0, makes the loop safe then. Without
-    `environment`, `energy_budget` is that of the devices. `meta["energy_budget"]` says how often forces were limited.
+    [J] (default 0) in all; the loop is safe then behind a coupling that is certified for any environment, with
+    psi = 0. Without `environment`, `energy_budget` is that of the devices. `meta["energy_budget"]` says how often
+    forces were limited, and `meta["assessment"]` what is guaranteed of this run, or why nothing is.
 
     Returns a Trace of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],
     f (N, m) [N] (the devices feel -f) and `meta`, with the scenario's digest and `meta["stability"]`: growth rates
@@ -138,17 +139,25 @@ def simulate(
         one_of("integrator", integrator, tuple(INTEGRATORS))
     if substeps is not None:
         substeps = whole("substeps", substeps, 1, MOST)
-    if environment is not None and is_world(scenario):
+    world = is_world(scenario)
+    if environment is not None and world:
         raise InputError("environment= with a scenario that has environment.world: give one of them")
-    limits = limits_of(scenario, chosen, limiter=limiter and environment is None and not is_world(scenario))
+    if world and energy_budget is None:
+        energy_budget = START_J
+    alone = scenario.replace(ranges=None) if scenario.ranges else scenario  # only the nominal environment runs
+    clipped = None if limiter else False
+    assessment = assessed(
+        alone, "I", chosen, environment=environment, energy_budget=energy_budget, limiter=clipped, seed=seed
+    )
     net: Wanted | None = None
-    if is_world(scenario):
-        net = Touched(START_J if energy_budget is None else energy_budget)
+    if world:
+        net = Touched(energy_budget or 0.0)
     elif environment is not None:
-        net = Plugged(environment, energy_budget or 0.0)
+        net = Plugged(environment, energy_budget or 0.0, claim(assessment))
     elif energy_budget is not None:
-        net = EnergyNet(energy_budget)
-    done = run_scenario(scenario, chosen.coupling, limits.rho, EngineSettings(engine, integrator, substeps), seed, net)
+        net = EnergyNet(energy_budget, guarantee=claim(assessment))
+    settings, rho = EngineSettings(engine, integrator, substeps), assessment.force_limits.rho
+    done = run_scenario(scenario, chosen.coupling, rho, settings, seed, net)
     trace = done.trace
     linear = not (scenario.switches or environment or is_world(scenario))
     meta = {
@@ -158,14 +167,14 @@ def simulate(
         "integrator": done.settings.integrator,
         "substeps": done.settings.substeps,
         "seed": seed,
-        "limiter": None if is_world(scenario) else plain(limits),
+        "assessment": plain(assessment),
         "stability": plain(stability_of(done.simulation, trace)) if linear else None,
         "remarks": done.remarks,
         "energy_budget": plain(trace.net.figures()) if trace.net else None,
     }
     if trace.net and (figures := trace.net.figures()) and isinstance(figures, WorldFigures):
-        claim = Claim.of(scenario, world_requirements(scenario, chosen.coupling), figures.start_J)
-        meta |= {"world": plain(WorldRecord.of(figures)), "guarantee": claim.words, "guaranteed": claim.guaranteed}
+        said = Claim.of(assessment)
+        meta |= {"world": plain(WorldRecord.of(figures)), "guarantee": said.words, "guaranteed": said.guaranteed}
     return replace(trace, meta=meta)
 
 
@@ -210,6 +219,7 @@ def validate(
     if not (duration == 0 or duration >= 4 * scenario.T):
         raise InputError(f"duration is {duration:g}, allowed are 0 and {4 * scenario.T:g} s or more")
     links = getattr(scenario.population, "links", 1)  # of a user's own population there are none
-    lag = limits_of(scenario, chosen, limiter=limiter).rho
+    alone = scenario.replace(ranges=None) if scenario.ranges else scenario
+    lag = assessed(alone, "I", chosen, limiter=None if limiter else False).force_limits.rho
     question = crowds.Validation(scenario, chosen.coupling, seed, humans, links, engine, duration, lag=lag)
     return validate_all(question, shards, progress)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
@@ -15,7 +16,6 @@ from haptic_loop.design.optimal import nearby as nearby_with_price
 from haptic_loop.design.result import CONDITIONS, Chosen, Requirement
 from haptic_loop.design.robustness import Nearby, robustness_nearby
 from haptic_loop.design.transparency import Transparency, transparency
-from haptic_loop.sim.couplings import CouplingFigures
 from haptic_loop.sim.scenario import Scenario
 
 
@@ -44,7 +44,8 @@ class ComparedCoupling:
     transparency: Transparency
     nearby: Nearby = off_table("inlined")
     curves: compare.Curves = off_table("inlined")
-    coupling: CouplingFigures = off_table("inlined")
+    kind: str = off_table()
+    gains: dict[str, Any] = off_table("inlined")
     conditions: dict[str, ConditionCurve] = off_table("inlined")
 
     @classmethod
@@ -61,7 +62,8 @@ class ComparedCoupling:
             transparency(judged.F, loop.E(), loop.lam),
             nearby(loop, chosen.coupling),
             curves,
-            CouplingFigures.of(chosen.kind, chosen.coupling, loop.T),
+            chosen.kind,
+            chosen.coupling.figures(loop.T),
             conditions,
         )
 

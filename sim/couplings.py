@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from haptic_loop.controller.coupling import PUBLISHED, Coupling, NoCoupling
-from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.environment import Environment
+from haptic_loop.controller.loop import Loop
 from haptic_loop.design.api import COUPLING, bare, fitting
-from haptic_loop.design.certificate import RangesCheck, assess, check_ranges, verify
+from haptic_loop.design.assessment import Assessment, PluggedEnvironment, assess, shelled
+from haptic_loop.design.certificate import verify
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Stored, load
-from haptic_loop.design.coverage import Limits, RangesFigures, covered_limits
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, own_coupling, usual_condition
 from haptic_loop.design.environments import THIS_ENVIRONMENT
-from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import guarantee_of
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.own import called, place_of
 from haptic_loop.design.result import (
@@ -26,9 +25,10 @@ from haptic_loop.design.result import (
     Chosen,
     Design,
     DesignFailed,
-    Requirement,
     switching_guarantee,
 )
+from haptic_loop.design.transparency import BAND_HZ
+from haptic_loop.design.worst_member import Progress
 from haptic_loop.sim.scenario import InputError, Scenario
 
 NAMES = ("none", "published", *KINDS)
@@ -93,13 +93,8 @@ def _choose(
         raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)}, a FILE.json or FILE.py:NAME")
     stored = read_coupling(name)
     coupling = fitted(stored, name, scenario.channels, scenario.T)
-    made_for = stored.certificate.condition if stored.certificate else THIS_ENVIRONMENT.name
-    checked = check_stored(stored, scenario.loop(case), own)
-    if made_for not in (*CONDITIONS, *KNOWN_CONDITIONS):  # one of the user's own, which has to be named again
-        made_for = THIS_ENVIRONMENT.name
-    proof = (stored.certificate and stored.certificate.limiter) or None
-    how = {"notes": checked.notes, "switching": checked.switching, "limiter": proof}
-    return Chosen(coupling, condition or made_for, kind=Path(name).name, **how)
+    chosen = from_file(stored, scenario.loop(case), Path(name).name, own, coupling)
+    return replace(chosen, condition=condition or chosen.condition)
 
 
 def own_of(name: str, loop: Loop) -> Chosen:
@@ -113,27 +108,9 @@ def given(coupling: Coupling | Design | None, kind: str = "given") -> Chosen:
     """A coupling, or that of a design with its proofs; None is the loop without one."""
     if isinstance(coupling, Design):
         proof = (coupling.certificate and coupling.certificate.limiter) or None
-        return replace(coupling, kind=kind, certificate=None, limiter=proof)
+        return replace(coupling, kind=kind, limiter=proof)
     alone = NoCoupling() if coupling is None else bare(coupling, f"{COUPLING}, or None for the loop without one")
     return Chosen(alone, THIS_ENVIRONMENT.name, kind=kind)
-
-
-def limits_of(
-    scenario: Scenario,
-    chosen: Chosen,
-    requirements: Mapping[str, Requirement] | None = None,
-    limiter: bool | None = None,
-) -> Limits:
-    """How forces are limited in a loop: by the limiter that a guarantee covers, unless `limiter` is False."""
-    within = tuple(device.force_limit for device in scenario.device)
-    if limiter is False:
-        return Limits(None, "forces are clipped, as asked", force_limit=within)
-    if scenario.varying_delay:
-        return Limits(None, "limited forces are proved for constant delays", force_limit=within)
-    loop = scenario.loop("I")  # the reference does not matter
-    coupling, proof = chosen.coupling, chosen.limiter
-    asked = requirements or assess(loop, coupling, chosen.certificate, own=chosen.own)
-    return covered_limits(loop, coupling, asked, proof, chosen.certificate).within(within)
 
 
 def read_coupling(path: str | Path) -> Stored:
@@ -156,20 +133,24 @@ def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
     return coupling
 
 
-@dataclass(frozen=True)
-class _FileCheck:
-    """Whether a coupling's file proves anything in this loop."""
+def from_file(
+    stored: Stored, loop: Loop, kind: str = "given", own: Condition | None = None, coupling: Coupling | None = None
+) -> Chosen:
+    """The stored coupling with what its file proves, and notes on what the file says of this loop.
 
-    notes: tuple[str, ...]  # what a reader should know of it
-    switching: DelayRange | None = None  # the file proves that any switching of the delays within it is safe here
+    Args:
+        stored: The content of the file.
+        loop: The loop in which the coupling is to stand.
+        kind: The name of the coupling in reports.
+        own: A condition of the user's own, for a certificate of that name.
+        coupling: The coupling of the file, where it was built for another T.
 
-
-def check_stored(stored: Stored, loop: Loop, own: Condition | None = None) -> _FileCheck:
-    """Whether the certificate on file holds, and what it says of the coupling in this loop.
-
-    `own` is a condition of the user's, for a certificate of that name.
+    Returns:
+        The choice. Its `certificate` holds for the loop of the file, which may be another one: `assess` compares them.
     """
-    claim = stored.certificate
+    claim, coupling = stored.certificate, coupling or stored.built()
+    named = (*CONDITIONS, *KNOWN_CONDITIONS)  # a condition of the user's own has to be given again
+    made_for = claim.condition if claim and claim.condition in named else THIS_ENVIRONMENT.name
     asked = own if claim and own and claim.condition == own.name else None
     try:
         reason = verify(stored, asked).reason if claim else None
@@ -178,93 +159,85 @@ def check_stored(stored: Stored, loop: Loop, own: Condition | None = None) -> _F
     notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []
     delays = ("theta", "varying_delay", "lam")  # lam matters to transparency only
     differ = [n for n in loop.__struct_fields__ if n not in delays and getattr(loop, n) != getattr(stored.loop, n)]
-    proved = stored.certificate is not None and not reason and not differ
-    switching = stored.loop.varying_delay if proved else None
-    if switching and switching.contains(loop.varying_delay or DelayRange(loop.theta, loop.theta)):
+    proved = claim is not None and not reason
+    switching = stored.loop.varying_delay if proved and not differ else None
+    if switching and switching.contains(loop.delays):
         if loop.theta != stored.loop.theta or loop.varying_delay not in (None, switching):
             constant = f"the constant theta = {list(loop.theta)}"
             here = switching_guarantee(loop.varying_delay) if loop.varying_delay else constant
             notes.append(f"the file proves {switching_guarantee(switching)}, which covers {here}")
-        return _FileCheck(tuple(notes), switching)
-    differ += ["theta"] if loop.theta != stored.loop.theta else []
-    if loop.varying_delay and proved:
-        made_for = switching_guarantee(switching) if switching else "constant delays"
-        notes.append(f"the file proves {made_for}: {switching_guarantee(loop.varying_delay)} are judged anew here")
-    if differ:
-        notes.append(
-            f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"
-        )
-    return _FileCheck(tuple(notes), switching)
-
-
-@dataclass(frozen=True)
-class CouplingFigures:
-    """Kind, gains (None where it has none) and order of V, Q or R."""
-
-    kind: str
-    order: int
-    K: list[float] | None = None  # (m,) [N/m]
-    B: list[float] | None = None  # (m,) [N s/m]
-    stiffness: list[float] | None = off_table("if given", None)  # (m,) [N/m], static, of a moving average
-
-    @classmethod
-    def of(cls, kind: str, coupling: Coupling, T: float) -> CouplingFigures:
-        return cls(kind, **coupling.figures(T))
+    else:
+        differ += ["theta"] if loop.theta != stored.loop.theta else []
+        if loop.varying_delay and proved and not differ:
+            made_for_delays = switching_guarantee(switching) if switching else "constant delays"
+            here = switching_guarantee(loop.varying_delay)
+            notes.append(f"the file proves {made_for_delays}: {here} are judged anew here")
+        if differ:
+            notes.append(
+                f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"
+            )
+    return Chosen(
+        coupling,
+        made_for,
+        kind=kind,
+        certificate=claim if proved else None,
+        limiter=(claim and claim.limiter) or None,
+        switching=switching,
+        notes=tuple(notes),
+    )
 
 
 # ----------------------------------------------------------------------------------------------------
-# A coupling in its loop before anything runs: what each condition asks, ranges, limits, and whom it is safe for.
+# The coupling in the scenario's loop, assessed before anything runs.
 
 
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """The parts that every report of a coupling begins with."""
-
-    chosen: Chosen = off_table("left out")
-    whole: RangesCheck | None = off_table("left out")
-    coupling: CouplingFigures = off_table()
-    certificates: dict[str, Requirement] = off_table()  # by condition
-    guarantee: str | None = off_table()
-    ranges: RangesFigures | None = off_table()
-    limiter: Limits = off_table()
-
-    @classmethod
-    def of(
-        cls,
-        chosen: Chosen,
-        loop: Loop,
-        requirements: dict[str, Requirement],
-        whole: RangesCheck | None,
-        limits: Limits,
-    ) -> Judged:
-        """The verdicts on a coupling in a loop."""
-        return cls(
-            chosen,
-            whole,
-            CouplingFigures.of(chosen.kind, chosen.coupling, loop.T),
-            requirements,
-            guarantee_of(requirements, loop, bool(whole and whole.proved)),
-            whole and RangesFigures.of(whole),
-            limits,
-        )
-
-    @property
-    def proved(self) -> bool:
-        """Whether the guarantee is proved for the ranges."""
-        return bool(self.whole and self.whole.proved)
-
-
-def judge(
+def assessed(
     scenario: Scenario,
     case: str,
     chosen: Chosen,
-    seed: int,
-    limiter: bool | None,
-    met: Scenario,
-    progress: Callable[[int, int], None],
-) -> Judged:
-    """The coupling in the scenario's loop; conditions are asked of `met`, one environment of its ranges."""
-    whole = check_ranges(scenario.loop(case), chosen.coupling, seed, progress=progress)
-    requirements = assess(met.loop(case), chosen.coupling, chosen.certificate, own=chosen.own)
-    limits = limits_of(met, chosen, requirements, limiter)
-    return Judged.of(chosen, met.loop(case), requirements, whole, limits)
+    *,
+    environment: Environment | PluggedEnvironment | None = None,
+    energy_budget: float | None = None,
+    limiter: bool | None = None,
+    seed: int = 0,
+    band_hz: tuple[float, float] = BAND_HZ,
+    progress: Progress = lambda done, total: None,
+) -> Assessment:
+    """Assess the chosen coupling in the loop of a scenario, as it will run.
+
+    Args:
+        scenario: Its ranges, delays, periods and force limits must all be covered by a guarantee.
+        case: The reference delays, "none", "I" or "II".
+        chosen: The coupling, with the proofs that it comes with.
+        environment: What runs in place of the scenario's environment, see design.assessment.assess.
+        energy_budget: W0 [J], see there.
+        limiter: False where forces are clipped, as the user asks.
+        seed: Of the environments that are drawn from inside ranges.
+        band_hz: Where the mismatch counts.
+        progress: Called with (points done, points in all) of the search over ranges.
+
+    Returns:
+        The assessment. Packets that are lost make forces older than any certificate covers, so that there is no
+        guarantee but that of an energy budget.
+    """
+    assessment = assess(
+        scenario.loop(case),
+        chosen.coupling,
+        environment=environment,
+        energy_budget=energy_budget,
+        certificate=chosen.certificate,
+        condition=chosen.asked,
+        ranges_seed=seed,
+        limiter=limiter,
+        limiter_proof=chosen.limiter,
+        force_limit=tuple(device.force_limit for device in scenario.device),
+        band_hz=band_hz,
+        progress=progress,
+    )
+    plugged = shelled(environment or scenario.environment)
+    if plugged and assessment.guarantee and any(device.encoder_step for device in scenario.device):
+        return assessment.without_guarantee("the devices have encoder steps, and the account needs exact positions")
+    budgeted = energy_budget is not None and not plugged
+    if scenario.loses_packets and assessment.guarantee and not budgeted:
+        return assessment.without_guarantee("a lost packet makes a force older than the range of delays")
+    return assessment

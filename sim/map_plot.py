@@ -91,7 +91,7 @@ def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
 def _designed_for(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:
     """The contact springs of the environment that the coupling was designed for, where they lie on the map."""
     style: dict[str, Any] = {"marker": "P", "markersize": 9, "color": "black", "linestyle": "none"}
-    shown = [(s.B, s.K) for s in report.fixed.designed_for.contact_springs] if report.fixed else []
+    shown = [(s.B, s.K) for s in report.fixed.contact_springs] if report.fixed else []
     for b, k in shown:
         if drawn.grid.B[0] <= b <= drawn.grid.B[-1] and drawn.grid.K[0] <= k <= drawn.grid.K[-1]:
             axes.plot(b, k, zorder=5, markeredgecolor="white", **style)
@@ -128,8 +128,8 @@ def _points(axes: Axes, report: MapReport) -> list[Line2D]:
 
 def _title(report: MapReport) -> str:
     what = report.scenario or "rigid wall"
-    if report.coupling:
-        what += f", {report.coupling.kind} coupling"
+    if report.fixed:
+        what += f", {report.fixed.kind} coupling"
     if report.one_sided:
         what += ", one-sided"
     parts = [

@@ -26,6 +26,7 @@ from haptic_loop.controller.budget import (
 from haptic_loop.controller.delay import LOST, Ticks, ages
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.tick import Net, Process
+from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.guarantees import ANY
 from haptic_loop.design.result import Requirement
 from haptic_loop.sim.run import Simulation
@@ -40,11 +41,7 @@ class EnergyNet:
 
     start: float  # W0 [J]
     cap: float = np.inf  # the most that it may save [J]
-
-    @property
-    def guarantee(self) -> str:
-        """In one line."""
-        return f"no passive hand is given {_more_than(self.start)}, whatever computes the forces"
+    guarantee: str | None = None  # what an assessment of this run guarantees
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
         """A fresh one."""
@@ -67,6 +64,7 @@ class Plugged:
 
     force: Callable[[Array], Array]  # where the port would be, (m,) [m], once a tick -> force fed back (m,) [N]
     start: float = 0.0  # W0 [J]
+    guarantee: str | None = None  # what an assessment of this run guarantees, or why it guarantees nothing
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
         """A fresh one."""
@@ -78,8 +76,12 @@ class Plugged:
         return _Shelled(Shell(V, start=self.start, nsim=nsim), self, process)
 
 
-def _more_than(start: float) -> str:
-    return f"{f'more than {start:g} J' if start else 'any energy'} beyond what the devices dissipate"
+def claim(assessment: Assessment) -> str:
+    """State in one line what is guaranteed of a run with an energy account, or why nothing is."""
+    if assessment.guarantee is None:
+        return f"no guarantee: {assessment.reason}"
+    behind = "behind a coupling certified for any environment, " if callable(assessment.environment) else ""
+    return f"{behind}{assessment.guarantee.words}"
 
 
 class Wanted(Protocol):
@@ -144,7 +146,7 @@ class _Budgeted(_InLoop):
     """The budget; behind it devices that let go of a force that is too old."""
 
     def __init__(
-        self, budget: EnergyBudget, guarantee: str, process: Process, late: Ticks | None, oldest: Array
+        self, budget: EnergyBudget, guarantee: str | None, process: Process, late: Ticks | None, oldest: Array
     ) -> None:
         super().__init__(process)
         self._budget, self._guarantee, self._late, self._oldest = budget, guarantee, late, oldest[:, None]
@@ -181,5 +183,4 @@ class _Shelled(_InLoop):
         pass
 
     def figures(self) -> ShellFigures:
-        given = f"no passive hand is given {_more_than(self._asked.start)}, whatever computes the force"
-        return self._shell.figures(f"behind a coupling certified for any environment, {given}")
+        return self._shell.figures(self._asked.guarantee)

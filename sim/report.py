@@ -8,11 +8,12 @@ from typing import Self
 import numpy as np
 from haptic_loop.controller.coupling import PUBLISHED, Coupling
 from haptic_loop.controller.delay import LOST, Timing, VaryingDelay, ages
-from haptic_loop.design.certificate import assess
+from haptic_loop.controller.loop import DelayRange
+from haptic_loop.design.assessment import Assessment
+from haptic_loop.design.certificate import requirements_of
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import EncoderSteps
-from haptic_loop.design.result import Chosen, finite, listed
-from haptic_loop.sim.couplings import CouplingFigures
+from haptic_loop.design.result import finite, listed
 from haptic_loop.sim.run import Simulation
 from haptic_loop.sim.scenario import Scenario, load
 from haptic_loop.sim.stability import Stability, close, dominant_mode, eigenvalues, linear_growth
@@ -50,9 +51,7 @@ class PaperRow:
     why: str
 
 
-def beside_the_paper(
-    scenario: Scenario, case: str, stability: Stability, coupling: CouplingFigures
-) -> tuple[PaperRow, ...]:
+def beside_the_paper(scenario: Scenario, case: str, stability: Stability, coupling: Coupling) -> tuple[PaperRow, ...]:
     """Every figure that the paper prints, beside ours; empty for any loop but the paper's."""
     if scenario.varying_delay or scenario.loop(case) != load().loop(case):
         return ()
@@ -60,14 +59,14 @@ def beside_the_paper(
     return (figure,) if case == "none" else (*_printed_gains(scenario, case, coupling), _tau(case), figure)
 
 
-def _printed_gains(scenario: Scenario, case: str, got: CouplingFigures) -> tuple[PaperRow, ...]:
-    printed = PUBLISHED[case]
-    need = assess(scenario.loop(case), printed)
+def _printed_gains(scenario: Scenario, case: str, coupling: Coupling) -> tuple[PaperRow, ...]:
+    printed, gains_here = PUBLISHED[case], coupling.figures(scenario.T)
+    need = requirements_of(scenario.loop(case), printed)
     any_environment, this_environment = (need[name].required for name in ("any-environment", "this-environment"))
     gains = PaperRow(
         "gains [N/m], [N s/m]",
         f"K = {listed(printed.K, 5)}, B = {listed(printed.B, 5)}",
-        "none" if got.K is None else f"K = {listed(got.K, 5)}, B = {listed(got.B or (), 5)}",
+        f"K = {listed(gains_here['K'], 5)}, B = {listed(gains_here['B'], 5)}" if "K" in gains_here else "none",
         "the printed gains are no solution of the paper's own problem (next row)",
     )
     damping = PaperRow(
@@ -194,11 +193,18 @@ class VaryingDelays:
     certified: DelaysCovered = off_table("inlined")
 
     @classmethod
-    def of(cls, simulation: Simulation, chosen: Chosen, period: Period | None, ticks: int, certified: bool) -> Self:
+    def of(
+        cls,
+        simulation: Simulation,
+        assessment: Assessment,
+        on_file: DelayRange | None,
+        period: Period | None,
+        ticks: int,
+    ) -> Self:
         scenario = simulation.scenario
         assert scenario.varying_delay is not None
         met = _DelaysMet.of(simulation, period, ticks) if scenario.switches else None
-        return cls(DelaySpan.of(scenario.varying_delay), met, DelaysCovered.of(scenario, chosen, certified))
+        return cls(DelaySpan.of(scenario.varying_delay), met, DelaysCovered.of(scenario, assessment, on_file))
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,14 @@ from dataclasses import dataclass, replace
 
 from haptic_loop.controller.budget import BudgetFigures
 from haptic_loop.controller.lti import Array
+from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.certificate import named
 from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import ANY, CAVEATS, MAKING, EncoderSteps
-from haptic_loop.design.result import Requirement, listed
+from haptic_loop.design.guarantees import ANY, MAKING, EncoderSteps
+from haptic_loop.design.result import Chosen, listed
 from haptic_loop.design.robustness import Nearby
-from haptic_loop.design.transparency import Transparency, transparency
 from haptic_loop.sim import accuracy
 from haptic_loop.sim.api import ScenarioRun
-from haptic_loop.sim.couplings import Judged
 from haptic_loop.sim.passivity_layer import idle
 from haptic_loop.sim.report import (
     PaperRow,
@@ -60,10 +59,10 @@ class RunReport:
 
     case: str
     scenario: str
-    certificate: Requirement
-    judged: Judged = off_table("inlined")
+    kind: str  # of the coupling
+    chosen: Chosen = off_table("left out")
+    assessment: Assessment
     encoder: EncoderSteps | None
-    transparency: Transparency
     stability: Stability
     varying_delay: VaryingDelays | None = off_table()
     run: Ran
@@ -82,24 +81,25 @@ class RunReport:
 
     def notes(self) -> list[str]:
         """Remarks that explain the figures."""
-        lines, guarantee = [], self.judged.guarantee
-        certificates, part = self.judged.certificates, self.certificate
+        lines, guarantee = [], self.assessment.guarantee
+        certificates, part = self.assessment.requirements, self.assessment.decisive
+        transparency, where = self.assessment.transparency, guarantee and guarantee.environments
         if not part.certified and not part.reason:
-            source = named(self.judged.chosen.asked).source
+            source = named(self.chosen.asked).source
             condition = f"the {part.condition} condition" + (f" ({source})" if source else "")
-            what = "The loop without" if self.judged.coupling.kind == "none" else "This"
+            what = "The loop without" if self.kind == "none" else "This"
             needs = f"it needs {part.ratio:.3g} times the damping that the devices guarantee"
             lines.append(f"{what} coupling fails {condition}: {needs}.")
         if contact := self.stability.contact:
-            making = [r.condition for r in certificates.values() if r.certified and r.guarantee == guarantee]
-            covered = making[0] if making and guarantee in (ANY, MAKING) else "no certificate"
+            making = [r.condition for r in certificates.values() if r.certified and r.guarantee == where]
+            covered = making[0] if making and where in (ANY, MAKING) else "no certificate"
             softer = f", and any walls with K + 2 B/T up to {listed(contact.slopes_n_per_m)} N/m"
-            softer = softer if guarantee == MAKING else ""
+            softer = softer if where == MAKING else ""
             lines.append(f"Contact that makes and breaks: {covered} covers it in this loop{softer}.")
         reasons = {
             "stability": self.stability.reason,
             "error": self.error.reason,
-            "transparency": self.transparency.reason,
+            "transparency": transparency and transparency.reason,
             "credible": self.credible.reason,
             **{name: part.reason for name, part in certificates.items()},
         }
@@ -108,24 +108,23 @@ class RunReport:
             lines.append(f"Delays that vary: {self.varying_delay.certified.covers}.")
         if self.encoder:
             lines.append(f"{self.encoder.words[0].upper()}{self.encoder.words[1:]}.")
-        return [*lines, CAVEATS]
+        return lines
 
 
 def run_report(
     scenario: Scenario,
     case: str,
-    judged: Judged,
+    chosen: Chosen,
+    assessment: Assessment,
     run: ScenarioRun,
     environment: str,
-    band_hz: tuple[float, float],
     check: bool,
 ) -> RunReport:
     """The report of a run in the environment of this name; `check` runs another integrator beside it."""
-    simulation, trace, loop, chosen = run.simulation, run.trace, scenario.loop(case), judged.chosen
-    covered = any(requirement.certified for requirement in judged.certificates.values())
+    simulation, trace, loop, requirements = run.simulation, run.trace, scenario.loop(case), assessment.requirements
     delays, grows = None, None
     if simulation.scenario.varying_delay:
-        delays = VaryingDelays.of(simulation, chosen, run.period, trace.t.size, covered)
+        delays = VaryingDelays.of(simulation, assessment, chosen.switching, run.period, trace.t.size)
     if delays and delays.met:
         stability = switched_stability(simulation, trace, delays)
         grows = stability.verdict == "unstable"
@@ -133,22 +132,21 @@ def run_report(
         stability = stability_of(simulation, trace)
     net = trace.net.figures() if trace.net else None
     budget = net if isinstance(net, BudgetFigures) else None
-    felt = transparency(simulation.felt, simulation.E, loop.lam, band_hz)
     found = RunReport(
         case=case,
         scenario=scenario.name,
-        certificate=judged.certificates[chosen.condition],
-        judged=judged,
+        kind=chosen.kind,
+        chosen=chosen,
+        assessment=assessment,
         encoder=encoder_steps(scenario, case, chosen.coupling),
-        transparency=felt,
         stability=stability,
         varying_delay=delays,
         run=_ran(run, loop.lam, environment, check),
         error=accuracy.position_error(trace, run.exact, simulation, grows),
         credible=accuracy.credible(simulation, trace),
         ideal_force=accuracy.force_error(run.ran, trace, loop.lam),
-        energy_budget=budget and replace(budget, idle=idle(simulation, judged.certificates.values(), budget)),
-        remarks=(*run.remarks, *chosen.remarks(judged.certificates)),
+        energy_budget=budget and replace(budget, idle=idle(simulation, requirements.values(), budget)),
+        remarks=(*run.remarks, *chosen.remarks(requirements)),
     )
     return replace(found, remarks=(*found.remarks, *found.notes()))
 

@@ -16,7 +16,7 @@ from typing import Any, Self, get_args
 
 import msgspec
 import numpy as np
-from haptic_loop.controller.delay import Periods, Timing, VaryingDelay, drawn
+from haptic_loop.controller.delay import LOST, Periods, Timing, VaryingDelay, drawn
 from haptic_loop.controller.environment import (
     RIGID_WALL,
     Block,
@@ -151,6 +151,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def switches(self) -> bool:
         """Whether the delay of the forces is anything but the constant theta."""
         return self.varying_delay is not None and not self.varying_delay.steady
+
+    @property
+    def loses_packets(self) -> bool:
+        """Whether packets may be lost, so that forces may become older than `delay_range`."""
+        varying = self.varying_delay
+        return varying is not None and (varying.loss > 0 or any(LOST in row for row in varying.recorded))
 
     @property
     def delay_range(self) -> DelayRange:

@@ -18,13 +18,15 @@ from functools import cache
 from itertools import product
 
 import numpy as np
-from haptic_loop.controller.delay import LOST, Ticks, Timing, VaryingDelay, realising
+from haptic_loop.controller.delay import Ticks, Timing, VaryingDelay, realising
 from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.coverage import Switching
+from haptic_loop.design.environments import SWITCHING
 from haptic_loop.design.files import off_table
-from haptic_loop.design.result import Chosen, switching_guarantee
+from haptic_loop.design.result import switching_guarantee
 from haptic_loop.models.hold import HeldPlant, hold
 from haptic_loop.models.scene import Scene, Variants
 from haptic_loop.sim.engines import Engine, ExactEngine, ExactTimedEngine
@@ -260,8 +262,10 @@ class DelaysCovered:
     on_file: DelayRange | None = None
 
     @classmethod
-    def of(cls, scenario: Scenario, chosen: Chosen, certified: bool) -> DelaysCovered:
-        """`certified` is about the constant theta."""
+    def of(cls, scenario: Scenario, assessment: Assessment, on_file: DelayRange | None = None) -> DelaysCovered:
+        """`on_file` is the range of delays within which the coupling's file proves any switching."""
+        constant_delays = (need for name, need in assessment.requirements.items() if name != SWITCHING.name)
+        certified = any(need.certified for need in constant_delays)
         varying, span = scenario.varying_delay, scenario.delay_range
         assert varying is not None
         constants = "certificates are about constant delays"
@@ -271,9 +275,9 @@ class DelaysCovered:
             text = "the delay is constant after all (theta): the certificates cover it"
             return cls(certified, text if certified else constants)
         loop = scenario.loop("I").switching(span)  # the case does not matter to stability
-        on_file = chosen.switching if chosen.switching and chosen.switching.contains(span) else None
-        figures = Switching.of(loop, chosen.coupling)
-        lossy = varying.loss > 0 or any(LOST in row for row in varying.recorded)
+        on_file = on_file if on_file and on_file.contains(span) else None
+        figures = Switching.of(loop, assessment.coupling, assessment.requirements.get(SWITCHING.name))
+        lossy = scenario.loses_packets
         if proof := _how_proved(figures, on_file):
             what = "any switching of the delays within their range is covered"
             losses = ", but a lost packet makes a force older than hi, which is not" if lossy else ""

@@ -20,10 +20,8 @@ from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.environment import Block, Network
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import Net, Process
-from haptic_loop.design.certificate import assess
+from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import InputError
-from haptic_loop.design.guarantees import ANY
-from haptic_loop.design.result import Requirement
 from haptic_loop.sim.run import Simulation
 from haptic_loop.sim.scenario import Scenario
 
@@ -70,18 +68,12 @@ class Claim:
     words: str
 
     @classmethod
-    def of(cls, scenario: Scenario, requirements: Sequence[Requirement], start: float) -> Claim:
-        """The claim of a coupling with these requirements, in this scenario, with W0 = `start` [J]."""
-        reason = _uncovered(scenario)
-        if reason is None:
-            anywhere = [need for need in requirements if need.guarantee == ANY]
-            if not anywhere:
-                reason = "the coupling is not judged for any environment"
-            elif not any(need.certified for need in anywhere):
-                reason = f"the coupling is not certified for any environment: {anywhere[0].shortfall}"
-        if reason:
-            return cls(False, f"No guarantee: {reason}.")
-        energy = f"W0 = {_energy(start)}"
+    def of(cls, assessment: Assessment) -> Claim:
+        """The claim of a run in a world, from the assessment of exactly this run."""
+        guarantee = assessment.guarantee
+        if guarantee is None or guarantee.energy_J is None:
+            return cls(False, f"No guarantee: {assessment.reason}.")
+        energy = f"W0 = {_energy(guarantee.energy_J)}"
         return cls(
             True,
             f"Whatever this scene does, no passive hand is given more than {energy} beyond what gravity and springs "
@@ -93,17 +85,6 @@ def _energy(joules: float) -> str:
     return f"{1e3 * joules:g} mJ"
 
 
-def _uncovered(scenario: Scenario) -> str | None:
-    """Why the account proves nothing in this scenario, whatever the coupling."""
-    if any(device.encoder_step for device in scenario.device):
-        return "the devices have encoder steps, and the account needs exact positions"
-    if scenario.switches:
-        return "the delays of the forces vary, and the certificate is for constant delays"
-    if any(scenario.psi):
-        return "psi is not 0"
-    return None
-
-
 # ----------------------------------------------------------------------------------------------------
 # The scene behind a coupling
 
@@ -111,11 +92,6 @@ def _uncovered(scenario: Scenario) -> str | None:
 def is_world(scenario: Scenario) -> bool:
     """Whether the scenario's environment is a MuJoCo scene."""
     return scenario.environment.world is not None
-
-
-def world_requirements(scenario: Scenario, coupling: Coupling) -> list[Requirement]:
-    """What each condition asks of the devices; those on this environment say nothing of a world."""
-    return list(assess(scenario.loop("I"), coupling).values())
 
 
 def require_no_world(scenario: Scenario, what: str) -> None:

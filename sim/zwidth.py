@@ -26,10 +26,10 @@ from haptic_loop.controller.law import Law, Limiter
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import Process
+from haptic_loop.design.assessment import covered_limits
 from haptic_loop.design.audit import check_loop, edge
 from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.coverage import covered_limits
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.guarantees import ANY
 from haptic_loop.design.result import CONDITIONS, Requirement, refusal

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 from haptic_loop.controller.environment import RIGID_WALL, Network
 from haptic_loop.controller.lti import Array
-from haptic_loop.design.coverage import Limits, RangesFigures
+from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table, write
 from haptic_loop.design.guarantees import CAVEATS
-from haptic_loop.design.result import Requirement
-from haptic_loop.sim.couplings import CouplingFigures, Judged
+from haptic_loop.design.result import Chosen, Requirement
 from haptic_loop.sim.limit_cycles import UNDECIDED, Plan
 from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import MARGINAL
@@ -100,29 +99,19 @@ class _ContactSpring:
 
 
 @dataclass(frozen=True, eq=False)
-class _DesignedFor:
-    """Where a fixed coupling was designed, and what is guaranteed of it there."""
-
-    contact_springs: list[_ContactSpring]
-    certificates: dict[str, Requirement]
-    guarantee: str | None = off_table()
-    ranges: RangesFigures | None = off_table()
-
-
-@dataclass(frozen=True, eq=False)
 class FixedCoupling:
     """The coupling of a map over environments."""
 
-    coupling: CouplingFigures
-    designed_for: _DesignedFor
-    limiter: Limits
+    kind: str
+    contact_springs: list[_ContactSpring]  # of the environment that it was designed for
+    assessment: Assessment  # in that environment
     remarks: tuple[str, ...]
 
     @classmethod
-    def of(cls, judged: Judged, network: Network, remarks: tuple[str, ...]) -> FixedCoupling:
+    def of(cls, chosen: Chosen, assessment: Assessment, network: Network, remarks: tuple[str, ...]) -> FixedCoupling:
+        """Describe a coupling with its assessment in the environment that it was designed for."""
         springs = [_ContactSpring(s.between, s.stiffness, s.damping) for s in contact_springs(network)]
-        there = _DesignedFor(springs, judged.certificates, judged.guarantee, judged.ranges)
-        return cls(judged.coupling, there, judged.limiter, remarks)
+        return cls(chosen.kind, springs, assessment, remarks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +194,6 @@ class MapReport:
     interrupted: bool
     wall_s: dict[str, float]
     axes: str  # coupling or environment: whose K and B they are
-    coupling: CouplingFigures | None
     ratios: dict[str, _Ratio] = off_table("inlined")
     fixed: FixedCoupling | None = off_table("inlined")  # of a map over environments
     error: dict[str, MapError | None] | None = off_table("if given")
@@ -249,7 +237,6 @@ class MapReport:
             drawn.interrupted,
             drawn.seconds,
             "environment" if fixed else "coupling",
-            fixed and fixed.coupling,
             ratios,
             fixed,
             {name: map_error(sweep, drawn, name) for name in drawn.ratio} if whole else None,

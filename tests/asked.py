@@ -83,3 +83,20 @@ def limiter_demand(G, theta, delta, rho, c, T_max=None):
 def limiter(G, theta, delta, rho, c=None, lags=1, T_max=None):
     flat = None if c is None else [v for row in c for v in row]
     return _lagging(rho, len(c[0]) if c else lags).required_of(G, loop(G.T, delta, theta, T_max=T_max), flat)
+
+
+def decisive(report):
+    """The requirement of the condition that must hold, of a command's JSON."""
+    assessment = report["assessment"]
+    return assessment["requirements"][assessment["condition"]]
+
+
+def needs(report, condition):
+    """The requirement of a condition, of a command's JSON."""
+    return report["assessment"]["requirements"][condition]
+
+
+def safe_with(report):
+    """The environments of the guarantee, of a command's JSON; None where there is no guarantee."""
+    guarantee = report["assessment"]["guarantee"]
+    return guarantee and guarantee["environments"]

@@ -32,15 +32,15 @@ def share_designs(folder: Path, patch=setattr) -> None:
     own are judged. What makes them, design.designs and the modules behind it, is as it was.
     """
     import haptic_loop.cli.design
-    from haptic_loop.design import api, bound, coverage, designs, optimal
-    from haptic_loop.sim import alternatives, couplings
+    from haptic_loop.design import api, assessment, bound, designs, optimal
+    from haptic_loop.sim import couplings
 
     for made, modules in (
         (designs.design_by_kind, (haptic_loop.cli.design, api, couplings)),
         (bound.bound, (bound,)),
         (optimal.spread, (optimal,)),
-        (coverage.required_damping, (coverage,)),
-        (alternatives.assess, (alternatives,)),
+        (assessment.required_damping, (assessment,)),
+        (assessment.requirements_of, (assessment,)),
         (api.instead, (api,)),
     ):
         for module in modules:

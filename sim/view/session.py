@@ -24,15 +24,13 @@ from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.tick import StepBuffer
-from haptic_loop.design.certificate import assess
+from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.coverage import Limits
 from haptic_loop.design.designs import KINDS, name_and_own
-from haptic_loop.design.guarantees import guarantee_of
-from haptic_loop.design.result import Chosen, DesignFailed, Requirement
+from haptic_loop.design.result import Chosen, DesignFailed
 from haptic_loop.models.hold import HeldPlant, hold
 from haptic_loop.models.scene import Plant, Scene
-from haptic_loop.sim.couplings import NAMES, choose, limits_of
+from haptic_loop.sim.couplings import NAMES, assessed, choose
 from haptic_loop.sim.engines import ExactEngine
 from haptic_loop.sim.run import Simulation, assemble, outside_forces, run_block
 from haptic_loop.sim.scenario import LONGEST_DELAY, InputError, Scenario
@@ -171,9 +169,7 @@ class PreparedLoop:
     chosen: Chosen
     simulation: Simulation
     mode: Mode  # of the exact linear loop; before walls, of the worst contact state
-    requirements: dict[str, Requirement]
-    guarantee: str | None
-    limits: Limits
+    assessment: Assessment
 
     @property
     def scenario(self) -> Scenario:
@@ -212,11 +208,10 @@ def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
 
 
 def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> PreparedLoop:
-    loop = scenario.loop(menu.case)
-    requirements = assess(loop, chosen.coupling, own=chosen.own)
-    limits = limits_of(scenario, chosen, requirements, menu.limiter)
-    simulation, guarantee = assemble(scenario, chosen.coupling, limits.rho), guarantee_of(requirements, loop)
-    return PreparedLoop(menu, label, chosen, simulation, worst_mode(simulation), requirements, guarantee, limits)
+    alone = scenario.replace(ranges=None) if scenario.ranges else scenario  # only the nominal environment runs
+    assessment = assessed(alone, menu.case, chosen, limiter=menu.limiter)
+    simulation = assemble(scenario, chosen.coupling, assessment.force_limits.rho)
+    return PreparedLoop(menu, label, chosen, simulation, worst_mode(simulation), assessment)
 
 
 # ----------------------------------------------------------------------------------------------------

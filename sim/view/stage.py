@@ -111,7 +111,7 @@ def _overlay(frame: Frame, live: bool) -> _Lines:
         ("coupling", prepared.label),
         ("delays", delays),
         ("growth", f"{mode.growth:+.3g} 1/s at {mode.frequency_hz:.1f} Hz: {mode.verdict}"),
-        *((name.replace("-", " "), _needs(need)) for name, need in prepared.requirements.items()),
+        *((name.replace("-", " "), _needs(need)) for name, need in prepared.assessment.requirements.items()),
         ("force limits", _limited(prepared)),
         ("largest force", f"{np.abs(frame.history).max():.2f} N in {HISTORY:g} s, {frame.clipped} ticks at the limit"),
     ]
@@ -129,7 +129,10 @@ def _overlay(frame: Frame, live: bool) -> _Lines:
 
 def _limited(prepared: PreparedLoop) -> str:
     """Whether a guarantee holds at the force limits."""
-    return "clipped: not covered" if prepared.limits.rho is None else "limited: the guarantee holds there too"
+    assessment = prepared.assessment
+    if assessment.guarantee is None:
+        return "no guarantee"
+    return "clipped: not covered" if assessment.force_limits.rho is None else "limited: the guarantee holds there too"
 
 
 def _needs(requirement: Requirement) -> str:

@@ -22,7 +22,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from haptic_loop.sim.accuracy import position_error, simulated_growth
-from haptic_loop.sim.couplings import choose, limits_of
+from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.engines import EXPONENTIAL
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.stability import exact_growth
@@ -45,7 +45,7 @@ def engines() -> Iterator[Sequence[str]]:
     """The default design with its limiter; goals: 3 x as fast as RK4 x 4, loop over raw 1.10, growth 1e-9 1/s."""
     scenario = SCENES["default"]
     chosen = choose(scenario, "I", "spring-damper", "this-environment")
-    simulation = assemble(scenario, chosen.coupling, limits_of(scenario, chosen).rho)
+    simulation = assemble(scenario, chosen.coupling, assessed(scenario, "I", chosen).force_limits.rho)
     exact = looped(simulation, "exact")
     rows = {"exact": ("exact", None, None), "exponential x 1": (EXPONENTIAL, 1), "RK4 x 4": ("RK4", 4)}
     settings = {name: ("exact", None, None) if name == "exact" else ("mujoco", *row) for name, row in rows.items()}

@@ -8,7 +8,7 @@ from haptic_loop.controller.coupling import PUBLISHED
 from haptic_loop.design import fixed_order as ccl
 from haptic_loop.design import optimal, spring_damper
 from haptic_loop.design.audit import audit
-from haptic_loop.design.certificate import assess, prove, verify
+from haptic_loop.design.certificate import prove, requirements_of, verify
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.program import LADDER, Options
 from haptic_loop.design.transparency import decibels
@@ -47,7 +47,7 @@ def test_optimal(benchmark, case, name):
 
 def test_both_margins_and_their_proofs(benchmark):
     coupling = spring_damper.design(LOOP).coupling
-    requirements = benchmark.pedantic(lambda: assess(LOOP, coupling), rounds=5, warmup_rounds=1)
+    requirements = benchmark.pedantic(lambda: requirements_of(LOOP, coupling), rounds=5, warmup_rounds=1)
     print(f"\nboth conditions, swept and proved: {[r.proof for r in requirements.values()]}")
     assert all(r.proof == "rational" for r in requirements.values())
 
@@ -60,7 +60,7 @@ def test_a_stored_proof_is_checked_again(benchmark):
 
 
 def test_a_refusal(benchmark):
-    requirements = benchmark.pedantic(lambda: assess(LOOP, PUBLISHED["I"]), rounds=5, warmup_rounds=1)
+    requirements = benchmark.pedantic(lambda: requirements_of(LOOP, PUBLISHED["I"]), rounds=5, warmup_rounds=1)
     print(f"\npublished gains refused: any-environment needs {requirements['any-environment'].required}")
     assert not any(r.certified for r in requirements.values())
 

@@ -11,6 +11,7 @@ from haptic_loop.design.files import InputError
 from haptic_loop.hw.control import SafetyStop, certified_coupling
 
 from haptic_loop import certify, design_coupling, load
+from tests.asked import decisive
 
 PAGE = (Path(__file__).parents[2] / "docs/architecture.md").read_text()
 NAME, OWN = "joined-devices", "joined_devices.py:JoinedDevices"
@@ -36,12 +37,12 @@ def run(command: str, *words: str) -> int:
 
 def test_a_design_for_it_is_proved_and_uses_nearly_all_that_it_allows(folder):
     report = json.loads((folder / "design.json").read_text())
-    needs = report["certificates"][NAME]
-    assert report["certificate"] == needs
+    needs = report["assessment"]["requirements"][NAME]
+    assert decisive(report) == needs
     assert (needs["proof"], report["stored"]["proof"]) == ("rational", "rational")
     assert 1.36 < max(needs["required_damping"]) < 1.37
     # the devices' joint damping is a full matrix: its least eigenvalue is .2 less, its largest .2 more
-    here = max(report["certificates"]["this-environment"]["required_damping"])
+    here = max(report["assessment"]["requirements"]["this-environment"]["required_damping"])
     assert 1.37 * here / 1.57 < max(needs["required_damping"]) < 1.37 * here / 1.17
     assert "yours to show" in report["claim"]
 
@@ -81,7 +82,7 @@ def test_an_audit_is_decided_by_the_condition_that_is_asked_for(folder, monkeypa
         import_module("haptic_loop.cli.audit").main(["--coupling", "joined.json", "--condition", "any-environment"])
         == 1
     )
-    assert "not certified, only for this environment" in " ".join(capsys.readouterr().out.split())
+    assert "Not certified by any-environment" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_file_says_so_where_its_condition_is_not_given(folder, monkeypatch):
@@ -91,7 +92,7 @@ def test_a_file_says_so_where_its_condition_is_not_given(folder, monkeypatch):
     words = ["--coupling", "joined.json", "--duration", ".1", "--no-plot", *JSON]
     assert import_module("haptic_loop.cli.run").main(words) == 0
     report = json.loads(Path("report.json").read_text())
-    assert report["certificate"]["condition"] == "this-environment"
+    assert report["assessment"]["condition"] == "this-environment"
     assert any("condition is 'joined-devices'" in remark for remark in report["remarks"])
 
 

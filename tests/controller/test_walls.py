@@ -17,7 +17,7 @@ from haptic_loop.controller.law import Law
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.controller.tick import Process
 from haptic_loop.design.audit import audit, requirement
-from haptic_loop.design.certificate import assess, prove
+from haptic_loop.design.certificate import prove, requirements_of
 from haptic_loop.design.guarantees import MAKING
 from haptic_loop.models.device import CompliantDevice
 from haptic_loop.models.hold import hold
@@ -28,6 +28,8 @@ from haptic_loop.sim.run import assemble, run, run_blocks
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load, parse
 from scipy.optimize import brentq
 from worlds import FIGURE_4, SOFT, force_map, loop_of
+
+from tests.asked import needs, safe_with
 
 T = 1e-3
 WALL = ("tip", GROUND)
@@ -191,7 +193,7 @@ def test_random_hands_on_walls_come_to_rest_under_any_environment(name, humans, 
     The speed falls from the first quarter to the last in every run, though contact is made thousands of times.
     """
     scenario = boxed(load())
-    assert assess(scenario.loop("I"), SOFT)["any-environment"].certified
+    assert requirements_of(scenario.loop("I"), SOFT)["any-environment"].certified
     loop = assemble(scenario, SOFT)
     ((_, crowd),) = crowds(Population(damping=(0.3, 30.0)), 2, 0, range(humans), 1)
     sets = variants(scenario.device, crowd)
@@ -236,23 +238,23 @@ def test_a_run_reports_the_contact_and_who_covers_it(tmp_path):
         return json.loads((tmp_path / "r.json").read_text())
 
     soft, bare = run(), run("--case", "none")
-    assert soft["guarantee"] == "any passive environment"
+    assert safe_with(soft) == "any passive environment"
     assert any("any-environment covers it" in line for line in soft["remarks"])
     assert soft["stability"]["contact"]["made"] == 2
     assert [state["touching"] for state in soft["stability"]["contact"]["frozen"]] == [[], [1]]
     assert soft["stability"]["growth_rate_per_s"] is None
     assert "contact was made 2 times" in soft["stability"]["reason"]
     # f = p/z, y = x: the block is positive if D g/k >= |1 + g + 1/z|^2/4 with k = K + 2 B/T, at best with g = 2
-    needed = bare["certificates"]["this-environment"]["required_damping"]
+    needed = needs(bare, "this-environment")["required_damping"]
     assert needed == pytest.approx([2 * (3000.0 * 1e-3 + 2 * 2.0)], rel=1e-6)
-    assert bare["guarantee"] is None
+    assert bare["assessment"]["guarantee"] is None
     assert any("no certificate covers it" in line for line in bare["remarks"])
 
 
 def test_this_environment_is_asked_of_every_frozen_state():
     """Two walls make four linear loops: switching between them asks more than each, recomputed here."""
     loop = boxed(load()).loop("I")
-    requirement = assess(loop, SOFT)["this-environment"]
+    requirement = requirements_of(loop, SOFT)["this-environment"]
     singles = [
         this_environment(
             force_map(environment(held(loop.environment, state), loop.T), SOFT, (1, 2), (0, 0)), loop.delta
@@ -264,7 +266,7 @@ def test_this_environment_is_asked_of_every_frozen_state():
     assert requirement.proof == "rational"
     assert prove(loop, SOFT, "any-environment").guarantee == "any passive environment"
     late = boxed(load()).replace(psi=(1, 0)).loop("I")
-    assert "no walls" in (assess(late, SOFT)["any-environment"].reason or "")
+    assert "no walls" in (requirements_of(late, SOFT)["any-environment"].reason or "")
 
 
 def test_a_stiffer_coupling_is_promised_for_walls_that_make_and_break():
@@ -273,7 +275,7 @@ def test_a_stiffer_coupling_is_promised_for_walls_that_make_and_break():
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
     assert requirement(loop, coupling, "this-environment").certified
     assert not requirement(loop, coupling, "any-environment").certified
-    assert audit(loop, coupling).guarantee == MAKING
+    assert audit(loop, coupling).assessment.guarantee.environments == MAKING
     stiff = SpringDamper([1772.0], [0.453])
     assert not requirement(loop, stiff, "this-environment").certified
     assert all(this_environment(state.F(stiff), loop.delta).certified for state in loop.frozen())

@@ -16,10 +16,13 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.ranges import Ranges
 from haptic_loop.design import budgets, certificate, coupling_file
 from haptic_loop.design.api import certify
+from haptic_loop.design.assessment import assess
 from haptic_loop.design.audit import MOST_EXTRA_SAMPLES, audit, edge, remedies, requirement, sensitivity, stiffest
 from haptic_loop.design.files import plain
-from haptic_loop.design.guarantees import ANY, CAVEATS, guarantee_of
+from haptic_loop.design.guarantees import ANY, CAVEATS
 from worlds import FIGURE_4, PAIR, SOFT
+
+from tests.asked import needs, safe_with
 
 CONDITIONS = ("this-environment", "any-environment")
 T = 1.2e-3
@@ -82,7 +85,8 @@ def test_a_coupling_before_a_rigid_wall_is_proved_and_stored_like_any_other(thet
     needs = certify(loop, coupling)
     assert needs["this-environment"].required[0] == pytest.approx((theta + 0.5) * 1000 * 1e-3)
     assert needs["this-environment"].proof == ("rational" if proved else "sampled")
-    assert guarantee_of(needs, loop) == ((ANY if theta == 0 else "a rigid wall only") if proved else None)
+    held = assess(loop, coupling).guarantee
+    assert (held and held.environments) == ((ANY if theta == 0 else "a rigid wall only") if proved else None)
     if proved:
         made = certificate.prove(loop, coupling, "this-environment")
         coupling_file.save(coupling_file.Stored.of(loop, coupling, made), tmp_path / "wall.json")
@@ -123,20 +127,20 @@ def test_the_largest_period_before_a_wall_is_colgates():
 
 def test_the_papers_gains_and_their_figures():
     outcome = report(*pair(PUBLISHED["I"]))
-    assert outcome["this-environment"]["required_damping"] == pytest.approx([1.39871] * 2, rel=1e-5)
-    assert outcome["any-environment"]["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
-    assert not outcome["certified"]
-    assert outcome["guarantee"] is None
-    assert outcome["any-environment"]["stiffest"]["K"] == [None, None]
-    assert "B = 5.47 N s/m alone uses up delta = 1.37" in outcome["any-environment"]["stiffest"]["reason"]
+    assert needs(outcome, "this-environment")["required_damping"] == pytest.approx([1.39871] * 2, rel=1e-5)
+    assert needs(outcome, "any-environment")["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
+    assert not outcome["assessment"]["holds"]
+    assert outcome["assessment"]["guarantee"] is None
+    assert outcome["margins"]["any-environment"]["stiffest"]["K"] == [None, None]
+    assert "B = 5.47 N s/m alone uses up delta = 1.37" in outcome["margins"]["any-environment"]["stiffest"]["reason"]
 
 
 def test_the_any_environment_gains_as_the_literature_rounds_them():
     """(879, 552) / (.39, .52) are 0.02 % beyond Theorem 4, and far inside the this-environment condition."""
     outcome = report(*pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
-    assert outcome["this-environment"]["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
-    assert outcome["any-environment"]["required_damping"] == pytest.approx([1.37026, 1.37015], abs=1e-5)
-    assert outcome["guarantee"] == "this environment"
+    assert needs(outcome, "this-environment")["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
+    assert needs(outcome, "any-environment")["required_damping"] == pytest.approx([1.37026, 1.37015], abs=1e-5)
+    assert safe_with(outcome) == "this environment"
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
@@ -202,24 +206,26 @@ def test_a_delayed_environment_needs_a_multiplier_that_the_default_scenario_has_
 def test_any_coupling_can_be_audited():
     V = SAFE.compliance(T)
     general, structured = report(*pair(Compliance(V))), report(*pair(SAFE))
-    assert general["this-environment"]["required_damping"] == pytest.approx(
-        structured["this-environment"]["required_damping"]
+    assert needs(general, "this-environment")["required_damping"] == pytest.approx(
+        needs(structured, "this-environment")["required_damping"]
     )
-    assert general["any-environment"]["margin"] == pytest.approx(structured["any-environment"]["margin"], rel=1e-6)
-    assert general["coupling"]["kind"] == "compliance"
-    assert "only a spring-damper" in general["any-environment"]["stiffest"]["reason"]
+    assert needs(general, "any-environment")["required_share"] == pytest.approx(
+        needs(structured, "any-environment")["required_share"], rel=1e-6
+    )
+    assert general["assessment"]["coupling"]["kind"] == "compliance"
+    assert "only a spring-damper" in general["margins"]["any-environment"]["stiffest"]["reason"]
     nothing = report(*pair(NoCoupling()))
-    assert nothing["this-environment"]["required_damping"] == pytest.approx([1.7229] * 2, rel=3e-5)
-    assert nothing["any-environment"]["required_damping"] == [None, None]
-    assert "without a coupling" in nothing["any-environment"]["reason"]
+    assert needs(nothing, "this-environment")["required_damping"] == pytest.approx([1.7229] * 2, rel=3e-5)
+    assert needs(nothing, "any-environment")["required_damping"] == [None, None]
+    assert "without a coupling" in needs(nothing, "any-environment")["reason"]
 
 
 def test_promises():
-    assert report(*pair(SAFE))["guarantee"] == "any passive environment"
-    assert report(*pair(SpringDamper([2000.0, 2000.0], [0.2, 0.2])))["guarantee"] == "this environment"
-    assert report(*wall(5000, 0))["guarantee"] is None
-    assert report(*wall(900, 0.2, 1))["guarantee"] == "any passive environment"
-    assert report(*wall(900, 0, 1))["guarantee"] == "a rigid wall only"
+    assert safe_with(report(*pair(SAFE))) == "any passive environment"
+    assert safe_with(report(*pair(SpringDamper([2000.0, 2000.0], [0.2, 0.2])))) == "this environment"
+    assert report(*wall(5000, 0))["assessment"]["guarantee"] is None
+    assert safe_with(report(*wall(900, 0.2, 1))) == "any passive environment"
+    assert safe_with(report(*wall(900, 0, 1))) == "a rigid wall only"
 
 
 def test_edge_takes_the_certified_side():
@@ -247,28 +253,28 @@ def test_edge_takes_the_certified_side():
     ],
 )
 def test_the_command(run, argv, code, required):
-    exit_code, out, err = run(*argv, "--json", "-")
+    exit_code, out, err = run(*argv, "--details", "--json", "-")
     outcome = strict(out)
     assert exit_code == code
-    assert outcome["certified"] == (code == 0)
+    assert outcome["assessment"]["holds"] == (code == 0)
     if required:
-        assert outcome["this-environment"]["required_damping"][0] == pytest.approx(required, rel=3e-5)
-    assert set(outcome) >= {"any-environment", "this-environment", "guarantee", "helps", "not_covered", "wall_s"}
+        assert needs(outcome, "this-environment")["required_damping"][0] == pytest.approx(required, rel=3e-5)
+    assert set(outcome) >= {"assessment", "margins", "helps", "not_covered", "wall_s"}
     assert outcome["not_covered"] == CAVEATS
-    assert "certified" in err
+    assert ("Stable" if code == 0 else "Not certified") in err
     assert "not for periods longer than the loop's T_max" in " ".join(err.split())
 
 
 def test_the_report_is_kept(run, tmp_path):
     assert run("--rigid", "--K", "100", "--B", "0", "--theta", "0", "--out", "here")[0] == 0
-    assert strict((tmp_path / "here" / "report.json").read_text())["guarantee"] == "any passive environment"
+    assert safe_with(strict((tmp_path / "here" / "report.json").read_text())) == "any passive environment"
 
 
 def test_gains_of_a_device_name_their_source(run):
     outcome = strict(run("--device", "omega.3", "--json", "-")[1])
     assert outcome["device"]["name"] == "omega.3"
     assert "CDeltaDevices.cpp" in outcome["gains"]
-    assert (outcome["loop"]["T_s"], outcome["loop"]["theta"]) == (1e-3, [0])
+    assert (outcome["assessment"]["loop"]["T_s"], outcome["assessment"]["loop"]["theta"]) == (1e-3, [0])
 
 
 @pytest.fixture
@@ -287,10 +293,10 @@ def test_stored_couplings(run):
     for name in ("gains.json", "space.json"):
         code, out, _ = run("--coupling", name, "--json", "-")
         assert code == 0
-        assert strict(out)["guarantee"] == "any passive environment"
+        assert safe_with(strict(out)) == "any passive environment"
     code, out, _ = run("--coupling", "unstable.json", "--json", "-")
     assert code == 1
-    assert "unit circle" in strict(out)["any-environment"]["reason"]
+    assert "unit circle" in needs(strict(out), "any-environment")["reason"]
     assert run("--coupling", "gains.json", "--T", "1e-3")[0] == 0
 
 
@@ -382,13 +388,14 @@ def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):
 def test_what_would_take_minutes_is_not_begun_and_what_does_is_given_up(monkeypatch):
     """A sweep of the pair is estimated at .16 ms, a search at sixty times that."""
     monkeypatch.setattr(budgets, "SWEEPS", 5e-3)
-    part = report(PAIR, SOFT)["this-environment"]
-    assert part["certified"]
+    told = report(PAIR, SOFT)
+    part, need = told["margins"]["this-environment"], needs(told, "this-environment")
+    assert need["certified"]
     assert part["stiffest"]["reason"].startswith("not searched: some 60 sweeps over 8 states and 2 channels would take")
-    assert part["sensitivity"]["least_delta"] == part["required_damping"]
+    assert part["sensitivity"]["least_delta"] == need["required_damping"]
     monkeypatch.setattr("haptic_loop.design.audit.too_long", lambda *_: None)
     monkeypatch.setattr(budgets, "SWEEPS", 1e-3)
-    part = report(PAIR, SOFT)["this-environment"]
+    part = report(PAIR, SOFT)["margins"]["this-environment"]
     assert part["stiffest"] == {
         "K": [None, None],
         "reason": "a search by sweeps was given up after the work of 0.001 s: these are many states or channels",

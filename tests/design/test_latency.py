@@ -12,7 +12,7 @@ from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti, Sampled, hstack, vstack
 from haptic_loop.design.api import design_coupling, transparency_of
-from haptic_loop.design.certificate import assess, prove, required_damping, verify
+from haptic_loop.design.certificate import prove, required_damping, requirements_of, verify
 from haptic_loop.design.conditions import Condition, Demand, least_scale
 from haptic_loop.design.coupling_file import Stored, load, save, sealed
 from haptic_loop.design.environments import THIS_ENVIRONMENT, ThisEnvironment
@@ -98,7 +98,7 @@ def test_it_is_proved_stored_and_verified(latency, longest):
 
 def test_where_it_is_not_derived_it_is_refused():
     loop = change(PAIR, latency=((0.0, TAU),) * 2)
-    judged = assess(loop, SOFT)
+    judged = requirements_of(loop, SOFT)
     assert judged["this-environment"].proof == "rational"
     assert judged["any-environment"].reason == LATE
     with pytest.raises(NotProved, match="count it as a whole sample"):
@@ -153,7 +153,7 @@ def test_a_design_for_late_forces_uses_the_damping_and_beats_a_whole_sample():
     loop = change(PAIR, latency=((0.0, TAU),) * 2)
     found = design_coupling(loop, "spring-damper", "this-environment")
     assert 0.99 < found.requirement.ratio < 1
-    assert assess(loop, found.coupling)["this-environment"].proof == "rational"
+    assert requirements_of(loop, found.coupling)["this-environment"].proof == "rational"
     whole = design_coupling(change(PAIR, theta=(1, 2)), "spring-damper", "this-environment")
     assert transparency_of(loop, found).rms_mismatch_db < transparency_of(loop, whole).rms_mismatch_db - 1
     with pytest.raises(ValueError, match="latency"):

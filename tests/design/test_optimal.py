@@ -628,7 +628,7 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     options = ["--best", "--scenario", str(scenario), "--out", str(tmp_path / "c.json")]
     assert main([*options, "--json", str(report)]) == 0
     found, text = json.loads(report.read_text()), " ".join(capsys.readouterr().out.split())
-    assert found["bound"]["rms_mismatch_db"] < found["transparency"]["rms_mismatch_db"]
+    assert found["bound"]["rms_mismatch_db"] < found["assessment"]["transparency"]["rms_mismatch_db"]
     assert found["rendered_stiffness"] > 0.5
     assert found["robustness"]["required_over_available"] > 1
     assert found["ladder"][-1]["mismatch_db"] <= found["ladder"][0]["mismatch_db"]

@@ -10,7 +10,7 @@ from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import constant_like
-from haptic_loop.design.certificate import assess, prove, required_damping, verify
+from haptic_loop.design.certificate import prove, required_damping, requirements_of, verify
 from haptic_loop.design.conditions import Condition, this_environment_demand
 from haptic_loop.design.coupling_file import Stored, save, sealed
 from haptic_loop.design.environments import LimitedForces, Multiplied, Unknowns
@@ -69,7 +69,7 @@ def test_a_proof_with_a_multiplier_without_entries_is_verified():
 
 def test_what_exact_arithmetic_contradicts_is_not_certified():
     assert required_damping(PAIR, STIFF, Contradicting()).certified
-    found = assess(PAIR, STIFF, own=Contradicting())["contradicting"]
+    found = requirements_of(PAIR, STIFF, own=Contradicting())["contradicting"]
     assert not found.certified
     assert "violated at" in (found.reason or "")
     assert found.required == (np.inf, np.inf)

@@ -10,13 +10,12 @@ from haptic_loop.controller.coupling import Compliance, Coupling, SpringDamper
 from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Lti, as_like, constant_like, numbers, taps
 from haptic_loop.design import compare
-from haptic_loop.design.certificate import assess, lag, prove, required_damping, verify
+from haptic_loop.design.assessment import assess, covered_limits
+from haptic_loop.design.certificate import lag, prove, required_damping, requirements_of, verify
 from haptic_loop.design.conditions import BEYOND, Condition, Demand
 from haptic_loop.design.coupling_file import Stored, filed, sealed
-from haptic_loop.design.coverage import covered_limits
 from haptic_loop.design.environments import SWITCHING, SwitchingDelays
 from haptic_loop.design.files import InputError
-from haptic_loop.design.guarantees import guarantee_of
 from haptic_loop.design.result import NotProved
 from haptic_loop.sim.zwidth import CouplingSweep, EnvironmentSweep
 
@@ -162,12 +161,12 @@ class Anywhere(Plain):
 
 def test_what_it_says_of_environments_is_said_and_what_limits_are_proved_for_too():
     stiff, own = SpringDamper([2000.0, 1500.0], [0.2, 0.2]), Anywhere()
-    needs = assess(PAIR, stiff, own=own)
-    assert guarantee_of(needs, PAIR) == "any passive environment"
+    needs = requirements_of(PAIR, stiff, own=own)
+    assert assess(PAIR, stiff, condition=own).guarantee.any_environment
     assert not needs["any-environment"].certified
     assert covered_limits(PAIR, stiff, needs).within((9.0, 9.0)).words.endswith("limited to 9 N, in this environment")
-    assert guarantee_of(assess(PAIR, stiff), PAIR) == "this environment"
-    assert covered_limits(PAIR, stiff, assess(PAIR, stiff)).within((9.0, 9.0)).words.endswith("limited to 9 N")
+    assert assess(PAIR, stiff).guarantee.environments == "this environment"
+    assert covered_limits(PAIR, stiff, requirements_of(PAIR, stiff)).within((9.0, 9.0)).words.endswith("limited to 9 N")
 
 
 @dataclass(frozen=True)

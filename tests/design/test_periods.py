@@ -13,7 +13,7 @@ from haptic_loop.cli.design import main as cli_design
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.loop import DelayRange, Loop
-from haptic_loop.design.certificate import assess, prove, prove_limiter, required_damping, verify
+from haptic_loop.design.certificate import prove, prove_limiter, required_damping, requirements_of, verify
 from haptic_loop.design.conditions import even_damping
 from haptic_loop.design.coupling_file import Stored, digest
 from haptic_loop.design.environments import LIMITER, SWITCHING
@@ -108,7 +108,7 @@ def test_a_certificate_of_uneven_periods_is_proved_stored_and_verified(condition
 def test_a_design_for_uneven_periods_is_certified_for_them():
     loop = change(LOOP, T_max=LONG)
     found = design(loop, "this-environment")
-    requirement = assess(loop, found.coupling)["this-environment"]
+    requirement = requirements_of(loop, found.coupling)["this-environment"]
     assert requirement.certified
     assert requirement.proof == "rational"
     assert requirement.ratio == pytest.approx(1, rel=1e-3)  # it uses the damping that there is

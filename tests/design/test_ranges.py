@@ -18,13 +18,15 @@ from haptic_loop.controller.environment import Network, Spring, environment
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.ranges import Ranges, UncertainSpring, inside, members, number_of_vertices
 from haptic_loop.design import optimal
-from haptic_loop.design.certificate import check_ranges, prove, verify
+from haptic_loop.design.assessment import check_ranges
+from haptic_loop.design.certificate import prove, verify
 from haptic_loop.design.coupling_file import Stored, digest, load, sealed
-from haptic_loop.design.coverage import RangesFigures
 from haptic_loop.design.program import Options
 from haptic_loop.design.result import NotProved
 from haptic_loop.sim.scenario import SCENARIOS, InputError, parse
 from worlds import FIGURE_4, environment_by_hand, filter_by_hand, force_map
+
+from tests.asked import decisive, safe_with
 
 T, THETA = 1.2e-3, (1, 2)
 #: the first spring softer or stiffer or lost: three vertices beside the environment
@@ -271,9 +273,9 @@ def test_wider_ranges_are_another_claim(stored):
 def test_a_coupling_for_one_environment_is_not_proved_for_the_ranges(nominal_only):
     with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.40"):
         prove(LOOP, nominal_only.coupling, "this-environment")
-    part = RangesFigures.of(check_ranges(LOOP, nominal_only.coupling, samples=8))
-    assert not part.certified
-    assert part.vertices_certified == 2
+    part = check_ranges(LOOP, nominal_only.coupling, samples=8).part()
+    assert not part["certified"]
+    assert part["vertices_certified"] == 2
 
 
 def test_nothing_is_promised_where_a_sample_inside_violates(robust):
@@ -317,7 +319,11 @@ def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, 
     code, design = told(
         design_main, "--coupling", "optimal", "--seconds", "0.1", "--samples", "8", "--out", str(file), *common
     )
-    assert (code, design["guarantee"], design["ranges"]["vertices"]) == (0, "these ranges", 3)
+    assert (code, safe_with(design), design["assessment"]["ranges"]["vertices"]) == (
+        0,
+        "these ranges",
+        3,
+    )
     alone, whole = design["price"]
     assert (alone["coupling"], whole["coupling"], whole["violated"]) == ("nominal only", "whole ranges", 0)
     assert alone["violated"] >= 1
@@ -341,12 +347,12 @@ def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, 
         "--no-plot",
     ]
     code, run = told(run_main, *at_vertex, *out)
-    assert (code, run["guarantee"]) == (0, "these ranges")
+    assert (code, safe_with(run)) == (0, "these ranges")
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")
     assert np.abs(np.load(tmp_path / "out" / "trace.npz")["f"][:, 0]).max() < 1e-3  # of the other's force, filtered
 
     code, audit = told(audit_main, "--coupling", str(file), *out)
-    assert (code, audit["guarantee"], audit["certified"]) == (0, "these ranges", True)
+    assert (code, safe_with(audit), audit["assessment"]["holds"]) == (0, "these ranges", True)
 
     quick = ["--humans", "24", "--engine", "exact", "--duration", "0", "--no-plot"]
     code, validated = told(validate_main, "--coupling", str(file), "--environments", "ranges", *quick, *out)
@@ -359,8 +365,8 @@ def test_a_violated_vertex_leaves_the_commands_with_1(scenario_file, tmp_path, c
     stiff = ["--condition", "this-environment", "--scenario", str(scenario_file), "--samples", "4"]
     assert design_main([*stiff, "--out", str(tmp_path / "s.json"), "--json", "-"]) == 1
     outcome = json.loads(capsys.readouterr().out)
-    assert outcome["guarantee"] == "this environment"
-    assert outcome["certificate"]["certified"]
+    assert safe_with(outcome) == "this environment"
+    assert decisive(outcome)["certified"]
     assert load(tmp_path / "s.json").loop.ranges is None
     assert verify(load(tmp_path / "s.json")).proved
 

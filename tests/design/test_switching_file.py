@@ -241,7 +241,7 @@ def test_a_run_says_what_the_file_covers(run, file):
     for theta in ("2,2", "1,1", "2,1"):
         outcome = run(file, "--theta", theta)
         assert remark + f"the constant theta = [{theta[0]}, {theta[2]}]" in outcome["remarks"]
-        assert outcome["certificates"]["this-environment"]["certified"]
+        assert outcome["assessment"]["requirements"]["this-environment"]["certified"]
     outcome = run(file, "--varying-delay", "1,2", "--playout")
     assert remark + "the constant theta = [2, 2]" in outcome["remarks"]
     assert outcome["varying_delay"]["covered"]

@@ -198,7 +198,7 @@ def audit(tmp_path, *options):
 def test_audit_reports_switching_beside_the_constants(tmp_path):
     code, report = audit(tmp_path, "--K", "7806,3137", "--B", "0.105,1.68", "--varying-delay", "1,2")
     assert code == 1  # certified for the constant (1, 2), not for what was asked
-    assert report["this-environment"]["certified"]
+    assert report["assessment"]["requirements"]["this-environment"]["certified"]
     assert report["switching"]["required_damping"] == pytest.approx([2.0413] * 2, rel=1e-4)
     assert report["switching"]["playout"]["required_damping"] == pytest.approx([1.7022] * 2, rel=1e-4)
     code, report = audit(tmp_path, "--K", "879,552", "--B", "0.39,0.52", "--varying-delay", "1-2,1-2")

@@ -11,11 +11,12 @@ from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.ranges import Ranges
-from haptic_loop.design.certificate import assess, prove, required_damping, verify
+from haptic_loop.design.assessment import assess, check_ranges
+from haptic_loop.design.certificate import prove, required_damping, requirements_of, verify
 from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.exact import find_storage
-from haptic_loop.design.guarantees import MAKING, guarantee_of, making_covered
+from haptic_loop.design.guarantees import MAKING
 from haptic_loop.design.result import NotProved
 from scipy.linalg import expm
 
@@ -199,7 +200,7 @@ def test_it_is_proved_stored_and_verified(loop, coupling):
     assert set(stored.certificate.matrices) == {"P", "g"}
     again = msgspec.json.decode(msgspec.json.encode(stored), type=Stored)
     assert verify(again).proved
-    judged = assess(loop, coupling)["this-environment"]
+    judged = requirements_of(loop, coupling)["this-environment"]
     assert judged.proof == "rational"
     required = np.array(judged.required)
     for factor, proved in ((1.001, True), (0.999, False)):
@@ -226,17 +227,17 @@ def test_longer_periods_scale_it():
 def test_what_is_not_covered_is_said():
     loop = held(3000.0)
     ranged = change(loop, ranges=Ranges(masses={"tip": (0.04, 0.06)}))
-    assert making_covered(loop)
-    assert not making_covered(ranged)
+    assert check_ranges(ranged, COUPLING) is None
+    assert not assess(ranged, COUPLING).holds
     with pytest.raises(NotProved, match="walls are proved in one environment"):
         prove(ranged, COUPLING, "this-environment")
     with pytest.raises(NotProved, match="linear model of the environment"):
         prove(loop, InternalModel(np.zeros(1), np.zeros((2, 1, 1))), "this-environment")
     one_way = Compliance(Lti.constant([[1e-3, 5e-4], [0.0, 1e-3]], PAIR.T))
     assert "not symmetric" in required_damping(PAIR, one_way, "this-environment").reason
-    judged = assess(pressed_at_rest(), SpringDamper([1300.0], [0.45]))
+    judged = requirements_of(pressed_at_rest(), SpringDamper([1300.0], [0.45]))
     assert not judged["any-environment"].certified
-    assert guarantee_of(judged, pressed_at_rest()) == MAKING
+    assert assess(pressed_at_rest(), SpringDamper([1300.0], [0.45])).guarantee.environments == MAKING
 
 
 def test_couplings_may_be_stiffer_than_any_environment_allows():

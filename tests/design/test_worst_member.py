@@ -12,9 +12,9 @@ from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.ranges import Member, Ranges, Region, UncertainSpring, members, regions
 from haptic_loop.design import optimal
 from haptic_loop.design.api import certify, store
-from haptic_loop.design.certificate import check_ranges, prove, verify
+from haptic_loop.design.assessment import check_ranges
+from haptic_loop.design.certificate import prove, verify
 from haptic_loop.design.coupling_file import Stored, load, save
-from haptic_loop.design.coverage import RangesFigures
 from haptic_loop.design.program import Options
 from haptic_loop.design.result import Design
 from haptic_loop.design.worst_member import search
@@ -172,10 +172,9 @@ def test_neither_the_vertices_nor_random_points_see_it_but_no_set_is_promised(kn
     assert len(known.at_samples) == 64
     assert all(r.certified for r in (*known.at_members, *known.at_samples))
     assert not known.proved
-    part = RangesFigures.of(known)
-    assert (part.proof, part.certified, part.search.violated) == ("rational", False, True)
-    assert part.reason.startswith("proved at the vertices, but violated between them: 1.04")
-    assert any("not guaranteed" in words for _, words in part.rows())
+    part = known.part()
+    assert (part["proof"], part["certified"], part["search"].violated) == ("rational", False, True)
+    assert part["reason"].startswith("proved at the vertices, but violated between them: 1.04")
 
 
 def test_fewer_samples_do_not_make_it_a_guarantee():
@@ -188,7 +187,7 @@ def test_fewer_samples_do_not_make_it_a_guarantee():
 def test_its_file_is_stored_for_the_environment_alone(known, tmp_path):
     assert known.at_members[0].certified
     design = Design(VERTICES_ONLY, "this-environment", "rms", 0.07, known.at_members[0], 1, 0.0)
-    assert store(RANGED, design, tmp_path / "c.json", known).proof == "rational"
+    assert store(RANGED, design, tmp_path / "c.json").proof == "rational"
     stored = load(tmp_path / "c.json")
     assert (stored.loop.ranges, stored.certificate.guarantee) == (None, "this environment")
 

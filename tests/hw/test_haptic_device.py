@@ -167,11 +167,10 @@ def test_a_session_with_a_device_that_the_host_clocks(scenario, tmp_path):
 def test_the_certificate_says_what_changes_when_the_host_is_the_clock(scenario):
     """T at most T_max, and a latency of part of a sample where a link of a whole tick is charged otherwise."""
     _, _, (made,) = held_session(scenario, StandIn(scenario), seconds=0.1)
-    part = made.figures((12.0, 12.0))
-    assert part.theta == scenario.theta  # no tick is added for the link
-    assert part.link_delay == 0
-    assert part.certificate.certified
-    (said,) = [remark for remark in part.remarks if "act as they come" in remark]
+    assert made.assessment.loop.theta == scenario.theta  # no tick is added for the link
+    assert made.link == 0
+    assert made.assessment.decisive.certified
+    (said,) = [remark for remark in made.remarks() if "act as they come" in remark]
     T_max, (t1, t2) = made.scenario.T_max or made.scenario.T, made.scenario.latency[0]
     kept = (
         f"periods up to {1e6 * T_max:.0f} us and forces that act {1e6 * t1:.0f} to {1e6 * t2:.0f} us after their sample"
@@ -188,10 +187,10 @@ def test_microseconds_are_charged_where_a_link_costs_a_tick(scenario):
     given = SpringDamper([879.0, 552.0], [0.39, 0.52])
     host = certified_coupling(judged, "I", None, None, 0, given)
     link = certified_coupling(scenario.replace(theta=(1, 2)), "I", None, None, 1, given)
-    assert max(host.requirements["this-environment"].required) == pytest.approx(
+    assert max(host.assessment.requirements["this-environment"].required) == pytest.approx(
         0.637433, rel=1e-4
     )  # switching in [0, 0.13] ms
-    assert max(link.requirements["this-environment"].required) == pytest.approx(0.714344, rel=1e-4)
+    assert max(link.assessment.requirements["this-environment"].required) == pytest.approx(0.714344, rel=1e-4)
 
 
 @pytest.mark.parametrize(("read", "write", "holds"), [(40, 50, True), (500, 500, False)])

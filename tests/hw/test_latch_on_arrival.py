@@ -16,7 +16,6 @@ from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Stage, session_for
 from haptic_loop.models.scene import plant
-from haptic_loop.sim.couplings import CouplingFigures
 from haptic_loop.sim.run import outside_forces
 from haptic_loop.sim.scenario import InputError
 from scipy.linalg import expm
@@ -80,7 +79,7 @@ def test_the_spread_of_the_ticks_is_what_certificates_are_for():
     needs = [
         certified_couplings(s.replace(delta=(2.0, 2.0)), "I", "published", "this-environment", 1, spare=0)[
             0
-        ].requirements
+        ].assessment.requirements
         for s in (even, spread)
     ]
     even_need, spread_need = (max(need["this-environment"].required) for need in needs)
@@ -98,10 +97,8 @@ def test_what_one_overlong_tick_may_cost():
 
 def test_the_report_names_the_latency():
     (made,) = certified_couplings(LAB.replace(latency=((3e-5, 2.3e-4),) * 2), "I", None, None, 0, spare=0)
-    part = made.figures((12.0, 12.0))
-    assert part.latency_s == ((3e-5, 2.3e-4),) * 2
-    assert part.link_delay == 0
-    assert part.coupling == CouplingFigures.of(made.chosen.kind, made.chosen.coupling, LAB.T)
+    assert made.assessment.loop.latency == ((3e-5, 2.3e-4),) * 2
+    assert made.link == 0
     assert made.name == "spring-damper for theta = [0, 0] and 30 to 230 us"
 
 
@@ -110,9 +107,9 @@ def test_a_session_is_certified_and_replayed_bit_for_bit(tmp_path, capsys):
     options = ["--rehearse", "--theta", "0", "--latch", "arrival", "--duration", "0.3", "--no-plot"]
     assert bridge([*options, "--out", str(tmp_path), "--json", str(file)]) == 0
     report = json.loads(file.read_text())
-    assert report["theta"] == [0, 0]
-    assert report["latency_s"][0] == pytest.approx([30e-6, 230e-6])
-    assert report["guarantee"] == "this environment"
+    assert report["assessment"]["loop"]["theta"] == [0, 0]
+    assert report["assessment"]["loop"]["latency_s"][0] == pytest.approx([30e-6, 230e-6])
+    assert report["assessment"]["guarantee"]["environments"] == "this environment"
     assert report["link"]["age_us"]["p50"] == pytest.approx(TAU)
     said = " ".join(capsys.readouterr().out.split())
     assert "forces act 30 to 230 us after their tick" in said

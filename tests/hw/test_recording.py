@@ -9,7 +9,6 @@ import pytest
 from haptic_loop.cli import bridge
 from haptic_loop.cli import replay as replay_command
 from haptic_loop.cli import trace as trace_command
-from haptic_loop.design.certificate import assess
 from haptic_loop.design.files import plain
 from haptic_loop.hw.control import CertifiedCoupling, _fill, certified_coupling
 from haptic_loop.hw.emulator import Emulator
@@ -18,7 +17,7 @@ from haptic_loop.hw.recording import Recorder, _digest, _recipes_of, load, repla
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session
 from haptic_loop.hw.session_report import outcome, save
-from haptic_loop.sim.couplings import choose, limits_of
+from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.scenario import load as scenario_of
@@ -26,6 +25,8 @@ from haptic_loop.sim.stability import close, dominant_mode
 from haptic_loop.sim.trace import Trace
 from rich.console import Console
 from sessions import FAST, rehearsal_of
+
+from tests.asked import decisive
 
 
 def test_missing_samples_are_filled_by_a_straight_line():
@@ -225,8 +226,7 @@ def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, 
     made = certified_coupling(scenario, "I", None, None, 1) if settles else None
     if made is None:
         chosen = choose(scenario, "I", name, None)
-        requirements = assess(scenario.loop("I"), chosen.coupling)
-        made = Dared(1, scenario, "I", chosen, requirements, limits_of(scenario, chosen, requirements))
+        made = Dared(1, scenario, "I", chosen, assessed(scenario, "I", chosen))
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, [made], recorder=recorder)
     session = rehearsal.run_until_armed(2.0 if settles else 7.0)
@@ -259,7 +259,7 @@ def test_the_report_is_json_and_names_its_end(trace):
     assert [e["stage"] for e in report["session"]["log"]][-2:] == ["disarming", "finished"]
     assert report["link"]["counters"]["gaps"] > 10
     assert report["link"]["age_us"]["p50"] == pytest.approx(130, abs=1)  # what the rehearsal's line takes
-    assert report["certificate"]["certified"]
+    assert decisive(report)["certified"]
 
 
 def test_results_of_nothing():

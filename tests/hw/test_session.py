@@ -280,8 +280,8 @@ def test_an_optimal_coupling_has_another_for_one_tick_more_in_reserve(optimal_ru
     fast, soft = optimal_rungs
     assert (fast.chosen.kind, soft.chosen.kind) == ("optimal", "optimal")
     assert (fast.link, soft.link) == (1, 2)
-    assert fast.requirements["this-environment"].certified
-    assert soft.requirements["this-environment"].certified
+    assert fast.assessment.requirements["this-environment"].certified
+    assert soft.assessment.requirements["this-environment"].certified
     assert soft.scenario.theta == (2, 2)
     bridge._print_certificate(Ages((130,) * 100), 1, optimal_rungs, (2.0, 2.0), Console(width=160))
     table = capsys.readouterr().out

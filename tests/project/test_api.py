@@ -26,9 +26,9 @@ from haptic_loop import (
     InputError,
     Scenario,
     Trace,
+    assess,
     certify,
     design_coupling,
-    guarantee,
     load,
     parse,
     rehearse,
@@ -36,6 +36,7 @@ from haptic_loop import (
     transparency_of,
     validate,
 )
+from tests.asked import safe_with
 
 SHORT = load().replace(duration=0.3)
 
@@ -79,21 +80,22 @@ def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
     found = design_coupling(loop)
     assert design_command(["--out", str(tmp_path / "c.json"), "--json", str(tmp_path / "r.json")]) == 0
     report = json.loads((tmp_path / "r.json").read_text())
-    assert guarantee(loop, certify(loop, found)) == report["guarantee"] == "this environment"
+    assert assess(loop, found).guarantee.environments == safe_with(report) == "this environment"
     figures = transparency_of(loop, found)
-    assert figures.mismatch_db == report["transparency"]["relative_mismatch_db"]
+    assert figures.mismatch_db == report["assessment"]["transparency"]["relative_mismatch_db"]
     assert figures == transparency_of(loop, found.coupling)
     assert transparency_of(loop, NoCoupling()).mismatch_db == -np.inf  # F = Theta Psi E = Lambda E in case I
-    assert guarantee(loop, certify(loop, SpringDamper([2870, 2320], [5.47, 5.55]))) is None
+    assert assess(loop, SpringDamper([2870, 2320], [5.47, 5.55])).guarantee is None
     ranges = load("omega-pair-ranges").loop("I")
-    assert guarantee(ranges, certify(ranges, SpringDamper([300, 300], [0.1, 0.1]))) == "any passive environment"
+    assert assess(ranges, SpringDamper([300, 300], [0.1, 0.1]), ranges_samples=0).guarantee.any_environment
 
 
 def test_a_session_is_rehearsed():
     """The link takes 130 us from a sample to its force, which one tick of 1 ms covers."""
     scenario = load().replace(T=1e-3, theta=(1, 1))
     session = rehearse(scenario, seconds=0.5)
-    assert (session.stage, session.theta, session.guarantee) == ("finished", (1, 1), "this environment")
+    assert (session.stage, session.theta) == ("finished", (1, 1))
+    assert session.assessment.guarantee.environments == "this environment"
     assert session.delay == pytest.approx(130e-6, abs=2e-6)  # the clock ticks in us, and each way is rounded
     designed = design_coupling(scenario.loop("I")).coupling
     np.testing.assert_array_equal(session.coupling.K, designed.K)
@@ -103,7 +105,7 @@ def test_a_session_is_rehearsed():
     assert force[-1] < 0.05 * force.max()  # the last tick of a ramp of 100 to 250
     given = rehearse(scenario, SOFT, seconds=0.5)
     assert given.coupling is SOFT
-    assert given.requirements["this-environment"].certified
+    assert given.assessment.requirements["this-environment"].certified
 
 
 def test_a_session_that_is_refused_says_why():
@@ -219,7 +221,6 @@ LOOP = SHORT.loop("I")
         (lambda: certify(LOOP, None), "coupling is None, expected a coupling (controller.coupling), or a Design"),
         (lambda: certify(LOOP, SpringDamper), "expected a coupling (controller.coupling), or a Design"),
         (lambda: transparency_of(LOOP, "spring-damper"), "coupling is 'spring-damper' (str), expected a coupling"),
-        (lambda: guarantee(LOOP, SOFT), "expected what certify returned"),
         (lambda: simulate(LOOP), 'scenario is a Loop, expected a Scenario, as load("omega-pair") gives it'),
         (lambda: simulate(SHORT, "spring-damper"), "coupling is 'spring-damper' (str), expected a coupling"),
         (lambda: simulate(SHORT, substeps=1.5), "substeps is 1.5 (float), allowed are whole numbers, 1 to 10000"),

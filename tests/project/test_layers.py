@@ -49,7 +49,15 @@ CONDITIONS = {"any-environment", "this-environment", "ANY_ENVIRONMENT", "THIS_EN
 AT_HOME = ("design/conditions", "design/environments", "design/lmi", "design/result")
 #: where they stand as data: what a design is made for, the rows of a table, the styles of a picture, one figure's key
 NAMED_IN = (
-    *("design/api", "design/certificate", "design/compare", "design/fixed_order", "design/optimal", "design/program"),
+    *(
+        "design/api",
+        "design/assessment",
+        "design/certificate",
+        "design/compare",
+        "design/fixed_order",
+        "design/optimal",
+        "design/program",
+    ),
     *("design/spring_damper", "sim/alternatives", "sim/baselines", "sim/map_plot", "sim/plots", "sim/report"),
     *("hw/control", "cli/validate"),
 )

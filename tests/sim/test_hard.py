@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from driven import driven
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
-from haptic_loop.design.certificate import assess
+from haptic_loop.design.certificate import requirements_of
 from haptic_loop.models.device import CompliantDevice
 from haptic_loop.models.human import Human, Link
 from haptic_loop.sim.accuracy import _limit_cycle, default_substeps, simulated_growth
@@ -98,7 +98,7 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
 
 def test_saturation_breaks_a_certificate_and_damped_hands_mend_it():
     """Section 7's counterexample: certified for the linear loop, yet with lossless hands clipping goes on for ever."""
-    assert assess(load().loop("I"), STIFF)["this-environment"].certified
+    assert requirements_of(load().loop("I"), STIFF)["this-environment"].certified
     far, near, frequency = sustained(0.0, near=100)
     print(f"lossless hands: {far:.1%} of 200 far and {near} of 100 near starts clip after 48 s, at {frequency:.2f} Hz")
     assert far > 0.2

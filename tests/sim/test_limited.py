@@ -8,11 +8,11 @@ import pytest
 from driven import tick_by_tick
 from haptic_loop.cli.run import main
 from haptic_loop.controller.coupling import SpringDamper
-from haptic_loop.design.certificate import assess, prove, prove_limiter
+from haptic_loop.design.assessment import covered_limits
+from haptic_loop.design.certificate import prove, prove_limiter, requirements_of
 from haptic_loop.design.coupling_file import Stored, save
-from haptic_loop.design.coverage import covered_limits
 from haptic_loop.sim.api import simulate
-from haptic_loop.sim.couplings import choose, limits_of
+from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.scenario import load
 from worlds import SOFT, STIFF
@@ -30,14 +30,14 @@ def weak(*limits):
 def test_which_limiter_a_coupling_may_have():
     scenario = weak(12.0, 5.657)
     loop = scenario.loop("I")
-    any_environment = covered_limits(loop, SOFT, assess(loop, SOFT))
+    any_environment = covered_limits(loop, SOFT, requirements_of(loop, SOFT))
     assert any_environment.rho == (0.0, 0.0)
-    own = covered_limits(loop, BUILT, assess(loop, BUILT))
+    own = covered_limits(loop, BUILT, requirements_of(loop, BUILT))
     assert own.rho == pytest.approx((11.4167, 11.4167))
     assert own.requirement is not None
     assert own.requirement.proof == "rational"
     stiff = STIFF
-    refused = covered_limits(loop, stiff, assess(loop, stiff))
+    refused = covered_limits(loop, stiff, requirements_of(loop, stiff))
     assert refused.rho is None
     assert "needs 1.385" in refused.reason
 
@@ -48,13 +48,13 @@ def test_the_limiter_that_a_file_proves_is_the_one_that_runs(tmp_path):
     loop = scenario.loop("I")
     proof = prove_limiter(loop, BUILT, 0.03)
     save(Stored.of(loop, BUILT, prove(loop, BUILT, "this-environment", limiter=proof)), path)
-    found = limits_of(scenario, choose(scenario, "I", str(path)))
+    found = assessed(scenario, "I", choose(scenario, "I", str(path))).force_limits
     assert found.certificate == proof
     assert (found.rho, found.c, found.proved) == (proof.rho, proof.c, True)
     assert found.rho == pytest.approx((34.25, 34.25))
     devices = tuple(msgspec.structs.replace(device, damping=1.5) for device in scenario.device)
     stronger = scenario.replace(device=devices)
-    assert limits_of(stronger, choose(stronger, "I", str(path))).rho == pytest.approx((37.5, 37.5))
+    assert assessed(stronger, "I", choose(stronger, "I", str(path))).force_limits.rho == pytest.approx((37.5, 37.5))
 
 
 @pytest.mark.parametrize(("coupling", "rho"), [(SOFT, (0.0, 0.0)), (BUILT, (11.4167, 11.4167))])
@@ -103,7 +103,7 @@ def test_a_script_limits_forces_as_the_command_does():
     for limiter, rho in ((True, (0.0, 0.0)), (False, None)):
         trace = simulate(scenario, SOFT, "exact", limiter=limiter)
         np.testing.assert_array_equal(trace.f, run(assemble(scenario, SOFT, rho), "exact").f)
-        assert trace.meta["limiter"]["rho"] == (None if rho is None else list(rho))
+        assert trace.meta["assessment"]["force_limits"]["rho"] == (None if rho is None else list(rho))
 
 
 def test_the_report_says_which_guarantee_holds(tmp_path):
@@ -121,13 +121,13 @@ def test_the_report_says_which_guarantee_holds(tmp_path):
         return json.loads((tmp_path / "r.json").read_text())
 
     anywhere = ("--case", "I", "--condition", "any-environment")
-    covered = report(*anywhere)["limiter"]
+    covered = report(*anywhere)["assessment"]["force_limits"]
     assert covered["rho"] == [0.0, 0.0]
     assert covered["force_limit"] == [12.0, 12.0]
-    assert report(*anywhere, "--no-limiter")["limiter"]["rho"] is None
-    usual = report("--case", "I")["limiter"]
+    assert report(*anywhere, "--no-limiter")["assessment"]["force_limits"]["rho"] is None
+    usual = report("--case", "I")["assessment"]["force_limits"]
     assert usual["rho"] == pytest.approx([11.4167, 11.4167])
     assert usual["words"].startswith("proved, also while forces are limited to 12 N")
-    uncovered = report("--case", "I", "--coupling", "optimal")["limiter"]
+    uncovered = report("--case", "I", "--coupling", "optimal")["assessment"]["force_limits"]
     assert uncovered["rho"] is None
     assert "no multiplier c that was found proves it, whatever the damping" in uncovered["words"]

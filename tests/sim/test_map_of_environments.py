@@ -151,8 +151,8 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
     report, text = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
     assert report["axes"] == "environment"
     assert report["coupling"]["kind"] == "optimal"
-    assert report["designed_for"]["guarantee"] == "this environment"
-    assert report["designed_for"]["certificates"]["this-environment"]["proof"] == "rational"
+    assert report["assessment"]["guarantee"]["environments"] == "this environment"
+    assert report["assessment"]["requirements"]["this-environment"]["proof"] == "rational"
     assert report["conditions"] == ["this-environment", "any-environment"]
     assert report["this-environment"]["contradicted_cells"] == 0
     assert 0 < report["this-environment"]["certified_cells"] < 36

@@ -25,7 +25,7 @@ from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session
-from haptic_loop.sim.couplings import choose, limits_of
+from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.run import run as close_loop
 from haptic_loop.sim.scenario import load
@@ -85,10 +85,10 @@ def test_it_runs_by_command_alone_and_in_a_batch(files, form, tmp_path):
     asked = [*common, "--duration", "0.2", "--out", str(tmp_path)]
     assert run.main(asked) == 0
     report = json.loads((tmp_path / "r.json").read_text())
-    assert report["guarantee"] == "this environment"
+    assert report["assessment"]["guarantee"]["environments"] == "this environment"
     assert report["robustness"]["percent"] == 10
     assert (report["designed_for_it"] is None) == (form == "pair")
-    assert (report["limiter"]["rho"] is not None) == (form == "filter")
+    assert (report["assessment"]["force_limits"]["rho"] is not None) == (form == "filter")
     assert validate.main([*common, "--humans", "6", "--duration", "0.1", "--out", str(tmp_path)]) == 0
     batch = json.loads((tmp_path / "r.json").read_text())
     assert (batch["unstable"], batch["holds"]) == ({"exact": 0, "mujoco": 0}, True)
@@ -99,7 +99,7 @@ def test_its_forces_are_limited_as_the_file_proves(files):
     weak = tuple(msgspec.structs.replace(device, force_limit=0.3) for device in scenario.device)
     scenario = scenario.replace(device=weak, duration=0.6)
     coupling = load_file(path).built()
-    rho = limits_of(scenario, choose(scenario, "I", str(path))).rho
+    rho = assessed(scenario, "I", choose(scenario, "I", str(path))).force_limits.rho
     assert rho is not None
     exact, own = (close_loop(assemble(scenario, coupling, rho), engine) for engine in ("exact", "mujoco"))
     np.testing.assert_allclose(own.f, exact.f, atol=1e-7)

@@ -1,0 +1,173 @@
+"""What every command says of a coupling: the verdict in one sentence, and the rows of its assessment."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator
+
+from haptic_loop.cli import render
+from haptic_loop.controller.environment import RIGID_WALL, Environment
+from haptic_loop.design.assessment import Assessment, Guarantee, RangesResult
+from haptic_loop.design.guarantees import ANY, HERE, RANGES, EncoderSteps
+from haptic_loop.design.result import MAKING, Chosen, finite
+from haptic_loop.design.robustness import Nearby
+from haptic_loop.design.transparency import BAND_HZ
+from haptic_loop.sim.couplings import assessed, choose
+from haptic_loop.sim.scenario import Scenario
+
+
+def chosen_by(args: argparse.Namespace, scenario: Scenario) -> Chosen:
+    """The coupling of --coupling for --condition and --no-limiter, designed where it is asked for by name."""
+    with render.designing(scenario.loop(args.case), args.coupling, args.condition) as progress:
+        return choose(scenario, args.case, args.coupling, args.condition, args.limiter, progress)
+
+
+def assessment_of(
+    args: argparse.Namespace,
+    scenario: Scenario,
+    chosen: Chosen,
+    environment: Environment | None = None,
+    energy_budget: float | None = None,
+) -> Assessment:
+    """Assess the coupling in the scenario's loop; `environment` is the one of its ranges that is simulated."""
+    ranges = scenario.loop(args.case).ranges
+    with render.progress("searching the ranges" if ranges else "assessing the coupling") as move:
+        return assessed(
+            scenario,
+            args.case,
+            chosen,
+            environment=environment,
+            energy_budget=energy_budget,
+            limiter=args.limiter,
+            seed=args.seed,
+            band_hz=getattr(args, "band_hz", None) or BAND_HZ,
+            progress=move,
+        )
+
+
+# ----------------------------------------------------------------------------------------------------
+# The verdict.
+
+
+#: environments of a guarantee -> what a user touches
+_OBJECTS = {
+    ANY: "any passive object",
+    RANGES: "every object of the ranges",
+    HERE: "this object",
+    RIGID_WALL.here: "a rigid wall",
+    MAKING: "this object, whose walls may be touched and left",
+}
+
+
+def verdict(
+    assessment: Assessment,
+    nearby: Nearby | None = None,
+    force_error: float | None = None,
+    encoder: EncoderSteps | None = None,
+) -> str:
+    """Say in one or two sentences for whom the loop is stable, what is felt, and what would end it.
+
+    Args:
+        assessment: Of exactly what the command is about.
+        nearby: The damping that is needed where the environment is ten percent off, where it was computed.
+        force_error: rms of a run, in percent of the ideal force.
+        encoder: Whether friction covers the encoder steps of the devices, where these have steps.
+    """
+    guarantee = assessment.guarantee
+    if guarantee is None:
+        return f"[red]Not certified[/]: {_sentence(assessment.reason or assessment.decisive.shortfall)}"
+    if guarantee.energy_J is not None:
+        return f"[green]Safe by an energy account[/]: {_sentence(guarantee.words)}"
+    felt = _felt(assessment, force_error)
+    words = [f"[green]Stable[/] for {_who(guarantee)}{': ' + felt if felt else ''}."]
+    if not assessment.holds:
+        words.append(f"[red]Not certified[/] {_missing(assessment)}")
+    if guarantee.proof != "rational":
+        words.append("By a refined sweep, without an exact proof.")
+    if encoder and not encoder.covered:
+        words.append("Not covered: the encoder steps of the devices.")
+    there = nearby and nearby.robustness
+    if there and not there.certified and not guarantee.any_environment:
+        words.append(f"Lost with {there.where}.")
+    return " ".join(words)
+
+
+def _who(guarantee: Guarantee) -> str:
+    """For whom, and with what: 'every passive hand with this object'."""
+    place = _OBJECTS.get(guarantee.environments, guarantee.environments)
+    delays, facts = guarantee.delays, guarantee.facts
+    late = f", with delays that switch within {delays}" if "switching" in facts else ""
+    return f"{guarantee.hands} with {place}{late}"
+
+
+def _felt(assessment: Assessment, force_error: float | None) -> str:
+    """The share of the stiffness that is rendered, and the force error of a run."""
+    figures = assessment.transparency
+    share = figures and finite(figures.dc_ratio)
+    words = [f"{_percent(share)} of the stiffness"] if share else []
+    return ", ".join([*words, *([] if force_error is None else [f"{_percent(force_error / 100)} force error"])])
+
+
+def _percent(ratio: float) -> str:
+    value = 100 * ratio
+    return f"{value:.0f} %" if value >= 1 or value == 0 else f"{value:.1g} %"
+
+
+def _missing(assessment: Assessment) -> str:
+    """What the guarantee lacks of what the loop and the user ask for."""
+    if not assessment.decisive.certified:
+        return f"by {_sentence(f'{assessment.condition}: {assessment.decisive.shortfall}')}"
+    reason = assessment.ranges and assessment.ranges.reason
+    return f"for the ranges: {_sentence(reason or 'walls are proved in one environment only')}"
+
+
+def _sentence(words: str) -> str:
+    return words if words.endswith(".") else f"{words}."
+
+
+# ----------------------------------------------------------------------------------------------------
+# The rows.
+
+
+def rows(assessment: Assessment) -> render.Rows:
+    """The rows of an assessment that every table begins with."""
+    yield from render.certificate_rows(assessment.requirements, 5)
+    yield from range_rows(assessment.ranges) if assessment.ranges else ()
+    guarantee = assessment.guarantee
+    yield "guarantee", guarantee.words if guarantee else f"none ({assessment.reason})"
+    yield "force limits", assessment.force_limits.words
+
+
+def gain_rows(assessment: Assessment) -> render.Rows:
+    """The gains of a spring-damper, or the static stiffness of a moving average."""
+    gains = assessment.gains
+    if "K" in gains:
+        K, B = (render.listed(gains[name], 5) for name in ("K", "B"))
+        yield "coupling K / B", f"{K} N/m / {B} N s/m"
+    if "stiffness" in gains:
+        yield "coupling, static", f"{render.listed(gains['stiffness'], 5)} N/m"
+
+
+_NEVER = "no damping is enough"
+
+
+def range_rows(ranges: RangesResult) -> Iterator[tuple[str, str]]:
+    """The rows of a check over ranges."""
+    part, count = ranges.part(), len(ranges.members) - 1
+    member, requirement = ranges.worst
+    exact = ranges.certificate is not None
+    ratio = f"{requirement.ratio:.4f} of the damping" if math.isfinite(requirement.ratio) else _NEVER
+    proof = "[green]all proved exactly[/]" if exact else f"[red]not proved[/]: {ranges.reason}"
+    every = f", of all {ranges.vertices}: any three parameters have all their ends among them"
+    of = every if ranges.vertices > count + 1 else ""
+    yield "ranges, vertices", f"{part['vertices_certified']} of {count} certified, {proof}{of}"
+    yield "ranges, worst vertex", f"{ratio}, at {member.name}"
+    yield "ranges, between", str(part["search"])
+    inside = part["inside"]
+    if inside["worst_ratio"] is not None:
+        most = f"at most {inside['worst_ratio']:.4f}" if math.isfinite(inside["worst_ratio"]) else _NEVER
+        drawn = f"{inside['certified']} of {inside['samples']} random samples certified, {most} of the damping"
+        yield "ranges, inside", drawn
+    if exact and not ranges.proved:
+        yield "ranges", f"[red]not guaranteed[/]: {ranges.reason}"

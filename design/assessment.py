@@ -1,0 +1,597 @@
+"""A coupling in a loop, assessed: what its conditions require, what is proved, and for whom the loop is safe.
+
+    assessment = assess(scenario.loop("I"), coupling)
+    assessment.guarantee  # a Guarantee, or None: assessment.reason then says why there is none
+
+Every command that names a guarantee takes it from such a record of exactly the loop, coupling, environment and force
+limits that run. Where one of them changes, `assess` has to be called again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.environment import Environment
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.lti import Array
+from haptic_loop.controller.ranges import Member, inside, number_of_vertices
+from haptic_loop.design.arguments import of_kind
+from haptic_loop.design.certificate import (
+    check_limiter,
+    judged,
+    named,
+    prove,
+    prove_limiter,
+    proves,
+    required_damping,
+    requirements_of,
+)
+from haptic_loop.design.conditions import Condition
+from haptic_loop.design.coupling_file import Certificate, LimiterCertificate
+from haptic_loop.design.environments import BETA, LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, in_each, worst
+from haptic_loop.design.frequency import too_long
+from haptic_loop.design.guarantees import ANY, RANGES
+from haptic_loop.design.known_device import KNOWN_DEVICE, described
+from haptic_loop.design.lmi import ANY_ENVIRONMENT
+from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Design, NotProved, Requirement
+from haptic_loop.design.transparency import BAND_HZ, Transparency, transparency
+from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
+
+PluggedEnvironment = Callable[[Array], Array]  # where the port would be without force, (m,) [m] -> its force (m,) [N]
+
+
+# ----------------------------------------------------------------------------------------------------
+# The environments of ranges.
+
+
+SAMPLES = 64  # environments drawn evenly from inside the ranges, beside what the search looks at
+
+
+@dataclass(frozen=True, eq=False)
+class RangesResult:
+    """The this-environment condition over ranges: every vertex, a search between them, and random samples."""
+
+    members: tuple[Member, ...]  # the nominal environment and the vertices
+    at_members: tuple[Requirement, ...]
+    samples: tuple[Member, ...]  # environments drawn from inside
+    at_samples: tuple[Requirement, ...]
+    vertices: int  # of the ranges; of more than 128 vertices only so many are members
+    searched: Searched  # between the vertices
+    at_found: Requirement  # at the worst environment that the search has found
+    seed: int  # of the samples
+    certificate: Certificate | None  # for all members, with the guarantee "these ranges"
+    reason: str | None  # why the ranges are not guaranteed
+
+    @property
+    def proved(self) -> bool:
+        """Whether every member is proved in exact arithmetic, and the search has found no violation between them."""
+        return self.certificate is not None and self.worst_found[1].certified
+
+    @property
+    def worst(self) -> tuple[Member, Requirement]:
+        """The member that requires the most damping."""
+        i = worst(self.at_members)
+        return self.members[i], self.at_members[i]
+
+    @property
+    def worst_found(self) -> tuple[Member, Requirement]:
+        """The environment that requires the most damping among members, search and samples."""
+        places = (*self.members, self.searched.worst[0].member, *self.samples)
+        requirements = (*self.at_members, self.at_found, *self.at_samples)
+        i = worst(requirements)
+        return places[i], requirements[i]
+
+    def part(self) -> dict[str, Any]:
+        """Return the fields of its JSON."""
+        member, requirement = self.worst
+        inside: dict[str, Any] = {"samples": len(self.samples), "certified": 0, "seed": self.seed}
+        inside |= {"worst_ratio": None, "worst": None}
+        if self.samples:
+            i, good = worst(self.at_samples), sum(r.certified for r in self.at_samples)
+            inside |= {"certified": good, "worst_ratio": self.at_samples[i].ratio, "worst": self.samples[i].name}
+        part = {
+            "vertices": len(self.members) - 1,
+            "all_vertices": self.vertices,
+            "vertices_certified": sum(r.certified for r in self.at_members[1:]),
+            "required_damping": requirement.required,
+            "available_damping": requirement.available,
+            "worst": member.name,
+            "proof": "rational" if self.certificate else "sampled",
+            "certified": self.proved,
+            "search": SearchFigures.of(self.searched),
+            "inside": inside,
+        }
+        return part | ({"reason": self.reason} if self.reason else {})
+
+
+@dataclass(frozen=True)
+class SearchFigures:
+    """What the search between the vertices has found: evidence, no proof."""
+
+    environments: int
+    worst_ratio: float
+    worst: str
+    violated: bool
+    ended_by_clock: bool
+    how: str = SEARCH
+
+    @classmethod
+    def of(cls, searched: Searched) -> SearchFigures:
+        """Summarise a search."""
+        worst = searched.worst[0]
+        return cls(searched.tried, worst.ratio, worst.member.name, not worst.ratio < 1, searched.ended)
+
+    def __str__(self) -> str:
+        found = "[red]violated[/]" if self.violated else "no violation found"
+        ratio = f"worst ratio {self.worst_ratio:.4f}" if math.isfinite(self.worst_ratio) else "no damping is enough"
+        ended = ", until its budget was spent" if self.ended_by_clock else ""
+        return f"searched, not proved: {found}, {ratio} in {self.environments} points{ended}, at {self.worst}"
+
+
+def check_ranges(
+    loop: Loop,
+    coupling: Coupling,
+    seed: int = 0,
+    samples: int = SAMPLES,
+    progress: Progress = lambda done, total: None,
+    searched: Searched | None = None,
+    certificate: Certificate | None = None,
+) -> RangesResult | None:
+    """Check a coupling over the ranges of its loop; None where it has none, or where walls stand in it.
+
+    The search is the same every time; `samples` more environments are drawn from inside, by the seed. A design that
+    has already searched, or proved the ranges, passes `searched` and `certificate`. Before walls only single
+    environments can be proved, so nothing is said of ranges.
+    """
+    if loop.ranges is None or loop.environment.walls:
+        return None
+    searched = searched or search_ranges(loop, coupling, progress)
+    members, drawn = loop.members(), inside(loop.network, loop.ranges, samples, seed)
+    try:
+        certificate, reason = certificate or prove(loop, coupling, "this-environment"), None
+    except NotProved as error:
+        certificate, reason = None, str(error)
+    at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)
+    (at_found,) = in_each(loop, coupling, [searched.worst[0].member])
+    result = RangesResult(
+        members,
+        tuple(at_members),
+        drawn,
+        tuple(at_samples),
+        number_of_vertices(loop.network, loop.ranges),
+        searched,
+        at_found,
+        seed,
+        certificate,
+        reason,
+    )
+    if certificate and not result.proved:
+        place, requirement = result.worst_found
+        result = replace(result, reason=violated_between(place, requirement.ratio))
+    return result
+
+
+def violated_between(place: Member, ratio: float) -> str:
+    """Explain why ranges are not guaranteed although every vertex is proved: a point between them violates."""
+    needs = f"{ratio:.4f} of the damping is needed" if np.isfinite(ratio) else "no damping is enough"
+    return f"proved at the vertices, but violated between them: {needs} at {place.name}"
+
+
+# ----------------------------------------------------------------------------------------------------
+# Forces at their limits.
+
+
+_OWN_PROOF = "by a proof of its own, for this environment"
+
+
+@dataclass(frozen=True)
+class ForceLimits:
+    """How forces are limited, and whether a condition holds while they are."""
+
+    rho: tuple[float, ...] | None  # (m,) [N/m] of the limiter; None: no condition covers it, so the tick clips
+    reason: str  # why a condition covers limited forces, or why none does
+    requirement: Requirement | None = None  # of the condition `limiter`, where it was evaluated
+    c: tuple[tuple[float, ...], ...] = ()  # its multiplier
+    certificate: LimiterCertificate | None = None  # its proof
+    force_limit: tuple[float, ...] = ()  # (m,) [N]
+    less: bool = False  # it is proved in one environment, while the guarantee holds in more
+    energy_budget: float | None = None  # W0 [J] that forces may give in all
+
+    def within(self, force_limit: Sequence[float]) -> ForceLimits:
+        """Return the record with other limits (m,) [N], which no proof depends on."""
+        return replace(self, force_limit=tuple(force_limit))
+
+    @property
+    def words(self) -> str:
+        """One line for a report."""
+        amounts = [f"{f:.4g}" for f in self.force_limit]
+        limit = f"{', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N"
+        if self.energy_budget is not None:
+            how = "clipped" if self.rho is None else "limited"
+            return f"{how} to {limit}, and scaled so that they give at most {self.energy_budget:g} J"
+        if self.rho is None:
+            why = self.reason.removeprefix("limiter: ")
+            return f"clipped at {limit}: a guarantee holds while forces stay below ({why})"
+        if not self.proved:
+            return f"certified, also while forces are limited to {limit} ({self.reason})"
+        return f"proved, also while forces are limited to {limit}{', in this environment' if self.less else ''}"
+
+    @property
+    def proved(self) -> bool:
+        """Whether limited forces are covered by exact arithmetic."""
+        return self.rho is not None and (self.requirement is None or self.requirement.proof == "rational")
+
+    def part(self) -> dict[str, Any]:
+        """Return the fields of its JSON."""
+        shown = {"rho": self.rho, "force_limit": self.force_limit, "reason": self.reason, "words": self.words}
+        return shown | {"certificate": self.requirement, "c": self.c, "energy_budget": self.energy_budget}
+
+
+def covered_limits(
+    loop: Loop,
+    coupling: Coupling,
+    requirements: Mapping[str, Requirement],
+    proof: LimiterCertificate | None = None,
+    known: Certificate | None = None,
+) -> ForceLimits:
+    """Find the limiter that a condition covers: of no lag under any-environment, else that of this-environment.
+
+    `proof` belongs to the coupling: its limiter is taken where the proof holds in this loop; where it does not, one of
+    the same beta is searched. What `known` contains is not proved again (design.certificate.check_limiter).
+    """
+    if loop.varying_delay:
+        return ForceLimits(None, str(LIMITER.beyond(loop)))
+    for each in requirements.values():
+        if each.certified and each.lag is not None:
+            return ForceLimits(each.lag, f"{each.condition} covers limited forces")
+    if not requirements[THIS_ENVIRONMENT.name].certified:
+        return ForceLimits(None, "no guarantee that it could extend")
+    less = any(each.certified and each.guarantee == ANY for each in requirements.values())
+    return replace(_by_its_own_block(loop, coupling, proof, known), less=less)
+
+
+def _by_its_own_block(
+    loop: Loop, coupling: Coupling, proof: LimiterCertificate | None, known: Certificate | None
+) -> ForceLimits:
+    """Find the limiter of this-environment."""
+    if proof:
+        try:
+            requirement = check_limiter(loop, coupling, proof, known)
+            return ForceLimits(proof.rho, _OWN_PROOF, requirement, proof.c, proof)
+        except NotProved:  # made for another loop
+            pass
+    limiter = LimitedForces(proof.beta if proof and 0 < proof.beta <= 1 else BETA)
+    requirement = required_damping(loop, coupling, limiter)
+    c = limiter.rows(loop, requirement.multiplier or ())
+    if not requirement.certified:
+        needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
+        return ForceLimits(None, requirement.reason or needs, requirement, c)
+    try:
+        proved = prove_limiter(loop, coupling, limiter.beta, swept=requirement)
+    except NotProved as refused:
+        return ForceLimits(limiter.rho(loop), f"swept, not proved: {refused}", requirement, c)
+    return ForceLimits(proved.rho, _OWN_PROOF, replace(requirement, proof="rational"), c, proved)
+
+
+# ----------------------------------------------------------------------------------------------------
+# The guarantee, and the record that it belongs to.
+
+
+@dataclass(frozen=True)
+class Guarantee:
+    """For whom, and while what, a coupling keeps its loop safe."""
+
+    condition: str  # the condition by which it holds, or "energy-budget"
+    proof: str  # "rational": exact arithmetic; "sampled": a refined sweep; "account": an energy account at every tick
+    facts: tuple[str, ...]  # of the loop that the condition covers beside a linear environment (Assessment.facts)
+    hands: str
+    environments: str  # "any passive environment", "these ranges", "this environment", ..
+    forces: str  # "also while they are limited", or the restriction
+    delays: DelayRange  # of the forces [samples]; any of them at every tick
+    periods: float  # the longest period [s]
+    energy_J: float | None = None  # what a hand may be given beyond what the devices dissipate; None: it comes to rest
+
+    @property
+    def any_environment(self) -> bool:
+        """Whether it holds whatever passive environment is touched."""
+        return self.environments == ANY
+
+    @property
+    def words(self) -> str:
+        """One line for a report: for whom and where the loop is safe."""
+        if self.energy_J is not None:
+            join = "" if self.environments.startswith("and ") else ","
+            amount = f"more than {self.energy_J:g} J" if self.energy_J else "any energy"
+            return f"{self.hands} is given {amount} beyond what the devices dissipate{join} {self.environments}"
+        return self.environments
+
+    def part(self) -> dict[str, Any]:
+        """Return the fields of its JSON."""
+        delays = {"lo": self.delays.lo, "hi": self.delays.hi}
+        part: dict[str, Any] = {"condition": self.condition, "proof": self.proof, "facts": self.facts}
+        part |= {"hands": self.hands, "environments": self.environments, "forces": self.forces}
+        part |= {"delays_samples": delays, "longest_period_s": self.periods, "words": self.words}
+        return part | ({} if self.energy_J is None else {"energy_J": self.energy_J})
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """A coupling in a loop: every report of a coupling, and every run, begins with this record."""
+
+    loop: Loop
+    coupling: Coupling
+    requirements: Mapping[str, Requirement]  # per condition: required and available damping, where it binds
+    environment: Environment | PluggedEnvironment  # what really runs
+    ranges: RangesResult | None  # every vertex of the ranges, and the search between them
+    force_limits: ForceLimits  # limiter (with its proof) or clipping, energy budget
+    transparency: Transparency | None  # None where the environment has no E(z), or the loop no solution
+    certificate: Certificate | None  # the exact proof, if one was given or made for the ranges
+    guarantee: Guarantee | None
+    reason: str | None  # why there is no guarantee
+    condition: str  # the one that must hold, beside which the others are reported
+
+    @property
+    def facts(self) -> tuple[str, ...]:
+        """What the loop has beyond constant delays, even periods and one linear environment."""
+        return facts_of(self.loop, self.environment, self.force_limits)
+
+    @property
+    def decisive(self) -> Requirement:
+        """The requirement of the condition that must hold."""
+        return self.requirements[self.condition]
+
+    @property
+    def holds(self) -> bool:
+        """Whether the condition that must hold does, with a guarantee for all that the loop may be."""
+        if self.guarantee is None or not self.decisive.certified:
+            return False
+        return self.loop.ranges is None or self.guarantee.environments in (ANY, RANGES)
+
+    @property
+    def gains(self) -> dict[str, Any]:
+        """Order and gains of the coupling (Coupling.figures)."""
+        return self.coupling.figures(self.loop.T)
+
+    def without_guarantee(self, reason: str) -> Assessment:
+        """Return the record without its guarantee, because of something that runs and that no loop describes."""
+        return replace(self, guarantee=None, reason=reason)
+
+    def part(self) -> dict[str, Any]:
+        """Return the fields of its JSON."""
+        loop, gains = self.loop, self.gains
+        about = {"T_s": loop.T, "T_max_s": loop.T_max, "latency_s": loop.latency}
+        about |= {name: getattr(loop, name) for name in ("theta", "psi", "lam", "delta")}
+        return {
+            "coupling": {"kind": self.coupling.kind, "K": gains.get("K"), "B": gains.get("B")} | gains,
+            "loop": about,
+            "condition": self.condition,
+            "requirements": dict(self.requirements),
+            "facts": self.facts,
+            "guarantee": self.guarantee,
+            "reason": self.reason,
+            "holds": self.holds,
+            "ranges": self.ranges,
+            "force_limits": self.force_limits,
+            "transparency": self.transparency,
+        }
+
+
+def assess(
+    loop: Loop,
+    coupling: Coupling | Design,
+    *,
+    environment: Environment | PluggedEnvironment | None = None,
+    energy_budget: float | None = None,
+    certificate: Certificate | None = None,
+    condition: str | Condition | None = None,
+    ranges_seed: int = 0,
+    ranges_samples: int = SAMPLES,
+    searched: Searched | None = None,
+    limiter: bool | None = None,
+    limiter_proof: LimiterCertificate | None = None,
+    force_limit: Sequence[float] = (),
+    band_hz: tuple[float, float] = BAND_HZ,
+    progress: Progress = lambda done, total: None,
+) -> Assessment:
+    """Assess a coupling in its loop, for what really runs.
+
+    Args:
+        loop: With its ranges, delays that switch, latency and longest period: all of them must be covered.
+        coupling: The coupling as it runs; of a design also its condition, its proof and its search.
+        environment: What is simulated or driven, where that is not the loop's own environment: one network, or a
+            function that is plugged in behind the coupling and a shell that makes it passive.
+        energy_budget: W0 [J]; of the shell before a function, else of an energy budget before the delays.
+        certificate: A proof on file. It counts only if it is of exactly this loop and coupling and is verified here,
+            unless this process has made it.
+        condition: The condition that must hold, by name or of the user's own; by default this-environment, and
+            known-device where the loop has bounds of its devices.
+        ranges_seed: Seed of the `ranges_samples` environments that are drawn from inside the ranges.
+        searched: A search between the vertices that a design has already made for this loop and coupling.
+        limiter: False where forces are clipped whatever a condition covers.
+        limiter_proof: A proof for limited forces that belongs to the coupling; it is checked in this loop.
+        force_limit: (m,) [N], for reports; no proof depends on it.
+        band_hz: Where the mismatch of the transparency counts.
+        progress: Called with (points done, points in all) of the search over ranges.
+
+    Returns:
+        The assessment. Its guarantee is about the environment that runs: over ranges it may be less than the loop asks
+        for, see `holds`.
+
+    Raises:
+        ValueError: Where coupling and loop do not fit each other, or for an unknown condition.
+    """
+    of_kind("loop", loop, Loop, 'a Loop, as scenario.loop("I") gives it')
+    if isinstance(coupling, Design):
+        certificate, condition = certificate or coupling.certificate, condition or coupling.asked
+        searched, coupling = searched or coupling.searched, coupling.coupling
+    asked = named(condition or (KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT))
+    network = loop.environment if environment is None or callable(environment) else environment
+    here = loop.at(network).switching(None)
+    own = None if asked.name in (*CONDITIONS, *KNOWN_CONDITIONS) else asked
+    by = own if own and certificate and own.name == certificate.condition else None
+    known = certificate if certificate and proves(loop, coupling, certificate, by) else None
+    requirements = requirements_of(here, coupling, known, own=own)
+    ranges = check_ranges(loop, coupling, ranges_seed, ranges_samples, progress, searched, known)
+    if loop.varying_delay:
+        requirements[SWITCHING.name] = judged(loop.at(network), coupling, SWITCHING)
+    if limiter_proof is None and known and known.limiter:
+        limiter_proof = known.limiter
+    plugged = shelled(network if environment is None else environment)
+    if plugged:
+        limits = ForceLimits(None, "the forces of the environment are clipped before the shell")
+    else:
+        where = loop if environment is None else here
+        limits = _force_limits(where, coupling, requirements, limiter, limiter_proof, known)
+    if plugged or energy_budget is not None:
+        limits = replace(limits, energy_budget=energy_budget or 0.0)
+    assessment = Assessment(
+        loop,
+        coupling,
+        requirements,
+        network if environment is None else environment,
+        ranges,
+        limits.within(force_limit),
+        _transparency(here, coupling, band_hz),
+        known or (ranges and ranges.certificate),
+        None,
+        None,
+        asked.name,
+    )
+    guarantee, reason = _guarantee(assessment)
+    by_itself = limits.requirement is not None and limits.rho is not None  # proved in the environment that runs
+    if guarantee and guarantee.environments == RANGES and by_itself and environment is not None:
+        assessment = replace(assessment, force_limits=replace(assessment.force_limits, less=True))
+        guarantee, reason = _guarantee(assessment)
+    return replace(assessment, guarantee=guarantee, reason=reason)
+
+
+def _force_limits(
+    loop: Loop,
+    coupling: Coupling,
+    requirements: Mapping[str, Requirement],
+    limiter: bool | None,
+    proof: LimiterCertificate | None,
+    known: Certificate | None,
+) -> ForceLimits:
+    """Find the limiter for a loop, or say why forces are clipped."""
+    if limiter is False:
+        return ForceLimits(None, "forces are clipped, as asked")
+    if loop.varying_delay:
+        return ForceLimits(None, "limited forces are proved for constant delays")
+    return covered_limits(loop, coupling, requirements, proof, known)
+
+
+def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) -> Transparency | None:
+    """Measure the mismatch, before walls while all of them touch."""
+    try:
+        F, E = loop.F(coupling), loop.E()
+    except ValueError:  # a rigid wall has no E(z), and a singular loop no F
+        return None
+    if too_long(F) or (not E.D.any() and not E.C.any()):
+        return None
+    try:
+        return transparency(F, E, loop.lam, band_hz)
+    except (SingularLoop, ArithmeticError, np.linalg.LinAlgError):
+        return None
+
+
+def shelled(environment: Environment | PluggedEnvironment) -> bool:
+    """Whether an environment runs behind the energy shell: a function that is plugged in, or a MuJoCo scene."""
+    return callable(environment) or getattr(environment, "world", None) is not None
+
+
+def facts_of(
+    loop: Loop, environment: Environment | PluggedEnvironment | None = None, limits: ForceLimits | None = None
+) -> tuple[str, ...]:
+    """Name what a loop has beyond constant delays, even periods and one linear environment, in a fixed order."""
+    network = loop.environment if environment is None or callable(environment) else environment
+    plugged = shelled(network if environment is None else environment)
+    there = {
+        KNOWN_DEVICE.name: bool(loop.known_devices),
+        "periods": loop.T_max not in (None, loop.T),
+        "latency": bool(loop.latency),
+        "switching": bool(loop.varying_delay),
+        "walls": bool(network.walls) and not plugged,
+        "ranges": bool(loop.ranges) and not plugged,
+        "shell": plugged,
+        "limiter": bool(limits and limits.rho is not None),
+    }
+    return tuple(name for name, present in there.items() if present)
+
+
+_EVERYONE = "every passive hand"
+_LIMITED = "also while they are limited"
+_LIMITED_HERE = "also while they are limited, in this environment"
+_BELOW = "while they stay below their limits"
+
+
+def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
+    """The guarantee for what runs, or the reason why there is none."""
+    loop, requirements, limits = assessment.loop, assessment.requirements, assessment.force_limits
+    own = requirements[assessment.condition]
+    if shelled(assessment.environment):
+        return _shell(assessment)
+    if limits.energy_budget is not None:
+        return _account(assessment, "whatever computes the forces"), None
+    if loop.varying_delay:
+        needs = requirements[SWITCHING.name]
+        if not needs.certified:
+            return None, f"delays that switch within {loop.varying_delay} are not covered: {needs.shortfall}"
+        return _stated(assessment, needs, loop.environment.here), None
+    held = [need for need in requirements.values() if need.certified and need.guarantee]
+    if anywhere := [need for need in held if need.guarantee == ANY]:
+        return _stated(assessment, anywhere[0], ANY), None
+    if assessment.ranges and assessment.ranges.proved and _within(assessment):
+        return _stated(assessment, replace(requirements[THIS_ENVIRONMENT.name], proof="rational"), RANGES), None
+    if held:
+        return _stated(assessment, held[0], str(held[0].guarantee)), None
+    return None, f"{own.shortfall} ({own.condition})"
+
+
+def _within(assessment: Assessment) -> bool:
+    """Whether what runs is the nominal environment of the ranges or one of their vertices."""
+    return any(assessment.environment == member.network for member in assessment.loop.members())
+
+
+def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guarantee:
+    """The guarantee that a certified requirement gives in these environments."""
+    loop, limits = assessment.loop, assessment.force_limits
+    forces = _BELOW if limits.rho is None else _LIMITED_HERE if limits.less else _LIMITED
+    longest = loop.T_max or loop.T
+    facts = tuple(fact for fact in assessment.facts if environments != ANY or fact not in ("walls", "ranges"))
+    bounded = by.condition in KNOWN_CONDITIONS
+    hands = f"{_EVERYONE}, on {described(loop)}" if bounded else _EVERYONE
+    facts = tuple(fact for fact in facts if bounded or fact != KNOWN_DEVICE.name)
+    return Guarantee(by.condition, by.proof, facts, hands, environments, forces, loop.delays, longest)
+
+
+def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
+    """The shell's guarantee, which needs a coupling that is certified for any environment without delay in it."""
+    loop, needs = assessment.loop, assessment.requirements[ANY_ENVIRONMENT.name]
+    if any(loop.psi):
+        return None, f"psi is {', '.join(map(str, loop.psi))}: a shell needs an environment without delay"
+    if loop.varying_delay:
+        return None, "the shell needs constant delays: any-environment does not cover delays that switch"
+    if not needs.certified or needs.guarantee != ANY:
+        return None, f"the coupling is not certified for any environment: {needs.shortfall}"
+    world = not callable(assessment.environment)
+    where = "and gravity and springs of the scene released, whatever the scene does" if world else None
+    return _account(assessment, where or "whatever computes the force"), None
+
+
+def _account(assessment: Assessment, whatever: str) -> Guarantee:
+    """What an energy account guarantees: behind a certified coupling (the shell), or at the devices (the budget)."""
+    loop, plugged = assessment.loop, shelled(assessment.environment)
+    condition = ANY_ENVIRONMENT.name if plugged else "energy-budget"
+    proof = assessment.requirements[ANY_ENVIRONMENT.name].proof if plugged else "account"
+    how = "scaled by the shell" if plugged else "scaled by the energy budget"
+    longest, W0 = loop.T_max or loop.T, assessment.force_limits.energy_budget
+    return Guarantee(
+        condition, proof, assessment.facts, "no passive hand", whatever, how, loop.delays, longest, energy_J=W0
+    )

@@ -1,0 +1,195 @@
+"""The guarantee of an assessment: it is there for exactly what was proved, and gone where anything else runs."""
+
+import json
+
+import msgspec
+import pytest
+from haptic_loop.cli.audit import main as audit
+from haptic_loop.cli.run import main as run
+from haptic_loop.cli.validate import main as validate
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.delay import VaryingDelay
+from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.ranges import Ranges
+from haptic_loop.design import compare as comparison
+from haptic_loop.design.assessment import assess
+from haptic_loop.design.certificate import prove
+from haptic_loop.design.coupling_file import Stored, digest, save, sealed
+from haptic_loop.design.guarantees import ANY, HERE
+from haptic_loop.sim.api import simulate
+from haptic_loop.sim.couplings import assessed, given
+from haptic_loop.sim.scenario import InputError, load
+
+from tests.asked import needs, safe_with
+
+LOOP = load("omega-pair").loop("I")
+SOFT = SpringDamper([800.0, 500.0], [0.3, 0.3])  # certified for any environment
+HERE_ONLY = SpringDamper([7000.0, 2900.0], [0.42, 1.69])  # 98 % of the damping, in this environment
+change = msgspec.structs.replace
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"delta": (1.2, 1.2)},
+        {"theta": (3, 4), "lam": (1, 2)},
+        {"T_max": 1.5e-3},
+        {"psi": (1, 1)},
+        {"latency": ((0.0, 1e-3),) * 2},
+        {"varying_delay": DelayRange((1, 1), (2, 3))},
+        {"environment": Network(LOOP.environment.contacts, (Spring(LOOP.environment.contacts, 9000.0),))},
+    ],
+    ids=str,
+)
+def test_another_loop_loses_the_guarantee(changes):
+    here = assess(LOOP, HERE_ONLY)
+    certificate = prove(LOOP, HERE_ONLY, "this-environment")
+    assert here.guarantee.environments == HERE
+    for known in (None, certificate):
+        elsewhere = assess(change(LOOP, **changes), HERE_ONLY, certificate=known)
+        assert elsewhere.guarantee is None
+        assert elsewhere.reason
+
+
+def test_another_coupling_does_not_inherit_a_certificate():
+    certificate = prove(LOOP, HERE_ONLY, "this-environment")
+    stiffer = HERE_ONLY.scaled(stiffness=1.2)
+    assert assess(LOOP, stiffer, certificate=certificate).guarantee is None
+
+
+def test_a_forged_certificate_proves_nothing():
+    stiffer = HERE_ONLY.scaled(stiffness=1.2)
+    certificate = prove(LOOP, HERE_ONLY, "this-environment")
+    forged = sealed(change(certificate, scenario=digest(LOOP, stiffer.form())))
+    assessment = assess(LOOP, stiffer, certificate=forged)
+    assert (assessment.guarantee, assessment.certificate) == (None, None)
+
+
+def test_the_forces_of_a_guarantee_are_those_that_run():
+    limited, clipped = assess(LOOP, HERE_ONLY), assess(LOOP, HERE_ONLY, limiter=False)
+    assert limited.force_limits.rho is not None
+    assert "limiter" in limited.facts
+    assert clipped.force_limits.rho is None
+    assert limited.guarantee.forces != clipped.guarantee.forces
+    assert "below" in clipped.guarantee.forces
+
+
+def test_lost_packets_end_the_guarantee():
+    scenario = load("omega-pair")
+    varying = {"lo": (1, 2), "hi": (1, 2), "pattern": "random", "loss": 0.1}
+    lossy = scenario.replace(varying_delay=VaryingDelay(**varying))
+    chosen = given(SOFT)
+    assert assessed(scenario, "I", chosen).guarantee
+    assert assessed(lossy, "I", chosen).guarantee is None
+
+
+# The shell behind which a user's own environment runs.
+
+
+def spring(u):
+    return 300.0 * u
+
+
+@pytest.mark.parametrize(
+    ("changes", "coupling", "holds"),
+    [
+        ({}, SOFT, True),
+        ({}, HERE_ONLY, False),
+        ({"psi": (1, 1)}, SOFT, False),
+        ({"theta": (3, 4)}, SOFT, False),
+        ({"T_max": 3e-3}, SOFT, False),
+    ],
+    ids=str,
+)
+def test_the_shell_needs_a_coupling_for_any_environment(changes, coupling, holds):
+    scenario = load("omega-pair").replace(duration=0.1, **changes)
+    meta = simulate(scenario, coupling, "exact", environment=spring, energy_budget=0.1).meta
+    guarantee, words = meta["assessment"]["guarantee"], meta["energy_budget"]["guarantee"]
+    assert (guarantee is not None) == holds
+    assert words.startswith("no guarantee: ") != holds
+    if holds:
+        assert (guarantee["energy_J"], guarantee["condition"]) == (0.1, "any-environment")
+    else:
+        assert meta["assessment"]["reason"] in words
+
+
+def test_the_energy_budget_is_what_its_run_guarantees():
+    """Forces that the budget scales are no longer those of the certified law: the account is what holds."""
+    scenario = load("omega-pair").replace(duration=0.1)
+    meta = simulate(scenario, HERE_ONLY, "exact", energy_budget=0.02).meta
+    guarantee = meta["assessment"]["guarantee"]
+    assert (guarantee["condition"], guarantee["energy_J"]) == ("energy-budget", 0.02)
+    assert meta["energy_budget"]["guarantee"] == guarantee["words"]
+
+
+# The commands.
+
+
+@pytest.fixture
+def stored(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    save(Stored.of(LOOP, HERE_ONLY, prove(LOOP, HERE_ONLY, "this-environment")), "own.json")
+
+
+_COMMANDS = {
+    "audit": (audit, ["--coupling", "own.json"]),
+    "run": (run, ["--coupling", "own.json", "--duration", "0.1", "--no-plot"]),
+    "validate": (validate, ["--coupling", "own.json", "--humans", "2", "--duration", "0", "--no-plot"]),
+}
+
+
+@pytest.mark.usefixtures("stored")
+@pytest.mark.parametrize("name", _COMMANDS)
+@pytest.mark.parametrize("elsewhere", [["--delta", "1.2"], ["--theta", "3,4"], ["--psi", "1"]], ids=str)
+def test_a_command_claims_nothing_in_another_loop(name, elsewhere, tmp_path):
+    main, words = _COMMANDS[name]
+
+    def report(*more):
+        main([*words, *more, "--json", str(tmp_path / "r.json"), "--out", str(tmp_path / "out")])
+        return json.loads((tmp_path / "r.json").read_text())
+
+    assert safe_with(report()) == HERE
+    there = report(*elsewhere)
+    assert safe_with(there) is None
+    assert not there["assessment"]["holds"]
+    assert there["assessment"]["reason"]
+
+
+# One wall: every command says what the condition for walls requires, none what a contact that is never left does.
+
+
+def test_one_wall_has_one_requirement(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    coupling = SpringDamper([1200.0], [0.5])
+    scenario = load("one-wall")
+    loop = scenario.loop("I")
+    expected = assess(loop, coupling).requirements["this-environment"].required
+    frozen = [assess(state, coupling).requirements["this-environment"].required[0] for state in loop.frozen()]
+    assert expected[0] > 1.01 * max(frozen)
+    save(Stored.of(loop, coupling), "wall.json")
+    words = ["--scenario", "one-wall", "--coupling", "wall.json", "--json", "r.json", "--out", "out"]
+    quick = ["--duration", "0.1", "--no-plot"]
+    for command, more in ((audit, []), (run, quick), (validate, [*quick, "--humans", "2"])):
+        command([*words, *more])
+        report = json.loads((tmp_path / "r.json").read_text())
+        assert needs(report, "this-environment")["required_damping"] == pytest.approx(expected, rel=1e-9)
+    judged = comparison.judge(loop, coupling)
+    assert judged.requirements["this-environment"].required == pytest.approx(expected, rel=1e-9)
+
+
+def test_delays_that_switch_before_walls_are_refused():
+    words = ["--scenario", "one-wall", "--K", "1200", "--B", "0.5", "--varying-delay", "0-2"]
+
+    with pytest.raises(InputError, match="walls"):
+        audit(words)
+
+
+def test_ranges_with_walls_are_not_held():
+    """Walls are proved in one environment: the nominal one may be certified, its ranges are not."""
+
+    wall = Network(("tip",), masses={"tip": 0.05}, walls=(Wall(("tip", GROUND), 1000.0),))
+    loop = Loop(1e-3, (0,), (0,), (0,), (1.37,), wall, ranges=Ranges(masses={"tip": (0.04, 0.06)}))
+    assessment = assess(loop, SpringDamper([1300.0], [0.3]))
+    assert assessment.ranges is None
+    assert assessment.guarantee is None or assessment.guarantee.environments == ANY or not assessment.holds
