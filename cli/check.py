@@ -9,6 +9,7 @@ from functools import partial
 
 from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
+from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.ranges import regions
 from haptic_loop.design.assessment import Assessment, SearchFigures, assess, violated_between
 from haptic_loop.design.certificate import (
@@ -24,6 +25,7 @@ from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Stored, SwitchingProof
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import HERE, RANGES
+from haptic_loop.design.known_device import described
 from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, listed, switching_guarantee
 from haptic_loop.design.worst_member import Searched, search, search_ranges
 from haptic_loop.sim.couplings import read_coupling
@@ -128,6 +130,12 @@ def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
         return search(regions(loop.network, loop.ranges), lambda m: need(loop.at(m.network)).ratio, move)
 
 
+def _guarantee(loop: Loop, condition: Condition) -> str:
+    """The environments of a condition, and the devices where it is about known ones only."""
+    devices = f"; every passive hand, on {described(loop)}" if condition.name in KNOWN_CONDITIONS else ""
+    return f"{condition.words(loop)}{devices}"
+
+
 def _checked(
     stored: Stored, condition: Condition | None, verdict: Verdict, searched: Searched | None, seconds: float
 ) -> _Checked:
@@ -141,7 +149,7 @@ def _checked(
         proved,
         verdict.reason,
         claim and claim.condition,
-        (condition or named(claim.condition)).words(loop) if claim and proved else None,
+        _guarantee(loop, condition or named(claim.condition)) if claim and proved else None,
         claim.proof if claim and proved else None,
         len(loop.members()) - 1 if loop.ranges else None,
         searched and SearchFigures.of(searched),

@@ -24,6 +24,7 @@ from haptic_loop.design.coverage import Switching
 from haptic_loop.design.files import InputError, off_table
 from haptic_loop.design.frequency import sweeping, too_long
 from haptic_loop.design.guarantees import CAVEATS
+from haptic_loop.design.known_device import KNOWN_DEVICE, LeftOver, left_over
 from haptic_loop.design.own import place_of
 from haptic_loop.design.result import ConditionName, Requirement, listed, refusal
 from haptic_loop.design.worst_member import Progress
@@ -323,6 +324,7 @@ class Audit:
     switching: Switching | None
     helps: list[Help]
     not_covered: str = CAVEATS
+    left_over: LeftOver | None = off_table("if given", None)  # what Theorem A asks of known devices
 
 
 def audit(
@@ -357,6 +359,7 @@ def audit(
         {name: _margins(constant, coupling, each, needs[name]) for name, each in conditions.items()},
         Switching.of(loop, coupling, needs["switching"]) if loop.varying_delay else None,
         _helps(constant, coupling, conditions[fails]),
+        left_over=left_over(constant, coupling, needs.get(KNOWN_DEVICE.name)),
     )
 
 

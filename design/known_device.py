@@ -17,17 +17,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import flint
 import numpy as np
 import scipy  # its parts load when they are used
-from haptic_loop.controller.arithmetic import Number, numbers, rational
+from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers, rational
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay
-from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.loop import DeviceBounds, Loop
 from haptic_loop.controller.lti import Array, Complex, Lti, hstack, taps, vstack
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design.conditions import Condition, Demand, even_damping, v_hat
@@ -36,6 +37,7 @@ from haptic_loop.design.exact import require_size
 from haptic_loop.design.frequency import Response, frequencies, hermitian, largest_eigenvalue, on_circle, supremum
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import Environments, NotProved, Requirement, from_ratio, refusal
+from numpy.typing import NDArray
 
 # ----------------------------------------------------------------------------------------------------
 # The least cost of a period.
@@ -69,7 +71,11 @@ class _Known(NamedTuple):
 
 
 def _known(loop: Loop, T: Number) -> _Known:
-    devices = loop.known_devices or ()
+    return _in_arithmetic(loop.known_devices or (), T)
+
+
+@lru_cache(maxsize=64, typed=True)  # typed: the period's type decides the arithmetic
+def _in_arithmetic(devices: tuple[DeviceBounds, ...], T: Number) -> _Known:
     stiffness, least = (
         numbers([getattr(device, f"transmission_{name}") for device in devices], T)
         for name in ("stiffness_max", "damping_min")
@@ -250,7 +256,7 @@ _SCANNED = np.concatenate([np.geomspace(1e-4, 0.6, 36), 1 - np.geomspace(0.35, 1
 _BISECTIONS = 52  # of an interval of shares: to 2e-16 of its length
 _THIN = 5  # every so many frequencies of the grid are looked at while the best beta is located
 _WORST = 6  # frequencies of least room at which the least share is found at once
-_MOST_CUTS = 40
+_IN_A_CUT, _MOST_CUTS = 28, 40  # bisections of a cut, whose result is from above
 _GOLDEN, _SECTIONS = (5**0.5 - 1) / 2, 30  # thirty sections locate log beta to 1e-6 of the bracket
 _STEPS = 0.2, 0.05, 0.0125, 0.003  # of log beta, channel by channel
 _MOST_MOVES = 12  # per channel and step
@@ -292,11 +298,11 @@ class Sweep(ABC):
     def room(self, here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
         """Return Hermitian matrices (k, m, m) that must be positive; entries of the cost are (k, m)."""
 
-    def shares(self, here: _Sampled, beta: Array, low: float, high: float) -> Array:
+    def shares(self, here: _Sampled, beta: Array, low: float, high: float, steps: int = _BISECTIONS) -> Array:
         """Return the least share (k,) in [low, high] at each frequency, inf where `high` is too little."""
         least, most = np.full(here.z.size, low), np.full(here.z.size, high)
         enough, plenty = (self._least_room(here, share, beta) > 0 for share in (least, most))
-        for _ in range(_BISECTIONS):
+        for _ in range(steps):
             middle = (least + most) / 2
             holds = self._least_room(here, middle, beta) > 0
             least, most = np.where(holds, least, middle), np.where(holds, middle, most)
@@ -325,7 +331,7 @@ class Sweep(ABC):
             if not worst.size:
                 return share
             at = _Sampled(*(part[worst] for part in here))
-            share = float(self.shares(at, beta, share, high).max())
+            share = float(self.shares(at, beta, share, high, _IN_A_CUT).max())
         return share
 
     def required(self, beta: Array, high: float) -> tuple[float, float]:
@@ -407,10 +413,14 @@ class ThisEnvironmentSweep(Sweep):
         return _Sampled(z, hermitian(self._regular.at(z)), self._F.at(z))
 
     def room(self, here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
+        return self.room_of(here, cost, beta)
+
+    @staticmethod
+    def room_of(here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
         """He[F/(z-1)] + l11 - M*M/(4 l22) with M = -beta F/z + l21: the Schur complement of the row of v."""
         own, cross, speed = device_rows(here.z, cost)
-        one = np.eye(beta.size)
-        M = -beta[:, None] * here.forces / here.z[:, None, None] + cross[..., None] * one
+        one = np.eye(beta.shape[-1])
+        M = -beta[..., None] * here.forces / here.z[:, None, None] + cross[..., None] * one
         return here.own + own[..., None] * one - np.conj(np.swapaxes(M, 1, 2)) @ (M / (4 * speed[..., None]))
 
 
@@ -426,8 +436,12 @@ class AnyEnvironmentSweep(Sweep):
         return _Sampled(z, hermitian(self._own.at(z)), self._V.at(z))
 
     def room(self, here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
+        return self.room_of(self.loop.theta, here, cost, beta)
+
+    @staticmethod
+    def room_of(theta: Sequence[int], here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
         """He[V/(1-z)] - diag chi."""
-        return here.own - chi(here.z, self.loop.theta, cost, beta)[..., None] * np.eye(beta.size)
+        return here.own - chi(here.z, theta, cost, beta)[..., None] * np.eye(beta.shape[-1])
 
 
 def chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Array:
@@ -542,6 +556,39 @@ class KnownDevice(Condition):
         low = sweep.floor(beta)
         return lambda w: sweep.shares(sweep.sampled(w), beta, low, max(_MOST_SHARE, 2 * low))
 
+    def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
+        """Return the required share of the damping for a stack of couplings, (n,), to three hundredths, on a grid.
+
+        Between _LEAST_DRAWN and what the plain condition asks each share is tried with _DRAWN values of beta, the same
+        part of the largest one on every channel: a map asks for thousands of couplings.
+        """
+        plain = self.plain.ratios(loop, coupling)
+        if plain is None or self.beyond(loop):
+            return plain if plain is None else np.full(plain.size, np.inf)
+        w = np.broadcast_to(_drawn_frequencies(loop), (plain.size, _DRAWN_POINTS))
+        here = self.drawn(loop, coupling, w)
+        low, high = np.full(plain.size, _LEAST_DRAWN), np.minimum(plain, _MOST_DRAWN)
+        open_ = (high > low) & np.isfinite(plain)
+        last = np.zeros(plain.size, dtype=int)  # which beta has served a cell before: it is tried first
+        enough = _shares_hold(self, loop, here, high, last)
+        high = np.where(enough, high, np.inf)
+        for _ in range(_DRAWN_STEPS):
+            middle = np.sqrt(low * np.where(open_ & enough, high, low))
+            holds = _shares_hold(self, loop, here, middle, last)
+            low, high = np.where(holds, low, middle), np.where(holds & enough, middle, high)
+        return np.minimum(np.where(open_ & enough, high, plain), plain)
+
+    def drawn(self, loop: Loop, coupling: Coupling, w: Array) -> _Sampled:
+        """Return the environment's side of a stack of couplings at w (n, k), one after the other."""
+        m, z = loop.channels, on_circle(w)
+        F = np.broadcast_to(loop.late(loop.sent_at(coupling, z)).G, (*w.shape, m, m)).reshape(-1, m, m)
+        step = -0.5 - 0.5j / np.tan(w.ravel() / 2)  # 1/(z - 1)
+        return _Sampled(z.ravel(), hermitian(F * step[:, None, None]), F)
+
+    def room(self, loop: Loop, here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
+        """Return the Hermitian matrices that must be positive."""
+        return ThisEnvironmentSweep.room_of(here, cost, beta)
+
     def not_varied(self, loop: Loop) -> str | None:
         return "every variation would need a search for its own beta: not searched"
 
@@ -550,9 +597,6 @@ class KnownDevice(Condition):
 
     def multiplier_name(self, loop: Loop) -> str | None:
         return "beta, q"
-
-    def words(self, loop: Loop) -> str:
-        return f"{super().words(loop)}; every passive hand, on {described(loop)}"
 
 
 class KnownDeviceAny(KnownDevice):
@@ -579,6 +623,15 @@ class KnownDeviceAny(KnownDevice):
         static, block = known_device_any_block(V, loop.theta, cost, beta)
         return Demand(block, _zero(block), {"V(1)": static})
 
+    def drawn(self, loop: Loop, coupling: Coupling, w: Array) -> _Sampled:
+        m, z = loop.channels, on_circle(w)
+        V = np.broadcast_to(coupling.sampled(z, loop.T).G, (*w.shape, m, m)).reshape(-1, m, m)
+        step = 0.5 + 0.5j / np.tan(w.ravel() / 2)  # 1/(1 - z)
+        return _Sampled(z.ravel(), hermitian(V * step[:, None, None]), V)
+
+    def room(self, loop: Loop, here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
+        return AnyEnvironmentSweep.room_of(loop.theta, here, cost, beta)
+
     def members(self, loop: Loop) -> tuple[Member, ...]:
         return ()
 
@@ -587,6 +640,41 @@ class KnownDeviceAny(KnownDevice):
 
     def guarantee(self, loop: Loop) -> Environments:
         return "any passive environment"
+
+
+_LEAST_DRAWN, _MOST_DRAWN = 0.02, 10.0  # shares of the damping between which a map tells them apart
+_DRAWN_STEPS = 10  # of halving their logarithm: to 0.6 %
+_DRAWN = np.concatenate([np.geomspace(0.003, 0.5, 18), [0.62, 0.74, 0.85, 0.93, 0.98, 0.9995]])
+_DRAWN_POINTS = 240
+
+
+def _drawn_frequencies(loop: Loop) -> Array:
+    """Frequencies of a map [rad/sample], even and in their logarithm."""
+    half = _DRAWN_POINTS // 2
+    return np.sort(np.concatenate([np.geomspace(1e-3, np.pi, half), np.linspace(0.011, np.pi, half)]))
+
+
+def _shares_hold(
+    condition: KnownDevice, loop: Loop, here: _Sampled, share: Array, last: NDArray[np.intp]
+) -> NDArray[np.bool_]:
+    """Whether some beta serves each cell at its share, (n,); `last` is updated with the one that does."""
+    n, known = share.size, _known(loop, loop.T)
+    points, holds = here.z.size // n, np.zeros(n, dtype=bool)
+    parts = [part.reshape(n, points, *part.shape[1:]) for part in here]
+    largest = np.minimum(2 * np.sqrt(share[:, None] * np.array(loop.delta) / known.P), 4 * known.mass / known.damping)
+    root = 1 / np.sqrt(even_damping(loop))
+    for turn in range(_DRAWN.size):
+        left = np.flatnonzero(~holds)
+        if not left.size:
+            break
+        which = (last[left] + turn) % _DRAWN.size
+        some = _Sampled(*(part[left].reshape(-1, *part.shape[2:]) for part in parts))
+        beta = np.repeat(_DRAWN[which, None] * largest[left], points, axis=0)
+        cost = period_cost(loop, np.repeat(share[left], points), beta)
+        matrix = root[:, None] * condition.room(loop, some, cost, beta) * root
+        served = (largest_eigenvalue(-matrix).reshape(-1, points) < 0).all(axis=1)
+        holds[left], last[left[served]] = served, which[served]
+    return holds
 
 
 def _zero(block: Lti) -> Lti:
@@ -691,6 +779,51 @@ def necessary_share(F: Lti, loop: Loop) -> Necessary:
 
     share, w = supremum(shares, frequencies(F, low=_LOWEST))
     return Necessary(share, w, bool(np.isfinite(share)) and _stable_with_held_ends(F, loop, share * (1 + 1e-6)))
+
+
+@dataclass(frozen=True)
+class LeftOver:
+    """What Theorem A asks of linear motors beside what is proved: how much a better proof could still gain."""
+
+    required_damping: tuple[
+        float, ...
+    ]  # (m,) [N s/m], by a sweep; no condition for these devices asks less if `attained`
+    frequency_hz: float
+    attained: bool  # one channel, or equal devices: some lossless hand destabilises the loop at any smaller damping
+    proved_damping: tuple[float, ...] | None  # (m,) [N s/m] by known-device; None where it certifies nothing
+
+    @property
+    def words(self) -> str:
+        """The comparison as a sentence without its full stop."""
+        need = ", ".join(f"{d:.5g}" for d in self.required_damping)
+        exact = "no proof for every passive hand can ask less" if self.attained else "that is enough, by a sweep"
+        if self.proved_damping is None:
+            return f"known devices with linear motors need {need} N s/m (Theorem A): {exact}"
+        given = ", ".join(f"{d:.3g}" for d in np.subtract(self.proved_damping, self.required_damping))
+        said = f"known devices with linear motors need {need} N s/m (Theorem A): {exact}"
+        return f"{said}; the proof gives away {given} N s/m"
+
+
+def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None) -> LeftOver | None:
+    """Return what Theorem A asks of this loop; None where it says nothing of it or finds no damping that is enough.
+
+    `proved` is what known-device asks, if it has been asked already.
+    """
+    if KNOWN_DEVICE.beyond(loop) or loop.ranges or loop.T_max not in (None, loop.T):
+        return None
+    try:
+        F = loop.F(coupling)
+    except SingularLoop:
+        return None
+    if not F.is_stable():
+        return None
+    found, proved = necessary_share(F, loop), proved or KNOWN_DEVICE.judge(loop, coupling)
+    if not (found.held and np.isfinite(found.share)):
+        return None
+    needed = tuple(found.share * d for d in loop.delta)
+    equal = len(set(zip(loop.known_devices or (), loop.delta, strict=True))) == 1
+    asked = proved.required if np.isfinite(proved.ratio) else None
+    return LeftOver(needed, found.w / (2 * np.pi * loop.T), equal, asked)
 
 
 def _stable_with_held_ends(F: Lti, loop: Loop, share: float) -> bool:

@@ -26,6 +26,8 @@ _STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # areas
 _LINES: dict[str, dict[str, Any]] = {
     "this-environment": plots.STYLES[2] | {"linestyle": "-", "linewidth": 3.6},
     "any-environment": plots.STYLES[0] | {"linestyle": "--", "linewidth": 1.8},
+    "known-device": plots.STYLES[1] | {"linestyle": "-", "linewidth": 3.6},
+    "known-device-any": plots.STYLES[4] | {"linestyle": "--", "linewidth": 1.8},
     MODEL_KEPT: plots.STYLES[3] | {"linewidth": 1.8},
 }
 _OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.2}  # of a condition of the user's

@@ -9,12 +9,13 @@ import pytest
 from asked import loop as loop_of
 from asked import this_environment
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
-from haptic_loop.controller.environment import GROUND, Network, Spring
+from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring
 from haptic_loop.controller.loop import DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.design.api import design_coupling
-from haptic_loop.design.certificate import prove, required_damping, verify
+from haptic_loop.design.audit import audit
+from haptic_loop.design.certificate import named, prove, required_damping, verify
 from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.exact import find_storage, prove_positive_real
 from haptic_loop.design.files import InputError
@@ -28,6 +29,7 @@ from haptic_loop.design.known_device import (
     exact_cost,
     known_device_any_block,
     known_device_block,
+    left_over,
     necessary_share,
     period_cost,
     q_bounds,
@@ -623,3 +625,30 @@ def test_what_known_devices_do_not_cover_is_refused_by_designs():
         design_coupling(KNOWN, "spring-damper", "known-device", limiter=True)
     with pytest.raises(ValueError, match="no guaranteed bounds"):
         design_coupling(PAIR, "spring-damper", "known-device")
+
+
+# ----------------------------------------------------------------------------------------------------
+# Maps and what is left.
+
+
+@pytest.mark.parametrize("name", ["known-device", "known-device-any"])
+def test_a_map_agrees_with_the_sweep_of_one_coupling(name):
+    """A stack of spring-dampers before a rigid wall: to three hundredths, and never above the plain condition."""
+    loop = one(1e-3, 1.37, environment=RIGID_WALL)
+    K, B = (part.ravel() for part in np.meshgrid([1500.0, 4000.0], [0.4, 1.2, 3.0]))
+    drawn = named(name).ratios(loop, SpringDamper(K[:, None], B[:, None]))
+    for k, b, ratio in zip(K, B, drawn, strict=True):
+        swept = required_damping(loop, SpringDamper([k], [b]), name).ratio
+        if ratio > 0.05:  # below, a map keeps what is surely enough
+            assert ratio == pytest.approx(swept, rel=0.03)
+        assert ratio >= swept * 0.98
+
+
+def test_the_audit_says_what_is_left():
+    left = audit(KNOWN, PUBLISHED["I"]).left_over
+    assert left.attained
+    assert left.required_damping[0] == pytest.approx(0.96269, rel=1e-4)
+    assert left.proved_damping[0] == pytest.approx(0.96294, rel=1e-4)
+    other = change(KNOWN, known_devices=(DEVICE, change(DEVICE, motor_mass_min=0.1)))
+    assert not left_over(other, PUBLISHED["I"]).attained
+    assert audit(PAIR, PUBLISHED["I"]).left_over is None
