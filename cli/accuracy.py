@@ -66,8 +66,14 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> options.Parser:
-    example = "python -m sim.accuracy --duration 5"
-    parser = options.Parser("sim.accuracy", "Speed against error, engine by engine.", example)
+    two = "python -m sim.accuracy --scenario three-rigid --coupling none"
+    parser = options.Parser(
+        "sim.accuracy",
+        "Speed against error, engine by engine.",
+        "python -m sim.accuracy --duration 5",
+        two,
+        first="scenario coupling condition reference duration json",
+    )
     parser.add_loop()
     parser.add_coupling(", ".join(NAMES))
     parser.add_limiter()

@@ -27,11 +27,10 @@ from haptic_loop.sim.report import encoder_steps
 from haptic_loop.sim.scenario import InputError, Scenario
 from rich.table import Table
 
-_EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
-  python -m design.audit --rigid --K 5000 --B 0 --T 1e-3 --theta 0 --delta 1.37
-  python -m design.audit --case I --K 879,552 --B 0.39,0.52 --varying-delay 1,2
-  python -m design.audit --device falcon --delta 0.5
-  python -m design.audit --devices"""
+_EXAMPLES = (
+    "python -m design.audit --K 2870,2320 --B 5.47,5.55",
+    "python -m design.audit --rigid --K 5000 --B 0 --T 1e-3 --theta 0 --delta 1.37",
+)
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,7 @@ def main(argv: list[str]) -> int:
 
 def _parser() -> options.Parser:
     what = "Say whether a coupling is safe for every passive human, and how far."
-    parser = options.Parser("design.audit", what, _EXAMPLE)
+    parser = options.Parser("design.audit", what, *_EXAMPLES, first="K B rigid device scenario json")
     coupling = parser.add_argument_group("the coupling")
     stiffness = options.several(float, 1e-3, 1e9, "N/m")  # far from overflow, and so is the damping
     coupling.add_argument("--K", type=stiffness, metavar="K,K,..", help="stiffness per channel [N/m]; one is for all")

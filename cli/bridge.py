@@ -80,7 +80,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = options.Parser(
         "hw.bridge",
         "Drive a device over a serial port with a coupling that is certified for the delay measured.",
-        "python -m hw.bridge --rehearse --case I --duration 2",
+        "python -m hw.bridge --rehearse --duration 2",
+        "python -m hw.bridge --port /dev/ttyACM0 --coupling coupling.json",
+        first="port rehearse scenario coupling arm duration",
     )
     parser.add_loop()
     session_cli.add_link_options(parser)

@@ -89,8 +89,11 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> options.Parser:
-    example = "python -m design.check coupling.json"
-    parser = options.Parser("design.check", "Prove a stored coupling again, in exact arithmetic.", example)
+    examples = (
+        "python -m design.check coupling.json",
+        "python -m design.check coupling.json --condition this-environment",
+    )
+    parser = options.Parser("design.check", "Prove a stored coupling again, in exact arithmetic.", *examples)
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling")
     parser.add_condition("the condition of the file's certificate, or another one that is proved anew")
     parser.add_json()

@@ -37,10 +37,11 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> options.Parser:
-    example = """python -m design.compare
-  python -m design.compare --coupling published,spring-damper:any-environment,optimal"""
+    two = "python -m design.compare --coupling published,spring-damper:any-environment,optimal"
     what = "Run the same devices and hands with every coupling, or compare the couplings of --coupling over frequency."
-    parser = options.Parser("design.compare", what, example)
+    parser = options.Parser(
+        "design.compare", what, "python -m design.compare", two, first="scenario coupling condition reference out json"
+    )
     parser.add_loop()
     given = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION asks for a condition"
     parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"over frequency: {given}")

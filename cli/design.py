@@ -50,14 +50,16 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> options.Parser:
-    example = "python -m design --case I --coupling spring-damper --out coupling.json"
-    parser = options.Parser("design", "Design a coupling, prove its certificate and store both.", example)
+    parser = options.Parser(
+        "design",
+        "Design a coupling, prove its certificate and store both.",
+        "python -m design --coupling optimal --out coupling.json",
+        "python -m design --scenario lab.toml --ranges 10%",
+        first="scenario coupling condition reference ranges out",
+    )
     parser.add_loop()
-    kind = parser.add_mutually_exclusive_group()
     kinds = f"{', '.join(KINDS)}, or FILE.py:NAME of your own (default spring-damper)"
-    kind.add_argument("--coupling", metavar="NAME", default="spring-damper", help=kinds)
-    best = "the coupling of the least transparency error: --coupling optimal"
-    kind.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
+    parser.add_argument("--coupling", metavar="NAME", default="spring-damper", help=kinds)
     around = "certify for every stiffness and mass this much more or less, as [ranges] of a scenario does"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
     parser.add_condition("what to certify")
@@ -71,14 +73,14 @@ def _parser() -> options.Parser:
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
     ways = "complementarity (as printed), inner or fixed-poles (default inner)"
     ccl.add_argument("--method", metavar="NAME", help=ways)
-    add_optimal_options(parser, "optimal: the best filter of the environment's forces")
+    _add_optimal_options(parser, "optimal: the filter of the environment's forces with the least transparency error")
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
     parser.add_argument("--samples", type=options.whole(0, 10_000), metavar="N", help=samples)
     parser.add_output("FILE.json", "the stored coupling (default out/design-<case or scenario>.json)")
     return parser
 
 
-def add_optimal_options(parser: options.Parser, title: str) -> None:
+def _add_optimal_options(parser: options.Parser, title: str) -> None:
     """The options of an optimal coupling, as a group of this title; None where not given."""
     group = parser.add_argument_group(title)
     group.add_argument("--objective", choices=OBJECTIVES, help="which transparency error is minimised (default rms)")
@@ -125,7 +127,7 @@ def _for_switching(args: argparse.Namespace) -> bool:
     return "switching" in kind.options and named(args.condition or kind.conditions[0]).extensible
 
 
-def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
+def _asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     """The options of a design by the names of its arguments. Raises InputError for options of another coupling."""
     known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
     given = {name: value for name in known if options.given(value := getattr(args, name, None))}
@@ -141,7 +143,7 @@ def asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 def _design(args: argparse.Namespace, loop: Loop) -> Design:
     """Design and prove. Raises InputError for options that contradict each other, DesignFailed without a coupling."""
-    asked = asked_of(args, args.coupling)
+    asked = _asked_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
         asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
     with options.refused(args=args), render.designing(loop, args.coupling, args.condition) as progress:
@@ -174,13 +176,13 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
     band, best = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None
     known = assessment.requirements.get("switching")
     switching = coverage.Switching.of(loop, design.coupling, known) if loop.varying_delay else None
-    asked = Options(**asked_of(args, "optimal")) if best else DEFAULT
+    asked = Options(**_asked_of(args, "optimal")) if best else DEFAULT
     with render.progress("working out robustness and its price, and the bound"):
         nearby = nearby_of(loop, design.coupling, asked, named(design.asked))
         limit = best and BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, asked)
     nominal = None
     if kind_of(args.coupling).model:
-        nominal = partial(design_by_kind, kind=args.coupling, **asked_of(args, args.coupling))
+        nominal = partial(design_by_kind, kind=args.coupling, **_asked_of(args, args.coupling))
     return _Report(
         case=args.case,
         seed=args.seed,

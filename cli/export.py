@@ -17,10 +17,9 @@ from haptic_loop.design.certificate import Verdict, named, verify
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.designs import name_and_own
 from haptic_loop.design.export import (
-    SUFFIXES,
     ExportedBlock,
     NothingToExport,
-    content,
+    c_source,
     coupling_block,
     process_block,
     trial,
@@ -47,7 +46,6 @@ class _Proof:
 class _Exported:
     """What was written."""
 
-    format: str
     what: str
     states: int
     T_s: float
@@ -72,15 +70,14 @@ def main(argv: list[str]) -> int:
         verdict = Verdict(False, str(error))
     claim = own.claim if own and verdict.proved else None
     block = _block(args, stored, verdict, claim)
-    path = out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{SUFFIXES[args.format]}")
+    path = out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}.c")
     test = trial(block, args.seed)
-    write(path, content(args.format, block, test, path.name))
+    write(path, c_source(block, test, path.name))
 
     forces = "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
     if block.limiter:
         forces = f"limited to {listed(block.limiter.limit)} N by the limiter"
     exported = _Exported(
-        args.format,
         block.name,
         block.system.order,
         block.system.T,
@@ -93,7 +90,7 @@ def main(argv: list[str]) -> int:
         {"ticks": len(test.inputs), "seed": args.seed, "largest_output": np.abs(test.outputs).max()},
         claim,
     )
-    title = f"{block.name} as {args.format}"
+    title = f"{block.name} as C99"
     render.publish(args, exported, [render.facts(title, render.rows_of(exported), left=True)])
     return options.exit_code(verdict.proved or not stored.certificate)
 
@@ -101,21 +98,20 @@ def main(argv: list[str]) -> int:
 def _parser() -> options.Parser:
     parser = options.Parser(
         "design.export",
-        "Write a stored coupling, or its whole discrete process, as C99, plain data or a python-control block.",
-        "python -m design.export coupling.json --process --format c",
+        "Write a stored coupling, or its whole discrete process, as C99.",
+        "python -m design.export coupling.json --process",
+        "python -m design.export coupling.json --process --force-limit 12",
     )
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling, which names its loop")
-    parser.add_argument("--format", choices=tuple(SUFFIXES), default="c", help="(default c)")
     parser.add_argument("--process", action="store_true", help="coupling, environment and delays as one block (6)")
     link = "leave out Theta, where the link to the devices is that delay"
     parser.add_argument("--without-theta", action="store_true", help=link)
     limit = "with the limiter that the certificate covers, for forces of up to so much [N]; one is for all channels"
     parser.add_argument("--force-limit", type=options.several(float, 1e-3, 1e6, "N"), metavar="N,N,..", help=limit)
     parser.add_condition("the condition of the file's certificate, where that is one of your own")
-    parser.add_output("FILE", "the file (default out/export/<coupling>-<what>.<suffix>)")
+    parser.add_output("FILE", "the file (default out/export/<coupling>-<what>.c)")
     parser.only("with --process: a coupling alone has no delay", lambda args: args.process, "without_theta")
     parser.only("with --process: a coupling alone sends no forces", lambda args: args.process, "force_limit")
-    parser.only("without --format control: that is linear", lambda args: args.format != "control", "force_limit")
     return parser
 
 

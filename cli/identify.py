@@ -96,6 +96,8 @@ def _parser() -> argparse.ArgumentParser:
         "hw.identify",
         "Estimate mass, friction and transmission of a device that nobody holds, and a lower bound of its damping.",
         "python -m hw.identify --rehearse",
+        "python -m hw.identify --port /dev/ttyACM0 --scenario omega-pair",
+        first="port rehearse scenario arm force out",
     )
     parser.add_loop()
     add_link_options(parser)

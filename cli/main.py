@@ -14,7 +14,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any, NoReturn
 
-from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, UNFINISHED
+from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, UNFINISHED, did_you_mean
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.design.files import nobody_reads, one_command, one_line
 from haptic_loop.design.own import is_refusal, place_of
@@ -24,21 +24,24 @@ from threadpoolctl import threadpool_limits
 
 #: command -> what python -m calls it, and what it is for; it lives in the file of its name in this folder
 COMMANDS = {
+    "audit": ("design.audit", "are these gains safe, and how far"),
+    "design": ("design", "design a coupling, prove its certificate and store both"),
     "run": ("sim.run", "close the loop once: stability, transparency and error"),
     "validate": ("sim.validate", "random passive humans in both engines, and a search for the worst"),
+    "bridge": ("hw.bridge", "drive a device over a serial port"),
     "zwidth": ("sim.zwidth", "the Z-width map: which springs and dampers are safe"),
     "view": ("sim.view", "feel the loop in a window, or film it"),
     "trace": ("sim.trace", "what grows in a stored trace"),
     "accuracy": ("sim.accuracy", "speed against error, engine by engine"),
-    "design": ("design", "design a coupling, prove its certificate and store both"),
-    "audit": ("design.audit", "are these gains safe, and how far"),
     "check": ("design.check", "prove a stored coupling again, from its file alone"),
     "compare": ("design.compare", "the same devices and hands with every coupling"),
-    "export": ("design.export", "a stored coupling as C99, plain data or a python-control block"),
-    "bridge": ("hw.bridge", "drive a device over a serial port"),
+    "export": ("design.export", "a stored coupling as C99"),
     "identify": ("hw.identify", "mass, damping and transmission of a device from a measurement"),
     "replay": ("hw.replay", "a recorded session through the controller again"),
 }
+
+
+_LEADING = 5  # commands with which most users begin
 
 
 def door(command: str) -> NoReturn:
@@ -51,15 +54,16 @@ def main() -> NoReturn:
     words = sys.argv[1:]
     if not words or words[0] in ("-h", "--help"):
         width = max(map(len, COMMANDS))
+        lines = [f"  {name:{width}}  {what} ({module})" for name, (module, what) in COMMANDS.items()]
         print("usage: haptic-loop COMMAND [options], or python -m MODULE [options]; --help after either\n")
-        print("\n".join(f"  {name:{width}}  {what} ({module})" for name, (module, what) in COMMANDS.items()))
+        print("\n".join([*lines[:_LEADING], "\nfurther commands:", *lines[_LEADING:]]))
         sys.exit(0)
     execute(lambda argv: _command(argv[0]).main(argv[1:]))
 
 
 def _command(name: str) -> ModuleType:
     if name not in COMMANDS:
-        raise InputError(f"unknown command {name!r}, allowed are {', '.join(COMMANDS)}")
+        raise InputError(f"unknown command {name!r}{did_you_mean(name, COMMANDS) or ', --help lists them'}")
     return import_module(f"haptic_loop.cli.{name}")
 
 

@@ -7,6 +7,7 @@ What depends on the scenario, such as one number per channel, is checked by `per
 from __future__ import annotations
 
 import argparse
+import difflib
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -36,25 +37,51 @@ _OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # of 
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse with one-line errors and the example at the end of --help."""
+    """argparse with one-line errors; --help shows the `first` options first and the examples at its end."""
 
-    def __init__(self, prog: str, description: str, example: str) -> None:
+    def __init__(self, prog: str, description: str, *examples: str, first: str = "") -> None:
         super().__init__(
             prog=f"python -m {prog}",
             description=description,
-            epilog=f"example:\n  {example}",
+            epilog="examples:\n" + "\n".join(f"  {example}" for example in examples),
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
+        self._first = first.split()
         self._only: list[tuple[str, Callable[[argparse.Namespace], Any], tuple[str, ...]]] = []
 
     def only(self, where: str, acts: Callable[[argparse.Namespace], Any], *names: str) -> None:
         """Refuse the options of these destinations where `acts` is false of what is given: they would be ignored."""
         self._only.append((where, acts, names))
 
+    def format_help(self) -> str:
+        """The usage in one line, the first options, and the others by their groups."""
+        arguments = [action for action in self._actions if not action.option_strings]
+        by_name = {name.removeprefix("--"): action for action in self._actions for name in action.option_strings}
+        first = [by_name[name] for name in self._first]
+        text = self._get_formatter()
+        text.add_usage(" ".join([self.prog, *(str(a.metavar) for a in arguments), "[options]"]), [], [])
+        text.add_text(self.description)
+        for title, actions in (
+            ("arguments", arguments),
+            ("first options", first),
+            *((group.title, group._group_actions) for group in self._action_groups),
+        ):
+            shown = [a for a in actions if actions is first or actions is arguments or a not in (*first, *arguments)]
+            text.start_section("more options" if title == "options" and first else title)
+            text.add_arguments(shown)
+            text.end_section()
+        text.add_text(self.epilog)
+        return text.format_help()
+
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
         """As argparse's; an empty word is refused for every option, and a --json file that cannot be written."""
         found, rest = super().parse_known_args(*args, **how)
+        if rest:
+            what = "option" if rest[0].startswith("-") else "word"
+            raise InputError(f"unknown {what} {rest[0]}{self._near(rest[0])} (--help lists the options)")
+        if "reference" in found:
+            _translate(found)
         if ":" in (getattr(found, "condition", None) or ""):
             found.condition = own_condition(found.condition)
         for action in self._actions:
@@ -69,6 +96,10 @@ class Parser(argparse.ArgumentParser):
             check_file("--json", Path(found.json), "a file or -")
         return found, rest
 
+    def _near(self, word: str) -> str:
+        known = [name for action in self._actions if action.help != argparse.SUPPRESS for name in action.option_strings]
+        return did_you_mean(word.partition("=")[0], known)
+
     def error(self, message: str) -> NoReturn:
         own = _OWN_WORDS.fullmatch(message)
         raise InputError(f"{own[1]} {own[2]}" if own else f"{message} (--help lists the options)")
@@ -78,7 +109,10 @@ class Parser(argparse.ArgumentParser):
     def add_loop(self) -> None:
         """The options that describe a loop, which every command takes."""
         loop = self.add_argument_group("the loop")
-        loop.add_argument("--case", choices=CASES, default="I", help="none, I (Lambda = Theta Psi) or II (Lambda = I)")
+        reference = "the ideal that a coupling is compared with: I with the loop's delays (default), II without delay"
+        loop.add_argument("--reference", choices=("I", "II"), help=reference)
+        paper = "the paper's spelling: I or II is that reference, none is --coupling none"
+        loop.add_argument("--case", choices=CASES, help=paper)
         names = ", ".join(built_in())
         loop.add_argument("--scenario", default=DEFAULT, metavar="FILE.toml", help=f"or one of: {names}")
         own = "your own environment in place of the scenario's: a Network, or a class with contacts and E(T) or parts()"
@@ -181,6 +215,20 @@ class Parser(argparse.ArgumentParser):
     def add_json(self, to: _Group | None = None) -> None:
         """--json."""
         (to or self).add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The end of a refusal that names the closest of the known words, or nothing."""
+    bare = {name.lstrip("-"): name for name in known}
+    close = difflib.get_close_matches(word.lstrip("-"), list(bare), n=1)
+    return f", did you mean {bare[close[0]]}?" if close else ""
+
+
+def _translate(args: argparse.Namespace) -> None:
+    """Make `case` of --reference and of the paper's --case. Raises InputError where both are given and differ."""
+    if args.reference and args.case and args.reference != args.case:
+        raise InputError(f"--reference {args.reference} with --case {args.case}: give one of them")
+    args.case = args.case or args.reference or "I"
 
 
 # ----------------------------------------------------------------------------------------------------

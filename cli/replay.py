@@ -30,6 +30,7 @@ def main(argv: list[str]) -> int:
         "hw.replay",
         "Feed a recorded session through the controller again and compare the forces bit by bit.",
         "python -m hw.replay out/bridge-I/trace.npz",
+        "python -m hw.replay out/bridge-I/trace.npz --json -",
     )
     parser.add_argument("trace", metavar="TRACE.npz", help="written by hw.bridge")
     parser.add_json()

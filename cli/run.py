@@ -58,7 +58,11 @@ def main(argv: list[str]) -> int:
 
 def _parser() -> options.Parser:
     parser = options.Parser(
-        "sim.run", "Close the loop once and report stability, transparency and error.", "python -m sim.run --case none"
+        "sim.run",
+        "Close the loop once and report stability, transparency and error.",
+        "python -m sim.run --coupling none",
+        "python -m sim.run --scenario three-rigid --condition any-environment --duration 5",
+        first="scenario coupling condition reference duration json",
     )
     add = parser.add_argument
     parser.add_loop()

@@ -48,6 +48,7 @@ def _parser() -> options.Parser:
     parser = options.Parser(
         "sim.trace",
         "Growth of the oscillations in a stored trace, from its displacements alone, and its picture.",
+        "python -m sim.trace out/bridge-I/trace.npz",
         "python -m sim.trace out/bridge-I/trace.npz --plot figure.png",
     )
     parser.add_argument("trace", metavar="TRACE.npz", help="written by sim.run or hw.bridge")

@@ -63,7 +63,9 @@ def _parser() -> options.Parser:
     parser = options.Parser(
         "sim.validate",
         "Test a loop with random passive humans in both engines, and search for the worst one.",
-        "python -m sim.validate --case I --humans 200 --adversary",
+        "python -m sim.validate --humans 200 --adversary",
+        "python -m sim.validate --coupling none --humans 200 --duration 0",
+        first="scenario coupling condition humans adversary json",
     )
     add, whole = parser.add_argument, options.whole
     parser.add_loop()

@@ -37,7 +37,10 @@ from haptic_loop.sim.view.stage import (
     show,
 )
 
-_EXAMPLE = "python -m sim.view --video out.gif --script '0:none 1:theta+1 6:designed'"
+_EXAMPLES = (
+    "python -m sim.view --coupling optimal",
+    "python -m sim.view --video out.gif --script '0:none 1:theta+1 6:designed'",
+)
 _SCRIPT = "0:none 1:theta+1 6:designed"  # of a video: an oscillation starts and dies
 _AFTER = 3.0  # [s] that a video goes on after the last event of its script
 _LONGEST = 3600  # [s]
@@ -150,7 +153,12 @@ class _Report:
 
 def _parser() -> options.Parser:
     keys = ", ".join(f"{name} {word}" for name, word in keys_help(given=True))
-    parser = options.Parser("sim.view", f"Feel the loop in a window, or film it.\n\nKeys: {keys}.", _EXAMPLE)
+    parser = options.Parser(
+        "sim.view",
+        f"Feel the loop in a window, or film it.\n\nKeys: {keys}.",
+        *_EXAMPLES,
+        first="scenario coupling condition reference video script",
+    )
     add = parser.add_argument
     parser.add_loop()
     what = f"to begin with: {', '.join(_names())} or FILE.json; designed is spring-damper"

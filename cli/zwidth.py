@@ -22,9 +22,10 @@ from haptic_loop.sim.scenario import InputError, Scenario, require_constant_dela
 from haptic_loop.sim.trace import SUSTAINED
 from haptic_loop.sim.zwidth_report import FixedCoupling, MapReport, Shown, save_csv
 
-_EXAMPLE = """python -m sim.zwidth --theta 1 --grid 30
-  python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0
-  python -m sim.zwidth --rigid --theta 1 --quantisation 1e-5 --saturation --friction 0.2 --wall"""
+_EXAMPLES = (
+    "python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0",
+    "python -m sim.zwidth --coupling optimal --grid 10",
+)
 _FINEST = 1e-5  # [m] least default threshold: what a desk device's encoders resolve
 
 
@@ -73,7 +74,7 @@ def main(argv: list[str]) -> int:
 
 def _parser() -> options.Parser:
     what = "Draw the Z-width map: which spring-dampers are safe, for whom, by which test."
-    parser = options.Parser("sim.zwidth", what, _EXAMPLE)
+    parser = options.Parser("sim.zwidth", what, *_EXAMPLES, first="scenario rigid coupling mark grid out")
     parser.add_loop()
     parser.add_rigid()
     of_map = parser.add_argument_group("the map (K and B are the same on all channels)")

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from string import Template
-from typing import Any, BinaryIO
 
 import numpy as np
 from haptic_loop.controller.complementarity import GROUNDED, PIVOT_ROUNDING
@@ -209,32 +207,6 @@ def _boxed(M: list[list[float]], limit: list[float], q: list[float]) -> tuple[li
     return e, f
 
 
-def data(block: ExportedBlock, test: _Trial) -> dict[str, Any]:
-    """The block as plain data, for JSON."""
-    system = block.system
-    return {
-        "what": block.name,
-        "about": list(block.about),
-        "T_s": system.T,
-        "input": block.input.what,
-        "output": block.output.what,
-        **{name: getattr(system, name).tolist() for name in "ABCD"},
-        **(_limiter_data(block.limiter) if block.limiter else {}),
-        "test_input": test.inputs.tolist(),
-        "test_output": test.outputs.tolist(),
-    }
-
-
-def _limiter_data(limiter: Limiter) -> dict[str, Any]:
-    """What turns the linear tick into the limited one; rows are counted in [y; z+] from 0."""
-    return {
-        "limit": limiter.limit.tolist(),
-        "box_matrix": _box_matrix(limiter).tolist(),
-        "kick": limiter.kick.tolist(),
-        "sent_rows": limiter.sent_rows.tolist(),
-    }
-
-
 def _delays(loop: Loop, with_theta: bool) -> str:
     def shown(steps: Sequence[int]) -> str:
         return ", ".join(map(str, steps))
@@ -244,91 +216,7 @@ def _delays(loop: Loop, with_theta: bool) -> str:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A block as a Python file that builds a python-control StateSpace.
-#
-# python-control has no file format of its own, and a pickle would tie the file to one version of it and of Python. A
-# script can be read, compared line by line, imported, and run: it tests itself. Writing it needs no python-control;
-# running it does.
-
-
-SOURCE = Template('''\
-$about
-#
-# statespace() is the block as a python-control StateSpace; run as a script, the file tests it.
-import sys
-
-T = $T  # [s]
-A = [
-$A
-]
-B = [
-$B
-]
-C = [
-$C
-]
-D = [
-$D
-]
-TEST_INPUT = [
-$test_input
-]
-TEST_OUTPUT = [
-$test_output
-]
-TOLERANCE = 1e-10  # of the largest output: matrix products sum in an order of their own
-
-
-def statespace():
-    """The block, inputs $input and outputs $output."""
-    import control
-
-    inputs = ["$u%d" % (i + 1) for i in range($m)]
-    outputs = ["$y%d" % (i + 1) for i in range($m)]
-    return control.ss(A, B, C, D, T, name="$name", inputs=inputs, outputs=outputs)
-
-
-def main():
-    """0 where python-control answers the test vector as it should, 1 where not."""
-    import control
-    import numpy as np
-
-    expected = np.array(TEST_OUTPUT).T
-    found = control.forced_response(statespace(), U=np.array(TEST_INPUT).T, squeeze=False).outputs
-    error = float(abs(found - expected).max() / abs(expected).max())
-    print("$name: largest difference %.1e of the largest output, allowed %.0e" % (error, TOLERANCE))
-    return int(not error <= TOLERANCE)
-
-if __name__ == "__main__":
-    sys.exit(main())
-''')
-
-
-def _control_source(block: ExportedBlock, test: _Trial) -> str:
-    """The file's text; numbers are decimals that read back to the same doubles."""
-    system = block.system
-    return SOURCE.substitute(
-        about="\n".join(_comment(block.about)),
-        name=block.name,
-        T=repr(system.T),
-        m=system.inputs,
-        u=block.input.letter,
-        y=block.output.letter,
-        input=block.input.what,
-        output=block.output.what,
-        test_input=_rows(test.inputs),
-        test_output=_rows(test.outputs),
-        **{name: _rows(getattr(system, name)) for name in "ABCD"},
-    )
-
-
-def _comment(lines: tuple[str, ...]) -> list[str]:
-    wrap = textwrap.TextWrapper(108, initial_indent="# ", subsequent_indent="#     ")
-    return [part for line in lines for part in wrap.wrap(line)]
-
-
-def _rows(values: Array) -> str:
-    return "\n".join(f"    {row}," for row in values.tolist())
+# A block as a C file, with its test.
 
 
 _SOURCE_C = Template("""\
@@ -532,7 +420,7 @@ _LIMITED = """    {
 """
 
 
-def _c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
+def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
     """The file's text; numbers are hexadecimal, so that no compiler's decimal conversion matters."""
     system, name = block.system, block.name
     words = {
@@ -589,10 +477,7 @@ def _row(values: Array) -> str:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A file: its format, and what stands above the block.
-
-
-SUFFIXES = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}  # by format
+# What stands above the block.
 
 
 def with_origin(
@@ -623,24 +508,6 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
     return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; " + (
         "also while forces are limited." if limited else "linear forces only."
     )
-
-
-def content(kind: str, block: ExportedBlock, test: _Trial, file: str) -> Any:
-    """A file in this format, as `design.files.write` takes it."""
-    if kind == "c":
-        return _c_source(block, test, file)
-    if kind == "control":
-        return _control_source(block, test)
-    plain = data(block, test)
-    if kind == "json":
-        return json.dumps(plain, indent=1, allow_nan=False) + "\n"
-
-    arrays: dict[str, Any] = {name: np.array(value) for name, value in plain.items()}
-
-    def archive(destination: BinaryIO) -> None:
-        np.savez(destination, **arrays)
-
-    return archive
 
 
 if __name__ == "__main__":

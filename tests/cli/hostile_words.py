@@ -181,7 +181,7 @@ SILENT = [
     (("run", *QUICK["run"], "--engine", "exact", "--integrator", "RK4"), "--integrator"),
     (("run", *QUICK["run"], "--engine", "exact", "--substeps", "4"), "--substeps"),
     (("run", *QUICK["run"], "--vertex", "1"), "--vertex"),
-    (("design", "--best", "--coupling", "ccl"), "--coupling"),
+    (("design", "--coupling", "optimal", "--coupling", "ccl"), "--coupling"),
     (("run", *QUICK["run"], "--error", "nan"), "--error is nan, allowed are 1e-18 to 1"),
     (("design", "--order", "2"), "--order"),
     (("design", "--method", "inner"), "--method"),
@@ -260,9 +260,10 @@ REFUSED = {
         --dask h:1 --shards 2 | --generations 5 | --links 3 | --humans 0 | --humans 1e3 | --shards 0
         --duration 1e-9 | --duration -1 | --latency 2e-3 | --T-max 1e-4 | --period 1e-3""",
     "design": """--ranges 0 | --ranges -5 | --ranges 101% | --ranges 1e9 | --ranges 10%% | --samples 5
-        --ranges 10 --varying-delay 0,2 | --limiter --no-limiter | --best --coupling ccl | --best --order 2
+        --ranges 10 --varying-delay 0,2 | --limiter --no-limiter | --coupling optimal --order 2
         --method inner | --compare | --objective sup | --order 0 --coupling ccl
-        --order 1e9 --coupling ccl | --high-gain 0 | --high-gain 2 | --seconds -1 --best | --band 1,0 --best
+        --order 1e9 --coupling ccl | --high-gain 0 | --high-gain 2 | --seconds -1 --coupling optimal
+        --band 1,0 --coupling optimal | --best
         --latency 1e-3 --varying-delay 0,2""",
     "audit": """--device nix | --devices --K 5 | --rigid | --rigid --K 5 --B 0 --theta 1,2 | --rigid --K 5 --B 0 --psi 1
         --rigid --K 0 --B 0 | --rigid --K 1e300 --B 0 | --K 1,2,3 --B 0 | --K 1,2 --B 0,0,0 | --K -1,2 --B 0

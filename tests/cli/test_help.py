@@ -54,8 +54,8 @@ def test_the_commands_are_found():
 @pytest.mark.parametrize("module", modules())
 def test_the_example_of_help_is_understood(module, capsys, monkeypatch):
     text = help_of(module, capsys)
-    lines = text.partition("\nexample:\n")[2].splitlines()
-    assert lines, f"the help of {module} ends without an example"
+    lines = text.partition("\nexamples:\n")[2].splitlines()
+    assert len(lines) == 2
     parse = Parser.parse_args
 
     def understood(self, *args, **kwargs):
@@ -112,4 +112,4 @@ def test_the_console_script_lists_every_command_and_runs_it():
     assert script("check", "--help").stdout.startswith("usage: python -m design.check")
     unknown = script("chekc")
     assert (unknown.returncode, unknown.stdout) == (2, "")
-    assert unknown.stderr.startswith("error: unknown command 'chekc', allowed are run, validate")
+    assert unknown.stderr == "error: unknown command 'chekc', did you mean check?\n"

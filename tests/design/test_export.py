@@ -1,6 +1,5 @@
-"""design.export: every format against the loop's formulas; the C file compiled, run, and called from other code."""
+"""design.export: the C file against the loop's formulas; the C file compiled, run, and called from other code."""
 
-import importlib.util
 import json
 import re
 import shutil
@@ -18,10 +17,10 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.tick import Process, StepBuffer
 from haptic_loop.design.certificate import prove, prove_limiter
-from haptic_loop.design.coupling_file import Stored, save
+from haptic_loop.design.coupling_file import Stored, load, save
 from haptic_loop.design.export import process_block, sequential, trial
 from haptic_loop.design.files import InputError, one_command
-from worlds import FIGURE_4, PAIR, SOFT, T, force_map
+from worlds import FIGURE_4, PAIR, SOFT, T
 
 SPRINGS = SpringDamper((300.0, 200.0), (0.0, 0.0))  # no state at all
 FULL = Compliance(
@@ -44,10 +43,9 @@ def place(tmp_path_factory):
     return folder
 
 
-def export(place, name, kind, *options):
-    path = place / f"{name}{'-process' if '--process' in options else ''}.{kind}"
-    path = path.with_suffix({"control": ".py", "json": ".plain.json"}.get(kind, f".{kind}"))
-    assert main([str(place / f"{name}.json"), "--format", kind, "--out", str(path), *options]) == 0
+def export(place, name, *options):
+    path = place / f"{name}{'-process' if '--process' in options else ''}.c"
+    assert main([str(place / f"{name}.json"), "--out", str(path), *options]) == 0
     return path
 
 
@@ -136,9 +134,6 @@ def test_force_limits_that_no_certificate_covers_are_refused(place, limited_file
         main([str(place / "full.json"), "--process", "--force-limit", "3", "--out", str(place / "x.c")])
     with pytest.raises(InputError, match="--force-limit is only with --process"):
         main([str(folder / "pair.json"), "--force-limit", "3", "--out", str(place / "x.c")])
-    control = ["--process", "--format", "control", "--force-limit", "3", "--out", str(place / "x.py")]
-    with pytest.raises(InputError, match="without --format control: that is linear"):
-        main([str(folder / "pair.json"), *control])
 
 
 @pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
@@ -169,7 +164,7 @@ def test_the_process_of_the_simulator_differs_by_rounding_alone(data):
 @pytest.mark.parametrize("what", [[], ["--process"]], ids=["coupling", "process"])
 @pytest.mark.parametrize("name", COUPLINGS)
 def test_the_c_file_repeats_its_test_vector_to_the_last_bit(place, name, what):
-    source = export(place, name, "c", *what)
+    source = export(place, name, *what)
     for flags in (["-O2"], ["-O3", "-march=native"]):  # sums may not be reordered, so vector units change nothing
         done = run(compiled([source], *flags, "-DHAPTIC_LOOP_TEST"))
         assert (done.returncode, done.stderr) == (0, "")
@@ -178,7 +173,7 @@ def test_the_c_file_repeats_its_test_vector_to_the_last_bit(place, name, what):
 
 @needs_cc
 def test_the_c_files_own_test_can_fail(place):
-    source = export(place, "gains", "c", "--process", "--seed", "3")
+    source = export(place, "gains", "--process", "--seed", "3")
     text = source.read_text()
     begin = text.index("process_C[2]")
     old = re.search(r"-?0x1\.\w+p[+-]\d+", text[begin:])[0]  # the first entry that is not zero
@@ -216,7 +211,7 @@ int main(void)
 @needs_cc
 def test_other_code_closes_the_loop_around_springs_of_its_own(place):
     """u = x - d, f = 900 u with V from the C file, against F = (I + E V)^-1 E with E = 900 I."""
-    source = export(place, "gains", "c")
+    source = export(place, "gains")
     driver = place / "driver.c"
     driver.write_text(DRIVER.replace("SOURCE", source.name))
     out = subprocess.run([compiled([driver, source])], capture_output=True, text=True, check=True).stdout
@@ -226,42 +221,15 @@ def test_other_code_closes_the_loop_around_springs_of_its_own(place):
     np.testing.assert_allclose(f, sequential(F, x), atol=1e-13)  # a few roundings of forces up to 1 N
 
 
-@pytest.mark.parametrize("kind", ["json", "npz"])
-def test_plain_data_is_the_force_map_of_the_paper(place, kind):
+def test_the_process_is_the_force_map_of_the_paper():
     """C (zI - A)^-1 B + D at three frequencies is Theta (I + E V)^-1 E, by the formulas of (6) and (26)."""
-    path = export(place, "gains", kind, "--process")
-    if kind == "json":
-        raw = json.loads(path.read_text())
-        plain = {name: np.array(raw[name]) for name in (*"ABCD", "T_s", "test_input", "test_output")}
-    else:
-        with np.load(path, allow_pickle=False) as stored:
-            plain = dict(stored)
+    system = process_block(Stored.of(PAIR, SOFT)).system
     E = environment(FIGURE_4, T)
     for hz in (1.0, 30.0, 300.0):
         z = np.exp(2j * np.pi * hz * T)
-        found = plain["C"] @ np.linalg.solve(z * np.eye(len(plain["A"])) - plain["A"], plain["B"]) + plain["D"]
         V = np.diag(1 / (np.array(SOFT.K) + np.array(SOFT.B) * (z - 1) / (T * z)))
         expected = np.diag([1 / z, 1 / z**2]) @ np.linalg.inv(np.eye(2) + E.at(z) @ V) @ E.at(z)
-        np.testing.assert_allclose(found, expected, rtol=1e-9)
-    assert plain["T_s"] == T
-    system = Lti(*(plain[name] for name in "ABCD"), T)
-    np.testing.assert_array_equal(sequential(system, plain["test_input"]), plain["test_output"])
-
-
-def test_the_control_script_builds_the_same_block_and_tests_itself(place):
-    pytest.importorskip("control", reason="python-control is not installed: the exported script is not run")
-    path = export(place, "gains", "control", "--process")
-    spec = importlib.util.spec_from_file_location("exported_process", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    system = module.statespace()
-    z = np.exp(2j * np.pi * 30.0 * T)
-    F = force_map(environment(FIGURE_4, T), Gains(SOFT.K, SOFT.B), PAIR.theta, PAIR.psi)
-    np.testing.assert_allclose(system(z), F.at(z), rtol=1e-9)
-    assert (system.dt, system.input_labels, system.output_labels) == (T, ["x1", "x2"], ["f1", "f2"])
-    assert module.main() == 0
-    module.D[0][0] += 1.0
-    assert module.main() == 1
+        np.testing.assert_allclose(system.at(z), expected, rtol=1e-9)
 
 
 def test_without_theta_the_link_is_the_delay():
@@ -274,11 +242,11 @@ def test_without_theta_the_link_is_the_delay():
 
 
 def test_a_file_says_what_it_is_and_repeats_byte_for_byte(place):
-    first = export(place, "gains", "c", "--process").read_text()
+    first = export(place, "gains", "--process").read_text()
     assert "Certified for any passive environment" in first
-    assert export(place, "gains", "c", "--process").read_text() == first
-    assert export(place, "gains", "c", "--process", "--seed", "1").read_text() != first
-    assert "NOT CERTIFIED: the file carries no certificate" in export(place, "full", "c").read_text()
+    assert export(place, "gains", "--process").read_text() == first
+    assert export(place, "gains", "--process", "--seed", "1").read_text() != first
+    assert "NOT CERTIFIED: the file carries no certificate" in export(place, "full").read_text()
 
 
 def test_a_certificate_that_does_not_hold_is_said_and_exits_with_1(place, tmp_path, capsys):
@@ -292,13 +260,12 @@ def test_a_certificate_that_does_not_hold_is_said_and_exits_with_1(place, tmp_pa
     assert "NOT CERTIFIED: scenario digest differs" in out.read_text()
 
 
-def test_a_hostile_name_stays_inside_the_comments(tmp_path):
-    path = tmp_path / "a\nimport os; #.json"
+def test_a_hostile_name_stays_inside_the_comment(tmp_path):
+    path = tmp_path / "a*\nint hostile;#.json"
     save(Stored.of(PAIR, SOFT), path)
-    assert main([str(path), "--format", "control", "--out", str(tmp_path / "out.py")]) == 0
-    code = [line for line in (tmp_path / "out.py").read_text().splitlines() if not line.startswith("#")]
-    assert code[0] == "import sys"
-    assert "import os" not in "".join(code)
+    assert main([str(path), "--out", str(tmp_path / "out.c")]) == 0
+    code = re.sub(r"/\*.*?\*/", "", (tmp_path / "out.c").read_text(), flags=re.DOTALL)
+    assert "hostile" not in code
 
 
 @pytest.mark.parametrize(
@@ -308,7 +275,6 @@ def test_a_hostile_name_stays_inside_the_comments(tmp_path):
         (["{gains}", "--out", "{gains}"], "name another file"),
         (["{gains}", "--out", "{place}"], "is a folder"),
         (["{gains}", "--seed", "-1"], "from 0"),
-        (["{gains}", "--format", "matlab"], "invalid choice"),
         (["{place}/missing.json"], "No such file"),
         (["{place}/none.json"], r"\(--process\)"),
     ],
@@ -323,9 +289,7 @@ def test_one_channel(tmp_path):
     """A single device before a wall, as the command would be used for a first device."""
     wall = Network(("tip",), (Spring(("tip", GROUND), 2000.0),))
     save(Stored.of(Loop(T, (1,), (0,), (1,), (1.37,), wall), SpringDamper((500.0,), (0.1,))), tmp_path / "one.json")
-    assert main([str(tmp_path / "one.json"), "--process", "--format", "json", "--out", str(tmp_path / "o.json")]) == 0
-    plain = json.loads((tmp_path / "o.json").read_text())
-    static = np.array(plain["C"]) @ np.linalg.inv(np.eye(len(plain["A"])) - plain["A"]) @ plain["B"] + plain["D"]
+    static = process_block(load(tmp_path / "one.json")).system.at(1.0)
     assert static == pytest.approx(2000 * 500 / 2500)  # two springs in series
 
 

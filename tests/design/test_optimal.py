@@ -625,7 +625,7 @@ def test_a_basis_has_more_for_few_than_for_many():
 
 def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     scenario, report = next(LOOPS.glob("n3*.toml")), tmp_path / "r.json"
-    options = ["--best", "--scenario", str(scenario), "--out", str(tmp_path / "c.json")]
+    options = ["--coupling", "optimal", "--scenario", str(scenario), "--out", str(tmp_path / "c.json")]
     assert main([*options, "--json", str(report)]) == 0
     found, text = json.loads(report.read_text()), " ".join(capsys.readouterr().out.split())
     assert found["bound"]["rms_mismatch_db"] < found["assessment"]["transparency"]["rms_mismatch_db"]

@@ -15,7 +15,7 @@ DESIGNS = [
     ("spring-damper", []),
     ("anywhere", ["--condition", "any-environment"]),
     ("average", ["--coupling", "moving-average"]),
-    ("best", ["--best"]),
+    ("best", ["--coupling", "optimal"]),
 ]
 
 
