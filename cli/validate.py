@@ -228,7 +228,8 @@ class _Report:
     humans: int = render.figure("humans", "{} (links {r.links}, seed {r.seed})")
     environments: verdicts.EnvironmentsMet = render.figure("environments")
     unstable: verdicts.Unstable = render.figure("unstable")
-    disagreements: int = render.figure("disagreements")
+    disagreements: int = render.figure("disagreements", "{r.disagreement_words}")
+    disagreement_words: str = off_table("left out")
     disagreeing: list[verdicts.DrawnHumans]
     worst: verdicts.WorstDrawn | None = render.figure("worst human")
     own_humans: _Own = render.several(_Own.rows)
@@ -309,6 +310,7 @@ def _reported(
         environments=verdicts.EnvironmentsMet.met(question, findings),
         unstable=verdicts.Unstable.of(question, int(bad.sum()), int(grows.sum())),
         disagreements=disagreements,
+        disagreement_words=verdicts.disagreement_words(findings, engine_name(question.engine)),
         disagreeing=[verdicts.DrawnHumans.of(question, int(i)) for i in findings.index[findings.disagreements]],
         worst=verdicts.WorstDrawn.of(question, findings) if any_done else None,
         own_humans=own,

@@ -157,6 +157,7 @@ class Findings:
     frequency: Array  # (n,) [Hz] of that mode
     mujoco: Array  # (n,) [1/s] growth, the period map of MuJoCo, or of a user's own engine
     trace: Array  # (n,) [1/s] growth on its trace, or on the exact one where no other is asked
+    trace_error: Array  # (n,) [1/s] by which that may be off; a rate within it does not vote
     clipped: NDArray[np.int64]  # (n,) ticks with a force at its limit, on that trace
     energy: Array  # (n,) [J] least W(N) on the exact trace
     audited: Array  # (n,) [J] magnitudes that W adds up
@@ -172,9 +173,15 @@ class Findings:
 
     @property
     def disagreements(self) -> NDArray[np.bool_]:
-        """(n,) whether MuJoCo, on its map or on a trace, contradicts the exact loop."""
+        """(n,) whether MuJoCo, on its map or on a trace that decides, contradicts the exact loop."""
         switching = disagree(self.switching, self.switching_mujoco)
-        return disagree(self.exact, self.mujoco) | disagree(self.exact, self.trace) | switching
+        trace = np.where(self.trace_decides, self.trace, np.nan)
+        return disagree(self.exact, self.mujoco) | disagree(self.exact, trace) | switching
+
+    @property
+    def trace_decides(self) -> NDArray[np.bool_]:
+        """(n,) whether the growth rate of the trace is larger than its error: only then its sign is a verdict."""
+        return np.abs(self.trace) > self.trace_error
 
 
 #: what Findings have one entry of for every set of humans
@@ -246,6 +253,7 @@ def _group(
         frequency=mode.frequency_hz,
         mujoco=mujoco,
         trace=last.growth if last else nowhere,
+        trace_error=last.error if last else nowhere,
         clipped=last.clipped if last else np.zeros(len(crowd), dtype=int),
         energy=exact.least_energy if exact else nowhere,
         audited=exact.audited if exact else nowhere,

@@ -31,6 +31,7 @@ _JUDGED = 4.0  # [s] of a loop whose ticks vary
 _DOUBTFUL, _LONGER = 1.0, 5  # [1/s]: slower growth is judged again, over so many times as long
 _NO_MODE = 1e-300  # of modulus, where none is fast enough
 _SHORTEST_TRACE = 200  # ticks below which a growth rate is not read from a trace
+_DECAY_TIMES = 4.0  # or times of growth, in a trace whose rate has a sign: other modes leave a few parts of e in it
 
 
 def unstable(growth: ArrayLike) -> NDArray[np.bool_]:
@@ -295,6 +296,10 @@ def stability_of(simulation: Simulation, trace: Trace) -> Stability:
         reason = "the simulation left the range of finite numbers: reported as unstable"
     exact = eigenvalues(worst_mode(simulation))
     found = "unstable" if trace.diverged else None if growth is None else verdict(growth)
+    seconds = len(trace.f) * simulation.scenario.T
+    slow = reason is None and growth is not None and abs(growth) * seconds < _DECAY_TIMES
+    if slow and growth is not None and disagree(exact.exact_growth_rate_per_s, growth):
+        found, reason = exact.exact_verdict, _not_decidable(growth, exact.exact_growth_rate_per_s, seconds)
     return Stability(
         **vars(exact),
         verdict=exact.exact_verdict if reason == _NOT_EXCITED else found,
@@ -303,6 +308,14 @@ def stability_of(simulation: Simulation, trace: Trace) -> Stability:
         frequency_hz=trace.dominant_frequency_hz(),
         contact=contact,
         reason=reason or None,
+    )
+
+
+def _not_decidable(growth: float, exact: float, seconds: float) -> str:
+    longer = _DECAY_TIMES / abs(exact)
+    return (
+        f"not decidable in {seconds:g} s: the trace's fit is {growth:+.3g} 1/s, the eigenvalue's {exact:+.3g} 1/s; "
+        f"the verdict is the eigenvalues', a trace of {longer:.3g} s would tell"
     )
 
 
@@ -335,6 +348,7 @@ class ImpulseTest:
     """One entry per simulation."""
 
     growth: Array  # (nsim,) [1/s] of the exact loop's dominant mode, up to the first clipped tick; nan below the noise
+    error: Array  # (nsim,) [1/s] by which that may be off: a rate within it says nothing of the sign
     clipped: NDArray[np.int64]  # (nsim,) ticks with a force at its limit
     least_energy: Array  # (nsim,) [J] least W(N), with a limiter at any tick, else up to the first clipped one
     audited: Array  # (nsim,) [J] sum of the magnitudes of what W adds up: the scale of its rounding
@@ -484,6 +498,7 @@ class _Audit:
         self._usable, self._clipped = np.zeros(nsim, dtype=int), np.zeros(nsim, dtype=int)
         self._energy, self._least, self._size = np.zeros(nsim), np.zeros(nsim), np.zeros(nsim)
         self._across, self._weight, self._whole = np.zeros(nsim, dtype=complex), np.zeros(nsim), np.zeros(nsim)
+        self._half, self._first = ticks // 2, (self._across, self._weight)  # of the first half of the trace
 
     def see(self, buffer: StepBuffer, first: int, count: int) -> None:
         """Take in the first `count` rows of the buffer; row 0 is tick `first`."""
@@ -513,8 +528,12 @@ class _Audit:
         y = np.einsum("ns,ksn->kn", self._left.conj(), xi)
         pushed = np.einsum("ns,nsw,kwn->kn", self._left.conj(), self._B, w[:count], optimize=True)
         y, after = np.where(linear, y[:-1], 0), y[1:] - pushed
-        self._across += (y.conj() * after).sum(axis=0)
-        self._weight += (np.abs(y) ** 2).sum(axis=0)
+        across, weight = y.conj() * after, np.abs(y) ** 2
+        if first < self._half <= first + count:
+            until = self._half - first
+            self._first = self._across + across[:until].sum(axis=0), self._weight + weight[:until].sum(axis=0)
+        self._across = self._across + across.sum(axis=0)
+        self._weight = self._weight + weight.sum(axis=0)
         self._whole += np.where(linear[:, None], xi[:-1] ** 2, 0.0).sum(axis=(0, 1))
 
     def result(self, simulated: float) -> ImpulseTest:
@@ -522,4 +541,8 @@ class _Audit:
         with np.errstate(divide="ignore", invalid="ignore"):
             growth = np.where(above_noise, np.log(np.abs(self._across / self._weight)) / self._T, np.nan)
             settling = np.sqrt(self._speeds.late / self._speeds.early)
-        return ImpulseTest(growth, self._clipped, self._least, self._size, settling, self._made, simulated)
+            across, weight = self._first
+            halves = np.abs(np.array([across / weight, (self._across - across) / (self._weight - weight)]))
+            apart = np.abs(np.log(halves[1] / halves[0])) / self._T
+            error = np.maximum(_DECAY_TIMES / (self._usable * self._T), np.where(np.isfinite(apart), apart, np.inf))
+        return ImpulseTest(growth, error, self._clipped, self._least, self._size, settling, self._made, simulated)

@@ -66,6 +66,19 @@ class EnvironmentsMet:
         return f"{self.count} of {self.of}, in turn; unstable in: {'; '.join(self.unstable_in) or 'none'}"
 
 
+def disagreement_words(findings: Findings, engine: str, most: int = 3) -> str:
+    """The number of disagreements; of the first ones each engine's rate and how to look at it."""
+    places = np.flatnonzero(findings.disagreements)
+    words = [str(places.size)]
+    for k in places[:most]:
+        rates = f"exact {findings.exact[k]:+.3g} 1/s, {engine} {findings.mujoco[k]:+.3g} on its map"
+        if findings.trace_decides[k]:
+            rates += f" and {findings.trace[k]:+.3g} ± {findings.trace_error[k]:.2g} on its trace"
+        index = findings.index[k]
+        words.append(f"index {index}: {rates}; replay disagreement-{index}.toml with sim.run --error 1e-6")
+    return "; ".join(words)
+
+
 @dataclass(frozen=True, eq=False)
 class _Held:
     """A channel's human: links, or of a user's own class what the handle feels of it."""
@@ -131,6 +144,7 @@ class Traces:
     clipped_runs: int
     contacts: int
     measured: int
+    undecided: int  # traces that are too short for the sign of their rate, which do not vote
     largest_difference_per_s: float | None
     stable_and_settling: int
     stable: int
@@ -150,6 +164,7 @@ class Traces:
             clipped_runs=int((findings.clipped > 0).sum()),
             contacts=int(findings.contacts.sum()),
             measured=int(np.isfinite(findings.trace).sum()),
+            undecided=int((np.isfinite(findings.trace) & ~findings.trace_decides).sum()),
             largest_difference_per_s=largest(np.abs(findings.trace - findings.exact)),
             stable_and_settling=int((stable & (findings.settling < 1)).sum()),
             stable=int(stable.sum()),
@@ -161,6 +176,8 @@ class Traces:
 
     def rows(self) -> Iterator[tuple[str, str | None]]:
         yield "traces", f"{self.duration_s:g} s each, {self.clipped_runs} reached a force limit"
+        undecided = f"not decidable in {self.duration_s:g} s: {self.undecided} of {self.measured}, left to eigenvalues"
+        yield "growth on traces", undecided if self.undecided else None
         yield "contacts made", f"{self.contacts} on these traces" if self.contacts else None
 
     def settled(self) -> str:

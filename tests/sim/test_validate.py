@@ -15,6 +15,7 @@ from haptic_loop.cli import run as run_command
 from haptic_loop.cli.validate import main
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.delay import VaryingDelay
+from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Person
@@ -34,7 +35,7 @@ from haptic_loop.sim.stability import (
     mujoco_loops,
     unstable,
 )
-from haptic_loop.sim.verdicts import Traces
+from haptic_loop.sim.verdicts import Traces, disagreement_words
 
 SCENARIO = load()
 TWO = "[[human]]\nlinks = [{mass = 1.0, damping = 0, stiffness = 0}]\n" * 2
@@ -386,3 +387,37 @@ def test_an_engine_of_one_s_own_needs_even_ticks():
     question = Validation(load().replace(latency=((0.0, 1e-4),) * 2), PUBLISHED["I"], 0, 2, 1, OwnEngine, 0.5)
     with pytest.raises(InputError, match=r"OwnEngine: uneven ticks \(period, latency\) run in mujoco and exact"):
         examine_module._examine(question, range(2))
+
+
+def slow_loops(humans: int, seed: int, duration: float) -> Findings:
+    """Three devices with delays of 2, 3 and 1 ticks and a mass of 0.3 kg between soft springs: decays of seconds."""
+    rng = np.random.default_rng(seed)
+    springs = tuple(Spring((end, "m"), float(rng.uniform(20, 400)), float(rng.uniform(0, 0.5))) for end in "abc")
+    scenario = load("three-rigid").replace(environment=Network(("a", "b", "c"), springs, {"m": 0.3}), theta=(2, 3, 1))
+    return validate(Validation(scenario, NoCoupling(), seed, humans, 1, "both", duration))
+
+
+def test_no_trace_contradicts_the_eigenvalues_of_slow_loops():
+    found = slow_loops(60, 3, 1.5)
+    assert not found.disagreements.any()
+    decided = found.trace_decides
+    assert 0 < decided.sum() < decided.size
+    np.testing.assert_array_equal(found.trace[decided] > 0, found.exact[decided] > 0)
+    assert (np.abs(found.trace[decided] - found.exact[decided]) < found.trace_error[decided]).all()
+    assert (np.abs(found.trace[decided]) * 1.5 >= 4 - 1e-9).all()  # four times of decay or growth
+
+
+def test_a_trace_too_short_for_its_rate_does_not_vote():
+    """A decay of 0.331 1/s that a fit to 2 s gives as a growth of 0.168 1/s: only MuJoCo's map may contradict."""
+    found = slow_loops(4, 0, 0.3)
+    rates = {name: np.full(4, value) for name, value in (("exact", -0.331), ("mujoco", -0.331), ("trace", 0.168))}
+    slow = replace(found, **rates, trace_error=np.full(4, 2.0))
+    assert not slow.disagreements.any()
+    assert disagreement_words(slow, "MuJoCo") == "0"
+    assert replace(slow, trace_error=np.full(4, 0.1)).disagreements.all()
+    grows = replace(slow, mujoco=np.array([-0.331, 0.2, -0.331, -0.331]))
+    assert grows.disagreements.tolist() == [False, True, False, False]
+    words = disagreement_words(grows, "MuJoCo")
+    for part in ("index 1", "exact -0.331 1/s", "MuJoCo +0.2 on its map", "sim.run"):
+        assert part in words
+    assert "trace" not in words
