@@ -22,7 +22,7 @@ from haptic_loop.design.certificate import (
     verify,
 )
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.coupling_file import Stored, SwitchingProof
+from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import HERE, RANGES
 from haptic_loop.design.known_device import described
@@ -144,10 +144,10 @@ def _checked(
 ) -> _Checked:
     loop, claim, proved = stored.loop, stored.certificate, verdict.proved
     span, switching = loop.varying_delay, None
-    if span and claim and isinstance(delays := claim.switching, SwitchingProof):
+    if span and claim and "switching" in claim.facts:
         guarantee = f"{switching_guarantee(span)}, in {HERE}" if proved else None
         shown = span.lo, span.hi, guarantee, "rational" if proved else None
-        switching = _Switching(*shown, delays.required, delays.margin)
+        switching = _Switching(*shown, claim.required, claim.margin)
     return _Checked(
         proved,
         verdict.reason,

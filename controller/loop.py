@@ -169,10 +169,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         Psi and Theta delay what the devices feel of the walls. Raises SingularLoop, and ValueError for a coupling that
         walls cannot stand behind.
         """
-        return self._beside_walls(self.theta, exact) @ self._walled(coupling, exact)
+        return self._beside_walls(self.theta, exact) @ self.walled_before_delay(coupling, exact)
 
-    def _walled(self, coupling: Coupling, exact: bool = False) -> Lti:
-        """The same before Theta."""
+    def walled_before_delay(self, coupling: Coupling, exact: bool = False) -> Lti:
+        """[x; p] to [f_e; y]: as `walled`, with the forces as they leave, before Theta."""
         E = walled_environment(self.network, self.period(exact))
         return coupling.around(self._beside_walls(self.psi, exact) @ E, further=len(self.environment.walls))
 
@@ -186,7 +186,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         Raises SingularLoop, and ValueError for a coupling that walls cannot stand behind.
         """
         walls = self.environment.walls
-        sent = self._walled(coupling) if walls else self.sent(coupling)
+        sent = self.walled_before_delay(coupling) if walls else self.sent(coupling)
         if limit is None or rho is None:
             return Law(sent, self.theta, walls)
         return Limiter(sent, self.theta, walls, limit=limit, rho=rho)

@@ -7,17 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypedDict, Unpack
 
-import msgspec
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design.arguments import known, of_kind, one_of, shown
 from haptic_loop.design.assessment import Assessment, check_ranges
-from haptic_loop.design.certificate import judged, lag, named, prove, prove_limiter, requirements_of
+from haptic_loop.design.certificate import judged, lag, named, prove, requirements_of
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save, sealed
+from haptic_loop.design.coupling_file import Certificate, Stored, digest, save
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, usual_condition
-from haptic_loop.design.environments import SWITCHING
+from haptic_loop.design.environments import SWITCHING, LimitedForces
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import ANY, HERE, RANGES
 from haptic_loop.design.result import ConditionName, Design, NotProved, Requirement, switching_guarantee
@@ -171,8 +170,7 @@ def proved(loop: Loop, design: Design) -> Design:
     if design.certificate or loop.ranges or loop.varying_delay:
         return design
     try:
-        limiter = prove_limiter(loop, design.coupling, c=design.c) if design.c else None
-        return replace(design, certificate=prove(loop, design.coupling, design.asked, _multiplier(design), limiter))
+        return replace(design, certificate=_certificate(loop, design))
     except NotProved:
         return design
 
@@ -208,16 +206,25 @@ def store(
     return Filed(path, certificate and certificate.proof, reason, switching, limited)
 
 
-def _proved(loop: Loop, design: Design, limiter: LimiterCertificate | None) -> tuple[Certificate | None, str | None]:
+def _proved(loop: Loop, design: Design, limiter: Certificate | None) -> tuple[Certificate | None, str | None]:
     """The certificate of all that the loop claims, or why there is none."""
     held = design.certificate
-    if held and held.scenario == digest(loop, design.coupling.form()):
-        limited = limiter if named(design.asked).extensible else None
-        return (sealed(msgspec.structs.replace(held, limiter=limited)) if limited else held), None
+    limited = limiter if named(design.asked).extensible else None
+    for certificate in (limited, held):
+        if certificate and certificate.scenario == digest(loop, design.coupling.form()):
+            return certificate, None
     try:
-        return prove(loop, design.coupling, design.asked, _multiplier(design), limiter), None
+        return _certificate(loop, design), None
     except NotProved as error:
         return None, str(error)
+
+
+def _certificate(loop: Loop, design: Design) -> Certificate:
+    """The proof of a design, of limited forces too where its search has found their multiplier. Raises NotProved."""
+    if design.c:
+        limiter = LimitedForces(lags=len(design.c[0]))
+        return prove(loop, design.coupling, limiter, [v for row in design.c for v in row])
+    return prove(loop, design.coupling, design.asked, _multiplier(design))
 
 
 def _multiplier(design: Design) -> list[float] | None:

@@ -23,18 +23,19 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.controller.ranges import Member, inside, number_of_vertices
 from haptic_loop.design.arguments import of_kind
 from haptic_loop.design.certificate import (
-    check_limiter,
+    condition_of,
     judged,
+    lag,
     named,
     prove,
-    prove_limiter,
     proves,
+    recheck,
     required_damping,
     requirements_of,
 )
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.coupling_file import Certificate, LimiterCertificate
-from haptic_loop.design.environments import BETA, LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, in_each, worst
+from haptic_loop.design.coupling_file import Certificate
+from haptic_loop.design.environments import LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
 from haptic_loop.design.frequency import too_long
 from haptic_loop.design.guarantees import ANY, RANGES
 from haptic_loop.design.known_device import KNOWN_DEVICE, described
@@ -198,7 +199,7 @@ class ForceLimits:
     reason: str  # why a condition covers limited forces, or why none does
     requirement: Requirement | None = None  # of the condition `limiter`, where it was evaluated
     c: tuple[tuple[float, ...], ...] = ()  # its multiplier
-    certificate: LimiterCertificate | None = None  # its proof
+    certificate: Certificate | None = None  # its proof
     force_limit: tuple[float, ...] = ()  # (m,) [N]
     less: bool = False  # it is proved in one environment, while the guarantee holds in more
     energy_budget: float | None = None  # W0 [J] that forces may give in all
@@ -237,13 +238,13 @@ def covered_limits(
     loop: Loop,
     coupling: Coupling,
     requirements: Mapping[str, Requirement],
-    proof: LimiterCertificate | None = None,
+    proof: Certificate | None = None,
     known: Certificate | None = None,
 ) -> ForceLimits:
     """Find the limiter that a condition covers: of no lag under any-environment, else that of this-environment.
 
     `proof` belongs to the coupling: its limiter is taken where the proof holds in this loop; where it does not, one of
-    the same beta is searched. What `known` contains is not proved again (design.certificate.check_limiter).
+    the same beta is searched. What `known` contains is not proved again (design.certificate.recheck).
     """
     if loop.varying_delay:
         return ForceLimits(None, str(LIMITER.beyond(loop)))
@@ -257,26 +258,28 @@ def covered_limits(
 
 
 def _by_its_own_block(
-    loop: Loop, coupling: Coupling, proof: LimiterCertificate | None, known: Certificate | None
+    loop: Loop, coupling: Coupling, proof: Certificate | None, known: Certificate | None
 ) -> ForceLimits:
     """Find the limiter of this-environment."""
     if proof:
         try:
-            requirement = check_limiter(loop, coupling, proof, known)
-            return ForceLimits(proof.rho, _OWN_PROOF, requirement, proof.c, proof)
+            requirement, condition = recheck(loop, coupling, proof, known), condition_of(proof)
+            assert isinstance(condition, LimitedForces)
+            c = condition.rows(loop, requirement.multiplier or ())
+            return ForceLimits(lag(loop, proof), _OWN_PROOF, requirement, c, proof)
         except NotProved:  # made for another loop
             pass
-    limiter = LimitedForces(proof.beta if proof and 0 < proof.beta <= 1 else BETA)
+    limiter = LimitedForces(beta_of(loop, proof)) if proof else LIMITER
     requirement = required_damping(loop, coupling, limiter)
     c = limiter.rows(loop, requirement.multiplier or ())
     if not requirement.certified:
         needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
         return ForceLimits(None, requirement.reason or needs, requirement, c)
     try:
-        proved = prove_limiter(loop, coupling, limiter.beta, swept=requirement)
+        proved = prove(loop, coupling, limiter, swept=requirement)
     except NotProved as refused:
         return ForceLimits(limiter.rho(loop), f"swept, not proved: {refused}", requirement, c)
-    return ForceLimits(proved.rho, _OWN_PROOF, replace(requirement, proof="rational"), c, proved)
+    return ForceLimits(limiter.rho(loop), _OWN_PROOF, replace(requirement, proof="rational"), c, proved)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -394,7 +397,7 @@ def assess(
     ranges_samples: int = SAMPLES,
     searched: Searched | None = None,
     limiter: bool | None = None,
-    limiter_proof: LimiterCertificate | None = None,
+    limiter_proof: Certificate | None = None,
     force_limit: Sequence[float] = (),
     band_hz: tuple[float, float] = BAND_HZ,
     progress: Progress = lambda done, total: None,
@@ -476,7 +479,7 @@ def _force_limits(
     coupling: Coupling,
     requirements: Mapping[str, Requirement],
     limiter: bool | None,
-    proof: LimiterCertificate | None,
+    proof: Certificate | None,
     known: Certificate | None,
 ) -> ForceLimits:
     """Find the limiter for a loop, or say why forces are clipped."""

@@ -6,7 +6,6 @@ import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from typing import Any
 
 import msgspec
@@ -20,18 +19,14 @@ from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Condition, Demand
 from haptic_loop.design.coupling_file import (
     Certificate,
-    LimiterCertificate,
     Rows,
     Stored,
-    SwitchingProof,
     digest,
     filed,
     own_fields,
     sealed,
 )
 from haptic_loop.design.environments import (
-    BETA,
-    SWITCHING,
     THIS_ENVIRONMENT,
     LimitedForces,
     SwitchingDelays,
@@ -78,7 +73,7 @@ def _in_time() -> Iterator[None]:
 # With ranges around the environment this-environment is proved for the environment (P) and for every vertex
 # (P1, P2, ..); nothing is proved of the environments in between, or of one that changes.
 #
-# A loop whose delays may switch within a range carries a second proof, of any switching.
+# A certificate names its base condition and the facts that are part of its block: latency, walls, limiter, switching.
 
 
 @dataclass(frozen=True)
@@ -94,40 +89,32 @@ def prove(
     loop: Loop,
     coupling: Coupling,
     condition: str | Condition,
-    phi: Sequence[float] | None = None,
-    limiter: LimiterCertificate | None = None,
+    multiplier: Sequence[float] | None = None,
     swept: Requirement | None = None,
 ) -> Certificate:
     """A certificate with an exact proof of the condition, one of your own or that of a name.
 
-    `phi` is its multiplier, of Theorem 4 where psi >= 1 in N s/m; the best one, or the least, where it is not given.
-    Where the delays of the loop may switch, the certificate proves that, too.
-
-    With `limiter`, which `prove_limiter` gives of this loop, also of forces that are limited, under this-environment;
-    under any-environment without delay in the environment rho is 0 and the certificate is the same. `swept` is what
-    `required_damping` gives, of a caller who has just asked. Raises NotProved with the reason.
+    `multiplier` are the numbers of its multipliers, one after the other (Phi in N s/m for Theorem 4 with psi >= 1);
+    the best ones where it is not given. The facts of the loop, such as walls or delays that switch, are part of the
+    condition; design.environments.LimitedForces covers limited forces, too. Under any-environment without delay in the
+    environment the limiter has no lag and needs no further proof. `swept` is what `required_damping` gives, of a caller
+    who has just asked. Raises NotProved with the reason.
     """
     asked, coupling = named(condition), filed(loop, coupling)
-    requirement, proof = _proof(asked, loop, coupling, phi, swept)
-    if name := asked.multiplier_name(loop):
-        proof[name] = rows_of(Matrix.of([[rational(float(p)) for p in requirement.multiplier or ()]]))
-    switching: SwitchingProof | msgspec.UnsetType = msgspec.UNSET
-    if loop.varying_delay:
-        found, P = _proof(SWITCHING, loop, coupling)
-        switching = SwitchingProof(found.required, _margin(found), found.multiplier or (), P["P"])
+    requirement, proof = _proof(asked, loop, coupling, multiplier, swept)
     certificate = sealed(
         Certificate(
-            condition=asked.name,
+            condition=asked.base,
+            facts=asked.fact_names(loop),
             required=requirement.required,
             available=loop.delta,
             margin=_margin(requirement),
             guarantee=asked.guarantee(loop),
             proof="rational",
+            multipliers=asked.parameters(loop) | asked.by_name(loop, requirement.multiplier or ()),
             matrices=proof,
             scenario=digest(loop, coupling.form()),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
-            switching=switching,
-            limiter=limiter if limiter and asked.extensible else msgspec.UNSET,
         )
     )
     if _is_ours(asked):
@@ -136,21 +123,6 @@ def prove(
 
 
 _made: set[str] = set()  # seals of the certificates that this process has proved, by conditions that have a name
-
-
-@_in_time()
-def prove_limiter(
-    loop: Loop,
-    coupling: Coupling,
-    beta: float = BETA,
-    c: Sequence[Sequence[float]] | None = None,
-    swept: Requirement | None = None,
-) -> LimiterCertificate:
-    """An exact proof with the multiplier `c` or the best one; `swept` as in `prove`. Raises NotProved."""
-    limiter = LimitedForces(beta, len(c[0]) if c else 1)
-    found, proof = _proof(limiter, loop, filed(loop, coupling), c and [v for row in c for v in row], swept)
-    c = limiter.rows(loop, found.multiplier or ())
-    return LimiterCertificate(beta, limiter.rho(loop), c, found.required, _margin(found), proof["P"])
 
 
 def _proof(
@@ -279,8 +251,8 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
     """rho (m,) [N/m] of the limiter that the certificate covers, or None where limited forces are not covered."""
     if certificate is None:
         return None
-    if certificate.limiter is not msgspec.UNSET:
-        return certificate.limiter.rho
+    if certificate.limiter:
+        return certificate.multipliers["rho"]
     known = _NAMED.get(certificate.condition)
     return known.lag(loop) if known else None
 
@@ -295,6 +267,19 @@ def proves(loop: Loop, coupling: Coupling, certificate: Certificate, condition: 
     if certificate.seal in _made and sealed(certificate).seal == certificate.seal:
         return True
     return verify(Stored(loop, coupling.form(), certificate), condition).proved
+
+
+def condition_of(certificate: Certificate, own: Condition | None = None) -> Condition:
+    """The condition that a certificate proves. Raises ValueError for an unknown name or impossible multipliers."""
+    base = named(own or certificate.condition)
+    if not certificate.limiter:
+        return base
+    if not base.extensible:
+        raise ValueError(f"facts: {certificate.condition} needs no multiplier for limited forces, and one is on file")
+    rho, c = (certificate.multipliers.get(name, ()) for name in ("rho", "c"))
+    if not rho or len(rho) != len(certificate.available) or len(c) % len(rho):
+        raise ValueError(f"multipliers: rho has {len(rho)} numbers and c {len(c)}, expected as many for each channel")
+    return LimitedForces(lags=len(c) // len(rho), held=rho)
 
 
 def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
@@ -314,7 +299,7 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
         return Verdict(False, f"the certificate is of {certificate.condition!r}, not of {condition.name!r}")
     coupling = stored.built()
     try:
-        asked = named(condition or certificate.condition)
+        asked = condition_of(certificate, condition)
         with _in_time():
             _check(loop, coupling, asked, certificate)
     except ValueError as refused:  # NotProved, or a user's own condition
@@ -332,52 +317,38 @@ def _check(loop: Loop, coupling: Coupling, condition: Condition, certificate: Ce
         raise NotProved(f"{certificate.condition} does not guarantee {certificate.guarantee!r}")
     if certificate.available != loop.delta:
         raise NotProved(f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}")
-    matrices, multiplier = dict(certificate.matrices), None
-    if name := condition.multiplier_name(loop):
-        multiplier = _fractions(name, matrices.pop(name, None))
-    _check_part(loop, coupling, condition, certificate, multiplier, matrices)
-    if certificate.limiter is not msgspec.UNSET:
-        if not condition.extensible:
-            raise NotProved(f"limiter: {condition.name} needs no proof of its own, and one is on file")
-        check_limiter(loop, coupling, certificate.limiter)
-    delays = certificate.switching
-    if (delays is msgspec.UNSET) != (loop.varying_delay is None):
-        there = "a proof for switching delays, but the loop's delays are constant"
-        raise NotProved(f"{SWITCHING.place(loop)}no proof is on file" if delays is msgspec.UNSET else there)
-    if delays is not msgspec.UNSET:
-        _check_part(loop, coupling, SWITCHING, delays, delays.alpha, {"P": delays.P})
+    if certificate.facts != (names := condition.fact_names(loop)):
+        raise NotProved(f"facts are {list(certificate.facts)}, expected {list(names)}")
+    _check_part(loop, coupling, condition, certificate, certificate.matrices)
 
 
-def check_limiter(
-    loop: Loop, coupling: Coupling, proof: LimiterCertificate, known: Certificate | None = None
-) -> Requirement:
-    """What the limiter on file asks of the devices, proved again. Raises NotProved where the file does not prove it.
+def recheck(loop: Loop, coupling: Coupling, certificate: Certificate, known: Certificate | None = None) -> Requirement:
+    """The damping that a certificate's condition and multipliers ask in this loop, proved again with its matrices.
 
-    What `known`, a certificate that was proved in this process, contains is swept, and not proved again.
+    `known` is a certificate that was proved in this process for this loop and coupling: it is only swept. Raises
+    NotProved where the certificate does not hold in the loop.
     """
-    limiter, lags = LimitedForces(proof.beta, len(proof.c[0]) if proof.c else 1), {len(row) for row in proof.c}
-    rho = limiter.rho(loop)
-    if proof.rho != rho or len(proof.c) != loop.channels or len(lags) > 1:
-        expected = f"expected beta delta/T with beta = {proof.beta:g}, one row of c each"
-        raise NotProved(f"limiter: rho is {list(proof.rho)}, {expected}")
-    shown = known and known.limiter is proof and known.scenario == digest(loop, coupling.form())
-    c = [v for row in proof.c for v in row]
-    return _check_part(loop, coupling, limiter, proof, c, None if shown else {"P": proof.P})
+    shown = known is certificate and certificate.scenario == digest(loop, coupling.form())
+    try:
+        condition = condition_of(certificate)
+    except ValueError as error:
+        raise NotProved(str(error)) from None
+    return _check_part(loop, coupling, condition, certificate, None if shown else certificate.matrices)
 
 
 def _check_part(
     loop: Loop,
     coupling: Coupling,
     condition: Condition,
-    claim: Certificate | SwitchingProof | LimiterCertificate,
-    multiplier: Sequence[Any] | None,
+    claim: Certificate,
     matrices: Mapping[str, Rows] | None,
 ) -> Requirement:
-    """What the condition asks at the multiplier on file: its figures swept, its matrices proved again if given.
+    """The damping that the condition asks with the multipliers on file: swept, and proved with the matrices if given.
 
-    Raises NotProved where they are not those on file, or prove nothing.
+    Raises NotProved where the figures are not those on file, or the matrices prove nothing.
     """
     _require_limits(loop, coupling, condition)
+    multiplier = _on_file(condition, loop, claim.multipliers)
     found, place = required_damping(loop, coupling, condition, multiplier), condition.place(loop)
     reason = found.reason or _other_figures(claim, found)
     if not (reason or found.certified):
@@ -395,7 +366,7 @@ def _check_part(
     return replace(found, proof="rational")
 
 
-def _other_figures(claim: Certificate | SwitchingProof | LimiterCertificate, found: Requirement) -> str | None:
+def _other_figures(claim: Certificate, found: Requirement) -> str | None:
     """Where the figures on file are not those of the sweep, or None."""
     required = found.required
     if len(claim.required) != len(required) or not np.allclose(claim.required, required, rtol=_CLAIM_TOLERANCE):
@@ -409,17 +380,15 @@ def _margin(requirement: Requirement) -> float:
     return 1 / max(requirement.ratio, 1e-12)
 
 
-def _fractions(name: str, rows: Rows | None) -> Sequence[Fraction]:
-    """A stored multiplier. Raises NotProved where it is no row of rationals that floating point reaches."""
-    if rows is None:
-        raise NotProved(f"no multiplier {name} is on file")
-    try:
-        (row,) = rows
-        found = [Fraction(value) for value in row]
-        [float(value) for value in found]
-    except (OverflowError, ValueError, ZeroDivisionError):
-        raise NotProved(f"{name} is no row of rational numbers within floating point") from None
-    return found
+def _on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[float]]) -> Sequence[float] | None:
+    """The numbers of the condition's multipliers, one after the other; None where it has none. Raises NotProved."""
+    sizes = condition.multiplier_sizes(loop)
+    expected = sizes | {name: len(values) for name, values in condition.parameters(loop).items()}
+    if {name: len(values) for name, values in stored.items()} != expected:
+        there = ", ".join(f"{name} ({len(values)})" for name, values in stored.items()) or "none"
+        needed = ", ".join(f"{name} ({count})" for name, count in expected.items()) or "none"
+        raise NotProved(f"multipliers are {there}, expected {needed}")
+    return tuple(v for name in sizes for v in stored[name]) if sizes else None
 
 
 _NAMED: dict[str, Condition] = {

@@ -1,28 +1,35 @@
 """What a loop must satisfy so that no passive human can make it oscillate. Each condition states its block once.
 
-A condition is a block that must be strictly positive real: He[block] > 0 on |z| = 1. `Demand` holds it as
-free + s gain, where s multiplies the damping Delta_D that the devices guarantee. Poles at z = 1 are split off by
+A condition is a block that must be strictly positive real: He[block] > 0 on |z| = 1. `Demand` (design.frame) holds it
+as free + s gain, where s multiplies the damping Delta_D that the devices guarantee. Poles at z = 1 are split off by
 `over_z_minus_one`. The same expression is evaluated in floating point (a sweep: the required damping), over Fractions
 (an exact proof), over stacks and over sampled responses (maps and designs). docs/theory.md derives them.
 
-this-environment   `this_environment_demand`; of forces that latch a fraction of a sample late `_latency_demand`
-any-environment    Lemma 4 of the paper for any passive environment under backward Euler: `v_hat`,
-                   `any_environment_demand`; of an environment that holds delay `delayed_environment_demand`
+How a condition is composed. design.facts has the lists: **hands' sides** (`HandsSide`: periods that are even or vary,
+a latency) and **facts** of the environment's side (`Fact`: walls, delays that switch, the limiter). `compose` stacks
+their inputs and adds their forms (design.frame says how). design.environments makes conditions of them, with one
+search for all multipliers; design.certificate has one exact proof and one file format.
 
-design/environments.py and lmi.py have the two as a `Condition` of a loop and a coupling: which form applies.
-environments.py also has those of this-environment that weigh an error with a multiplier: walls that make and break
-contact, delays that switch, forces that leave through the limiter of controller.law.
+How a hands' side is added. Derive from `HandsSide` and state
+  `inputs`   one `Input` per scalar input: `moved`, the weights of its share of the displacement that f[k] multiplies,
+             w_0 + w_1 z + .. (dx: (1,); xa of a latency, which f[k-1] multiplies: (0, 1); the speed v of a known device
+             in f'(dx + beta dv): (-beta, beta), `follows=0`), `slips` whether the limiter's slip is taken off it;
+  `damping`  the matrix over its inputs that grows in proportion to Delta_D;
+  `rest`     matrices M_0, M_1: what does not grow with Delta_D, M_0 + M_1/z;
+  `unknowns` its multipliers, by name.
+`hands_side(loop)` then chooses it for the loops that declare it. Rows, walls, limiter and switching follow.
 
-The period may vary from tick to tick, up to T_max, in all of them: `even_damping` is where it enters.
+any-environment is Lemma 4 of the paper for any passive environment under backward Euler: `v_hat`,
+`any_environment_demand`; of an environment that holds delay `delayed_environment_demand` (design.lmi).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any, Generic
+from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
@@ -33,7 +40,9 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Block, Complex, Lti, Sampled, as_like, constant_like, hstack, vstack
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design.arguments import shown
+from haptic_loop.design.facts import compose
 from haptic_loop.design.files import InputError
+from haptic_loop.design.frame import Demand, even_damping
 from haptic_loop.design.frequency import (
     Response,
     frequencies,
@@ -49,74 +58,14 @@ from haptic_loop.design.frequency import (
 from haptic_loop.design.result import Environments, Requirement, from_ratio, refusal
 
 
-@dataclass(frozen=True, eq=False)
-class Demand(Generic[Block]):
-    """free + s gain must be strictly positive real, with s = 1 for the available damping.
-
-    `static` are matrices that must be symmetric, by name; those in `semidefinite` also positive semidefinite.
-    """
-
-    free: Block
-    gain: Block
-    static: Mapping[str, Array] = field(default_factory=dict)
-    semidefinite: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for name, part in (("free", self.free), ("gain", self.gain)):
-            if not isinstance(part, Lti | Sampled):
-                raise ValueError(f"{name} of a demand is {shown(part)}, expected an Lti")
-        if isinstance(self.free, Lti) and isinstance(self.gain, Lti):
-            (rows, columns), other = (self.free.outputs, self.free.inputs), (self.gain.outputs, self.gain.inputs)
-            if not rows == columns == other[0] == other[1]:
-                sizes = f"free is {rows} x {columns}, gain is {other[0]} x {other[1]}"
-                raise ValueError(f"{sizes} in a demand, expected square blocks of one size")
-
-
-def even_damping(loop: Loop, T: Number | None = None) -> Any:
-    """Delta_D T/T_max [N s/m], (m,): the damping that does in even periods T what delta does in periods up to T_max.
-
-    The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. Nothing else
-    in the energy balance depends on T: the force map is the same at every tick, however long the tick is.
-    """
-    T = loop.T if T is None else T
-    damping = numbers(loop.delta, T)
-    return damping if loop.T_max is None else damping * (T / numbers(loop.T_max, T))
-
-
 def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
     """He[F/(z-1)] > -s Delta_D/T_max. F displaces devices to forces (6), in any arithmetic.
 
     The energy that a device with a passive human can give back in a tick is at most the damping's, Delta_D dx^2/T, and
     what the force map gives is -F dx; with F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T. Forces that
-    latch later than at the tick have a block of twice the size, see `_latency_demand`.
+    latch later than at the tick have a block of twice the size (design.facts.Latency).
     """
-    if loop.latency is not None:
-        return _latency_demand(F, loop)
-    F1, regular = F.over_z_minus_one()
-    return Demand(regular, constant_like(F, np.diag(even_damping(loop, F.T) / F.T)), {"F(1)": F1}, ("F(1)",))
-
-
-def _latency_demand(F: Block, loop: Loop) -> Demand[Block]:
-    """this-environment for forces that latch at kT + tau_k, with any tau_k in [t1, t2] at every tick and channel.
-
-    Between kT and kT + tau_k the force of the tick before still acts: a device moves by a under f[k-1] and then by b
-    under f[k], and dissipates at least delta a^2/t2 + delta b^2/(T_max - t1). With Gam = F/(z-1) the block is, on
-    (a, b),
-        [[Gam/z + s Delta_D/t2, Gam/z], [Gam, Gam + s Delta_D/(T_max - t1)]],
-    whose pole at z = 1 has F(1) in all four entries. A channel with t2 = 0 has no row of the first kind. The shortest
-    period must be longer than t2.
-    """
-    T, m = F.T, loop.channels
-    longest = T if loop.T_max is None else numbers(loop.T_max, T)
-    first, last = (numbers([row[i] for row in loop.latency or ()], T) for i in (0, 1))
-    late = [i for i in range(m) if last[i]]
-    one = np.eye(m, dtype=int)
-    before = one[late] @ delay((1,) * m, T)
-    both = as_like(F, vstack(before, Lti.constant(one, T))) @ F @ np.hstack([one[:, late], one])
-    E1, regular = both.over_z_minus_one()
-    damping = numbers(loop.delta, T)
-    gain = np.concatenate([damping[late] / last[late], damping / (longest - first)])
-    return Demand(regular, constant_like(F, np.diag(gain)), {"F(1)": E1[..., len(late) :, len(late) :]}, ("F(1)",))
+    return compose(F, loop, late=False)
 
 
 def theta_hat(theta: Sequence[int], damping: Any, T: Number) -> Lti:
@@ -263,6 +212,10 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
 BEYOND = ("psi", "T_max", "latency", "varying_delay", "walls", "ranges")
 
 
+#: The facts of the environment's side that a certificate may cover, in the order of reports and files.
+FACTS = ("latency", "walls", "limiter", "switching", "ranges")
+
+
 class Condition(ABC):
     """What must hold of a coupling in a loop, as a block. One of your own is a class with a name and `demand`.
 
@@ -280,7 +233,7 @@ class Condition(ABC):
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         """The block of this coupling in this loop, over Fractions where `exact`. Raises SingularLoop.
 
-        Only a condition that has a `multiplier_name` is given a multiplier.
+        Only a condition that has `multiplier_sizes` is given a multiplier.
         """
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
@@ -336,13 +289,36 @@ class Condition(ABC):
         left = f"the loop has {', '.join(missing)}, which the condition {self.name} does not name in covers"
         return left if missing else None
 
+    @property
+    def base(self) -> str:
+        """The name by which a certificate calls the condition; its facts stand beside it."""
+        return self.name
+
+    def fact_names(self, loop: Loop) -> tuple[str, ...]:
+        """What holds of this loop, of `FACTS`."""
+        walls, limited = loop.environment.walls, self.parameters(loop)
+        there = loop.latency, walls, limited, loop.varying_delay, loop.ranges
+        return tuple(name for name, has in zip(FACTS, there, strict=True) if has)
+
+    def parameters(self, loop: Loop) -> dict[str, tuple[float, ...]]:
+        """Numbers that a certificate keeps beside the multipliers, because what runs must use them: rho [N/m]."""
+        return {}
+
     def lag(self, loop: Loop) -> tuple[float, ...] | None:
         """rho (m,) [N/m] of a limiter that needs no further proof; None where limited forces are not covered."""
         return None
 
-    def multiplier_name(self, loop: Loop) -> str | None:
-        """What a file calls the numbers that the block needs beside the coupling; None for a condition without any."""
-        return None
+    def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
+        """What a file calls the multipliers, and how many numbers each has; {} for a condition without any."""
+        return {}
+
+    def by_name(self, loop: Loop, multiplier: Sequence[Any]) -> dict[str, tuple[float, ...]]:
+        """The numbers of the multipliers, which come one after the other, by name."""
+        found, start = dict[str, tuple[float, ...]](), 0
+        for name, count in self.multiplier_sizes(loop).items():
+            found[name] = tuple(float(v) for v in multiplier[start : start + count])
+            start += count
+        return found
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
         """The one for every coupling, None where none is needed; and why it says nothing of the loop, if so."""

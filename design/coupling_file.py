@@ -28,41 +28,26 @@ Rows = tuple[tuple[_Rational, ...], ...]  # of a matrix, rationals "p/q"
 _Part = TypeVar("_Part", bound=msgspec.Struct)
 
 
-class SwitchingProof(Strict, frozen=True):
-    """What proves that the delays may switch within the loop's range (design.environments)."""
-
-    required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
-    margin: float  # available / required
-    alpha: tuple[float, ...]  # (m,) multiplier [N/m], 0 where the delay does not vary
-    P: Rows
-
-
-class LimiterCertificate(Strict, frozen=True):
-    """What proves this-environment also while forces are limited, by the limiter of controller.law."""
-
-    beta: float  # rho = beta delta/T, to six digits
-    rho: tuple[float, ...]  # (m,) lag of the limiter [N/m]; the tick must use these
-    c: tuple[tuple[float, ...], ...]  # (m, lags) multiplier
-    required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
-    margin: float  # available / required
-    P: Rows
-
-
 class Certificate(Strict, frozen=True):
-    """The claim about a coupling in its loop, and its proof."""
+    """The claim about a coupling in its loop, and its proof: a base condition, the facts it holds with, multipliers."""
 
-    condition: str  # of design.result.CONDITIONS, or the name of one's own
-    required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
+    condition: str  # the base: a name of design.result.CONDITIONS, or that of one's own condition
+    facts: tuple[str, ...]  # what it covers beyond one linear network with constant delays (design.conditions.FACTS)
+    required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep with these multipliers
     available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
     margin: float  # available / required
     guarantee: Environments
     proof: Literal["sampled", "kyp", "rational"]
-    matrices: dict[str, Rows]
+    multipliers: dict[str, tuple[float, ...]]  # by name, each decimal taken exactly; "rho" is the limiter's lag [N/m]
+    matrices: dict[str, Rows]  # P, and P1, P2, .. of further environments
     scenario: str  # digest of the loop and the coupling
     versions: dict[str, str]
     seal: str = ""  # digest of all other fields
-    switching: SwitchingProof | msgspec.UnsetType = msgspec.UNSET  # where delays vary; left out of other files
-    limiter: LimiterCertificate | msgspec.UnsetType = msgspec.UNSET  # where it was proved; left out of other files
+
+    @property
+    def limiter(self) -> Certificate | None:
+        """The certificate itself where it covers limited forces, else None."""
+        return self if "limiter" in self.facts else None
 
 
 class Stored(Strict, frozen=True):
@@ -71,7 +56,7 @@ class Stored(Strict, frozen=True):
     loop: Loop
     coupling: Form
     certificate: Certificate | None = None
-    version: Literal[1, 2] = 2  # 2: force filters
+    version: Literal[3] = 3
 
     def __post_init__(self) -> None:
         require_channels(self.coupling, self.loop.channels)

@@ -9,20 +9,19 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers
+from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
-from haptic_loop.controller.lti import Array, Block, Lti, as_like, constant_like, hstack, taps, vstack
+from haptic_loop.controller.lti import Array, Block, Lti
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design.conditions import (
     BEYOND,
     Condition,
     Demand,
-    even_damping,
     least_scale,
     ratio_in,
     this_environment,
@@ -32,7 +31,9 @@ from haptic_loop.design.conditions import (
     unsound_static,
 )
 from haptic_loop.design.cone import ConeProgram, Inequality
+from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.exact import require_size
+from haptic_loop.design.facts import Fact, Limiter, Switching, Unknowns, Walls, compose
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, peaks, supremum, sweeping
 from haptic_loop.design.result import MAKING, DesignFailed, Requirement, from_ratio, refusal, switching_guarantee
@@ -43,33 +44,12 @@ from haptic_loop.design.result import MAKING, DesignFailed, Requirement, from_ra
 # frequencies join, until it attains the bound.
 
 
-@dataclass(frozen=True)
-class Unknowns:
-    """The numbers of a multiplier, and where a search looks for them: in [least, most] units each."""
-
-    name: str  # what a file calls them
-    units: tuple[float, ...]  # (n,); 0 for a number that is 0
-    expected: str  # what they must be, for messages; positive where `least` is
-    least: float
-    most: float
-    spare: tuple[float, ...] | float = 0.0  # (p,) that the block's diagonal keeps, however large the damping
-
-    def check(self, values: Sequence[Any]) -> None:
-        """Raises ValueError for what is no multiplier."""
-        right = len(values) == len(self.units) and all(
-            (v > 0 or v == self.least if unit else v == 0) and v < np.inf
-            for v, unit in zip(values, self.units, strict=True)
-        )
-        if not right:
-            raise ValueError(f"{self.name} is {[float(v) for v in values]}, expected {self.expected}")
-
-
 class Multiplied(Condition):
-    """A condition whose block is affine in a multiplier. One of your own has `unknowns`, `map` and `block`."""
+    """A condition whose block is affine in its multipliers. One of your own has `unknowns`, `map` and `block`."""
 
     @abstractmethod
-    def unknowns(self, loop: Loop) -> Unknowns | None:
-        """What the multiplier consists of; None where the block needs none."""
+    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
+        """The multipliers, in the order in which `block` takes their numbers; () where the block needs none."""
 
     @abstractmethod
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
@@ -84,15 +64,18 @@ class Multiplied(Condition):
 
     def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
         """The multiplier that a search begins with; the one of a block of many rows, whose search would take long."""
-        unknowns = self.unknowns(loop)
-        return unknowns.units if unknowns else ()
+        return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
+
+    def check(self, loop: Loop, multiplier: Sequence[Any]) -> None:
+        """Raise ValueError unless the numbers are multipliers."""
+        for each, values in zip(self.unknowns(loop), _parted(self.unknowns(loop), multiplier), strict=True):
+            each.check(values)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """At this multiplier, or at the best one: `multiplier` and `bound` of the requirement say which."""
-        unknowns, reason = self.unknowns(loop), self.beyond(loop)
-        if reason:
+        if reason := self.beyond(loop):
             return refusal(self.name, loop.delta, reason)
-        if unknowns is None:
+        if not self.unknowns(loop):
             return super().required(loop, coupling)
         try:
             with sweeping():
@@ -105,18 +88,18 @@ class Multiplied(Condition):
     def required_of(self, G: Lti, loop: Loop, multiplier: Any = None) -> Requirement:
         """The same of a map."""
         unknowns, delta = self.unknowns(loop), loop.delta
-        assert unknowns
         values = tuple(float(v) for v in (self.usual(G, loop) if multiplier is None else multiplier))
-        unknowns.check(values)
+        self.check(loop, values)
         asked = self.is_demand(self.block(G, loop, values))
         if reason := unsound(asked.free, delta) or self.unsound_static(G, loop, asked):
             return replace(refusal(self.name, delta, reason), multiplier=values)
-        search, bound = _Search(lambda x: self.block(G, loop, x), unknowns, asked.free), None
+        search, bound = _Search(lambda x: self.block(G, loop, x), unknowns, asked), None
         if multiplier is None and search.pays:
             bound, values = search.best(values)
         ratio, w = search.swept(values)
         if np.isinf(ratio):
-            reason = f"no multiplier {unknowns.name} that was found proves it, whatever the damping"
+            names = ", ".join(each.name for each in unknowns)
+            reason = f"no multiplier {names} that was found proves it, whatever the damping"
             return replace(refusal(self.name, delta, reason), multiplier=values)
         found = from_ratio(self.name, max(ratio, 0.0), tuple(delta), w / (2 * np.pi * loop.T))
         return replace(found, multiplier=values, bound=bound and min(bound, ratio))
@@ -126,13 +109,21 @@ class Multiplied(Condition):
         return unsound_static(asked.free, asked, loop.delta)
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
-        if unknowns := self.unknowns(loop):
-            unknowns.check(multiplier)
+        if self.unknowns(loop):
+            self.check(loop, multiplier or ())
         return super().exact_demands(loop, coupling, multiplier)
 
-    def multiplier_name(self, loop: Loop) -> str | None:
-        unknowns = self.unknowns(loop)
-        return unknowns and unknowns.name
+    def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
+        return {each.name: len(each.units) for each in self.unknowns(loop)}
+
+
+def _parted(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> list[Sequence[Any]]:
+    """The values of each multiplier. Raises ValueError where there are too few or too many."""
+    ends = np.cumsum([0, *(len(each.units) for each in unknowns)]).tolist()
+    if ends[-1] != len(values):
+        expected = "; ".join(f"{each.name}: {each.expected}" for each in unknowns)
+        raise ValueError(f"the multipliers have {len(values)} numbers, expected {ends[-1]} ({expected})")
+    return [values[a:b] for a, b in pairwise(ends)]
 
 
 _MOST_ROWS = 24  # of a block whose multiplier is searched: twelve devices with limited forces
@@ -146,12 +137,18 @@ _DIGITS, _NOTHING = 8, 1e-6  # of a number of the multiplier; what counts as 0, 
 class _Search:
     """The multiplier at which a block asks least, by cutting planes."""
 
-    def __init__(self, block: Callable[[Sequence[float]], Demand[Lti]], unknowns: Unknowns, system: Lti) -> None:
-        self._block, self._unknowns, self._units = block, unknowns, np.array(unknowns.units)
+    def __init__(
+        self, block: Callable[[Sequence[float]], Demand[Lti]], unknowns: Sequence[Unknowns], asked: Demand[Lti]
+    ) -> None:
+        system, self._block = asked.free, block
+        self._names = ", ".join(each.name for each in unknowns)
+        self._units = np.array([unit for each in unknowns for unit in each.units])
         self._searched = np.flatnonzero(self._units)
+        bounds = [(each.least, each.most) for each in unknowns for _ in each.units]
+        self._least, self._most = np.array(bounds).reshape(-1, 2)[self._searched].T
         self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # what was swept last
         self._grid = np.concatenate([[0.0], frequencies(system)])
-        self._spare = np.diag(np.broadcast_to(unknowns.spare, system.outputs))
+        self._spare = np.diag(np.zeros(system.outputs) if asked.spare is None else asked.spare)
         self._plain: list[Demand[Lti]] = []  # the blocks of no multiplier, and of each unknown alone
         self._root = np.ones(system.outputs)  # what makes the rows of an inequality about one
         self.pays = system.outputs <= _MOST_ROWS and self._searched.size > 0
@@ -165,13 +162,14 @@ class _Search:
 
     def best(self, values: Sequence[float]) -> tuple[float, tuple[float, ...]]:
         """(a ratio that no multiplier is below, the best one), beginning with these values."""
-        unknowns, count, bound = self._unknowns, self._searched.size, 0.0
+        count, bound = self._searched.size, 0.0
         units = np.eye(self._units.size)[self._searched] * self._units
         self._plain = [self._block(tuple(x)) for x in (0 * self._units, *units)]
         by = np.abs(np.diagonal(self._parts(self._grid[[0, -1]])[1], axis1=2, axis2=3)).max(axis=1)
         self._root = 1 / np.sqrt(np.where(by[-1] > 0, by[-1], np.maximum(by.max(axis=0), 1e-300)))
-        low = Inequality.least(range(count), unknowns.least), Inequality.least([count], 0.0)
-        blocks = [*low, Inequality.most(range(count), unknowns.most)]
+        low = [Inequality.least([i], float(v)) for i, v in enumerate(self._least)]
+        high = [Inequality.most([i], float(v)) for i, v in enumerate(self._most)]
+        blocks = [*low, Inequality.least([count], 0.0), *high]
         top, w = self._worst(values, bound)
         best, least, stalled = values, top, 0
         for _ in range(_MOST_ROUNDS):
@@ -179,7 +177,7 @@ class _Search:
                 break
             blocks.append(self._inequality(w))
             try:
-                found = ConeProgram(np.eye(count + 1)[-1], blocks).solve(f"the multiplier {unknowns.name}")
+                found = ConeProgram(np.eye(count + 1)[-1], blocks).solve(f"the multiplier {self._names}")
             except DesignFailed:  # none within the bounds makes the block positive, however large the damping
                 break
             stalled = 0 if found[-1] > bound + _SETTLED * max(bound, 1.0) else stalled + 1
@@ -190,8 +188,8 @@ class _Search:
 
     def _values(self, x: Array) -> tuple[float, ...]:
         """The multiplier of x, in units, in few digits."""
-        values, least, most = np.zeros(self._units.size), self._unknowns.least, self._unknowns.most
-        x = np.where(x < _NOTHING, 0.0, np.minimum(x, most)) if least == 0 else np.clip(x, least, most)
+        values = np.zeros(self._units.size)
+        x = np.where((self._least == 0) & (x < _NOTHING), 0.0, np.clip(x, self._least, self._most))
         values[self._searched] = [float(f"{v:.{_DIGITS}g}") for v in x * self._units[self._searched]]
         return tuple(values.tolist())
 
@@ -228,39 +226,55 @@ class _Search:
 
 
 class ThisEnvironment(Multiplied):
-    """Safe in the environment of the loop: around its walls, whether they touch or not, and at all of its members."""
+    """Safe in the environment of the loop, with the facts that hold there (design.facts).
+
+    Walls may touch or not, delays may switch within the loop's range, and it may be any member of its ranges.
+    """
 
     name, covers, extensible = "this-environment", BEYOND, True
 
+    def facts(self, loop: Loop) -> tuple[Fact, ...]:
+        """How the forces of this loop come about, beyond a linear network with constant delays."""
+        walls = (Walls(),) if loop.environment.walls else ()
+        return (*walls, Switching()) if loop.varying_delay else walls
+
+    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
+        return tuple(each for fact in self.facts(loop) for each in fact.unknowns(loop))
+
+    def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
+        """The start of each multiplier; alpha is half the width times a device's largest own force per displacement.
+
+        Of many devices, whose multipliers are not searched, the best share of it is taken.
+        """
+        unknowns, usual = self.unknowns(loop), super().usual(G, loop)
+        if not loop.varying_delay:
+            return usual
+        w, m = frequencies(G, points=60), loop.channels
+        most = _half_widths(loop) * np.abs(np.diagonal(G.at(on_circle(w))[:, :m, :m], axis1=1, axis2=2)).max(axis=0)
+        others = [
+            () if each.name == "alpha" else part for each, part in zip(unknowns, _parted(unknowns, usual), strict=True)
+        ]
+        units = next(each.units for each in unknowns if each.name == "alpha")
+        tried = []
+        for share in _SHARES if 2 * m > _MOST_ROWS else (1.0,):
+            alpha = np.maximum(share * most, 1e-8 * np.array(units)).tolist()
+            tried.append([v for part in others for v in (part or alpha)])
+        return min(tried, key=lambda values: float(least_scale(self.block(G, loop, values), w).max()))
+
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
-        G = loop.walled(coupling, exact)
+        G = loop.walled_before_delay(coupling, exact) if loop.environment.walls else loop.sent(coupling, exact)
         if exact:
-            require_size(G.order)
+            require_size(G.order + sum(loop.delays.hi))
         return G
 
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
-        """this-environment for walls of any stiffness and damping with k + 2 b/T up to that of the loop's, and any gap.
-
-        G takes [x; p] to [f; y], displacements (m,) and wall forces to the forces of the devices and the ways into the
-        walls, [[F, J], [H, Y]]. With the multiplier g (w,) and M = g (z-1) - 1 the block is, on (dx, dp),
-            [[F, J], [-M H, -M Y]]/(z-1) + diag(s Delta_D/T, g/slopes),
-        whose static part must be symmetric, J(1) = H(1)' and Y(1) = Y(1)', with F(1) >= 0 >= Y(1). docs/theory.md has a
-        weight of each wall beside g; it is 1 here.
-        """
-        T, m, w = G.T, loop.channels, len(loop.environment.walls)
-        none, g = numbers([0] * m, T), numbers(multiplier, T)
-        slopes: Any = [wall.slope(T) for wall in loop.environment.walls]
-        S1, regular = G.over_z_minus_one()
-        steep = np.diag(np.concatenate([none, g]))
-        limits = np.concatenate([none, g / numbers(slopes, T)])
-        free = np.hstack([numbers(np.eye(m + w), T), -steep]) @ vstack(regular, G) + np.diag(limits)
-        damping = np.concatenate([even_damping(loop, T) / T, numbers([0] * w, T)])
-        F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
-        static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
-        return Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
+        """The block of a map from [x; p] to [f_e; y], with the numbers of its multipliers one after the other."""
+        facts, unknowns = self.facts(loop), self.unknowns(loop)
+        parts = _parted(unknowns, () if multiplier is None else multiplier)
+        return compose(G, loop, facts, {each.name: part for each, part in zip(unknowns, parts, strict=True)})
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """With the multiplier of its walls; without one as if they all touched, where it has some."""
+        """With its multipliers; without them as if all walls touched and delays were constant."""
         if multiplier is not None:
             return super().demand(loop, coupling, exact, multiplier)
         F = loop.F(coupling, exact)
@@ -270,7 +284,7 @@ class ThisEnvironment(Multiplied):
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """The most that any member asks."""
-        if loop.environment.walls:
+        if self.unknowns(loop) or self.beyond(loop):
             return super().required(loop, coupling, multiplier)
         if loop.ranges is None:
             return this_environment(loop.F(coupling), loop)
@@ -282,12 +296,10 @@ class ThisEnvironment(Multiplied):
             return "walls and ranges: walls are proved in one environment"
         return super().beyond(loop)
 
-    def unknowns(self, loop: Loop) -> Unknowns | None:
-        walls = len(loop.environment.walls)
-        return Unknowns("g", (1.0,) * walls, f"a number > 0 for each of {walls} walls", 1e-3, 1e3) if walls else None
-
     def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
         """Rounding is relative to what each channel and wall is elsewhere: forces and ways have units of their own."""
+        if not loop.environment.walls:
+            return super().unsound_static(G, loop, asked)
         m, S1 = loop.channels, G.dc()
         own = np.abs([np.diag(part) for part in (S1, G.D, G.at(-1.0))]).max(axis=0)
         if (np.abs(S1 - S1.T) > _ROUNDING * np.sqrt(np.outer(own, own))).any():
@@ -303,6 +315,9 @@ class ThisEnvironment(Multiplied):
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
         poles = loop.F(coupling).poles()
         return this_environment_ratios(lambda z: loop.late(loop.sent_at(coupling, z)), poles, loop)
+
+    def place(self, loop: Loop, matrix: str = "P") -> str:
+        return f"{switching_guarantee(loop.delays)}: " if loop.varying_delay else super().place(loop, matrix)
 
     def words(self, loop: Loop) -> str:
         return MAKING if loop.environment.walls else super().words(loop)
@@ -334,64 +349,21 @@ def worst(requirements: Sequence[Requirement]) -> int:
 # Delays that switch within [lo, hi] at every tick and on every channel.
 
 
-class SwitchingDelays(Multiplied):
-    """Safe in the environment of the loop whatever its delays do within loop.delays."""
+class SwitchingDelays(ThisEnvironment):
+    """this-environment of a loop whose delays switch, under a name of its own."""
 
     name, covers = "switching", ("psi", "T_max", "varying_delay")
 
-    def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
-        G = loop.sent(coupling, exact)
-        if exact:
-            require_size(G.order + sum(loop.delays.hi))
-        return G
+    @property
+    def base(self) -> str:
+        return ThisEnvironment.name if self.name == SwitchingDelays.name else self.name
 
-    def unknowns(self, loop: Loop) -> Unknowns:
-        units = tuple((even_damping(loop) / loop.T * (_half_widths(loop) > 0)).tolist())
-        return Unknowns("alpha", units, "a positive number where the delay varies and 0 elsewhere", 1e-8, 1e6)
-
-    def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
-        """[[this-environment - diag(alpha)/2, 0], [2 h G, 2 diag(alpha)]] for delays that switch within loop.delays.
-
-        F = Theta_nom G with Theta_nom = (z^-lo + z^-hi)/2 and 2 h = hi - lo; G are the forces as they leave,
-        alpha (m,) [N/m] is the multiplier, positive where the delay varies. Channels whose delay does not vary have no
-        row and column of the second kind.
-
-        A force that is late by n in [lo, hi] differs from the nominal one by at most h times the sum of the steps in
-        between; the multiplier weighs that error against the displacement (an S-procedure, channel by channel).
-        """
-        T, m, lo, hi = G.T, loop.channels, loop.delays.lo, loop.delays.hi
-        varying = [i for i in range(m) if lo[i] < hi[i]]
-        a, one = numbers(multiplier, T), np.eye(m, dtype=int)
-        half = Lti.diag(*(taps(_halves(p, q), T) for p, q in zip(lo, hi, strict=True)))
-        spread = Lti.constant(np.diag([q - p for p, q in zip(lo, hi, strict=True)])[varying], T)
-        both: Any = as_like(G, vstack(half, spread)) @ G
-        linear = this_environment_demand(both.rows(slice(None, m)), loop)
-        if not varying:
-            return linear
-        upper = vstack(linear.free - np.diag(a / 2), both.rows(slice(m, None)))
-        corner = np.vstack([0 * one[:, varying], np.diag(2 * a[varying])])
-        free = hstack(upper, constant_like(G, corner))
-        wide = np.eye(m, m + len(varying), dtype=int)
-        return replace(linear, free=free, gain=np.transpose(wide) @ linear.gain @ wide)
-
-    def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
-        """h times the largest own force of each device per displacement, best for springs; of many a share of it."""
-        w, least = frequencies(G, points=60), 1e-8 * np.array(self.unknowns(loop).units)
-        most = _half_widths(loop) * np.abs(np.diagonal(G.at(on_circle(w)), axis1=1, axis2=2)).max(axis=0)
-        shares = _SHARES if 2 * loop.channels > _MOST_ROWS else (1.0,)
-        tried = [np.maximum(share * most, least).tolist() for share in shares]
-        return min(tried, key=lambda alpha: float(least_scale(self.block(G, loop, alpha), w).max()))
-
-    def place(self, loop: Loop, matrix: str = "P") -> str:
-        return f"{switching_guarantee(loop.delays)}: "
+    def facts(self, loop: Loop) -> tuple[Fact, ...]:
+        return (Switching(),)
 
 
 SWITCHING = SwitchingDelays()
 _SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # the best one is taken
-
-
-def _halves(lo: int, hi: int) -> list[Number]:
-    return [Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)]
 
 
 def _half_widths(loop: Loop) -> Array:
@@ -404,63 +376,40 @@ def _half_widths(loop: Loop) -> Array:
 # proof of its own: with rho = 0 the limiter and the environment together are a passive environment.
 
 BETA = 0.01  # of a limiter's lag under this-environment unless another is asked for
-_SPARE = 0.02  # of rho: what the block keeps, however large the damping, so that c may be rounded and the proof exact
 
 
 @dataclass(frozen=True)
-class LimitedForces(Multiplied):
+class LimitedForces(ThisEnvironment):
     """this-environment also while forces are limited, by a limiter of lag rho = beta delta/T."""
 
     beta: float = BETA
     lags: int = 1  # weights c_ij per channel
+    held: tuple[float, ...] | None = None  # (m,) rho [N/m] where it is given, as by a certificate
     name, covers = "limiter", ("psi", "T_max")
 
     def __post_init__(self) -> None:
         if not 0 <= self.beta < np.inf:
             raise ValueError(f"limiter: beta is {self.beta}, expected a number >= 0")
+        if self.held is not None and not all(0 < r < np.inf for r in self.held):
+            raise ValueError(f"limiter: rho is {list(self.held)}, expected positive numbers in N/m")
 
     def rho(self, loop: Loop) -> tuple[float, ...]:
         """(m,) [N/m], to six digits, which the damping in a sweep does not scale."""
-        return tuple(float(f"{self.beta * d / loop.T:.6g}") for d in loop.delta)
+        return self.held or tuple(float(f"{self.beta * d / loop.T:.6g}") for d in loop.delta)
 
-    def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
-        G = loop.sent(coupling, exact)
-        if exact:
-            require_size(G.order + 2 * loop.channels + sum(max(n, self.lags) for n in loop.theta))
-        return G
+    @property
+    def base(self) -> str:
+        return ThisEnvironment.name
 
-    def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
-        """The limiter's block on (dx - de, de), the steps of what the environment follows and of the slip.
+    def parameters(self, loop: Loop) -> dict[str, tuple[float, ...]]:
+        return {"rho": self.rho(loop)}
 
-        G are the forces as they leave without the limiter, rho its lag, which the damping does not scale, and c the
-        multiplier. With df_e = G (dx - de) - rho (1 - 1/z) de, the steps of the limited forces, the block is
-        [Theta/(z-1); N] df_e + s Delta_D/T [1, 0; 2, 1], where
-        N_i = -(1 + .. + z^-theta_i) - sum_j c_ij (j + (j-1)/z + .. + z^-(j-1)).
-        """
-        theta, c, m, T = loop.theta, self.rows(loop, multiplier), loop.channels, G.T
-        damping = np.diag(even_damping(loop, T) / T)
-        lines = Lti.diag(*(_delay_and_weights(n, row, T) for n, row in zip(theta, c, strict=True)))
-        lines = lines.rows([*range(0, 2 * m, 2), *range(1, 2 * m, 2)])
-        difference = Lti.diag(*(taps([1, -1], T) for _ in theta))
-        steps: Any = hstack(G, as_like(G, difference @ np.diag(-numbers(self.rho(loop), T))))
-        both = as_like(G, lines) @ steps
-        static, regular = both.rows(slice(None, m)).over_z_minus_one()  # [F(1), 0]: the slip's steps have no mean
-        zero = np.zeros((m, m), dtype=int)
-        free = vstack(regular, both.rows(slice(m, None)))
-        gain = np.block([[damping, zero], [2 * damping, damping]])
-        return Demand(free, constant_like(G, gain), {"F(1)": static[..., :m]}, ("F(1)",))
+    def facts(self, loop: Loop) -> tuple[Fact, ...]:
+        return (Limiter(self.rho(loop), self.lags),)
 
     def rows(self, loop: Loop, multiplier: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
         """c as a row per channel, of one entry per lag."""
         return tuple(tuple(multiplier[i * self.lags : (i + 1) * self.lags]) for i in range(loop.channels))
-
-    def unknowns(self, loop: Loop) -> Unknowns:
-        spare = tuple(_SPARE * r for r in self.rho(loop) * 2)
-        units = (1.0,) * loop.channels * self.lags
-        return Unknowns("c", units, "numbers >= 0, as many for each channel", 0.0, 10.0, spare)
-
-    def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
-        return (0.0,) * loop.channels * self.lags
 
     def beyond(self, loop: Loop) -> str | None:
         if loop.varying_delay:
@@ -480,11 +429,8 @@ class LimitedForces(Multiplied):
 LIMITER = LimitedForces()
 
 
-def _delay_and_weights(theta: int, c: Sequence[Any], T: Number) -> Lti:
-    """[z^-theta; N] of one channel, over one line of delays."""
-    lags = range(1, len(c) + 1)
-    size = max(theta + 1, len(c))
-    late = [int(k == theta) for k in range(size)]
-    weights = [-sum([numbers(c[j - 1], T) * (j - k) for j in lags if j > k], int(k <= theta)) for k in range(size)]
-    first, second = taps(late, T), taps(weights, T)
-    return Lti(first.A, first.B, np.vstack([first.C, second.C]), np.vstack([first.D, second.D]), T)
+def beta_of(loop: Loop, certificate: Certificate) -> float:
+    """beta of the limiter that a certificate covers, for another one like it; the usual one where it has none."""
+    rho = certificate.multipliers.get("rho", ())
+    beta = float(f"{rho[0] * loop.T / certificate.available[0]:.6g}") if rho else BETA
+    return beta if 0 < beta <= 1 else BETA

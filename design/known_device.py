@@ -595,9 +595,6 @@ class KnownDevice(Condition):
     def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
         return dict.fromkeys(("beta", "q_below", "q_above"), loop.channels)
 
-    def multiplier_name(self, loop: Loop) -> str | None:
-        return "beta, q"
-
 
 class KnownDeviceAny(KnownDevice):
     """Safe around every passive environment for every passive hand, on devices within their guaranteed bounds."""

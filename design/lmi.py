@@ -304,6 +304,8 @@ class _AnyEnvironment(Condition):
     def beyond(self, loop: Loop) -> str | None:
         if loop.environment.walls and any(loop.psi):
             return "with delay in the environment its multiplier is of a linear one: no walls"
+        if loop.varying_delay:
+            return "delays that switch are covered in one environment: ask this-environment, or for a constant delay"
         return LATE if loop.latency else None
 
     def not_varied(self, loop: Loop) -> str | None:
@@ -359,8 +361,8 @@ class _AnyEnvironment(Condition):
             "P_E": conditions.delayed_environment_demand(delayed, multiplier),
         }
 
-    def multiplier_name(self, loop: Loop) -> str | None:
-        return "Phi" if any(loop.psi) else None
+    def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
+        return {"Phi": loop.channels} if any(loop.psi) else {}
 
     def members(self, loop: Loop) -> tuple[Member, ...]:
         return ()

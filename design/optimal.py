@@ -18,11 +18,11 @@ from haptic_loop.controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoC
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.design import budgets, program
-from haptic_loop.design.certificate import prove, prove_limiter, required_damping
+from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.conditions import Condition, ratio_in
 from haptic_loop.design.conditions import this_environment as requirement_of
-from haptic_loop.design.coupling_file import Certificate, LimiterCertificate
-from haptic_loop.design.environments import BETA, LIMITER, THIS_ENVIRONMENT, LimitedForces, in_each, worst
+from haptic_loop.design.coupling_file import Certificate
+from haptic_loop.design.environments import BETA, LIMITER, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
 from haptic_loop.design.guarantees import ANY
 from haptic_loop.design.result import Design, DesignFailed, NotProved, from_ratio
 from haptic_loop.design.robustness import Nearby, Spread, at, robustness_nearby, vertices
@@ -239,9 +239,10 @@ class _Search:
         if not self.options.limiter:
             return (None,)
         if before and before.certificate:
-            proof = before.certificate.limiter
-            assert isinstance(proof, LimiterCertificate)
-            return (program.Slip(proof.beta, proof.c),)
+            slip = program.Slip(beta_of(self.loop, before.certificate), ((),) * self.loop.channels)
+            c = before.certificate.multipliers["c"]
+            condition = LimitedForces(slip.beta, len(c) // self.loop.channels)
+            return (replace(slip, c=condition.rows(self.loop, c)),)
         return tuple(program.Slip.even(self.loop, *some) for some in (_LAGS if any(self.loop.psi) else _LAGS[:1]))
 
     def slip_of(self, coupling: Coupling) -> program.Slip | None:
@@ -473,8 +474,12 @@ class _Search:
         """The same with its certificate, or why it has none."""
         loop, coupling = self.loop, found.coupling
         try:
-            limited = prove_limiter(loop, coupling, slip.beta) if slip else None
-            certificate = prove(loop, coupling, "this-environment", limiter=limited, swept=found.requirement)
+            if slip:
+                certificate = prove(loop, coupling, LimitedForces(slip.beta))
+            else:
+                certificate = prove(
+                    loop, coupling, THIS_ENVIRONMENT, swept=None if loop.varying_delay else found.requirement
+                )
         except NotProved as error:
             return replace(found, wall_s=self.elapsed, reason=str(error))
         requirement = replace(found.requirement, proof="rational")

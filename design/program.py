@@ -156,11 +156,14 @@ class Slip:
 def limiter(loop: Loop, slip: Slip) -> _Constraint:
     """design.environments.LimitedForces: forces that are limited. A little of rho stays unused, as of the damping."""
     condition, c = slip.condition, [v for row in slip.c for v in row]
-    spare = np.diag(condition.unknowns(loop).spare)
 
     def block(G: Sampled, own: Array) -> Sampled:
         demand = condition.block(G, loop, c)
-        return demand.free + demand.gain * (1 - MARGIN) - spare
+        return (
+            demand.free
+            + demand.gain * (1 - MARGIN)
+            - np.diag(np.zeros(len(c)) if demand.spare is None else demand.spare)
+        )
 
     return _Constraint("limiter", block, np.tile(1 / np.sqrt(even_damping(loop) / loop.T), 2))
 

@@ -29,7 +29,7 @@ KNOWN_CONDITIONS: dict[str, str] = {
 
 
 #: what this-environment holds for before walls
-MAKING = "this environment, with walls up to their stiffness and damping that make and break contact"
+MAKING = "this environment, with its walls, at any gap, or softer ones in proportion, that make and break contact"
 
 C = TypeVar("C", bound=str)  # a ConditionName, "switching" or "limiter"
 
@@ -156,7 +156,7 @@ class Chosen:
     kind: str = field(kw_only=True, default="given")
     phi: Array | None = field(kw_only=True, default=None)  # (m,) multiplier Phi_E [N s/m] of Theorem 4, if it needs one
     certificate: Any = field(kw_only=True, default=None)  # the file's Certificate, where it was proved in this process
-    limiter: Any = field(kw_only=True, default=None)  # LimiterCertificate: what it comes with for limited forces
+    limiter: Any = field(kw_only=True, default=None)  # Certificate with which it comes for limited forces
     own: Any = field(kw_only=True, default=None)  # the design.conditions.Condition, where that is one of the user's own
     switching: DelayRange | None = field(kw_only=True, default=None)  # its file proves any switching within it
     notes: tuple[str, ...] = field(kw_only=True, default=())  # what a reader should know of its origin

@@ -5,6 +5,7 @@ from __future__ import annotations
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.design import conditions, environments
+from haptic_loop.design.certificate import prove
 
 
 def loop(T, delta, theta=None, walls=(), psi=None, environment=None, **further) -> Loop:
@@ -42,12 +43,10 @@ def any_environment_per_channel(V, theta, delta):
     return conditions.any_environment_per_channel(V, loop(V[0].T, delta, theta))
 
 
-def walls_demand(G, delta, slopes, g):
-    return environments.THIS_ENVIRONMENT.block(G, loop(G.T, delta, walls=slopes), g)
-
-
-def walls_proof(G, delta, slopes, g=None):
-    return environments.THIS_ENVIRONMENT.required_of(G, loop(G.T, delta, walls=slopes), g)
+def walls_demand(G, delta, stiffness, a):
+    """Walls without dampers, with the multiplier a (w,) [N/m]; G has all delays."""
+    none = (0,) * (3 * len(stiffness))
+    return environments.THIS_ENVIRONMENT.block(G, loop(G.T, delta, walls=stiffness), (*a, *none))
 
 
 def _switching(G, lo, hi, delta, T_max=None):
@@ -62,17 +61,14 @@ def switching_sweep(G, lo, hi, delta, alpha=None, T_max=None):
     return environments.SWITCHING.required_of(G, _switching(G, lo, hi, delta, T_max), alpha)
 
 
-class _Lagging(environments.LimitedForces):
-    """The limiter of any lag."""
-
-    lag_given = ()
-
-    def rho(self, loop):
-        return tuple(self.lag_given)
+def prove_limiter(loop, coupling, beta=environments.BETA, c=None, swept=None):
+    """A certificate of limited forces, with a multiplier (m, lags) or the best one."""
+    condition = environments.LimitedForces(beta, len(c[0]) if c else 1)
+    return prove(loop, coupling, condition, [v for row in c for v in row] if c else None, swept)
 
 
 def _lagging(rho, lags):
-    return type("Lagging", (_Lagging,), {"lag_given": rho})(lags=lags)
+    return environments.LimitedForces(lags=lags, held=tuple(float(r) for r in rho))
 
 
 def limiter_demand(G, theta, delta, rho, c, T_max=None):

@@ -15,9 +15,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from asked import prove_limiter
 from haptic_loop.controller.coupling import PUBLISHED, SpringDamper
 from haptic_loop.controller.loop import Loop
-from haptic_loop.design.certificate import prove_limiter
 from haptic_loop.design.result import Design, NotProved
 from haptic_loop.models.scene import MIXED
 from haptic_loop.sim.crowds import Validation, validate

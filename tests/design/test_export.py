@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from asked import prove_limiter
 from haptic_loop.cli.export import main
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
 from haptic_loop.controller.coupling import SpringDamper as Gains
@@ -16,7 +17,7 @@ from haptic_loop.controller.law import Law
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.tick import Process, StepBuffer
-from haptic_loop.design.certificate import prove, prove_limiter
+from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, load, save
 from haptic_loop.design.export import process_block, sequential, trial
 from haptic_loop.design.files import InputError, one_command
@@ -92,7 +93,7 @@ def limited_files(tmp_path_factory):
         soft = SpringDamper((600.0,) * m, (0.5,) * m)
         stored[name] = Stored.of(loop, soft, prove(loop, soft, "any-environment"))
     built = SpringDamper((5832.0, 2545.0), (0.187, 1.386))
-    stored["pair"] = Stored.of(PAIR, built, prove(PAIR, built, "this-environment", limiter=prove_limiter(PAIR, built)))
+    stored["pair"] = Stored.of(PAIR, built, prove_limiter(PAIR, built))
     for name, one in stored.items():
         save(one, folder / f"{name}.json")
     return folder, stored

@@ -491,12 +491,10 @@ def test_a_file_proves_it_again_and_forgeries_are_refused():
     def forged(**changes):
         return verify(msgspec.structs.replace(back, certificate=sealed(change(certificate, **changes))))
 
-    name = next(n for n in certificate.matrices if n.startswith("beta"))
-    (row,) = certificate.matrices[name]
-    for at, factor in ((0, Fraction(3)), (2, Fraction(1001, 1000)), (4, Fraction(999, 1000))):
-        value = str(Fraction(row[at]) * factor)  # another beta, q below that is too large, q above that is too small
-        rows = ((*row[:at], value, *row[at + 1 :]),)
-        assert not forged(matrices=dict(certificate.matrices) | {name: rows}).proved
+    known = certificate.multipliers
+    for name, factor in (("beta", 3.0), ("q_below", 1.001), ("q_above", 0.999)):
+        first, *others = known[name]  # another beta, q below that is too large, q above that is too small
+        assert not forged(multipliers=known | {name: (first * factor, *others)}).proved
     assert not forged(required=(0.5, 0.5), margin=2.74).proved
     assert not forged(condition="this-environment", matrices={"P": certificate.matrices["P"]}).proved
     lighter = change(DEVICE, motor_mass_min=0.05)

@@ -5,7 +5,7 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
-from asked import limiter, limiter_demand, this_environment
+from asked import limiter, limiter_demand, prove_limiter, this_environment
 from haptic_loop.cli.design import main as design_main
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import Network, Wall
@@ -13,9 +13,9 @@ from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Lti, Sampled, taps
 from haptic_loop.controller.ranges import Ranges
 from haptic_loop.design import environments
-from haptic_loop.design.certificate import lag, prove, prove_limiter, required_damping, verify
+from haptic_loop.design.certificate import lag, prove, required_damping, verify
 from haptic_loop.design.conditions import least_multiple
-from haptic_loop.design.coupling_file import Certificate, LimiterCertificate, Stored, load, save, sealed
+from haptic_loop.design.coupling_file import Certificate, Stored, load, save, sealed
 from haptic_loop.design.environments import LIMITER, LimitedForces
 from haptic_loop.design.frequency import hermitian, on_circle
 from haptic_loop.design.gain_search import LimiterLoop
@@ -189,7 +189,7 @@ def test_the_least_multiple_of_a_singular_gain(rank):
 
 @pytest.fixture(scope="module")
 def stored() -> Stored:
-    return Stored.of(PAIR, BUILT, prove(PAIR, BUILT, "this-environment", limiter=prove_limiter(PAIR, BUILT)))
+    return Stored.of(PAIR, BUILT, prove_limiter(PAIR, BUILT))
 
 
 def test_the_exact_proof_survives_the_file(stored, tmp_path):
@@ -198,9 +198,9 @@ def test_the_exact_proof_survives_the_file(stored, tmp_path):
     assert read == stored
     assert verify(read).proved
     assert read.certificate is not None
-    proof = read.certificate.limiter
-    assert isinstance(proof, LimiterCertificate)
-    assert proof.rho == LAG
+    proof = read.certificate
+    assert (proof.condition, proof.facts) == ("this-environment", ("limiter",))
+    assert proof.multipliers["rho"] == LAG
     assert lag(PAIR, read.certificate) == LAG
     assert proof.required == pytest.approx((1.32327, 1.32327), abs=5e-6)
     assert proof.margin == pytest.approx(1.37 / 1.32327, rel=1e-5)
@@ -210,7 +210,7 @@ def test_files_without_it_stay_as_they_were(tmp_path):
     """A coupling needs 1.385 with the limiter: its linear proof is untouched, the other is refused with the figure."""
     stiff = STIFF
     plain = prove(PAIR, stiff, "this-environment")
-    assert "limiter" not in msgspec.to_builtins(plain)
+    assert plain.facts == ()
     assert lag(PAIR, plain) is None
     with pytest.raises(NotProved, match=r"limiter: needs 1.38533, 1.38533 N s/m of damping, has 1.37, 1.37"):
         prove_limiter(PAIR, stiff)
@@ -223,23 +223,25 @@ def test_any_environment_is_its_own_proof():
 
 
 def tampered(stored, **fields):
-    proof = msgspec.structs.replace(stored.certificate.limiter, **fields)
-    return msgspec.structs.replace(
-        stored, certificate=sealed(msgspec.structs.replace(stored.certificate, limiter=proof))
-    )
+    known = stored.certificate.multipliers
+    multipliers = known | {name: fields.pop(name) for name in ("c", "rho") if name in fields}
+    proof = msgspec.structs.replace(stored.certificate, multipliers=multipliers, **fields)
+    return msgspec.structs.replace(stored, certificate=sealed(proof))
 
 
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
-        ({"c": ((0.5,), (0.5,))}, "limiter: required is"),
-        ({"c": ((1.0,), (1.0,))}, "limiter: no multiplier c that was found"),
-        ({"c": ((0.3, 0.1), (0.6,))}, "one row of c each"),
-        ({"c": ((-0.1,), (0.7,))}, "limiter: c is [-0.1, 0.7], expected numbers >= 0"),
-        ({"c": ((0.3,),)}, "one row of c each"),
-        ({"beta": 0.02}, "rho is"),
+        ({"c": (0.5, 0.5)}, "limiter: required is"),
+        ({"c": (1.0, 1.0)}, "limiter: no multiplier c that was found"),
+        ({"c": (0.3, 0.1, 0.6)}, "expected as many for each channel"),
+        ({"c": (-0.1, 0.7)}, "limiter: c is [-0.1, 0.7], expected numbers >= 0"),
+        ({"c": (0.3,)}, "expected as many for each channel"),
+        ({"rho": (20.0, 20.0)}, "required is"),
+        ({"rho": (-1.0, 10.0)}, "rho is"),
+        ({"facts": ()}, "multipliers are"),
         ({"margin": 1.1}, "limiter: margin is 1.1"),
-        ({"P": (("1",),)}, "limiter: P has 1 rows"),
+        ({"matrices": {"P": (("1",),)}}, "limiter: P has 1 rows"),
     ],
 )
 def test_what_was_changed_is_refused(stored, fields, reason):
@@ -249,9 +251,9 @@ def test_what_was_changed_is_refused(stored, fields, reason):
 
 
 def test_a_storage_matrix_of_something_else_proves_nothing(stored):
-    P = [list(row) for row in stored.certificate.limiter.P]
+    P = [list(row) for row in stored.certificate.matrices["P"]]
     P[0][0] = "1/1000"
-    assert "limiter: " in str(verify(tampered(stored, P=tuple(map(tuple, P)))).reason)
+    assert "limiter: " in str(verify(tampered(stored, matrices={"P": tuple(map(tuple, P))})).reason)
 
 
 @pytest.mark.parametrize(
@@ -270,7 +272,7 @@ def test_loops_that_are_not_covered_are_refused_in_words(change, reason):
 def test_delay_in_the_environment_is_open_under_any_environment():
     loop = msgspec.structs.replace(PAIR, psi=(1, 1))
     some = Certificate(
-        "any-environment", (1.0, 1.0), PAIR.delta, 1.37, "any passive environment", "rational", {}, "", {}
+        "any-environment", (), (1.0, 1.0), PAIR.delta, 1.37, "any passive environment", "rational", {}, {}, "", {}
     )
     assert lag(PAIR, some) == (0.0, 0.0)
     assert lag(loop, some) is None

@@ -13,7 +13,8 @@ from haptic_loop.controller.lti import constant_like
 from haptic_loop.design.certificate import prove, required_damping, requirements_of, verify
 from haptic_loop.design.conditions import Condition, this_environment_demand
 from haptic_loop.design.coupling_file import Stored, save, sealed
-from haptic_loop.design.environments import LimitedForces, Multiplied, Unknowns
+from haptic_loop.design.environments import LimitedForces, Multiplied
+from haptic_loop.design.facts import Unknowns
 from haptic_loop.design.result import MAKING
 from worlds import PAIR, SOFT, STIFF
 
@@ -26,7 +27,7 @@ class PerWall(Multiplied):
     name, covers = "per-wall", ("walls",)
 
     def unknowns(self, loop):
-        return Unknowns("g", (1.0,) * len(loop.environment.walls), "a number > 0 for each wall", 1e-3, 1e3)
+        return (Unknowns("g", (1.0,) * len(loop.environment.walls), "a number > 0 for each wall", 1e-3, 1e3),)
 
     def map(self, loop, coupling, exact=False):
         return loop.F(coupling, exact)
@@ -145,7 +146,6 @@ def test_the_right_multiplier_must_be_all_that_is_on_file(tmp_path, capsys):
     save(stored, path := tmp_path / "wall.json")
     assert check.main([str(path), "--condition", "this-environment"]) == 0
     assert MAKING in " ".join(capsys.readouterr().out.replace("│", " ").split())
-    (g,) = held.matrices["g"]
-    for rows in ((("1" + 400 * "0",),), (g, ("1",)), ()):
-        forged = change(stored, certificate=sealed(change(held, matrices={**held.matrices, "g": rows})))
-        assert "g is no row of rational numbers" in (verify(forged).reason or "")
+    for wrong in ({}, {"a": (1.0,)}, held.multipliers | {"d": (1.0, 1.0)}, held.multipliers | {"g": (1.0,)}):
+        forged = change(stored, certificate=sealed(change(held, multipliers=wrong)))
+        assert "multipliers are" in (verify(forged).reason or "")

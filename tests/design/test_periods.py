@@ -6,14 +6,14 @@ from fractions import Fraction
 import msgspec
 import numpy as np
 import pytest
-from asked import any_environment, any_environment_demand, this_environment_demand
+from asked import any_environment, any_environment_demand, prove_limiter, this_environment_demand
 from asked import loop as loop_of
 from driven import growing
 from haptic_loop.cli.design import main as cli_design
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.loop import DelayRange, Loop
-from haptic_loop.design.certificate import prove, prove_limiter, required_damping, requirements_of, verify
+from haptic_loop.design.certificate import prove, required_damping, requirements_of, verify
 from haptic_loop.design.conditions import even_damping
 from haptic_loop.design.coupling_file import Stored, digest
 from haptic_loop.design.environments import LIMITER, SWITCHING

@@ -66,7 +66,8 @@ def test_the_proof_survives_the_file(stored, file):
     read = load(file)
     assert read == stored
     assert verify(read).proved
-    proof = read.certificate.switching
+    proof = read.certificate
+    assert (proof.condition, proof.facts) == ("this-environment", ("switching",))
     assert proof.required == pytest.approx(switching_sweep(sent(SOFT), *[(1, 1), (2, 2)], DELTA).required)
     assert 1.07 < proof.required[0] < 1.08
     assert proof.margin == pytest.approx(1.37 / proof.required[0])
@@ -75,12 +76,12 @@ def test_the_proof_survives_the_file(stored, file):
 def test_what_is_on_file_is_a_witness_on_a_dense_sweep(stored):
     """From the numbers of the file alone, without the code that proves: the condition at 20000 frequencies, and
     the KYP inequality in floating point."""
-    proof = stored.certificate.switching
+    proof = stored.certificate
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
-    demand = switching_demand(Sampled.of(sent(SOFT), z[None]), (1, 1), (2, 2), DELTA, proof.alpha)
+    demand = switching_demand(Sampled.of(sent(SOFT), z[None]), (1, 1), (2, 2), DELTA, proof.multipliers["alpha"])
     assert np.linalg.eigvalsh(hermitian(demand.free.G + demand.gain.G)).min() > 0
-    G = exact_block(LOOP, SOFT, proof.alpha)
-    F, S = G.floats(), Matrix.of(proof.P).floats()
+    G = exact_block(LOOP, SOFT, proof.multipliers["alpha"])
+    F, S = G.floats(), Matrix.of(proof.matrices["P"]).floats()
     A, B, C, D = F.A, F.B, F.C, F.D
     kyp = np.block([[S - A.T @ S @ A, (C - B.T @ S @ A).T], [C - B.T @ S @ A, D + D.T - B.T @ S @ B]])
     scale = 1 / np.sqrt(np.diag(kyp))
@@ -91,9 +92,9 @@ def test_what_is_on_file_is_a_witness_on_a_dense_sweep(stored):
 def test_other_ranges_are_proved_too(lo, hi):
     soft = SpringDamper((300.0, 250.0), (0.3, 0.3))
     loop = PAIR.switching(DelayRange(lo, hi))
-    made = Stored.of(loop, soft, prove(loop, soft, "any-environment"))
+    made = Stored.of(loop, soft, prove(loop, soft, "this-environment"))
     assert verify(made).proved
-    assert [a > 0 for a in made.certificate.switching.alpha] == [a < b for a, b in zip(lo, hi, strict=True)]
+    assert [a > 0 for a in made.certificate.multipliers["alpha"]] == [a < b for a, b in zip(lo, hi, strict=True)]
 
 
 @pytest.mark.parametrize("coupling", [SOFT, STIFF])
@@ -106,7 +107,7 @@ def test_every_constant_delay_of_the_range_asks_no_more(coupling):
 
 
 def test_what_is_not_safe_under_switching_is_not_certified_as_such():
-    assert prove(PAIR, STIFF, "this-environment").switching is msgspec.UNSET
+    assert prove(PAIR, STIFF, "this-environment").facts == ()
     with pytest.raises(NotProved, match=r"^delays switching within \[1, 2\] samples: needs 2\.04"):
         prove(LOOP, STIFF, "this-environment")
 
@@ -124,8 +125,7 @@ def test_files_without_a_range_keep_their_digests():
 def test_a_changed_file_is_refused(stored):
     wider = change(LOOP, varying_delay=DelayRange((1, 1), (2, 3)))
     assert "digest differs" in verify(change(stored, loop=wider)).reason
-    proof = change(stored.certificate.switching, alpha=(100.0, 100.0))
-    forged = change(stored, certificate=change(stored.certificate, switching=proof))
+    forged = change(stored, certificate=change(stored.certificate, multipliers={"alpha": (100.0, 100.0)}))
     assert "seal differs" in verify(forged).reason
 
 
@@ -136,24 +136,23 @@ def exact_block(loop, coupling, alpha) -> Lti:
 
 def forged(stored: Stored, loop: Loop = LOOP, **fields) -> str:
     """Why a file is refused whose forger repairs digests and seals."""
-    switching = change(stored.certificate.switching, **fields)
-    certificate = change(stored.certificate, scenario=digest(loop, SOFT.form()), switching=switching)
+    certificate = change(stored.certificate, scenario=digest(loop, SOFT.form()), **fields)
     verdict = verify(Stored.of(loop, SOFT, sealed(certificate)))
     assert not verdict.proved
     return verdict.reason
 
 
 def test_a_forger_who_repairs_the_digests_still_has_to_prove(stored):
-    proof = stored.certificate.switching
+    P, alpha = stored.certificate.matrices["P"], stored.certificate.multipliers["alpha"]
     begins = "delays switching within [1, 2] samples: "
     assert forged(stored, required=(1.0, 1.0)).startswith(f"{begins}required is [1.0, 1.0], the sweep finds [1.07")
     assert forged(stored, margin=2.0).startswith(f"{begins}margin is 2, the sweep finds 1.27")
-    assert forged(stored, alpha=(0.0, proof.alpha[1])).startswith(f"{begins}alpha is [0.0")
-    assert "the sweep finds" in forged(stored, alpha=(proof.alpha[0] * 3, proof.alpha[1]))
-    assert forged(stored, P=proof.P[:-1]).startswith(f"{begins}P has ")
-    assert "not a rational number" in forged(stored, P=(("1/0", *proof.P[0][1:]), *proof.P[1:]))
-    negated = tuple(tuple(f"-{v}".replace("--", "") for v in row) for row in proof.P)
-    assert forged(stored, P=negated).startswith(begins)
+    assert forged(stored, multipliers={"alpha": (0.0, alpha[1])}).startswith(f"{begins}alpha is [0.0")
+    assert "the sweep finds" in forged(stored, multipliers={"alpha": (alpha[0] * 3, alpha[1])})
+    assert forged(stored, matrices={"P": P[:-1]}).startswith(f"{begins}P has ")
+    assert "not a rational number" in forged(stored, matrices={"P": (("1/0", *P[0][1:]), *P[1:])})
+    negated = tuple(tuple(f"-{v}".replace("--", "") for v in row) for row in P)
+    assert forged(stored, matrices={"P": negated}).startswith(begins)
     other = forged(stored, LOOP.switching(DelayRange((1, 1), (2, 3))))
     assert other.startswith("delays switching within [1, 2], [1, 3] samples: required is")
     narrow = forged(stored, LOOP.switching(DelayRange((1, 2), (2, 2))))
@@ -161,10 +160,10 @@ def test_a_forger_who_repairs_the_digests_still_has_to_prove(stored):
 
 
 def test_a_proof_goes_with_its_range(stored):
-    bare = sealed(change(stored.certificate, switching=msgspec.UNSET))
-    assert verify(change(stored, certificate=bare)).reason.endswith("no proof is on file")
+    bare = sealed(change(stored.certificate, facts=()))
+    assert verify(change(stored, certificate=bare)).reason == "facts are [], expected ['switching']"
     smuggled = sealed(change(stored.certificate, scenario=digest(PAIR, SOFT.form())))
-    assert "delays are constant" in verify(Stored.of(PAIR, SOFT, smuggled)).reason
+    assert "facts are ['switching'], expected []" in verify(Stored.of(PAIR, SOFT, smuggled)).reason
 
 
 def test_a_multiplier_below_zero_lends_no_damping():
@@ -215,8 +214,8 @@ def test_check_names_the_guarantee_and_the_proof(stored, file, tmp_path, capsys)
     assert (code, report["proved"]) == (0, True)
     assert report["switching"]["guarantee"] == "delays switching within [1, 2] samples, in this environment"
     assert report["switching"]["proof"] == "rational"
-    broken = change(stored.certificate.switching, required=(1.0, 1.0))
-    save(change(stored, certificate=sealed(change(stored.certificate, switching=broken))), tmp_path / "broken.json")
+    broken = sealed(change(stored.certificate, required=(1.0, 1.0)))
+    save(change(stored, certificate=broken), tmp_path / "broken.json")
     code, report = told(capsys, check_main, str(tmp_path / "broken.json"))
     assert (code, report["proved"]) == (1, False)
     assert report["switching"]["guarantee"] is report["switching"]["proof"] is report["proof"] is None
@@ -276,7 +275,7 @@ def test_what_the_file_does_not_cover_is_judged_anew(run, file, constant_file):
 
 
 def test_a_tampered_file_covers_nothing(run, stored, tmp_path):
-    broken = sealed(change(stored.certificate, switching=change(stored.certificate.switching, margin=9.0)))
+    broken = sealed(change(stored.certificate, margin=9.0))
     save(change(stored, certificate=broken), tmp_path / "broken.json")
     outcome = run(str(tmp_path / "broken.json"), "--varying-delay", "1,2")
     assert any("does not hold: delays switching within" in remark for remark in outcome["remarks"])

@@ -5,8 +5,8 @@ import itertools
 import msgspec
 import numpy as np
 import pytest
-from asked import any_environment, this_environment, walls_demand, walls_proof
-from haptic_loop.controller.coupling import Compliance, InternalModel, SpringDamper
+from asked import any_environment, this_environment
+from haptic_loop.controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
@@ -15,6 +15,7 @@ from haptic_loop.design.assessment import assess, check_ranges
 from haptic_loop.design.certificate import prove, required_damping, requirements_of, verify
 from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.designs import design_by_kind
+from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.exact import find_storage
 from haptic_loop.design.guarantees import MAKING
 from haptic_loop.design.result import NotProved
@@ -54,53 +55,87 @@ DAMPED = change(
 BOTH = SpringDamper([500.0, 400.0], [0.3, 0.3])
 
 
-@pytest.mark.parametrize(("stiffness", "g", "needs"), [(3000.0, 0.6, 1.244369), (1e9, 0.3, 1.251404)])
-def test_what_a_wall_asks(stiffness, g, needs):
-    loop = held(stiffness)
-    given = required_damping(loop, COUPLING, "this-environment", [g])
-    assert given.required[0] == pytest.approx(needs, abs=1e-6)
-    found = required_damping(loop, COUPLING, "this-environment")
-    assert needs - 5e-4 < found.required[0] < needs
-    each = [this_environment(loop.at(state).F(COUPLING), loop.delta) for state in loop.environment.frozen()]
-    assert found.ratio > max(r.ratio for r in each)
-    if stiffness == 3000.0:
-        assert [r.required[0] for r in each] == pytest.approx([1.244099, 1.242139], abs=1e-6)
+T = 1e-3
 
 
-def test_the_block_written_out():
-    """Against the definition at a few frequencies, for two channels and three walls."""
-    G, g, s = PAIR.walled(BOTH), np.array([0.5, 1.5, 2.0]), 0.9
-    stiffness = [w.stiffness for w in NETWORK.walls]
-    demand = walls_demand(G, PAIR.delta, stiffness, g)
+def bare(stiffness, damping, theta, delta=1.0):
+    """A wall on the device itself."""
+    network = Network(("tip",), walls=(Wall(("tip", GROUND), stiffness, damping),))
+    return Loop(T, (theta,), (0,), (theta,), (delta,), network)
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "damping", "needs"),
+    [
+        (3000.0, 2.0, (3.5, 4.22206, 5.79736)),
+        (3000.0, 0.5, (2.0, 4.0, 7.0)),
+        (1000.0, 5.0, (5.5, 5.5455, 5.6358)),
+        (3000.0, 0.0, (1.5, 4.5, 7.5)),  # (theta + 1/2) k T
+        (700.0, 0.0, (0.35, 1.05, 1.75)),
+    ],
+)
+def test_bare_walls_need_the_known_damping(stiffness, damping, needs):
+    """Between what the frozen contact alone needs and the figures of a separate computation."""
+    for theta, need in enumerate(needs):
+        loop = bare(stiffness, damping, theta)
+        found = required_damping(loop, NoCoupling(), "this-environment")
+        assert found.required[0] == pytest.approx(need, rel=5e-5)  # the search ends within this
+        assert found.bound == pytest.approx(found.ratio, rel=5e-5)
+        touching = this_environment(loop.at(loop.environment.frozen()[-1]).F(NoCoupling()), loop.delta)
+        assert touching.required[0] <= found.required[0] * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("damping", "needs"), [(0.0, (1.0, 1.6764, 2.4319)), (2.0, (1.6154, 1.8630, 2.3639))], ids=["spring", "damped"]
+)
+def test_walls_behind_a_coupling_need_the_known_damping(damping, needs):
+    """A wall of 3000 N/m behind 2000 N/m and 2 N s/m, one, two and three ticks late."""
+    for theta, need in enumerate(needs):
+        found = required_damping(bare(3000.0, damping, theta), SpringDamper([2000.0], [2.0]), "this-environment")
+        assert found.required[0] == pytest.approx(need, abs=6e-5)
+
+
+def test_without_m_closed_forms_hold():
+    """(k/2 + b) T without delay, and (k/2 + b + k^2/(4 b)) T one sample late where b >= k/2."""
+    k, damping = 3000.0, 2.0
+    b = damping / T
+    for theta, need in ((0, (k / 2 + b) * T), (1, (k / 2 + b + k**2 / (4 * b)) * T), (2, 7.5)):
+        loop = bare(k, damping, theta)
+        values = {0: (b, 2 * b, b, 0.0), 1: (b, k + 2 * k**2 / k, b, 0.0), 2: (2 * k - 1207.44, 2 * k, b, 0.0)}[theta]
+        found = required_damping(loop, NoCoupling(), "this-environment", values)
+        assert found.required[0] >= need * (1 - 1e-6)  # no multiplier does better without m
+
+
+def test_the_block_is_the_definition():
+    """Against the inequality written out at a few frequencies, for two channels and three walls, two with dampers."""
+    G, s = DAMPED.walled(BOTH), 0.9
+    k, b, _, _ = walls_by_hand(DAMPED)
+    a, both, d, m = np.array([900.0, 500.0, 200.0]), np.array([700.0, 0, 900.0]), np.array([50.0, 0, 80]), [0.3, 0, 0.7]
+    demand = THIS_ENVIRONMENT.block(DAMPED.walled_before_delay(BOTH), DAMPED, (*a, *both, *d, *m))
+    c, damped = both - a, [0, 2]
     for w in (0.003, 0.2, 1.0, 3.0):
         z = np.exp(1j * w)
         response = G.at(z)
         F, J, H, Y = response[:2, :2], response[:2, 2:], response[2:, :2], response[2:, 2:]
-        M = np.diag(g * (z - 1) - 1)
-        D = s * np.diag(PAIR.delta) / PAIR.T
-        whole = np.block(
-            [[F / (z - 1) + D, J / (z - 1)], [-M @ H / (z - 1), -M @ Y / (z - 1) + np.diag(g / stiffness)]]
-        )
+        W, one = np.diag(k + b * (1 - 1 / z)), np.eye(3)
+        D = np.hstack([H, Y @ W - one, Y @ (W - np.diag(k))])
+        pull = np.diag(m * ((k + b) / z - b))
+        rows = [
+            np.hstack([F / (z - 1) + s * np.diag(DAMPED.delta) / DAMPED.T, J @ W / (z - 1), J @ np.diag(b) / z]),
+            np.diag(k / (z - 1) - a) @ D - np.hstack([np.zeros((3, 5)), pull]),
+            np.diag(c) @ D + np.hstack([np.zeros((3, 2)), np.diag(d), np.diag(d + m * b * (1 - 1 / z))]),
+        ]
+        order = [0, 1, 2, 5, 3, 4, 7]  # the inputs as the block has them: per wall u, then s where it has a damper
+        whole = np.vstack(rows)[np.ix_(order, order)]
         ours = demand.free.at(z) + s * demand.gain.at(z)
-        assert (ours + ours.conj().T) == pytest.approx(whole + whole.conj().T, rel=1e-9, abs=1e-9)
+        assert damped == [0, 2]
+        assert (ours + ours.conj().T) == pytest.approx(whole + whole.conj().T, rel=1e-9, abs=1e-6)
 
 
 def test_without_walls_to_speak_of_it_is_the_plain_condition():
     soft = held(1e-6)
     plain = this_environment(soft.at(change(soft.environment, walls=())).F(COUPLING), soft.delta)
     assert required_damping(soft, COUPLING, "this-environment").required == pytest.approx(plain.required, rel=1e-6)
-
-
-def steps_of(loop, coupling, damping):
-    """The proof's parts: G, the storage P of its block at this damping, the static map, and the multipliers."""
-    slopes = [w.slope(loop.T) for w in loop.environment.walls]
-    proof = walls_proof(loop.walled(coupling), damping, slopes)
-    G = loop.walled(coupling, exact=True)
-    demand = walls_demand(G, damping, slopes, proof.multiplier)
-    P, reason = find_storage(demand.free + demand.gain)
-    assert P is not None, reason
-    static = np.array(demand.static["the static map of devices and walls"], dtype=float)
-    return G.floats(), P.floats() / 2, static, np.array(proof.multiplier)  # the matrix of (KYP) is twice the balance
 
 
 def walls_by_hand(loop):
@@ -111,93 +146,135 @@ def walls_by_hand(loop):
     return stiff, b, gap, stiff + 2 * b
 
 
+def test_six_facts_hold_at_every_transition():
+    """Random ways into random walls that are touched, left faster than they relax, and made again."""
+    rng = np.random.default_rng(0)
+    n = 200_000
+    k, b = 10 ** rng.uniform(1, 4, n), 10 ** rng.uniform(1, 4, n) * (rng.random(n) < 0.8)
+    size = 10 ** rng.uniform(-5, -2, n)
+    y = rng.normal(size=(4, n)) * size
+    h, p = np.zeros((4, n)), np.zeros((4, n))
+    for j in range(1, 4):  # the wall's own law, from rest off the wall
+        h[j] = np.maximum(0, y[j])
+        p[j] = np.where(h[j] > 0, np.maximum(0, k * h[j] + b * (h[j] - h[j - 1])), 0)
+    e = np.where(h > 0, (p - k * h) / np.maximum(b, 1e-300), 0) * (b > 0)
+    u, r = np.diff(h, axis=0), y - h
+    s = np.where(b > 0, e[1:] - u, 0) * 1.0
+    s = np.where((b > 0) & (h[1:] == 0), -u, s)  # off the wall its damper feels nothing
+    dr, dp = np.diff(r, axis=0)[1:], np.diff(p, axis=0)[1:]
+    before, now, u = s[:-1], s[1:], u[1:]
+    scale = 1e-12 * size**2
+    assert (now > 1e-9 * size).mean() > 0.05
+    assert (np.abs(dp - ((k + b) * u + b * now - b * e[1:-1])) <= 1e-9 * (k + b) * size).all()
+    assert (now >= -1e-12 * size).all()
+    for fact in (
+        np.where(True, -u * r[1:-1], 0) - h[2:] * dr,  # (1), with equality
+        h[2:] * dr - (-u * r[1:-1]),
+        h[2:] * dr,
+        u * dr,
+        -now * dr,
+        (u + now) * dr,
+        -now * (u + now),
+    ):
+        assert (fact >= -scale * 1e3).all()
+    assert (before * dp >= -scale * 1e3 * (k + b)).all()
+
+
+def test_the_slope_form_covers_every_wall_up_to_it():
+    """Its two inequalities with kw = k + 2b, at random transitions of random walls."""
+    rng = np.random.default_rng(1)
+    n = 200_000
+    k, b = 10 ** rng.uniform(1, 4, n), 10 ** rng.uniform(1, 4, n) * (rng.random(n) < 0.8)
+    size = 10 ** rng.uniform(-5, -2, n)
+    y, h, p = rng.normal(size=(3, n)) * size, np.zeros((3, n)), np.zeros((3, n))
+    for j in (1, 2):
+        h[j] = np.maximum(0, y[j])
+        p[j] = np.where(h[j] > 0, np.maximum(0, k * h[j] + b * (h[j] - h[j - 1])), 0)
+    e = np.where(h > 0, (p - k * h) / np.maximum(b, 1e-300), 0) * (b > 0)
+    dp, dy, kw = p[2] - p[1], y[2] - y[1], k + 2 * b
+    kept = b * (e[2] ** 2 - e[1] ** 2) / 2
+    rounding = 1e-12 * kw * size**2
+    assert (p[2] * dy - k * (h[2] ** 2 - h[1] ** 2) / 2 - dp**2 / (2 * kw) - kept >= -rounding).all()
+    assert (dp * (dy - dp / kw) - kept >= -rounding).all()
+
+
+def steps_of(loop, coupling, damping):
+    """The proof's parts: the map G, the block with its storage P, the residue S on (x, h), and the multipliers."""
+    asked = change(loop, delta=tuple(damping))
+    multiplier = required_damping(asked, coupling, "this-environment").multiplier
+    demand = THIS_ENVIRONMENT.block(loop.walled_before_delay(coupling, exact=True), asked, multiplier)
+    block = demand.free + demand.gain
+    P, reason = find_storage(block)
+    assert P is not None, reason
+    G, m = loop.walled(coupling), loop.channels
+    k = np.array([w.stiffness for w in loop.environment.walls])
+    S1 = G.dc()
+    S = np.block([[S1[:m, :m], S1[:m, m:] * k], [k[:, None] * S1[m:, :m], k[:, None] * S1[m:, m:] * k - np.diag(k)]])
+    return G, block.floats(), P.floats() / 2, S, np.array(multiplier).reshape(4, -1)  # (KYP) is twice the balance
+
+
+class Walled:
+    """A loop among walls, tick by tick by the law of the controller, with the state of the block beside it."""
+
+    def __init__(self, loop, coupling, block):
+        self.loop, self.block, self.m = loop, block, loop.channels
+        self.G = loop.walled(coupling)
+        self.k, self.b, self.gap, _ = walls_by_hand(loop)
+        self.tick, self.state = loop.law(coupling).transition(), np.zeros(self.G.order + len(self.k))
+        self.h, self.e, self.s, self.x = (np.zeros(n) for n in (*(len(self.k),) * 3, self.m))
+        self.xi = np.zeros(block.order)
+
+    def step(self, x):
+        """(f, y, p) at this tick; depth, damper's step, s and the block's state are then those of this tick."""
+        before, after = np.concatenate([self.state, x])[:, None], np.zeros((self.m + len(self.state), 1))
+        self.tick(before, after)
+        xi, f, last = self.state[: self.G.order], after[: self.m, 0], self.h
+        h = after[-len(self.k) :, 0]
+        p = np.where(h > 0, np.maximum(0, self.k * h + self.b * (h - last)), 0)
+        output = self.G.C @ xi + self.G.D @ np.concatenate([x, p])
+        assert output[: self.m] == pytest.approx(f, rel=1e-7, abs=1e-9)
+        e = np.where(h > 0, (p - self.k * h) / np.maximum(self.b, 1e-9), 0) * (self.b > 0)
+        u = h - last
+        s = np.where(self.b > 0, e - u, 0)
+        parts = zip(u, s, self.b, strict=True)
+        self.v = np.array([*(x - self.x), *(value for one, two, b in parts for value in ((one, two) if b else (one,)))])
+        self.state, self.h, self.e, self.s, self.x = after[self.m :, 0], h, e, s, np.array(x)
+        return f, output[self.m :], p
+
+
 @pytest.mark.parametrize("loop", [PAIR, DAMPED], ids=["springs", "dampers"])
 def test_every_step_of_the_proof(loop):
-    """Random motions: the walls' two inequalities, the balance of the storage at every tick, and Z >= 0.
-
-    A wall is (h, e): its depth, and the step that its damper feels, p = K h + (b/T) e, never more than lets p vanish.
-    """
+    """Random motions: the balance of Z at every tick and Z >= 0, with f and the walls' forces of the running law."""
     rng = np.random.default_rng(0)
     need = required_damping(loop, BOTH, "this-environment").ratio
     delta = 1.01 * need * np.array(loop.delta)
-    G, P, S, g = steps_of(loop, BOTH, delta.tolist())
-    stiff, b, gap, slope = walls_by_hand(loop)
-    tick, m, w = loop.law(BOTH).transition(), 2, len(stiff)
-
-    def stored(xi, x, p):
-        X = np.concatenate([x, p])
-        change = G.A @ xi + G.B @ X - xi
-        return change @ P @ change + X @ S @ X / 2
-
-    ticks = 800
-    x = np.cumsum(rng.standard_normal((ticks + 1, m)) * rng.choice([1e-5, 3e-4], (ticks + 1, 1)), axis=0)
-    state, h = np.zeros(G.order + w), np.zeros(w)
+    _, block, P, S, (_, _, _, m_) = steps_of(loop, BOTH, delta.tolist())
+    there, ticks = Walled(loop, BOTH, block), 800
+    x = np.cumsum(rng.standard_normal((ticks + 1, 2)) * rng.choice([1e-5, 3e-4], (ticks + 1, 1)), axis=0)
     seen, pressed, left = [], 0, 0
     for k in range(ticks + 1):
-        before = np.concatenate([state, x[k]])[:, None]
-        after = np.zeros((m + G.order + w, 1))
-        tick(before, after)
-        xi, f, last = state[: G.order], after[:m, 0], h
-        h = after[-w:, 0]
-        p = np.where(h > 0, np.maximum(0, stiff * h + b * (h - last)), 0)
-        output = G.C @ xi + G.D @ np.concatenate([x[k], p])
-        assert output[:m] == pytest.approx(f, rel=1e-7, abs=1e-9)
-        y = output[m:]
-        assert h == pytest.approx(np.maximum(0, y - gap), rel=1e-6, abs=1e-9)
-        e = np.where(h > 0, (p - stiff * h) / np.maximum(b, 1e-9), 0) * (b > 0)
-        kept, potential = b * e**2 / 2, p * y - stiff * h**2 / 2
-        Z = stored(xi, x[k], p) + (g * kept - potential).sum()
-        assert Z >= -1e-12
-        seen.append((x[k], f, y, p, kept, potential, Z))
-        pressed, left = pressed + (p > 0).any(), left + ((p == 0) & (h > 0)).any()
-        state = after[m:, 0]
+        f, _, p = there.step(x[k])
+        there.xi = block.A @ there.xi + block.B @ there.v  # the inputs are the steps up to here, the first from rest
+        X = np.concatenate([x[k], there.h])
+        Z = there.xi @ P @ there.xi + X @ S @ X / 2 - (there.k * there.gap * there.h).sum()
+        Z -= (m_ * there.b * there.s * there.e).sum()
+        seen.append((x[k], f, Z))
+        pressed, left = pressed + (p > 0).any(), left + ((p == 0) & (there.h > 0)).any()
+    start = seen[0][2]
     assert 50 < pressed < ticks
     assert (left > 0) == (loop is DAMPED)  # left faster than its damper lets it follow
-    for (x0, f, y, p, kept, potential, Z), (x1, _, y1, p1, kept1, potential1, Z1) in itertools.pairwise(seen):
-        dx, dy, dp = x1 - x0, y1 - y, p1 - p
+    for (x0, f, Z), (x1, _, Z1) in itertools.pairwise(seen):
+        dx = x1 - x0
         size = 1e-9 * (abs(Z) + abs(Z1) + 1e-6)
-        assert (dp * (dy - dp / slope) - (kept1 - kept)).min() >= -size
-        assert (potential1 - potential - y * dp).min() >= -size
         assert f @ dx + dx @ (delta / loop.T * dx) >= Z1 - Z - size
-
-
-@pytest.mark.parametrize("loop", [PAIR, DAMPED], ids=["springs", "dampers"])
-def test_frozen_motions_fall_to_a_nonnegative_value(loop):
-    """The step that bounds Z from below: x held, pressed walls kept as spring-dampers; from any state whatever."""
-    rng = np.random.default_rng(5)
-    delta = (1.01 * required_damping(loop, BOTH, "this-environment").ratio * np.array(loop.delta)).tolist()
-    G, P, S, g = steps_of(loop, BOTH, delta)
-    stiff, damped, gap, _ = walls_by_hand(loop)
-    for _trial in range(6):
-        on = rng.random(3) < 0.6
-        share = np.where(on, rng.uniform(0.05, 1, 3), 0.0)  # any slope up to the wall's
-        k, b = share * stiff, share * damped
-        solve = np.linalg.inv(np.eye(3) - (k + b)[:, None] * G.D[2:, 2:])
-        x, xi, last_h = (
-            1e-3 * rng.standard_normal(2),
-            1e-3 * rng.standard_normal(G.order),
-            1e-4 * rng.standard_normal(3),
-        )
-        last = np.inf
-        for _ in range(6000):
-            p = solve @ ((k + b) * (G.C[2:] @ xi + G.D[2:, :2] @ x - gap) - b * last_h)
-            X = np.concatenate([x, p])
-            y, after = G.C[2:] @ xi + G.D[2:] @ X, G.A @ xi + G.B @ X
-            h = y - gap
-            potential = (p * y - k * h**2 / 2 - g * b * (h - last_h) ** 2 / 2)[on].sum()
-            Z = (after - xi) @ P @ (after - xi) + X @ S @ X / 2 - potential
-            assert last - Z >= -1e-9 * (abs(Z) + 1e-9)
-            last, xi, last_h = Z, after, h
-        limit = x @ S[:2, :2] @ x / 2 - p @ S[2:, 2:] @ p / 2 + (p[on] ** 2 / (2 * k[on])).sum()
-        assert (p[on] / k[on] + gap[on]) == pytest.approx((G.dc()[2:] @ X)[on], rel=1e-3, abs=1e-7)
-        assert last == pytest.approx(limit, rel=1e-3, abs=1e-9)  # every frozen motion has come to rest
-        assert limit >= 0
+        assert min(start, 0) - 1e-12 <= Z1
 
 
 @pytest.mark.parametrize(("loop", "coupling"), [(held(3000.0), COUPLING), (PAIR, BOTH), (DAMPED, BOTH)])
 def test_it_is_proved_stored_and_verified(loop, coupling):
     stored = Stored.of(loop, coupling, prove(loop, coupling, "this-environment"))
-    assert set(stored.certificate.matrices) == {"P", "g"}
+    assert set(stored.certificate.multipliers) == {"a", "a + c", "d", "m"}
+    assert stored.certificate.facts == ("walls",)
     again = msgspec.json.decode(msgspec.json.encode(stored), type=Stored)
     assert verify(again).proved
     judged = requirements_of(loop, coupling)["this-environment"]
@@ -210,17 +287,17 @@ def test_it_is_proved_stored_and_verified(loop, coupling):
         else:
             with pytest.raises(NotProved):
                 prove(one, coupling, "this-environment")
-    matrices = stored.certificate.matrices
-    forged = sealed(change(stored.certificate, matrices=matrices | {"g": (("0",) * len(matrices["g"][0]),)}))
-    assert not verify(change(stored, certificate=forged)).proved
-    lost = sealed(change(stored.certificate, matrices={"P": matrices["P"]}))
-    assert not verify(change(stored, certificate=lost)).proved
+    known = stored.certificate.multipliers
+    for wrong in (known | {"a": (0.0,) * len(known["a"])}, {}, {name: v for name, v in known.items() if name != "m"}):
+        forged = sealed(change(stored.certificate, multipliers=wrong))
+        assert not verify(change(stored, certificate=forged)).proved
 
 
 def test_longer_periods_scale_it():
-    loop = change(held(3000.0), T_max=1.5e-3)
-    assert required_damping(loop, COUPLING, "this-environment", [0.6]).required[0] == pytest.approx(
-        1.5 * 1.244369, rel=1e-6
+    loop, longer = held(3000.0), change(held(3000.0), T_max=1.5e-3)
+    found = required_damping(loop, COUPLING, "this-environment")
+    assert required_damping(longer, COUPLING, "this-environment", found.multiplier).required[0] == pytest.approx(
+        1.5 * found.required[0], rel=1e-6
     )
 
 
@@ -289,7 +366,7 @@ def test_hands_come_to_rest_at_the_requirement_and_some_swing_below(damping, sho
     need = required_damping(loop, coupling, "this-environment").required[0]
     fastest, made = swinging(loop, coupling, 1.02 * need)
     assert made > (300 if damping else 500)
-    assert fastest < 0.02  # and falling: 60 hands, the slowest of them heavy
+    assert fastest < 0.05  # and falling: 60 hands, the slowest of them heavy
     assert swinging(loop, coupling, short * need)[0] > 0.5  # for ever, the wall made and left
 
 
@@ -299,6 +376,6 @@ def test_a_design_before_a_wall_with_a_damper_spends_the_damping_and_is_proved()
     loop = Loop(1e-3, (1,), (0,), (1,), (1.37,), Network(("tip",), walls=(wall,)))
     made = design_by_kind(loop, condition="this-environment")
     assert 0.99 < made.requirement.ratio < 1
-    assert 1100 < made.coupling.K[0] < 1300
+    assert 1500 < made.coupling.K[0] < 1772
     assert prove(loop, made.coupling, "this-environment").proof == "rational"
     assert not any_environment(made.coupling.compliance(loop.T), loop.theta, loop.delta).certified

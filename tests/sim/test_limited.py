@@ -5,11 +5,12 @@ import json
 import msgspec
 import numpy as np
 import pytest
+from asked import prove_limiter
 from driven import tick_by_tick
 from haptic_loop.cli.run import main
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.assessment import covered_limits
-from haptic_loop.design.certificate import prove, prove_limiter, requirements_of
+from haptic_loop.design.certificate import requirements_of
 from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.sim.api import simulate
 from haptic_loop.sim.couplings import assessed, choose
@@ -47,10 +48,14 @@ def test_the_limiter_that_a_file_proves_is_the_one_that_runs(tmp_path):
     scenario, path = weak(12.0, 5.657), tmp_path / "own.json"
     loop = scenario.loop("I")
     proof = prove_limiter(loop, BUILT, 0.03)
-    save(Stored.of(loop, BUILT, prove(loop, BUILT, "this-environment", limiter=proof)), path)
+    save(Stored.of(loop, BUILT, proof), path)
     found = assessed(scenario, "I", choose(scenario, "I", str(path))).force_limits
     assert found.certificate == proof
-    assert (found.rho, found.c, found.proved) == (proof.rho, proof.c, True)
+    assert (found.rho, found.c, found.proved) == (
+        proof.multipliers["rho"],
+        tuple((c,) for c in proof.multipliers["c"]),
+        True,
+    )
     assert found.rho == pytest.approx((34.25, 34.25))
     devices = tuple(msgspec.structs.replace(device, damping=1.5) for device in scenario.device)
     stronger = scenario.replace(device=devices)

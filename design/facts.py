@@ -1,0 +1,286 @@
+"""The hands' sides and the facts of the environment's side of which conditions are composed (design.frame)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from haptic_loop.controller.arithmetic import Number, numbers
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Block, constant_like
+from haptic_loop.design.frame import Collected, Demand, Input, Weights, even_damping, less_advance
+
+Values = Mapping[str, Sequence[Any]]  # of the multipliers, by name
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """The numbers of one multiplier, and where a search looks for them: in [least, most] units each."""
+
+    name: str  # what a file calls them
+    units: tuple[float, ...]  # (n,); 0 for a number that is 0
+    expected: str  # what they must be, for messages; positive where `least` is
+    least: float
+    most: float
+    start: tuple[float, ...] | None = None  # (n,) where a search begins; the units if None
+
+    def check(self, values: Sequence[Any]) -> None:
+        """Raise ValueError unless the values may be a multiplier: 0 without a unit, else at least 0, or positive."""
+        right = len(values) == len(self.units) and all(
+            (v >= 0 if self.least == 0 else v > 0) and v < np.inf if unit else v == 0
+            for v, unit in zip(values, self.units, strict=True)
+        )
+        if not right:
+            raise ValueError(f"{self.name} is {[float(v) for v in values]}, expected {self.expected}")
+
+
+def longest(loop: Loop, T: Number) -> Any:
+    """The longest period [s] in the arithmetic of T."""
+    return T if loop.T_max is None else numbers(loop.T_max, T)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Hands' sides: what every passive hand takes, whatever forces act.
+
+
+class HandsSide(ABC):
+    """A bound from below on what devices and hands take per tick, as a quadratic form of some inputs."""
+
+    name: str
+
+    @abstractmethod
+    def inputs(self, loop: Loop, T: Number) -> list[Input]:
+        """Its inputs: their shares of the displacement that a force multiplies, and whether the environment follows."""
+
+    @abstractmethod
+    def damping(self, loop: Loop, T: Number, values: Values) -> Any:
+        """The matrix (n, n) over its inputs that grows in proportion to the damping of the devices [N s/m^2]."""
+
+    def rest(self, loop: Loop, T: Number, values: Values) -> Sequence[Any]:
+        """Matrices M_0, M_1 over its inputs: M_0 + M_1/z does not grow with the damping."""
+        return ()
+
+    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
+        """Its multipliers."""
+        return ()
+
+
+class EvenPeriods(HandsSide):
+    """Periods that are even, or vary up to T_max: dx' Delta dx/T_max."""
+
+    name = "even"
+
+    def inputs(self, loop: Loop, T: Number) -> list[Input]:
+        return [Input("dx", i) for i in range(loop.channels)]
+
+    def damping(self, loop: Loop, T: Number, values: Values) -> Any:
+        return np.diag(even_damping(loop, T) / T)
+
+
+class Latency(HandsSide):
+    """Forces that latch at kT + tau, with any tau in [t1, t2] at every tick and on every channel.
+
+    The device moves by xa under f[k-1] and then by xb under f[k]. A channel with t2 = 0 has no xa. The shortest
+    period must be longer than t2.
+    """
+
+    name = "latency"
+
+    def inputs(self, loop: Loop, T: Number) -> list[Input]:
+        late = [i for i, (_, last) in enumerate(loop.latency or ()) if last]
+        before = [Input("xa", i, moved=(0, 1), slips=False) for i in late]
+        return before + [Input("xb", i) for i in range(loop.channels)]
+
+    def damping(self, loop: Loop, T: Number, values: Values) -> Any:
+        first, last = (numbers([row[i] for row in loop.latency or ()], T) for i in (0, 1))
+        late, damping = [i for i, t in enumerate(last) if t], numbers(loop.delta, T)
+        return np.diag(np.concatenate([damping[late] / last[late], damping / (longest(loop, T) - first)]))
+
+
+def hands_side(loop: Loop) -> HandsSide:
+    return Latency() if loop.latency else EvenPeriods()
+
+
+# ----------------------------------------------------------------------------------------------------
+# Facts of the environment's side.
+
+
+class Fact(ABC):
+    """How the forces of the environment's side come about, beyond one linear network with constant delays."""
+
+    name: str  # in reports and files
+
+    @abstractmethod
+    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
+        """Its multipliers."""
+
+    @abstractmethod
+    def enter(self, block: Collected[Any], loop: Loop, values: Values) -> None:
+        """Enter its inputs, rows and multipliers."""
+
+    def beyond(self, loop: Loop) -> str | None:
+        """Why it says nothing of this loop, or None."""
+        return None
+
+
+class Walls(Fact):
+    """Walls that make and break contact: the wall's own law, at every tick, weighed by multipliers a, c, d, m.
+
+    Inputs per wall: u, the step of the depth h, and, where the wall has a damper, s >= 0, which differs from 0 only
+    where the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z). With `stiff`
+    the block is that of a wall of k + 2b without a damper, and covers every wall up to it.
+    """
+
+    name = "walls"
+
+    def __init__(self, stiff: bool = False) -> None:
+        self.stiff = stiff
+
+    def laws(self, loop: Loop, T: Number) -> list[tuple[Any, Any]]:
+        """(k, b) of every wall [N/m], b the damping divided by T."""
+        each = []
+        for wall in loop.environment.walls:
+            k, b = numbers(wall.stiffness, T), numbers(wall.damping, T) / T
+            each.append((k + 2 * b, 0 * b) if self.stiff else (k, b))
+        return each
+
+    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
+        laws = self.laws(loop, loop.T)
+        stiff, damped = tuple(float(k) for k, _ in laws), tuple(float(k) if b else 0.0 for k, b in laws)
+        ones = tuple(1.0 if b else 0.0 for _, b in laws)
+        none = (0.0,) * len(laws)
+        said = f"a number >= 0 for each of {len(laws)} walls"
+        return (
+            Unknowns("a", stiff, said, 0.0, 1e3),
+            Unknowns("a + c", damped, said, 0.0, 1e3),
+            Unknowns("d", damped, said, 0.0, 1e3),
+            Unknowns("m", ones, said, 0.0, 1e3, start=none),
+        )
+
+    def enter(self, block: Collected[Any], loop: Loop, values: Values) -> None:
+        laws = self.laws(loop, block.T)
+        for j, (k, b) in enumerate(laws):
+            u = block.input("u", j)
+            a, both, d, m = (numbers(values[name][j], block.T) for name in ("a", "a + c", "d", "m"))
+            block.press(u, j, (k + b, -b) if b else (k,))
+            block.way(u, j, k, summed=True)
+            block.way(u, j, -a)
+            block.term(u, u, k / 2 + a)
+            if b:
+                s, c = block.input("s", j), both - a
+                block.press(s, j, (b, -b))
+                block.way(s, j, c)
+                block.term(s, u, d - c)
+                block.term(s, s, d + m * b)
+                block.term(u, s, m * b)
+                block.before(u, s, -m * (k + b))
+                block.before(s, s, -m * b)
+
+
+class Switching(Fact):
+    """Delays that switch within [lo, hi] at every tick and on every channel, weighed by alpha > 0 [N/m].
+
+    A force that is late by n in [lo, hi] differs from the nominal one by at most half the width times the sum of the
+    steps in between; the multiplier weighs that error w against the displacement that the force multiplies.
+    """
+
+    name = "switching"
+
+    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
+        moves = np.array(loop.delays.hi) > np.array(loop.delays.lo)
+        units = tuple((even_damping(loop) / loop.T * moves).tolist())
+        said = "a positive number where the delay varies and 0 elsewhere"
+        return (Unknowns("alpha", units, said, 1e-8, 1e6),)
+
+    def enter(self, block: Collected[Any], loop: Loop, values: Values) -> None:
+        for i, (lo, hi) in enumerate(zip(loop.delays.lo, loop.delays.hi, strict=True)):
+            if lo == hi:
+                continue
+            alpha = numbers(values["alpha"][i], block.T)
+            moving = block.moving(i)
+            for g, p in moving:
+                for h, q in moving:
+                    for power, weight in _correlation(p, q):
+                        at_once = power == 0
+                        (block.term if at_once else block.before)(
+                            g, h, -alpha * weight / 2 if at_once else -alpha * weight
+                        )
+            w = block.input("w", i)
+            block.steps(w, i, (hi - lo,))
+            block.term(w, w, 2 * alpha)
+
+
+def _correlation(p: Weights, q: Weights) -> list[tuple[int, Any]]:
+    """(power of 1/z, weight) of the terms of p(1/z) q(z) that are causal: the others are their mirror images."""
+    return [(i - j, a * b) for i, a in enumerate(p) for j, b in enumerate(q) if i >= j and a * b]
+
+
+_SPARE = 0.02  # of rho: what the block keeps, however large the damping, so that c may be rounded and the proof exact
+
+
+class Limiter(Fact):
+    """Forces that leave through the limiter of controller.law, of lag rho > 0 [N/m] per channel."""
+
+    name = "limiter"
+
+    def __init__(self, rho: Sequence[float], lags: int = 1) -> None:
+        self.rho, self.lags = tuple(rho), lags
+
+    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
+        units = (1.0,) * loop.channels * self.lags
+        return (Unknowns("c", units, "numbers >= 0, as many for each channel", 0.0, 10.0, start=(0.0,) * len(units)),)
+
+    def enter(self, block: Collected[Any], loop: Loop, values: Values) -> None:
+        for i in range(loop.channels):
+            for part, _ in block.moving(i)[-2:]:  # the displacement that the slip is taken off, and the slip
+                block.keep(part, _SPARE * self.rho[i])
+            c = [numbers(v, block.T) for v in values["c"][i * self.lags : (i + 1) * self.lags]]
+            e, rho = block.slip(i), numbers(self.rho[i], block.T)
+            block.force(e, i, (-rho, rho))
+            block.steps(e, i, less_advance(block.path[i], 1))
+            for j, weight in enumerate(c, start=1):
+                block.steps(e, i, tuple(range(j, 0, -1)), -weight)
+
+
+# ----------------------------------------------------------------------------------------------------
+# The composition.
+
+
+def compose(
+    G: Block, loop: Loop, facts: Sequence[Fact] = (), values: Values | None = None, late: bool = True
+) -> Demand[Block]:
+    """The block of the loop's hands' side with these facts, at these values of their multipliers.
+
+    Args:
+        G: [x; p], displacements (m,) and wall forces, to [f_e; y], forces as they leave and ways into the walls.
+        late: whether the delays Theta are still to come; False where G has them.
+
+    Raises ValueError for values that are no multipliers.
+    """
+    values = values or {}
+    path: list[Weights] = [(1,)] * loop.channels
+    if late:
+        switch = any(isinstance(fact, Switching) for fact in facts)
+        spans = zip(loop.delays.lo, loop.delays.hi, strict=True) if switch else zip(loop.theta, loop.theta, strict=True)
+        path = [[Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)] for lo, hi in spans]
+    hands, T = hands_side(loop), G.T
+    walls = len(loop.environment.walls) if any(isinstance(fact, Walls) for fact in facts) else 0
+    block: Collected[Block] = Collected(T, path, walls, hands.inputs(loop, T))
+    if any(isinstance(fact, Limiter) for fact in facts):
+        block.limit()
+    block.take(hands.damping(loop, T, values), hands.rest(loop, T, values))
+    for fact in facts:
+        fact.enter(block, loop, values)
+    S, free, gain = block.build(G)
+    m, ways = [block.places[i.name, i.channel] for i in block.hands if i.slips], list(block.of("u").values())
+    F1, Y1 = S[..., m, :][..., :, m], S[..., ways, :][..., :, ways]
+    static, least = {"F(1)": F1}, ("F(1)",)
+    if walls:
+        every = [*m, *ways]
+        static |= {"-Y(1)": -Y1, "the static map of devices and walls": S[..., every, :][..., :, every]}
+        least = ("F(1)", "-Y(1)")
+    return Demand(free, constant_like(G, gain), static, least, block.spare)

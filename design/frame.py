@@ -1,0 +1,331 @@
+"""The block of a condition, composed from one hands' side and the facts of the environment's side.
+
+Every proof in docs/theory.md has two sides, which meet only in the displacements and in the forces as the devices
+receive them. The **hands' side** bounds from below what every passive hand takes, whatever forces act. Its inputs are
+the displacements of a period: dx, or xa and xb before and after a force latches. A **fact** of the environment's side
+says how forces come about; it adds inputs, a row for each, and multipliers. The block's form, summed over ticks, is
+
+    sum f'(displacement that f multiplies) + what the damping takes + the multipliers' terms,
+
+and the block must be strictly positive real, with its pole at z = 1 split off. `Collected` holds what the hands' side
+and the facts enter, and builds the block in any arithmetic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic
+
+import numpy as np
+from haptic_loop.controller.arithmetic import Number, numbers
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Lti, Sampled, as_like, vstack
+from haptic_loop.controller.lti import Block as AnyBlock
+from haptic_loop.design.arguments import shown
+from haptic_loop.design.exact import require_size
+
+
+@dataclass(frozen=True, eq=False)
+class Demand(Generic[AnyBlock]):
+    """free + s gain must be strictly positive real, with s = 1 for the available damping.
+
+    `static` are matrices that must be symmetric, by name; those in `semidefinite` also positive semidefinite.
+    """
+
+    free: AnyBlock
+    gain: AnyBlock
+    static: Mapping[str, Array] = field(default_factory=dict)
+    semidefinite: tuple[str, ...] = ()
+    spare: Array | None = None  # (n,) that the diagonal keeps in a search for multipliers
+
+    def __post_init__(self) -> None:
+        for name, part in (("free", self.free), ("gain", self.gain)):
+            if not isinstance(part, Lti | Sampled):
+                raise ValueError(f"{name} of a demand is {shown(part)}, expected an Lti")
+        if isinstance(self.free, Lti) and isinstance(self.gain, Lti):
+            (rows, columns), other = (self.free.outputs, self.free.inputs), (self.gain.outputs, self.gain.inputs)
+            if not rows == columns == other[0] == other[1]:
+                sizes = f"free is {rows} x {columns}, gain is {other[0]} x {other[1]}"
+                raise ValueError(f"{sizes} in a demand, expected square blocks of one size")
+
+
+def even_damping(loop: Loop, T: Number | None = None) -> Any:
+    """Delta_D T/T_max [N s/m], (m,): the damping that does in even periods T what delta does in periods up to T_max.
+
+    The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. Nothing else
+    in the energy balance depends on T: the force map is the same at every tick, however long the tick is.
+    """
+    T = loop.T if T is None else T
+    damping = numbers(loop.delta, T)
+    return damping if loop.T_max is None else damping * (T / numbers(loop.T_max, T))
+
+
+Weights = Sequence[Any]  # w_0 + w_1/z + .. of a row, or w_0 + w_1 z + .. of a displacement
+
+
+def product(p: Weights, q: Weights) -> list[Any]:
+    """The weights of the product of two polynomials."""
+    out: list[Any] = [0] * (len(p) + len(q) - 1)
+    for i, a in enumerate(p):
+        for j, b in enumerate(q):
+            out[i + j] = out[i + j] + a * b
+    return out
+
+
+def less_advance(p: Weights, follows: Any) -> list[Any]:
+    """The weights of (p(1/z) - follows z)/(z - 1) for p(1) = follows: causal, with the same number of weights.
+
+    With p = z^-theta it is -(1 + 1/z + .. + z^-theta), the window of a delay with its sign turned.
+    """
+    out, left = [], follows
+    for weight in p:
+        out.append(-left)
+        left = left - weight
+    return out
+
+
+@dataclass(frozen=True)
+class Input:
+    """One scalar input of the hands' side: a displacement or a speed of a device at every tick."""
+
+    name: str
+    channel: int
+    moved: Weights = (1,)  # w_0 + w_1 z + ..: its share of the displacement that the force f[k] multiplies
+    follows: int = 1  # 1 where the environment follows it, 0 for a speed
+    slips: bool = True  # whether the limiter's slip is taken off it
+
+
+class Collected(Generic[AnyBlock]):
+    """What hands' side and facts enter: inputs, weights of forces, rows, and constant terms."""
+
+    def __init__(self, T: Number, path: Sequence[Weights], walls: int, hands: Sequence[Input]) -> None:
+        self.T, self.channels, self.walls = T, len(path), walls
+        self.path, self.hands = path, hands  # path: per channel the weights of the nominal delay of its forces
+        self.places: dict[tuple[str, int], int] = {}  # (name, channel or wall) -> input
+        self._into: list[tuple[int, int, Weights]] = []  # (output of the inputs' filter, input, weights)
+        self._force: list[tuple[int, int, Weights]] = []  # (channel, input, weights) beside the environment's response
+        self._sums: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of f_e, scale)
+        self._steps: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of df_e, scale)
+        self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight of dy, whether it is summed)
+        self._terms: list[tuple[int, int, Any]] = []
+        self._before: list[tuple[int, int, Any]] = []  # (row, input one tick before, weight)
+        self._gain: list[tuple[int, int, Any]] = []
+        self._keep: list[tuple[int, float]] = []
+        for i in hands:
+            row = self.input(i.name, i.channel)
+            self.sums(row, i.channel, product(path[i.channel], i.moved))
+            if i.follows:
+                self._into.append((i.channel, row, (1,)))
+
+    def limit(self) -> None:
+        """Take the limiter's slip off the displacements that carry it: an input more per channel."""
+        for i in self.hands:
+            if i.slips:
+                self.input("de", i.channel)
+
+    def take(self, damping: Any, rest: Sequence[Any] = ()) -> None:
+        """Enter the quadratic form of the hands' side, of displacements from which no slip is taken off."""
+        parts = [self._with_slip(i) for i in self.hands]
+        for enter, form in zip((self.damping, self.term, self.before), (damping, *rest), strict=False):
+            for g, h in zip(*np.nonzero(form), strict=True):
+                for row in parts[g]:
+                    for column in parts[h]:
+                        enter(row, column, form[g, h])
+
+    def _with_slip(self, i: Input) -> list[int]:
+        """The numbers of the inputs of which a hands' input consists."""
+        slip = self.places.get(("de", i.channel)) if i.slips else None
+        return [self.places[i.name, i.channel], *([] if slip is None else [slip])]
+
+    def input(self, name: str, place: int) -> int:
+        """A new input, of a device or a wall; its number."""
+        self.places[name, place] = len(self.places)
+        return len(self.places) - 1
+
+    def of(self, name: str) -> dict[int, int]:
+        """The inputs of a name: device or wall -> number."""
+        return {place: i for (known, place), i in self.places.items() if known == name}
+
+    def slip(self, channel: int) -> int:
+        """The limiter's slip of a channel."""
+        return self.places["de", channel]
+
+    def moving(self, channel: int) -> list[tuple[int, Weights]]:
+        """The inputs of which the displacement that a channel's force multiplies consists, with their weights in z."""
+        parts: list[tuple[int, Weights]] = [
+            (self.places[i.name, i.channel], i.moved) for i in self.hands if i.channel == channel
+        ]
+        return parts + ([(self.slip(channel), (1,))] if ("de", channel) in self.places else [])
+
+    @property
+    def size(self) -> int:
+        return len(self.places)
+
+    # -- what an input does
+
+    def press(self, i: int, wall: int, weights: Weights) -> None:
+        """A share of the steps of a wall's force."""
+        self._into.append((self.channels + wall, i, weights))
+
+    def force(self, i: int, channel: int, weights: Weights) -> None:
+        """A share of the steps of a device's force beside what the environment answers."""
+        self._force.append((channel, i, weights))
+
+    # -- what a row reads
+
+    def sums(self, row: int, channel: int, weights: Weights, scale: Any = 1) -> None:
+        """The row reads weights of the force as it leaves, which is the sum of its steps: a pole at z = 1."""
+        self._sums.append((row, channel, weights, scale))
+
+    def steps(self, row: int, channel: int, weights: Weights, scale: Any = 1) -> None:
+        """The row reads weights of the steps of the force as it leaves."""
+        self._steps.append((row, channel, weights, scale))
+
+    def way(self, row: int, wall: int, weight: Any, summed: bool = False) -> None:
+        """The row reads the steps of the way into a wall, or the way itself."""
+        self._walls.append((row, wall, weight, summed))
+
+    def term(self, row: int, column: int, weight: Any) -> None:
+        """The row reads an input."""
+        self._terms.append((row, column, weight))
+
+    def before(self, row: int, column: int, weight: Any) -> None:
+        """The row reads an input of the tick before."""
+        self._before.append((row, column, weight))
+
+    def damping(self, row: int, column: int, weight: Any) -> None:
+        """As `term`, in proportion to the damping of the devices."""
+        self._gain.append((row, column, weight))
+
+    def keep(self, row: int, amount: float) -> None:
+        """An amount that the diagonal keeps in a search, so that multipliers may be rounded."""
+        self._keep.append((row, amount))
+
+    @property
+    def spare(self) -> Array | None:
+        """(n,) what `keep` collected, None where that is nothing."""
+        spare = np.zeros(self.size)
+        for row, amount in self._keep:
+            spare[row] += amount
+        return spare if self._keep else None
+
+    # -- the block
+
+    @property
+    def states(self) -> int:
+        """How many states the block has beside those of the environment's response."""
+        return self._bank(self._reads()[1]).order + self._filter()[0].order
+
+    def _matrix(self, entries: Sequence[tuple[int, int, Any]]) -> Any:
+        out: Any = numbers(np.zeros((self.size, self.size), dtype=int), self.T) + 0
+        for i, j, weight in entries:
+            out[i, j] = out[i, j] + weight
+        return out
+
+    def gain(self) -> Any:
+        return self._matrix(self._gain)
+
+    def _reads(self) -> tuple[list[tuple[int, Any, bool]], list[tuple[int, Weights]]]:
+        """Per reading of the forces (row, scale, summed); and (channel, weights)."""
+        kinds = [*((r, True) for r in self._sums), *((r, False) for r in self._steps)]
+        return [(row, scale, summed) for (row, _, _, scale), summed in kinds], [(c, w) for (_, c, w, _), _ in kinds]
+
+    def _bank(self, reads: Sequence[tuple[int, Weights]]) -> Lti:
+        """Forces as they leave (m,) -> one output per reading, over one delay line per channel."""
+        order = sorted(range(len(reads)), key=lambda r: reads[r][0])
+        parts = [_taps([w for c, w in reads if c == channel], self.T) for channel in range(self.channels)]
+        return Lti.diag(*parts).rows(np.argsort(order)) if reads else Lti.constant(np.zeros((0, self.channels)), self.T)
+
+    def _filter(self) -> tuple[Lti, list[int]]:
+        """Inputs -> (x, p, steps of forces beside, inputs of the tick before); and which those last inputs are."""
+        late = sorted({j for _, j, _ in self._before})
+        first, second = self.channels + self.walls, 2 * self.channels + self.walls
+        entries = [*self._into, *((first + c, i, w) for c, i, w in self._force)]
+        entries += [(second + r, i, (0, 1)) for r, i in enumerate(late)]
+        return _of_weights(entries, second + len(late), self.size, self.T), late
+
+    def build(self, G: AnyBlock | None) -> tuple[Array, AnyBlock, Any]:
+        """(the residue at z = 1, (n, n); the block without its pole; the part that damping multiplies).
+
+        G takes [x; p], displacements and wall forces, to [f_e; y], forces as they leave and ways into walls. None: no
+        environment, whose forces' steps are an input instead (`force`).
+        """
+        m, w, n, T = self.channels, self.walls, self.size, self.T
+        into, late = self._filter()
+        rows, reads = self._reads()
+        bank = self._bank(reads)
+        follows = len(reads)
+        # signals: readings of the forces, ways into walls, inputs of the tick before
+        inner = m + w  # outputs of G
+        rest = m + len(late)  # outputs of the filter that pass beside G
+        mix: Any = numbers(np.zeros((m + w + len(late), inner + rest), dtype=int), T) + 0
+        for i in range(m):
+            mix[i, i] = mix[i, inner + i] = 1
+        for j in range(w):
+            mix[m + j, m + j] = 1
+        for j in range(len(late)):
+            mix[m + w + j, inner + m + j] = 1
+        lines = Lti.diag(bank, Lti.constant(np.eye(w + len(late), dtype=int), T)) @ mix
+        if isinstance(G, Sampled):
+            filtered = Sampled(G.z, into.at(G.z), G.T)
+            through = vstack(G @ filtered.rows(slice(0, inner)), filtered.rows(slice(inner, None)))
+        else:
+            silent = Lti.constant(np.zeros((inner, inner), dtype=int), T) if G is None else G
+            through = Lti.diag(silent, Lti.constant(np.eye(rest, dtype=int), T)) @ into
+        signals = as_like(through, lines) @ through
+        if isinstance(signals, Lti) and signals.is_exact:
+            require_size(signals.order)
+        static, regular = signals.over_z_minus_one()
+        sums: Any = numbers(np.zeros((n, signals_of(signals)), dtype=int), T) + 0
+        steps: Any = sums + 0
+        for r, (row, scale, summed) in enumerate(rows):
+            target = sums if summed else steps
+            target[row, r] = target[row, r] + scale
+        for row, wall, weight, summed in self._walls:
+            target = sums if summed else steps
+            target[row, follows + wall] = target[row, follows + wall] + weight
+        for row, column, weight in self._before:
+            place = follows + w + late.index(column)
+            steps[row, place] = steps[row, place] + weight
+        free = np.hstack([sums, steps]) @ vstack(regular, signals) + self._matrix(self._terms)
+        return sums @ static, free, self.gain()
+
+
+def signals_of(signals: Any) -> int:
+    return signals.G.shape[-2] if isinstance(signals, Sampled) else signals.outputs
+
+
+def _taps(rows: Sequence[Weights], T: Number) -> Lti:
+    """One channel -> w_0 + w_1/z + .. for each row, over one delay line."""
+    n = max((len(row) for row in rows), default=1) - 1
+    table: Any = numbers(np.zeros((len(rows), n + 1), dtype=int), T) + 0
+    for r, row in enumerate(rows):
+        for k, weight in enumerate(row):
+            table[r, k] = numbers(weight, T)
+    first = np.zeros((n, 1), dtype=int)
+    first[:1] = 1
+    return Lti(np.eye(n, k=-1, dtype=int), first, table[:, 1:], table[:, :1], T)
+
+
+def _of_weights(entries: Sequence[tuple[int, int, Weights]], outputs: int, inputs: int, T: Number) -> Lti:
+    """A block of weighted and delayed inputs, over one delay line per input."""
+    length = [max((len(w) for _, j, w in entries if j == i), default=1) for i in range(inputs)]
+    starts = np.cumsum([0, *(n - 1 for n in length)])
+    order = int(starts[-1])
+    A, B = np.zeros((order, order), dtype=int), np.zeros((order, inputs), dtype=int)
+    C: Any = numbers(np.zeros((outputs, order), dtype=int), T) + 0
+    D: Any = numbers(np.zeros((outputs, inputs), dtype=int), T) + 0
+    for i, n in enumerate(length):
+        if n > 1:
+            B[starts[i], i] = 1
+            for k in range(n - 2):
+                A[starts[i] + k + 1, starts[i] + k] = 1
+    for row, i, weights in entries:
+        for k, weight in enumerate(weights):
+            value = numbers(weight, T)
+            if k:
+                C[row, starts[i] + k - 1] = C[row, starts[i] + k - 1] + value
+            else:
+                D[row, i] = D[row, i] + value
+    return Lti(A, B, C, D, T)
