@@ -33,6 +33,7 @@ DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 _Number = TypeVar("_Number", int, float)
 _Given = TypeVar("_Given")
 _Group = argparse._ActionsContainer
+_CHOICE = re.compile(r"argument ([\w-]+): invalid choice: (.*) \(choose from (.*)\)")  # argparse's own words
 _OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # of the types below
 
 
@@ -101,6 +102,9 @@ class Parser(argparse.ArgumentParser):
         return did_you_mean(word.partition("=")[0], known)
 
     def error(self, message: str) -> NoReturn:
+        if choice := _CHOICE.fullmatch(message):
+            allowed = choice[3].replace("'", "")
+            raise InputError(f"{choice[1]} is {choice[2]}, allowed are {allowed}")
         own = _OWN_WORDS.fullmatch(message)
         raise InputError(f"{own[1]} {own[2]}" if own else f"{message} (--help lists the options)")
 

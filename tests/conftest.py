@@ -13,7 +13,6 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 # What a test finds does not depend on what ran before it.
-os.environ["HAPTIC_LOOP_CACHE"] = "off"
 
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402

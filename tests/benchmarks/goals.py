@@ -69,15 +69,10 @@ def engines() -> Iterator[Sequence[str]]:
         yield *row, f"{np.median(ratios):.2f}", f"{np.median(least):.2f}", f"{position:.1e}", f"{growth:+.1e} 1/s"
 
 
-def command(words: str, folder: str, cache: str = "") -> float:
-    """CPU seconds of a command and what it starts; designs are kept in a folder of that name."""
+def command(words: str, folder: str) -> float:
+    """CPU seconds of a command and what it starts."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    fonts = matplotlib.get_cachedir()
-    kept = {
-        "MPLCONFIGDIR": fonts,
-        "HAPTIC_LOOP_CACHE": "" if cache else "off",
-        "XDG_CACHE_HOME": str(Path(folder, cache)),
-    }
+    kept = {"MPLCONFIGDIR": matplotlib.get_cachedir()}
     subprocess.run(
         [sys.executable, "-m", *words.split()],
         cwd=folder,
@@ -99,11 +94,8 @@ def cold() -> Iterator[Sequence[str]]:
     with tempfile.TemporaryDirectory() as folder:
         for words, goal in COMMANDS.items():
             yield f"`{words}`", f"{min(command(words, folder) for _ in range(3)):.2f}", f"{goal:g}"
-        own = "sim.run --delta 1.36", ", a loop of one's own"
-        for words, whose in (("sim.run", ""), own, (f"{own[0]}", own[1])):
-            for when in ("the first time", "its designs kept"):
-                best = min(command(words, folder, str(i)) for i in range(3))
-                yield f"`{words}` with its picture{whose}, {when}", f"{best:.2f}", f"{RUN:g}"
+        best = min(command("sim.run", folder) for _ in range(3))
+        yield "`sim.run` with its picture", f"{best:.2f}", f"{RUN:g}"
 
 
 def peers() -> Iterator[Sequence[str]]:

@@ -5,7 +5,6 @@ PYTHONPATH=. python tests/benchmarks/scale.py [devices|commands|delays|hands|dur
 
 from __future__ import annotations
 
-import os
 import resource
 import subprocess
 import sys
@@ -75,7 +74,7 @@ def devices() -> None:
 
 
 def commands() -> None:
-    """Whole commands: a design without kept ones, a run at first, and one with its designs kept."""
+    """Whole commands: a design and a run."""
     with TemporaryDirectory() as place:
         for n in (8, 16, 32):
             scenario = Path(place, f"star{n}.toml")
@@ -84,10 +83,9 @@ def commands() -> None:
             design = ["design", *asked, str(Path(place, "coupling.json"))]
             run = ["sim.run", *asked, str(Path(place, "run"))]
             seconds = []
-            for command, kept in ((design, {"HAPTIC_LOOP_CACHE": "off"}), (run, {}), (run, {})):
+            for command in (design, run):
                 before = resource.getrusage(resource.RUSAGE_CHILDREN)
-                environment = os.environ | {"XDG_CACHE_HOME": place, "HAPTIC_LOOP_CACHE": ""} | kept
-                subprocess.run([sys.executable, "-m", *command], env=environment, check=True, capture_output=True)
+                subprocess.run([sys.executable, "-m", *command], check=True, capture_output=True)
                 after = resource.getrusage(resource.RUSAGE_CHILDREN)
                 seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
             print(f"| {n} devices | {' | '.join(f'{value:.1f}' for value in seconds)} |", flush=True)

@@ -238,7 +238,6 @@ def main() -> int:
     for command in COMMANDS:
         import_module(f"haptic_loop.cli.{command}")
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    os.environ["HAPTIC_LOOP_CACHE"] = "off"  # every case takes as long as the first
     if shared := os.environ.get("SHARED_DESIGNS"):
         sys.path.append(str(Path(__file__).parents[1]))
         import_module("forked").share_designs(Path(shared))

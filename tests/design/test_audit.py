@@ -334,7 +334,7 @@ BAD = [
     ("--K 1 --B 1 --theta 0.5", "--theta is '0.5', expected whole numbers"),
     ("--K 1 --B 1 --seed x", "--seed is 'x'"),
     ("--K 1 --B 1 --json nowhere/x.json", "the folder nowhere does not exist"),
-    ("--K 1 --B 1 --sceanrio x", "unrecognized arguments"),
+    ("--K 1 --B 1 --sceanrio x", "unknown option --sceanrio, did you mean --scenario"),
 ]
 
 
