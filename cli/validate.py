@@ -15,8 +15,10 @@ from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design.assessment import Assessment, RangesResult
 from haptic_loop.design.conditions import this_environment
+from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import ANY, RANGES
+from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.result import CONDITIONS, Chosen
 from haptic_loop.models.human import Human, Population
 from haptic_loop.models.scene import MIXED
@@ -143,9 +145,14 @@ class _Searched:
     interrupted: bool = False
 
 
+#: conditions that hold in the environment of the loop; the second asks no more, where devices are known
+_OF_HERE = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name
+
+
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, assessment: Assessment) -> _Searched:
     """The worst humans, in the environment that needs the most damping; what was found before Ctrl-C is kept."""
-    scenario, ratio = question.scenario, assessment.requirements["this-environment"].ratio
+    asked = [need for need in assessment.requirements.values() if need.condition in _OF_HERE]
+    scenario, ratio = question.scenario, min(need.ratio for need in asked)
     if question.environments and assessment.ranges:
         member, requirement = assessment.ranges.worst_found
         scenario, ratio = scenario.replace(environment=member.network, ranges=None), requirement.ratio

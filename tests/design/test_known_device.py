@@ -650,3 +650,58 @@ def test_the_audit_says_what_is_left():
     other = change(KNOWN, known_devices=(DEVICE, change(DEVICE, motor_mass_min=0.1)))
     assert not left_over(other, PUBLISHED["I"]).attained
     assert audit(PAIR, PUBLISHED["I"]).left_over is None
+
+
+def random_walls(rng, T):
+    """An environment that the contact pushes against: a rigid wall, a spring, or a mass between two springs."""
+    k = np.exp(rng.uniform(np.log(300), np.log(3e6), 2))
+    springs = [(Spring(("tip", GROUND), k[0]),), (Spring(("tip", "mass"), k[0]), Spring(("mass", GROUND), k[1]))]
+    masses = {"mass": float(np.exp(rng.uniform(-5, 1)))}
+    which = rng.integers(2)
+    return Network(("tip",), springs[which], masses if which else {})
+
+
+@pytest.mark.parametrize("theta", [0, 1])
+def test_no_hand_and_no_environment_grow_above_the_requirement(theta):
+    """Lossless hands before lossless environments behind a coupling at 1.01 of what it needs; some grow at 0.6."""
+    T, rng = 1e-3, np.random.default_rng(theta)
+    loop = one(T, 1.0, theta)
+    coupling = SpringDamper([(2500.0, 1200.0)[theta]], [(4.0, 1.5)[theta]])
+    needed = required_damping(loop, coupling, "known-device-any").ratio
+    assert needed < 0.9 * required_damping(loop, coupling, "any-environment").ratio
+    worst = {1.01: 0.0, 0.6: 0.0}
+    for _ in range(25):
+        F = loop.at(random_walls(rng, T)).F(coupling)
+        for links in (1, 2):
+            drawn = ladders(rng, 300, links, T)
+            for share in worst:
+                worst[share] = max(worst[share], radii(F, loop, share * needed, drawn).max())
+    assert worst[1.01] < 1 + 1e-9
+    assert worst[0.6] > 1
+
+
+def test_periods_that_vary_lose_no_lossless_hand():
+    """Products of steps with drawn periods: with T_min and T_max certified at 1.01 every one of 200 hands decays."""
+    K, B, theta, T, low, high = 800.0, 0.6, 1, 1e-3, 0.8e-3, 1.25e-3
+    loop, F = one(T, 1.0, theta, T_max=high, T_min=low), wall(K, B, theta, T)
+    needed = required(F, loop, this_environment(F, loop.delta, T_max=high).ratio)
+    assert needed < this_environment(F, loop.delta, T_max=high).ratio
+    rng = np.random.default_rng(9)
+    drawn = ladders(rng, 200, 1, T)
+    m, k, b = DEVICE.motor_mass_min, DEVICE.transmission_stiffness_max, DEVICE.transmission_damping_max
+    worst = 0.0
+    for mass, spring in drawn[:, 0]:
+        M, S = np.array([m, mass]), np.array([[k, -k], [-k, k + spring]])
+        D = np.array([[b + 1.01 * needed, -b], [-b, b]])
+        G = np.zeros((5, 5))
+        G[:2, 2:4], G[2:4, :2], G[2:4, 2:4], G[2, 4] = np.eye(2), -S / M[:, None], -D / M[:, None], -1 / m
+        steps = []
+        for period in np.linspace(low, high, 5):
+            held = expm(G * period)[:4]
+            C = np.eye(1, 4)
+            top = np.hstack([held[:, :4] + held[:, 4:] @ F.D @ C, held[:, 4:] @ F.C])
+            steps.append(np.vstack([top, np.hstack([F.B @ C, F.A])]))
+        for pattern in rng.integers(0, 5, (6, 8)):
+            product = np.linalg.multi_dot([steps[i] for i in pattern])
+            worst = max(worst, np.abs(np.linalg.eigvals(product)).max())
+    assert worst < 1 + 1e-9
