@@ -31,6 +31,7 @@ check: .venv/ready build/typed
 
 validate: .venv/ready
 	$(PY) -m pytest -m validate tests/checks
+	$(PY) -m tests.checks.faults
 	$(PY) tests/cli/hostile.py --signals
 	$(PY) docs/regenerate.py --check
 	$(MAKE) installed

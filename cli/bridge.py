@@ -49,8 +49,10 @@ def main(argv: list[str]) -> int:
     if args.energy_budget and not args.energy_budget[0]:
         raise InputError("--energy-budget is 0 J: encoders are tested by a small force at arming, give it 0.01 or so")
     settings = replace(settings, rereference=not args.no_rereference, energy_budget=args.energy_budget)
-    settings = replace(settings, deadman=args.deadman == "device")
-    session = session_for(scenario, settings, **session_cli.limits_from(args, scenario))
+    limits = session_cli.limits_from(args, scenario)
+    held = args.held or not args.port  # emulated people never let go
+    settings = replace(settings, deadman=args.deadman == "device", held=held)
+    session = session_for(scenario, settings, **limits)
     session.record = recorder = Recorder(scenario.channels)
     out = options.out_folder(args, "bridge")
 
@@ -73,7 +75,7 @@ def main(argv: list[str]) -> int:
     render.console(args).print("files: " + ", ".join(files), soft_wrap=True)
     if args.json:
         write_json(args.json, plain(report) | {"files": files})
-    return options.exit_code(session.stage == Stage.FINISHED, bool(set(live.signals) - {signal.SIGUSR1}))
+    return options.exit_code(report.session.stage == Stage.FINISHED, bool(set(live.signals) - {signal.SIGUSR1}))
 
 
 def _parser() -> argparse.ArgumentParser:

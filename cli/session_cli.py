@@ -77,9 +77,12 @@ def add_safety_options(parser: options.Parser) -> None:
     absolute = "count positions from the encoders' zero, not from where the handles are at arming"
     add("--no-rereference", action="store_true", help=absolute)
     who = "forces act only while the user presses a key or touches FILE once a second, or holds the device's own switch"
-    add("--deadman", metavar="key|device|FILE", help=who)
+    add("--deadman", metavar="key|device|FILE", help=f"{who} (default with --port: key)")
+    add("--no-dead-man", action="store_true", help="let forces act though nobody says that he is there")
+    hands = "hands hold the handles while they are tested at arming: then no motion is too small"
+    add("--held", action="store_true", help=hands)
     add("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
-    parser.only("with --port", lambda args: args.port, "no_preflight")
+    parser.only("with --port", lambda args: args.port, "no_preflight", "no_dead_man", "held")
     parser.only("with --continuous-force", lambda args: args.continuous_force, "thermal_time")
 
 
@@ -96,8 +99,12 @@ def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
     more: dict[str, Any] = {"cap": args.force_cap, "speed": _speed(args, scenario), "thermal": args.thermal_time}
     if args.continuous_force is not None:
         more["continuous"] = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)
+    if args.port and not args.deadman and not args.no_dead_man:
+        args.deadman = "key"  # the least that a live device asks for
+    if args.deadman and args.no_dead_man:
+        raise InputError("--no-dead-man contradicts --deadman: give one of them")
     if args.deadman == "key" and not sys.stdin.isatty():
-        raise InputError("--deadman key needs a terminal; without one give it a file to be touched")
+        raise InputError("--deadman key needs a terminal: give --deadman FILE, --deadman device or --no-dead-man")
     return more
 
 
@@ -278,6 +285,8 @@ def _show(session: Session) -> None:
     elif drive and drive.x:
         words += [f"{1e3 * x:+.3f} mm {f:+.3f} N" for x, f in zip(drive.x, drive.force, strict=True)]
         words.append(f"gain {session.gain:.2f}")
+    elif session.info and session.link.last:  # signs and sizes are looked at before anything is armed
+        words += [f"{1e3 * x:+.3f} mm" for x in session.units.positions(session.link.last.counts)]
     words += [f"margin {margin} us"] if (margin := session.link.least_margin) is not None else []
     words += [f"{name} {n}" for name in _SHOWN if (n := getattr(counters, name))]
     line = " · ".join(words)[: shutil.get_terminal_size().columns - 1]

@@ -175,7 +175,10 @@ class Drive:
         settings: monitor.LinkSettings,
         counters: monitor.Counters,
         record: Callable[[TraceRow], None],
+        still: Sequence[int] | None = None,
+        expected: Sequence[monitor.Expected] | None = None,
     ) -> None:
+        """`still` (m,) [counts] are within an encoder's noise, `expected` (m,) is what the test at arming compares."""
         self.controller, config = arming.program.controller(limits.cap), arming.config
         self.units, self.config, self.limits = units, config, limits
         self.T = T = self.controller.T
@@ -184,13 +187,20 @@ class Drive:
         self.x: tuple[float, ...] | None = None  # [m] of the last STATE
         self.reference: tuple[int, ...] | None = None  # [counts] that positions are counted from
         self._rereference = settings.rereference
-        self._test = monitor.EncoderTest(limits.cap, T) if settings.test_encoders else None
-        self._encoders, self._heat = monitor.EncoderMonitor(units.encoder_step, units.force_step, T), Heat(limits, T)
+        test = monitor.EncoderTest(limits.cap, T, units, still, expected, settings.held)
+        self._test = test if settings.test_encoders else None
+        self._encoders = monitor.EncoderMonitor(units.encoder_step, units.force_step, T, still)
+        self._heat = Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] over which a speed is taken
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] tick by tick
         self._before: tuple[float, ...] | None = None  # [m] of the STATE before that, where none is missing
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
         self._commands, self._clock = monitor.CommandMonitor(config), monitor.ClockMonitor(limits.watchdog_us, T)
+
+    @property
+    def dead(self) -> str | None:
+        """What to say of an axis that does not move although a force acts on it for long; None: there is none."""
+        return self._encoders.dead
 
     def step(self, state: State, ticks: int, direction: int, now: int) -> tuple[int, ...]:
         """The force [steps] that answers `state`, which came at `now` [us], `ticks` after the one before.
@@ -213,7 +223,7 @@ class Drive:
         if ticks > 1 and self.x is not None:
             self._miss(state, _fill(self.x, x, ticks)[:-1])
         asked = self.controller.step(x)
-        test = self._test.force(state.counts, ticks) if self._test and direction > 0 else None
+        test = self._test.force(state, ticks) if self._test and direction > 0 else None
         if direction > 0 and test is None:
             self._test = None
             self.gain.rise(ticks)

@@ -65,6 +65,7 @@ _DEVICE = {
     "period": ("length of a tick in T", 0.5, 4.0, 2.0),
     "estop": ("no value: the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: a fault that the firmware found", 0.0, 0.0, 0.0),
+    "swap": ("no value: the encoders of axes 1 and 2 are connected the wrong way round", 0.0, 0.0, 0.0),
     "letgo": ("no value: nobody holds the deadman at the device any more", 0.0, 0.0, 0.0),
 }
 #: kind -> the same, for one axis of it
@@ -75,6 +76,10 @@ _AXIS = {
     "saturate": ("millimetres beyond which its encoder shows no more", -1000.0, 1000.0, 5.0),
     "shake": ("millimetres by which its encoder is wrong at every other tick", -1000.0, 1000.0, 2.0),
     "drift": ("metres per second that its encoder shows beside its motion", -10.0, 10.0, 2.0),
+    "reverse": ("no value: its encoder counts backwards", 0.0, 0.0, 0.0),
+    "scale": ("counts that its encoder shows for one", 0.01, 100.0, 3.0),
+    "noise": ("counts of noise, root mean square, that its encoder shows", 0.0, 100.0, 0.5),
+    "motor": ("part of a force that its motor makes: 0 a dead motor, -1 a reversed one", -10.0, 10.0, 0.0),
     "own": ("newtons that its motor has while armed, whatever it is told", -12.0, 12.0, 2.0),
 }
 KINDS = _LINE | _DEVICE | _AXIS
@@ -179,8 +184,8 @@ class Line:
 class _EmulatedPlant:
     """The devices and their passive humans between ticks, by the matrix exponential.
 
-    The person starts to move at the first tick after `begin`, so that a session can be armed at rest. With `coulomb`
-    [N] every motor has dry friction too, which is held for an eighth of a tick.
+    The person starts to move at the first tick after `begin`, and holds still while `still`, so that a session is armed
+    at rest. With `coulomb` [N] every motor has dry friction too, which is held for an eighth of a tick.
     """
 
     def __init__(self, scenario: Scenario, encoder_step: Array, coulomb: float = 0.0) -> None:
@@ -192,6 +197,8 @@ class _EmulatedPlant:
         self.s = np.zeros(len(self._plant.A))
         self._w = np.zeros(self.scene.outside)
         self._limit = np.array([device.force_limit for device in scenario.device])
+        self.still = False
+        self.fastest = 0.0  # [m/s] of any motor, so far
         self._outside, self._first, self.tick = np.zeros((0, self.scene.outside)), 0, None
 
     @property
@@ -212,11 +219,12 @@ class _EmulatedPlant:
         What acts from outside is that of the tick, which `begins` or goes on.
         """
         if begins and self.tick is not None:
-            self._w = self._next_outside()
+            self._w = self._next_outside() * (not self.still)
         f, m, n = np.clip(f, -self._limit, self._limit), self.channels, self.scene.model.nq
         for _ in range(self._substeps):
             friction = self.coulomb * np.tanh(self.s[n : n + m] / _SLIP) if self.coulomb else 0.0
             self.s = self._held(share) @ np.concatenate([self.s, self._w, f + friction])
+            self.fastest = max(self.fastest, float(np.abs(self.s[n : n + m]).max()))
 
     def _hold(self, share: float) -> Array:
         held = hold(self._plant, share * self.scenario.T / self._substeps)
@@ -274,6 +282,8 @@ class Emulator:
         self.stalled_until = 0  # [us]
         self.stretch = 1.0  # length of a tick in T
         self.applied: Array = np.zeros(scenario.channels)  # [N] by the motors
+        self._motor: Array = np.ones(scenario.channels)  # part of a force that each makes
+        self._swapped = False
         self._begun, self._rest, self._at_tick = 0, 0.0, False  # [us] of the tick; the share of it that is to come
         self._offset = [0] * scenario.channels  # [counts] of an encoder that jumped
         self._encoder: dict[int, Callable[[int], int]] = {}  # by axis: what a broken encoder makes of its count
@@ -297,7 +307,7 @@ class Emulator:
         self.device.receive(data, now)
         if self._rest and self.device.applied != before:
             self._move(now)
-            self.applied = np.array(self.device.applied) * self.force_step
+            self.applied = np.array(self.device.applied) * self.force_step * self._motor
 
     def _move(self, now: float) -> None:
         """The plant moves on up to `now` [us], within the tick."""
@@ -318,12 +328,14 @@ class Emulator:
             max(-_FARTHEST, min(_FARTHEST, self._encoder.get(i, int)(n + o)))
             for i, (n, o) in enumerate(zip(self.plant.counts(), self._offset, strict=True))
         )
+        if self._swapped:
+            counts = (counts[1], counts[0], *counts[2:])
         self._begun = now
         steps, data = self.device.tick(now, counts)
         if self.device.phase in RUNNING and self.armed_at is None:
             self.armed_at = now
         self._wake_person()
-        self.applied = np.array(steps) * self.force_step
+        self.applied = np.array(steps) * self.force_step * self._motor
         return b"" if self.unplugged else data
 
     def advance(self) -> None:
@@ -347,6 +359,13 @@ class Emulator:
                 return lambda n: now + (n - now) % 2
             case "saturate":
                 return lambda n: min(n, most) if most >= 0 else max(n, most)
+            case "reverse":
+                return lambda n: -n
+            case "scale":
+                return lambda n: round(fault.value * n)
+            case "noise":
+                draw = np.random.default_rng(fault.axis)
+                return lambda n: round(n + draw.normal(0.0, fault.value))
             case "drift":
                 each, begun = fault.value * 1e-9 * self.info.period_ns, self.device.k
                 return lambda n: n + round(each / (1e-12 * step) * distance(self.device.k, begun))
@@ -354,7 +373,9 @@ class Emulator:
 
     def _wake_person(self) -> None:
         config = self.device.config
-        self._ready += config is not None and self.armed_at is not None and self.device.run >= config.ramp_in
+        full = config is not None and self.device.run >= config.ramp_in
+        self.plant.still = not full
+        self._ready += full and self.armed_at is not None
         if self._ready >= _SETTLED and self.begun_at is None:
             self.begun_at = self.device.k
             self.plant.begin()
@@ -371,8 +392,13 @@ class Emulator:
                     self.device = Device(self.info)
                 case "jump":
                     self._offset[fault.axis] += self._in_counts(fault)
-                case "freeze" | "toggle" | "saturate" | "shake" | "drift":
-                    self._encoder[fault.axis] = self._broken(fault)
+                case "freeze" | "toggle" | "saturate" | "shake" | "drift" | "reverse" | "scale" | "noise":
+                    earlier, broken = self._encoder.get(fault.axis, int), self._broken(fault)
+                    self._encoder[fault.axis] = lambda n, one=earlier, two=broken: two(one(n))
+                case "motor":
+                    self._motor[fault.axis] = fault.value
+                case "swap":
+                    self._swapped = True
                 case "leap":
                     self.device.k = (self.device.k + round(fault.value)) & 0xFFFF
                 case "own":

@@ -9,12 +9,17 @@ kept the last one; in DISARMED there is none.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+import scipy  # its parts load when they are used
+from haptic_loop.hw.limits import Units
 from haptic_loop.hw.protocol import NO_MARGIN, Config, Phase, SafetyStop, State, distance
+from haptic_loop.models.device import Device
 
 _STATES_PER_ANSWER = 8  # at most: a USB frame of 1 ms may bring several FORCEs, of which one margin is told
 _MEASURED_TOLERANCE = 0.01  # of the device's clock against T, over the measurement
@@ -29,6 +34,11 @@ _CHANGE = 1.0  # [N] of force that moves any handle which is not against a stop
 _IMPULSE = 0.1  # [N s] of such a change without a motion: 100 ms of 1 N, 20 ms of 5 N
 _HEAVIEST = 2.5  # [kg] of hand and handle
 _TEST_FORCE, _TEST_SECONDS, _TEST_HALF = 1.0, 0.24, 0.03  # [N] reached after so many seconds, and half a period
+_TEST_BEFORE = 0.012  # [s] without a force, in which the drift of a hand is seen
+_TEST_RATIO = 2.0  # between a motion and the one that is expected of a free handle
+_SWAPPED = 0.1  # part of a free handle's motion that another encoder must show: a heavy, stiff hand leaves as much
+_REST = 0.1  # [s] in which a handle rests
+_PRESSING, _PRESSED = 0.3, 0.5  # [N], [s]
 _FORGETTING = 8  # right ticks that make up for a wrong one: seldom wrong is stopped too, just later
 
 
@@ -42,6 +52,7 @@ class LinkSettings:
     late: float = 0.1  # part of late answers above which the coupling is too fast for the link
     missed: float = 0.2  # part of missing answers above which nothing is certified: mean-square stability ends there
     test_encoders: bool = True  # by a small force at every arming
+    held: bool = True  # hands may hold the handles meanwhile, so that a motion that is too small says nothing
     energy_budget: tuple[float, float] | None = None  # W0 and cap [J]
     rereference: bool = True  # positions count from where the handles are at arming
     deadman: bool = False  # forces act only while the deadman at the device is held
@@ -396,37 +407,195 @@ class CommandMonitor:
 # encoders: a hand that holds still looks like a cable that is off, but no hand is as stiff as a dead encoder
 
 
-class EncoderTest:
-    """A small force on every axis, up and down by turns and growing, until its encoder has moved by more than a count.
+class EncoderNoise:
+    """The noise of every encoder at rest, while no force acts.
 
-    A free handle of 0.25 kg answers an encoder of 10 um within 25 ms, at 0.1 N. Raises SafetyStop, naming the axis,
-    where 1 N, or as much as is allowed, was answered by nothing.
+    It is the least range of counts in 100 ms, so a person may move the handles as long as each of them rests once.
     """
 
-    def __init__(self, cap: Sequence[float], T: float) -> None:
-        self._cap, self._T = cap, T
-        self._band: list[list[int]] | None = None  # least and most counts of every axis
-        self._ticks = 0
+    def __init__(self, axes: int, T: float) -> None:
+        self._recent = [deque[int](maxlen=max(8, round(_REST / T))) for _ in range(axes)]
+        self.range = [0] * axes  # [counts] least in a window; before the first is full, nothing is known
+        self._known = [False] * axes
 
-    def force(self, counts: Sequence[int], ticks: int) -> tuple[float, ...] | None:
-        """Forces fed back (m,) [N], `ticks` after the call before; None once every encoder has answered."""
-        self._band = [[n, n] for n in counts] if self._band is None else self._band
-        for pair, n in zip(self._band, counts, strict=True):
-            pair[0], pair[1] = min(pair[0], n), max(pair[1], n)
-        dead = [i for i, (low, high) in enumerate(self._band) if high - low <= 1]
-        if not dead:
-            return None
-        t = self._ticks * self._T
-        if t > _TEST_SECONDS:
-            strongest = min(_TEST_FORCE, self._cap[dead[0]])
-            what = f"it moved by {self._band[dead[0]][1] - self._band[dead[0]][0]} counts at a test force of"
-            raise SafetyStop(f"encoder of axis {dead[0] + 1} does not follow: {what} up to {strongest:g} N")
-        size = _TEST_FORCE * t / _TEST_SECONDS * (-1 if int(t / _TEST_HALF) % 2 else 1)
+    def note(self, counts: Sequence[int]) -> None:
+        """Process the counts (m,) of a tick."""
+        for i, n in enumerate(counts):
+            recent = self._recent[i]
+            recent.append(n)
+            if len(recent) == recent.maxlen:
+                least = max(recent) - min(recent)
+                self.range[i] = min(self.range[i], least) if self._known[i] else least
+                self._known[i] = True
+
+    @property
+    def still(self) -> tuple[int, ...]:
+        """Counts within which an encoder stands still: 1 where there is no noise, since one channel may be broken.
+
+        Noise leaves twice the range of a tenth of a second in a longer one with a chance below 1e-6.
+        """
+        return tuple(1 if range_ <= 1 else 2 * range_ for range_ in self.range)
+
+
+class Expected:
+    """What the encoder of a free handle shows under a force: a mass, or a motor and a handle with a spring between."""
+
+    def __init__(self, device: Device, T: float) -> None:
+        """`device` is its model, T [s] the time for which a force is held."""
+        masses, link = list(device.bodies.values()), device.transmission or (0.0, 0.0)
+        n = len(masses)
+        a = np.zeros((2 * n + 1, 2 * n + 1))
+        a[:n, n : 2 * n] = np.eye(n)
+        a[n, n], a[n, 2 * n] = -device.damping / masses[0], 1 / masses[0]
+        if n == 2:
+            for column, value in ((0, link[1]), (2, link[0])):
+                spring = value * np.array([-1.0, 1.0])
+                a[2, column : column + 2] += spring / masses[0]
+                a[3, column : column + 2] -= spring / masses[1]
+        self.mass, self._friction, self._n = sum(masses), device.friction, n
+        self._held = np.asarray(scipy.linalg.expm(a * T))
+        self._state = np.zeros(2 * n + 1)
+
+    def rest(self) -> None:
+        """Begin at rest."""
+        self._state[:] = 0.0
+
+    def advance(self, force: float) -> float:
+        """Hold a force [N] for T and return the place [m] at its end."""
+        speed = self._state[self._n]
+        rubs = math.copysign(min(self._friction, abs(force)), speed or force) if self._friction else 0.0
+        self._state[-1] = force - rubs
+        self._state = self._held @ self._state
+        return float(self._state[0])
+
+
+class EncoderTest:
+    """A small force on one axis after the other, up and down by turns and growing, until its encoder has answered.
+
+    From rest, the work of a force on anything passive is positive. An encoder of which the work is negative has the
+    wrong sign, and one that stands still while another moves is swapped with that. The motion of a free handle is
+    known from its mass: one that is more than a factor of 2 larger has a wrong scale, and so has one that is
+    smaller, unless hands hold the handles. A drift from before the force is taken off.
+    """
+
+    def __init__(
+        self,
+        cap: Sequence[float],
+        T: float,
+        units: Units,
+        still: Sequence[int] | None = None,
+        expected: Sequence[Expected] | None = None,
+        held: bool = True,
+    ) -> None:
+        """`still` (m,) [counts] are within noise. Without `expected` (m,) no scale is tested."""
+        self._cap, self._T, self._units, self._expected, self._held = cap, T, units, expected, held
+        self._still = tuple(still or (1,) * len(cap))
+        self._axis = -1
+        self._last: State | None = None
+        self._begin(None)
+
+    def _begin(self, state: State | None) -> None:
+        """The next axis."""
+        self._axis, self._ticks, self._first = self._axis + 1, 0, state
+        self._drift = [0.0] * len(self._cap)  # [counts per tick] before the force
+        self._passed = 0  # ticks under the force
+        self._squares, self._before = 0.0, 0.0  # [N2] of the force's changes so far, and [N] the last force
+        m = len(self._cap)
+        self._moved = [0.0] * m  # [counts] beyond the drift
+        self._work = [0.0] * m  # [N counts] of the force on this axis at every encoder
+        self._least, self._most = ([0.0] * m for _ in range(2))  # [counts] of that
+        if self._expected and self._axis < m:
+            self._expected[self._axis].rest()
+        self._along = [0.0] * m  # [m2] sums of x x_free at every encoder
+        self._square = 0.0  # [m2] sum of x_free^2
+
+    def force(self, state: State, ticks: int) -> tuple[float, ...] | None:
+        """Forces fed back (m,) [N], `ticks` after the call before; None once every encoder has answered.
+
+        Raises SafetyStop, naming the axis, where an encoder answers in a wrong way, or not even to 1 N.
+        """
+        m, before = len(self._cap), max(1, round(_TEST_BEFORE / self._T))
+        if self._last is None or self._first is None:
+            self._first = state
+        elif self._ticks > before:
+            self._note(self._last, state, ticks)
+        self._last = state
+        if self._answered(self._axis) and self._wrong() is None:
+            self._begin(state)
+            if self._axis == m:
+                return None
         self._ticks += ticks
-        return tuple(
-            max(-cap, min(cap, size)) if i in dead else 0.0
-            for i, cap in zip(range(len(counts)), self._cap, strict=True)
-        )
+        if self._ticks <= before:
+            return (0.0,) * m
+        if self._passed == 0:
+            past = self._ticks - ticks
+            own = self._axis  # the others only have to tell a swap, and swing on for as long as they are tested
+            self._drift[own] = (state.counts[own] - self._first.counts[own]) / max(1, past)
+            self._first = state
+        t = (self._ticks - before - 1) * self._T
+        if t > _TEST_SECONDS:
+            raise SafetyStop(self._wrong() if self._answered(self._axis) else self._unanswered())
+        size = _TEST_FORCE * t / _TEST_SECONDS * (-1 if int(t / _TEST_HALF) % 2 else 1)
+        cap = self._cap[self._axis]
+        return tuple(max(-cap, min(cap, size)) if i == self._axis else 0.0 for i in range(m))
+
+    def _note(self, last: State, state: State, ticks: int) -> None:
+        """Process the motion from `last` to `state`, in which the force of `last` acted."""
+        axis, units = self._axis, self._units
+        assert self._first
+        pushed = last.applied[axis] * units.force_step[axis]
+        self._passed += ticks
+        self._squares += (pushed - self._before) ** 2
+        self._before = pushed
+        moved = [
+            n - n0 - self._passed * v for n, n0, v in zip(state.counts, self._first.counts, self._drift, strict=True)
+        ]
+        for i, (now, before) in enumerate(zip(moved, self._moved, strict=True)):
+            self._work[i] += pushed * (now - before)
+            self._least[i], self._most[i] = min(self._least[i], now), max(self._most[i], now)
+        self._moved = moved
+        if self._expected:
+            place = [self._expected[axis].advance(pushed) for _ in range(ticks)][-1]
+            self._square += place**2
+            for i, step in enumerate(units.encoder_step):
+                self._along[i] += moved[i] * step * place
+
+    def _answered(self, i: int) -> bool:
+        """Whether the work at encoder i is beyond what its rounding and noise can make of no motion at all."""
+        if self._passed * self._T < _TEST_HALF:  # by then a free handle is far enough for its scale to be told
+            return False
+        # sum F de errs by sum e dF; rounding has a deviation of 0.29 counts, noise a quarter of its range
+        doubt = 4 * max(0.29, self._still[i] / 4) * math.sqrt(self._squares + self._before**2)
+        return self._most[i] - self._least[i] > 2 * self._still[i] and abs(self._work[i]) > doubt
+
+    def _wrong(self) -> str | None:
+        """What is wrong with the answer of this axis; None where nothing is."""
+        name = f"axis {self._axis + 1}"
+        if self._work[self._axis] < 0:
+            return (
+                f"{name} has the wrong sign: a positive force moves it to negative counts. Reverse its motor or "
+                "encoder (or hold still, if a hand moved it)"
+            )
+        if not self._expected or not self._square:
+            return None
+        ratio, mass = self._along[self._axis] / self._square, self._expected[self._axis].mass
+        moved = f"{name} moves {ratio:.2g} times as far as a free handle of {mass:.3g} kg"
+        if ratio > _TEST_RATIO:
+            return f"{moved}: its encoder step, force step or mass is wrong"
+        if ratio < 1 / _TEST_RATIO and not self._held:
+            return f"{moved}: let go of it while arming (or say --held), or correct its steps or mass"
+        return None
+
+    def _unanswered(self) -> str:
+        """What to say of an axis whose encoder has not answered."""
+        axis = self._axis
+        follows = [self._answered(i) and abs(self._along[i]) > _SWAPPED * self._square for i in range(len(self._cap))]
+        other = [i + 1 for i, one in enumerate(follows) if one and i != axis]
+        if other and self._most[axis] - self._least[axis] <= self._still[axis]:
+            return f"a force on axis {axis + 1} moves encoder {other[0]}: axes are swapped"
+        strongest, moved = min(_TEST_FORCE, self._cap[axis]), self._most[axis] - self._least[axis]
+        what = f"it moved by {moved:.0f} counts at a test force of up to {strongest:g} N"
+        return f"encoder of axis {axis + 1} does not follow: {what}. Is its motor on?"
 
 
 class EncoderMonitor:
@@ -435,10 +604,16 @@ class EncoderMonitor:
     The handle that a changing force does not move by more than one count is held by nothing that lives: an encoder of
     which one channel is broken still toggles between two counts. What is compared is the force that the device says
     it applies, with the one at the last motion; a change of more than 1 N is summed up over time. A mass M that a
-    change F turns around stays within two counts of q for 4 sqrt(q M / F): a coarse encoder gets twice as long.
+    change F turns around stays within two counts of q for 4 sqrt(q M / F): a coarse encoder gets twice as long. Under
+    a force that does not change, of more than 0.3 N, no hand holds still for half a second: its tremor shows.
     """
 
-    def __init__(self, encoder_step: Sequence[float], force_step: Sequence[float], T: float) -> None:
+    def __init__(
+        self, encoder_step: Sequence[float], force_step: Sequence[float], T: float, still: Sequence[int] | None = None
+    ) -> None:
+        """`still` (m,) [counts] are within noise."""
+        self._still = tuple(still or (1,) * len(force_step))
+        self._quiet = [0.0] * len(force_step)  # [s] under a force without a motion
         self._encoder_step, self._force_step, self._T = encoder_step, force_step, T
         self._band: list[list[int]] | None = None
         self._reference = [0.0] * len(force_step)  # [N] at the last motion
@@ -449,10 +624,10 @@ class EncoderMonitor:
         if self._band is None:
             self._band = [[n, n] for n in counts]
         for i, (n, steps) in enumerate(zip(counts, applied, strict=True)):
-            force, band = steps * self._force_step[i], self._band[i]
-            if n > band[0] + 1 or n < band[1] - 1:
+            force, band, still = steps * self._force_step[i], self._band[i], self._still[i]
+            if n > band[0] + still or n < band[1] - still:
                 band[:] = n, n
-                self._reference[i], self._impulse[i] = force, 0.0
+                self._reference[i], self._impulse[i], self._quiet[i] = force, 0.0, 0.0
                 continue
             if n > band[1]:
                 band[1] = n
@@ -461,6 +636,16 @@ class EncoderMonitor:
             change = abs(force - self._reference[i])
             if change > _CHANGE:
                 self._impulse[i] += change * ticks * self._T
-            if self._impulse[i] > max(_IMPULSE, 8.0 * (self._encoder_step[i] * _HEAVIEST * change) ** 0.5):
-                still = f"it stands still while the force changes by {change:.3g} N"
-                raise SafetyStop(f"encoder of axis {i + 1} does not follow: {still}")
+            q = self._encoder_step[i] * still
+            if self._impulse[i] > max(_IMPULSE, 8.0 * (q * _HEAVIEST * change) ** 0.5):
+                doing = f"it stands still while the force changes by {change:.3g} N"
+                raise SafetyStop(f"encoder of axis {i + 1} does not follow: {doing}")
+            self._quiet[i] = self._quiet[i] + ticks * self._T if abs(force) > _PRESSING else 0.0
+
+    @property
+    def dead(self) -> str | None:
+        """What to say of an encoder that does not move although a force acts on it for long; None: there is none."""
+        for i, seconds in enumerate(self._quiet):
+            if seconds > _PRESSED:
+                return f"encoder or motor of axis {i + 1} is dead: nothing moves for {_PRESSED:g} s under a force"
+        return None

@@ -25,11 +25,11 @@ from haptic_loop.hw.limits import (
     probe_delay,
     watchdog_for,
 )
-from haptic_loop.hw.monitor import Ages, Counters, LinkMonitor, LinkSettings, Measurement
+from haptic_loop.hw.monitor import Ages, Counters, EncoderNoise, Expected, LinkMonitor, LinkSettings, Measurement
 from haptic_loop.sim.scenario import InputError, Scenario
 
 _PATIENCE_US = 2_000_000  # after which a question is given up
-_ARMING_US = 500_000  # in which a device must follow ARM
+_ARMING_US = 500_000  # for each axis, in which a device must follow ARM and its encoders be tested
 _QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
 _STOPPING_US = 50_000  # in which STOP is repeated to a device that says nothing
 _OBEYING_US = 30_000  # in which one that was told to stop must rest: the longest hold and ramp, and half as long again
@@ -75,6 +75,7 @@ class Session:
         self.missed_while_driving = 0  # ticks
         self.now = self.entered = self.heard = 0  # [us]
         self._units: Units | None = None
+        self._noise: EncoderNoise | None = None
         self._shutdown: _Shutdown | None = None
         self._after: Stage | None = Stage.FINISHED  # what a ramp-out ends in; None: with a softer coupling, disarmed
 
@@ -141,7 +142,9 @@ class Session:
             assert self.config
             arming = Arming(len(self.armings), self.program, self.config, self._fresh_budget(self.config))
             self.armings.append(arming)
-            self.drive = Drive(arming, self.units, self.limits, self.settings, self.counters, self.record)
+            assert self._noise
+            told = self.units, self.limits, self.settings, self.counters, self.record
+            self.drive = Drive(arming, *told, self._noise.still, _expected(self.scenario))
             self._enter(Stage.ARMING, "asked to")
         return ()
 
@@ -212,11 +215,13 @@ class Session:
             return self._shutdown.again(now) if self._shutdown else ()
         if self.stage in (Stage.CONNECTING, Stage.CONFIGURING):
             return self._no_answer() if now - self.entered > _PATIENCE_US else ()
-        if self.stage == Stage.ARMING and self.gain == 0 and now - self.entered > _ARMING_US:
-            return self._end(Stage.STOPPED, f"the device did not arm within {_ARMING_US // 1000} ms")
+        if self.stage == Stage.ARMING and self.gain == 0 and now - self.entered > _ARMING_US * self.scenario.channels:
+            return self._end(
+                Stage.STOPPED, f"the device did not arm within {_ARMING_US * self.scenario.channels // 1000} ms"
+            )
         silence = now - self.heard
         if silence > (self.limits.watchdog_us if self.stage in DRIVING else _QUIET_US) and self.stage != Stage.MEASURED:
-            return self._end(Stage.LOST, f"no new STATE for {silence / 1000:.1f} ms")
+            return self._end(Stage.LOST, f"no new STATE for {silence / 1000:.1f} ms: hung, or reset by a brown-out?")
         return ()
 
     def _no_answer(self) -> Said:
@@ -229,6 +234,7 @@ class Session:
         if reasons := self.limits.objections(info, self.scenario, self.settings.baud):
             return self._end(Stage.REFUSED, "; ".join(reasons))
         self.info, self._units = info, Units.of(info)
+        self._noise = EncoderNoise(info.axes, self.scenario.T)
         name = "".join(c if c.isprintable() else "?" for c in info.firmware) or "device"
         return self._configure(self.probe, f"{name} {info.serial}, to be measured")
 
@@ -272,6 +278,8 @@ class Session:
         if self.stage in DRIVING:
             ended = () if self.held else self.stop("the deadman at the device was let go", self.now)
             return ended or self._on_driving(state, ticks)
+        assert self._noise
+        self._noise.note(state.counts)
         if self.stage == Stage.MEASURING:
             return self._measure(state)
         return self._answer(state, wire.Command.IDLE)
@@ -297,6 +305,8 @@ class Session:
             self._log(f"positions count from where the handles are: {places} mm")
         if self.stage != Stage.DISARMING and (late := self.link.too_late()):
             self._soften(late)
+        if self.stage != Stage.DISARMING and (dead := self.drive.dead):
+            self._ramp_out(Stage.STOPPED, dead)
         if self.stage == Stage.ARMING and self.gain == 1.0:
             self._enter(Stage.ARMED, "full gain")
         if self.stage == Stage.DISARMING and self.gain == 0.0:
@@ -368,6 +378,11 @@ def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: flo
         raise wire.SafetyStop("the device has disarmed itself")
     if not armed and any(state.applied):
         raise wire.SafetyStop(f"the device is disarmed and applies {state.applied} steps")
+
+
+def _expected(scenario: Scenario) -> list[Expected]:
+    """What the free handles of a scenario's devices are expected to do."""
+    return [Expected(device, scenario.T) for device in scenario.device]
 
 
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:

@@ -15,6 +15,7 @@ from haptic_loop.controller.budget import BudgetFigures
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table, plain, write_json
 from haptic_loop.hw.control import CertifiedCoupling
+from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.protocol import NO_MARGIN
 from haptic_loop.hw.recording import Recipe, Recorder
 from haptic_loop.hw.session import Session
@@ -152,6 +153,11 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     step = list(session.units.encoder_step) if ticks else None
     ran = _Ran(ticks, ticks * T, T, session.scenario.digest, pace, step, steady)
     trace = recorder.trace(session.units, T, {"run": asdict(ran)}) if coupled and ticks else None
+    grown = growths(trace) if trace else []
+    stage, cause = str(session.stage), session.cause
+    if session.stage == Stage.FINISHED and (doubt := _doubt(session, grown, ticks)):
+        stage, cause = str(Stage.STOPPED), f"{cause}, but {doubt}"
+        log.append(_Event(log[-1].t_s, stage, cause))
     return SessionReport(
         case,
         session.scenario.name,
@@ -159,12 +165,23 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
         coupled and coupled.capped(session.limits.cap),
         coupled and coupled.link,
         coupled and coupled.remarks(),
-        _Ended(str(session.stage), session.cause, ticks > 0, log),
+        _Ended(stage, cause, ticks > 0, log),
         _Link.of(session, recorder, dropped),
         ran,
-        growths(trace) if trace else [],
+        grown,
         [arming.budget.figures() for arming in session.armings if arming.budget] or None,
     )
+
+
+def _doubt(session: Session, growths: list[Growth], ticks: int) -> str | None:
+    """Why a session that came to its end has not finished; None where forces acted as they were asked for."""
+    clipped = max(session.counters.clipped, session.counters.slowed)
+    if 2 * clipped > ticks > 0:
+        return f"{100 * clipped / ticks:.0f} % of its forces were cut: raise --force-cap, or ask for less"
+    for i, growth in enumerate(growths, start=1):
+        if growth.trend == "grows":
+            return f"an oscillation grew in arming {i}"
+    return None
 
 
 def _percentiles(values: np.ndarray) -> dict[str, float] | None:

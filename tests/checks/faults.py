@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from haptic_loop.hw.control import CertifiedCoupling, certified_couplings
-from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of
+from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
 from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.protocol import Info
@@ -54,6 +54,7 @@ class Fault:
     designed: bool = False  # the coupling for the measured delay, in place of one made beforehand
     counted: tuple[str, ...] = ()  # counters that must not be zero
     first_tick: int = 0
+    free: bool = False  # nobody holds the handles, and the session knows it
     deadman: bool = False  # forces act only while the device's own is held
     period: float = 1.0  # of the device's clock, in T
     lasts: float = _LASTS  # [s] after arming
@@ -188,6 +189,50 @@ CASES = (
         "@0.3",
         lasts=2.0,
     ),
+    # what the test at arming is for
+    *(
+        Fault(f"{what} of axis {axis} before", G.STOPPED, f"{axis} {cause}", (f"axis{axis}:{fault}",), _AT_ONCE)
+        for axis in (1, 2)
+        for what, fault, cause in (
+            ("reversed encoder", "reverse", "has the wrong sign"),
+            ("reversed motor", "motor=-1", "has the wrong sign"),
+            ("encoder scale 6", "scale=6", ".*"),
+            ("dead motor", "motor=0", "does not follow"),
+        )
+    ),
+    Fault("axes swapped before", G.STOPPED, "force on axis 1 moves encoder 2", ("swap",), _AT_ONCE),
+    Fault("axes swapped and reversed before", G.STOPPED, "encoder 2", ("swap", "reverse", "axis2:reverse"), _AT_ONCE),
+    *(
+        Fault(
+            f"{what} of axis {axis} before, free",
+            G.STOPPED,
+            f"axis {axis} {cause}",
+            (f"axis{axis}:{fault}",),
+            _AT_ONCE,
+            free=True,
+        )
+        for axis in (1, 2)
+        for what, fault, cause in (
+            ("reversed encoder", "reverse", "has the wrong sign"),
+            ("encoder scale 2.5", "scale=2.5", "moves 2.* times as far"),
+            ("encoder scale 0.4", "scale=0.4", "moves 0.* times as far"),
+            ("motor 2.5 times as strong", "motor=2.5", "moves 2.* times as far"),
+            ("motor 0.4 times as strong", "motor=0.4", "moves 0.* times as far"),
+        )
+    ),
+    *(
+        Fault(f"encoder noise of {counts} counts, axis {axis}", A, faults=(f"axis{axis}:noise={counts}",))
+        for axis in (1, 2)
+        for counts in (0.3, 0.5, 1.0)
+    ),
+    Fault("dead encoder with noise before", G.STOPPED, "axis 1 does not follow", ("freeze", "noise=0.5"), _AT_ONCE),
+    Fault(
+        "encoder with noise dies",
+        G.STOPPED,
+        "axis 1 does not follow|dead",
+        ("noise=0.5", *at("freeze noise=0.5")),
+        _DEAD,
+    ),
     Fault("e-stop at the device", G.ESTOP, "estop_device", at("estop"), _AT_ONCE),
     Fault("e-stop at the device before", G.REFUSED, "refuses the configuration: estop", ("estop",)),
     Fault("motor 1 gets hot", G.STOPPED, "motor 1 gets hot", within=1500.0, continuous=(0.2, 12.0), lasts=2.5),
@@ -247,6 +292,8 @@ class _FaultOutcome:
     fault: str
     stage: str
     cause: str
+    peak_force_n: float  # of any motor
+    peak_speed: float  # [m/s] of any handle
     zero_force_ms: float | None  # from the fault on; None: not asked, or forces go on
     allowed_ms: float | None
     wrong: tuple[str, ...]  # empty where it went as it must
@@ -273,18 +320,20 @@ def _lively(scenario: Scenario) -> Scenario:
 
 
 def _rehearse_case(
-    case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...]
+    case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...], free: bool = False
 ) -> tuple[Rehearsal, _FaultOutcome]:
-    """One case. `made` are couplings for a link of one tick, and softer ones."""
+    """One case, with nobody at the handles if `free`. `made` are couplings for a link of one tick, and softer ones."""
     info = info_of(scenario)
     cap = tuple(d.force_limit for d in scenario.device)
     session = Session(
         scenario,
-        SafetyLimits(cap, continuous=case.continuous, thermal=1.0),
-        LinkSettings(case.baud, _MEASURED, deadman=case.deadman),
+        SafetyLimits(cap, continuous=tuple(map(min, case.continuous, cap)), thermal=1.0),
+        LinkSettings(case.baud, _MEASURED, deadman=case.deadman, held=not case.free),
     )
     faults = tuple(FaultInjection.parse(text) for text in case.faults)
-    emulator = Emulator(scenario, faults, case.info(info) if case.info else info)
+    emulator = Emulator(
+        nobody(scenario) if free or case.free else scenario, faults, case.info(info) if case.info else info
+    )
     emulator.device.k = case.first_tick
     rehearsal = Rehearsal(
         session,
@@ -300,7 +349,9 @@ def _rehearse_case(
     to_zero = rehearsal.zero_after(_WHEN) if timed else None
     zero_ms = None if to_zero is None else 1e3 * to_zero
     wrong = tuple(_wrong(case, rehearsal, zero_ms))
-    return rehearsal, _FaultOutcome(case.name, str(session.stage), session.cause, zero_ms, case.within, wrong)
+    force = max((float(np.abs(m.applied).max()) for m in rehearsal.moments), default=0.0)
+    told = case.name, str(session.stage), session.cause, force, emulator.plant.fastest
+    return rehearsal, _FaultOutcome(*told, zero_ms, case.within, wrong)
 
 
 def _plan(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) -> Plan:
@@ -337,3 +388,37 @@ def _wrong(case: Fault, rehearsal: Rehearsal, zero_ms: float | None) -> list[str
         if session.stage not in ENDED:
             wrong.append("it could be armed again")
     return wrong
+
+
+_DEFAULT_CAP = 2.0  # [N] of hw.bridge
+_MOST_SPEED = 1.0  # [m/s] that no fault may exceed at a free handle
+
+
+def table() -> int:
+    """Print fault x (peak force, peak speed held and free, time to zero, verdict) at the default cap.
+
+    Returns the number of faults that end in a wrong verdict, or in which a free handle exceeds 1 m/s.
+    """
+    scenario = _lively(load())
+    limited = scenario.replace(
+        device=tuple(msgspec.structs.replace(d, force_limit=_DEFAULT_CAP) for d in scenario.device)
+    )
+    made, capped = (certified_couplings(s, "I", None, None, 1, spare=1) for s in (scenario, limited))
+    wrong = 0
+    print(f"{'fault':46s} {'peak N':>7s} {'held m/s':>8s} {'free m/s':>8s} {'zero ms':>8s}  verdict")
+    for case in CASES:
+        held = _rehearse_case(case, scenario, made)[1]
+        free = _rehearse_case(case, limited, capped, free=True)[1]
+        bad = [*held.wrong, *[f"free handle at {free.peak_speed:.2f} m/s"] * (free.peak_speed > _MOST_SPEED)]
+        wrong += bool(bad)
+        zero = "-" if held.zero_force_ms is None else f"{held.zero_force_ms:.1f}"
+        print(
+            f"{case.name[:46]:46s} {held.peak_force_n:7.2f} {held.peak_speed:8.2f} {free.peak_speed:8.2f} {zero:>8s}  "
+            f"{held.stage}{': ' + '; '.join(bad) if bad else ''}"
+        )
+    print(f"{len(CASES)} faults, {wrong} wrong")
+    return wrong
+
+
+if __name__ == "__main__":
+    raise SystemExit(table() > 0)

@@ -6,12 +6,16 @@ from runpy import run_path
 import numpy as np
 import pytest
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
-from haptic_loop.hw.limits import SafetyLimits, Stage
-from haptic_loop.hw.monitor import EncoderMonitor, EncoderTest, LinkSettings
-from haptic_loop.hw.protocol import SafetyStop
+from haptic_loop.hw.limits import SafetyLimits, Stage, Units
+from haptic_loop.hw.monitor import EncoderMonitor, EncoderNoise, EncoderTest, Expected, LinkSettings
+from haptic_loop.hw.protocol import Phase, SafetyStop, State
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Session
-from haptic_loop.sim.scenario import InputError
+from haptic_loop.models.device import RigidDevice
+from haptic_loop.models.hold import hold
+from haptic_loop.models.human import Human, Link
+from haptic_loop.models.scene import build
+from haptic_loop.sim.scenario import InputError, load
 from msgspec.structs import replace
 
 T = 1.2e-3
@@ -50,7 +54,7 @@ def test_both_dead_encoders_are_found_at_arming(scenario, rungs):
     assert "axis 1 does not follow" in session_with(scenario, rungs, "freeze", "axis2:freeze")[0].cause
 
 
-@pytest.mark.parametrize(("step", "most"), [(1e-6, 0.04), (1e-5, 0.1), (1e-4, 0.4)])
+@pytest.mark.parametrize(("step", "most"), [(1e-6, 0.13), (1e-5, 0.25), (1e-4, 0.8)])
 @pytest.mark.parametrize("held", [True, False])
 def test_live_encoders_answer_a_force_that_one_hardly_feels(scenario, rungs, step, most, held):
     """Newtons until encoders of 1 to 100 um have answered, held by the scenario's hands and free."""
@@ -59,31 +63,147 @@ def test_live_encoders_answer_a_force_that_one_hardly_feels(scenario, rungs, ste
     session = Session(still, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
     devices = tuple(replace(d, encoder_step=step) for d in still.device)
     session.record = lambda row: forces.append(row.test or (0.0, 0.0))
-    Rehearsal(session, Emulator(still.replace(device=devices)), lambda ages: rungs).run_until_armed(0.5)
+    Rehearsal(session, Emulator(still.replace(device=devices)), lambda ages: rungs).run_until_armed(0.8)
     assert session.stage == Stage.ARMED
     assert 0 < np.abs(forces).max() <= most
 
 
+def played(test, motion, ticks=400):
+    """Play a test to encoders with `motion`(k, applied so far) -> counts; what it asked for (ticks, m) [N]."""
+    forces, applied = [], []
+    for k in range(ticks):
+        counts = motion(k, np.array(applied).reshape(-1, 2))
+        last = tuple(round(f / STEP) for f in forces[-1]) if forces else (0, 0)
+        applied.append(last)
+        force = test.force(State(Phase.ARMED, k, k, 0, 0, 0, 0, counts, last), 1)
+        if force is None:
+            break
+        forces.append(tuple(-f for f in force))  # the wire carries -f
+    return np.array(forces)
+
+
+def masses(signs=(1, 1), scale=1.0, order=(0, 1), mass=0.25, q=1e-6):
+    """Two free masses under the applied forces, twice summed: independent of the model in the test."""
+
+    def motion(k, applied):
+        v = np.cumsum(applied * STEP / mass * T, axis=0)
+        x = np.vstack([np.zeros((1, 2)), np.cumsum(v * T, axis=0)])[-1]
+        return tuple(round(scale * signs[i] * x[order[i]] / q) for i in range(2))
+
+    return motion
+
+
+UNITS = Units((1e-6, 1e-6), (STEP, STEP), (10**6, 10**6))
+
+
+def arming_test(held=False, cap=12.0):
+    expected = [Expected(RigidDevice(mass=0.25, damping=1e-6), T) for _ in range(2)]
+    return EncoderTest((cap, cap), T, UNITS, None, expected, held)
+
+
+def test_axes_are_tested_one_after_another():
+    forces = played(arming_test(), masses())
+    assert not np.any(forces[:, 0] * forces[:, 1])
+    first, second = (np.flatnonzero(forces[:, i]) for i in (0, 1))
+    assert first.size > 0
+    assert first.max() < second.min()
+
+
 @pytest.mark.parametrize("cap", [0.05, 12.0])
 def test_the_test_force_alternates_grows_and_stays_within_the_cap(cap):
-    test, forces = EncoderTest((cap, cap), T), []
-    told = f"axis 2 does not follow: it moved by 1 counts at a test force of up to {min(1, cap):g} N"
-    ticks = iter(range(1000))
+    test, kept = arming_test(cap=cap), []
 
-    def play():
-        for k in ticks:
-            forces.append(test.force((k, k % 2), 1))
+    def still(k, applied):
+        kept.append(applied)
+        return (0, 0)
 
-    with pytest.raises(SafetyStop, match=told):
-        play()
-    moved, still = np.array(forces[2:]).T
-    assert not moved.any()
-    assert np.abs(still).max() == pytest.approx(min(1.0, cap), rel=0.01)
-    assert still.max() > 0 > still.min()
-    assert abs(still.sum()) < 0.5 * np.abs(still).sum()  # a free handle is not pushed away
+    with pytest.raises(SafetyStop, match=f"axis 1 does not follow: it moved by 0 counts .* up to {min(1, cap):g} N"):
+        played(test, still)
+    moved, other = (kept[-1] * STEP).T
+    assert not other.any()
+    assert np.abs(moved).max() == pytest.approx(min(1.0, cap), rel=0.02)
+    assert moved.max() > 0 > moved.min()
+    assert abs(moved.sum()) < 0.5 * np.abs(moved).sum()  # a free handle is not pushed away
+
+
+@pytest.mark.parametrize("held", [True, False])
+@pytest.mark.parametrize("axis", [1, 2])
+def test_a_wrong_sign_is_named_with_its_axis(axis, held):
+    signs = (-1, 1) if axis == 1 else (1, -1)
+    with pytest.raises(SafetyStop, match=f"axis {axis} has the wrong sign"):
+        played(arming_test(held), masses(signs))
+
+
+def test_swapped_axes_are_named():
+    with pytest.raises(SafetyStop, match="a force on axis 1 moves encoder 2: axes are swapped"):
+        played(arming_test(), masses(order=(1, 0)))
+
+
+@pytest.mark.parametrize(
+    ("scale", "held", "refused"),
+    [
+        *((1, False, False), (1.8, False, False), (0.55, False, False), (2.3, False, True), (0.45, False, True)),
+        *((2.3, True, True), (0.45, True, False)),
+    ],
+)
+def test_a_motion_twice_or_half_of_what_the_mass_predicts_is_refused(scale, held, refused):
+    if refused:
+        with pytest.raises(SafetyStop, match=r"axis 1 moves .* times as far as a free handle of 0\.25 kg"):
+            played(arming_test(held), masses(scale=scale))
+    else:
+        played(arming_test(held), masses(scale=scale))
+
+
+def test_the_expected_motion_is_that_of_the_exact_plant():
+    """Against the simulation's own matrices, of a motor and a handle, under a force that changes at every tick."""
+    device = load().device[0]
+    scene = build((device,), (Human((Link(0.0, 0.0, 0.0),)),), ())
+    held, s = hold(scene.plant, T), np.zeros(len(scene.plant.A))
+    expected, draw = Expected(device, T), np.random.default_rng(1)
+    for force in draw.normal(0.0, 0.3, 200):
+        s = held.A @ s + held.B @ np.concatenate([np.zeros(scene.outside), [-force]])
+        assert expected.advance(force) == pytest.approx(s[0], rel=1e-6, abs=1e-12)
+
+
+# noise
+
+
+@pytest.mark.parametrize("noise", [0.3, 0.5, 1.0])
+def test_noise_at_rest_widens_both_tests(scenario, rungs, noise):
+    """Live encoders with noise are armed; dead ones with the same noise are found, before and while forces act."""
+    alive, _ = session_with(scenario, rungs, f"axis1:noise={noise}", seconds=0.8)
+    assert alive.stage == Stage.ARMED
+    dead, _ = session_with(scenario, rungs, "axis1:freeze", f"axis1:noise={noise}")
+    assert (dead.stage, dead.cause[:36]) == (Stage.STOPPED, "encoder of axis 1 does not follow: i")
+    later, _ = session_with(
+        scenario, rungs, f"axis1:noise={noise}", "axis1:freeze@0.45", f"axis1:noise={noise}@0.45", seconds=2.0
+    )
+    assert later.stage == Stage.STOPPED
+    assert "axis 1" in later.cause
+
+
+def test_the_noise_is_the_least_range_in_a_tenth_of_a_second():
+    noise, draw = EncoderNoise(2, T), np.random.default_rng(2)
+    for k in range(400):
+        moving = 50 * k if k < 250 else 12_500
+        noise.note((round(moving + draw.normal(0.0, 0.5)), 7))
+    assert noise.range[1] == 0
+    assert 2 <= noise.range[0] <= 4
+    assert noise.still == (2 * noise.range[0], 1)
 
 
 # while forces act
+
+
+@pytest.mark.parametrize(("newton", "found"), [(0.5, True), (-0.5, True), (0.2, False)])
+def test_an_encoder_that_stands_still_under_a_constant_force_is_dead(newton, found):
+    monitor = EncoderMonitor((1e-6,), (STEP,), T)
+    for _ in range(round(0.45 / T)):
+        monitor.check((0,), (round(newton / STEP),), 1)
+    assert monitor.dead is None
+    for _ in range(round(0.1 / T)):
+        monitor.check((0,), (round(newton / STEP),), 1)
+    assert (monitor.dead == "encoder or motor of axis 1 is dead: nothing moves for 0.5 s under a force") == found
 
 
 @pytest.mark.parametrize("axis", [1, 2])

@@ -138,7 +138,7 @@ def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: Non
 def test_a_session_with_a_device_that_the_host_clocks(scenario, tmp_path):
     """Handshake, delay, certificate, forces, ramp, replay: the same session as over the serial link."""
     sdk = StandIn(scenario)
-    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * t)
+    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # still while it is armed
     session, recorder, (made,) = held_session(scenario, sdk)
     assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
     assert session.info.firmware == "omega.3"
@@ -257,7 +257,7 @@ def test_motors_that_saturate_are_a_fault_of_the_device(scenario):
 
 def test_the_emergency_stop_is_at_once(scenario):
     sdk = StandIn(scenario)
-    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * t)
+    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # still while it is armed
     held = []
 
     def watch(session):
@@ -285,7 +285,7 @@ def test_the_emergency_stop_is_at_once(scenario):
 def test_without_the_library_the_import_fails_with_one_clear_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "forcedimension_core", None)
     with pytest.raises(InputError) as error:
-        bridge.main(["--port", "force-dimension", "--arm", "--no-preflight"])
+        bridge.main(["--port", "force-dimension", "--arm", "--no-preflight", "--no-dead-man"])
     assert str(error.value).startswith(
         "--port force-dimension needs the Python package forcedimension_core and Force Dimension's SDK"
     )

@@ -87,7 +87,19 @@ def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
     """A session over a serial line, a report, a trace that replays bit by bit."""
     monkeypatch.chdir(tmp_path)
     for pace in PACES:
-        options = ["--arm", "--case", "I", "--duration", "0.1", "--measure", "60", "--pace", str(pace)]
+        options = [
+            "--arm",
+            "--no-dead-man",
+            "--held",
+            "--case",
+            "I",
+            "--duration",
+            "0.1",
+            "--measure",
+            "60",
+            "--pace",
+            str(pace),
+        ]
         with emulated(f"--pace={pace}") as path:
             code = bridge.main([*options, "--port", path, "--no-preflight", "--json", "-"])
         report = json.loads(capsys.readouterr().out)
@@ -117,7 +129,19 @@ def test_an_interrupt_while_forces_act_is_130_after_a_ramp(tmp_path, capsys, mon
     monkeypatch.setattr(IncidentLog, "update", update)
     for pace in PACES:
         sent = []
-        options = ["--arm", "--case", "I", "--duration", "20", "--measure", "60", "--pace", str(pace)]
+        options = [
+            "--arm",
+            "--no-dead-man",
+            "--held",
+            "--case",
+            "I",
+            "--duration",
+            "20",
+            "--measure",
+            "60",
+            "--pace",
+            str(pace),
+        ]
         with emulated(f"--pace={pace}") as path:
             code = bridge.main([*options, "--port", path, "--no-preflight", "--no-plot", "--json", "-"])
         report = json.loads(capsys.readouterr().out)
@@ -344,7 +368,9 @@ def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
         ([], "either --port PATH or --rehearse"),
         (["--rehearse", "--port", "x"], "either --port PATH or --rehearse"),
         (["--port", "/dev/null", "--fault", "drop"], "--fault is only with --rehearse"),
-        (["--port", "/nowhere", "--arm"], "--port /nowhere"),
+        (["--port", "/nowhere", "--arm", "--no-dead-man"], "--port /nowhere"),
+        (["--port", "/nowhere", "--arm"], "--deadman key needs a terminal"),
+        (["--port", "/nowhere", "--arm", "--no-dead-man", "--deadman", "device"], "--no-dead-man contradicts"),
         (["--rehearse", "--case", "none"], "no coupling"),
         (["--rehearse", "--baud", "5"], "--baud is 5, allowed are"),
         (["--rehearse", "--baud", "no"], "--baud is 'no', expected a whole number"),

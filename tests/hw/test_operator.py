@@ -55,7 +55,7 @@ def test_a_key_arms_a_disarmed_session_only(scenario, rungs):
     session = rehearsal.run(0.5)
     assert session.stage == Stage.DISARMED
     assert operator.press("a", session, session.now) == ()
-    rehearsal.run_until_armed(0.3)
+    rehearsal.run_until_armed(0.4)
     assert session.stage == Stage.ARMED
     begun = session.now
     while session.stage != Stage.DISARMING:

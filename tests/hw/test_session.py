@@ -234,7 +234,7 @@ def test_a_delay_that_the_protocol_cannot_carry_waits_in_the_host(scenario):
     controller = made.controller((12.0, 12.0))
     answers = np.array([controller.step((1e-3 * (k == 0), 1e-3 * (k == 0))) for k in range(4)])
     assert (answers != 0).tolist() == [[False, False], [True, False], [True, True], [True, True]]
-    session = rehearsal_of(scenario, [made]).run_until_armed(0.3)
+    session = rehearsal_of(scenario, [made]).run_until_armed(0.5)
     assert session.stage == Stage.ARMED
     assert session.config
     assert session.config.theta == made.link == 15
