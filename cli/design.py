@@ -195,7 +195,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
         switching=switching,
         delays=stored.switching.guarantee if stored.switching and stored.switching.proof else None,
         nearby=nearby,
-        best=best and _Best(limit, best.g, best.ladder),
+        best=best and _Best(limit, best.g, best.ladder, best.hurried),
         sdps=design.sdps,
         stored=stored,
         claim=design.own and design.own.said(assessment.requirements[design.condition]),
@@ -241,6 +241,7 @@ class _Best:
     bound: BoundBeside | None
     rendered_stiffness: float
     ladder: Sequence[Any]
+    ended_by_seconds: bool
 
     def rows(self) -> render.Rows:
         yield "bound", self.bound and self.bound.words
@@ -248,6 +249,7 @@ class _Best:
         yield "rendered stiffness", None if share is None else f"{share:.3f} of the environment's"
         rungs = (f"{rung.mismatch_db:.2f}{_why_left(rung)}" for rung in self.ladder)
         yield "ladder [dB]", ", ".join(rungs) or None
+        yield "ended by --seconds", "a larger basis may be better" if self.ended_by_seconds else None
         yield "last not taken", next((rung.left for rung in reversed(self.ladder) if rung.left), None)
         if missed := [rung.reason for rung in self.ladder if not (rung.proved or rung.left)]:
             yield "last not proved", missed[-1]

@@ -186,4 +186,4 @@ class Design(Chosen):
     wall_s: float = 0.0
     c: Sequence[Sequence[float]] | None = field(kw_only=True, default=None)  # of the limiter, where its search is long
     searched: Any = field(kw_only=True, default=None)  # design.worst_member.Searched, between the vertices of ranges
-    hurried: bool = field(kw_only=True, default=False)  # its clock ended it: more time may find a better
+    hurried: bool = field(kw_only=True, default=False)  # --seconds ended the search: more time may find a better one

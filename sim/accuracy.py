@@ -338,7 +338,8 @@ def _rms(values: Array) -> float:
 
 _CANDIDATES = ((EXPONENTIAL, 1), ("RK4", 1), ("RK4", 2), ("RK4", 4), ("RK4", 8), ("Euler", 1), ("Euler", 4))
 _MOST_COMPARED = 256  # substeps, where a refined run is the reference
-_MOST_CPU_S = 120.0  # [s] of all these runs together
+_EVALUATIONS = {"RK4": 4}  # of the dynamics in a step; the others take one
+_MOST_EVALUATIONS = 6e7  # in all runs of a refinement: two minutes, at 2e-6 s each
 _EVEN = 0.6
 _CONTRACTS = 0.7  # q above this is no convergence; then a few times the largest difference is what may be missed
 _FEW = 4.0
@@ -352,11 +353,16 @@ class EngineChoice:
     substeps: int
     position_relative_rms: float  # of the encoders' positions over the run, at most, as far as refining shows
     verdict_correct: bool  # whether the loop that it simulates has the exact loop's verdict
-    cpu_s: float  # of that run
+    cpu_s: float  # of that run: measured and shown, it decides nothing
 
     @property
     def name(self) -> str:
         return f"{self.integrator} x {self.substeps}"
+
+    @property
+    def cost(self) -> tuple[int, float]:
+        """The evaluations of the dynamics per tick; of as many, the setting of the smaller error counts as cheaper."""
+        return self.substeps * _EVALUATIONS.get(self.integrator, 1), self.position_relative_rms
 
 
 def compare_engines(
@@ -366,7 +372,7 @@ def compare_engines(
 
     With its walls, limits, encoder steps, varying delays and net; verdicts are of the loop without a net and with
     constant delays. Where something rubs the reference is refined until RK4 keeps `error`. Raises InputError where it
-    cannot, or not in two minutes, and where nothing moves. `progress` is that of each run.
+    cannot, or not with 60 million evaluations of the dynamics, and where nothing moves. `progress` is that of each run.
     """
     if not error > 0:
         raise InputError(f"--error is {error:g}, expected a positive relative error")
@@ -388,14 +394,14 @@ def compare_engines(
         own, cost = runs.get((name, n)) or _positions(simulation, ticks, "mujoco", name, n, progress)
         right = not disagree(exact_growth(linear), simulated_growth(linear, name, n))
         choices.append(EngineChoice(name, n, _apart(own, truth) + missed, right, cost))
-    return tuple(sorted(choices, key=lambda choice: choice.cpu_s))
+    return tuple(sorted(choices, key=lambda choice: choice.cost))
 
 
 def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
     """The cheapest setting with an error small enough and the right verdict. Raises InputError without one."""
     kept = [choice for choice in choices if choice.verdict_correct and choice.position_relative_rms <= error]
     if kept:
-        return min(kept, key=lambda choice: choice.cpu_s)
+        return min(kept, key=lambda choice: choice.cost)
     best = min(choices, key=lambda choice: choice.position_relative_rms)
     raise InputError(f"--error {error:g}: the nearest, {best.name}, is within {best.position_relative_rms:.1g}")
 
@@ -443,19 +449,20 @@ def _refined(
     runs["RK4", 1] = _positions(simulation, ticks, "mujoco", "RK4", 1, progress)
     _require_motion(runs["RK4", 1][0])
     while finest < _MOST_COMPARED:
-        (coarse, cheaper), finest = runs["RK4", finest], 2 * finest
-        fine, cost = runs["RK4", finest] = _positions(simulation, ticks, "mujoco", "RK4", finest, progress)
+        coarse, finest = runs["RK4", finest][0], 2 * finest
+        fine, _ = runs["RK4", finest] = _positions(simulation, ticks, "mujoco", "RK4", finest, progress)
         gaps.append(_apart(coarse, fine))
         missed = _missed(gaps)
         best = min(best, gaps[-1] + missed)
         if gaps[-1] + missed <= error:
             return fine, missed
         needed = min(max(2 * gaps[-1] / error, 1.0) * finest, _MOST_COMPARED)  # by a method of first order
-        seconds = 4 * needed / finest * (cost - cheaper)  # of n + n/2 + ... steps
-        if seconds > _MOST_CPU_S:
+        count = ticks * _EVALUATIONS["RK4"] * 2 * needed  # with n + n/2 + ... substeps
+        if count > _MOST_EVALUATIONS:
             raise InputError(
-                f"--error {error:g}: where devices rub it asks for RK4 with about {needed:.0f} substeps, {seconds:.0f} "
-                f"CPU s; allowed are {_MOST_CPU_S:g}: give a shorter --duration or a larger error"
+                f"--error {error:g}: where devices rub it asks for RK4 with about {needed:.0f} substeps, "
+                f"{1e-6 * count:.0f} million evaluations; allowed are {1e-6 * _MOST_EVALUATIONS:g} million: give a "
+                "shorter --duration or a larger error"
             )
     within = f"comes within {best:.1g}" if best < math.inf else "does not converge"
     raise InputError(f"--error {error:g}: RK4 {within} with up to {_MOST_COMPARED // 2} substeps")

@@ -351,12 +351,12 @@ def test_errors_that_nothing_keeps(scenario, error, message):
         cheapest(assemble(scenario, PUBLISHED["I"]), error, 100)
 
 
-def test_what_would_take_minutes_is_refused_after_two_runs(monkeypatch):
-    """The third would be one of the many that the first two foretell; seconds are those of a clock that is made up."""
-    clock = iter(np.cumsum([0.0, 2.0, 0.0, 3.0]))  # so that a run takes 1 s, and 1 s for each substep
-    monkeypatch.setattr("haptic_loop.sim.accuracy.time.process_time", lambda: float(next(clock)))
+def test_too_many_evaluations_are_refused_after_two_runs(monkeypatch):
+    """The third would be one of the many that the first two foretell: 100 ticks of 512 steps of 4 evaluations."""
+    monkeypatch.setattr("haptic_loop.sim.accuracy._MOST_EVALUATIONS", 2e5)
     moved = []
-    with pytest.raises(InputError, match="asks for RK4 with about 256 substeps, 512 CPU s; allowed are 120"):
+    words = r"asks for RK4 with about 256 substeps, 0 million evaluations; allowed are 0\.2 million"
+    with pytest.raises(InputError, match=words):
         compare_engines(assemble(RUBBING, PUBLISHED["I"]), 1e-12, 100, lambda done, ticks: moved.append((done, ticks)))
     assert moved.count((100, 100)) == 2
 
