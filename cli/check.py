@@ -26,7 +26,7 @@ from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import HERE, RANGES
 from haptic_loop.design.known_device import described
-from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, listed, switching_guarantee
+from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, listed, suffices, switching_guarantee
 from haptic_loop.design.worst_member import Searched, search, search_ranges
 from haptic_loop.sim.couplings import read_coupling
 from rich.table import Table
@@ -76,7 +76,7 @@ def main(argv: list[str]) -> int:
         anew = own is not None and not (stored.certificate and stored.certificate.condition == own.name)
         stored, verdict = _anew(stored, own) if own and anew else (stored, verify(stored, own))
     searched = _searched(stored, own) if verdict.proved else None
-    if searched and not searched.worst[0].ratio < 1:
+    if searched and not suffices(searched.worst[0].ratio):
         verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
     checked = _checked(stored, own, verdict, searched, time.perf_counter() - begin)
     if own and verdict.proved and own.name not in (*CONDITIONS, *KNOWN_CONDITIONS):

@@ -40,7 +40,7 @@ from haptic_loop.design.frequency import too_long
 from haptic_loop.design.guarantees import ANY, RANGES
 from haptic_loop.design.known_device import KNOWN_DEVICE, described
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
-from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Design, NotProved, Requirement
+from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Design, NotProved, Requirement, suffices
 from haptic_loop.design.transparency import BAND_HZ, Transparency, transparency
 from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
 
@@ -126,7 +126,7 @@ class SearchFigures:
     def of(cls, searched: Searched) -> SearchFigures:
         """Summarise a search."""
         worst = searched.worst[0]
-        return cls(searched.tried, worst.ratio, worst.member.name, not worst.ratio < 1, searched.ended)
+        return cls(searched.tried, worst.ratio, worst.member.name, not suffices(worst.ratio), searched.ended)
 
     def __str__(self) -> str:
         found = "[red]violated[/]" if self.violated else "no violation found"

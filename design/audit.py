@@ -26,7 +26,7 @@ from haptic_loop.design.frequency import sweeping, too_long
 from haptic_loop.design.guarantees import CAVEATS
 from haptic_loop.design.known_device import KNOWN_DEVICE, LeftOver, left_over
 from haptic_loop.design.own import place_of
-from haptic_loop.design.result import ConditionName, Requirement, listed, refusal
+from haptic_loop.design.result import GUARD, ConditionName, Requirement, listed, refusal, suffices
 from haptic_loop.design.worst_member import Progress
 
 # ----------------------------------------------------------------------------------------------------
@@ -137,11 +137,11 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Asked) -> _Stiffest:
         return requirement(loop, coupling.scaled(stiffness=scale), asked).ratio
 
     scale = _STIFFEST / K.max()
-    if ratio(scale) < 1:
+    if suffices(ratio(scale)):
         return _Stiffest(unknown, f"certified up to the stiffest K tried, {_STIFFEST:g} N/m")
     while scale * K.max() > _SOFTEST:
         softer = scale / _STEP
-        if ratio(softer) < 1:
+        if suffices(ratio(softer)):
             return _Stiffest(tuple((edge(ratio, softer, scale) * K).tolist()))
         scale = softer
     return _Stiffest(unknown, "no scale of K is certified beside this B")
@@ -216,19 +216,19 @@ def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int 
 
 
 def edge(ratio: _Ratio, inside: float, outside: float) -> float:
-    """The argument nearest `outside` at which the ratio is still below 1, to a relative EDGE."""
+    """Return the argument nearest `outside` at which the damping still suffices, to a relative EDGE."""
     from scipy.optimize import brentq  # slow to load, and seldom needed
 
-    if ratio(outside) < 1:
+    if suffices(ratio(outside)):
         return outside
 
     def above(x: float) -> float:
-        return float(np.clip(math.log(max(ratio(x), 1e-9)), -3, 3))
+        return float(np.clip(math.log(max(ratio(x), 1e-9) / (1 - GUARD)), -3, 3))
 
     root = cast(float, brentq(above, inside, outside, rtol=np.float64(_EDGE), xtol=_EDGE * inside))
     for back in _EDGE * 4.0 ** np.arange(12):
         x = root + back * (inside - root)
-        if ratio(x) < 1:
+        if suffices(ratio(x)):
             return float(x)
     return inside
 

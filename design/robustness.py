@@ -13,6 +13,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.design.result import suffices
 
 #: Of more environments than _FEW every _THIN-th frequency is looked at; only those that ask for the most there, or for
 #: next to it, are swept whole.
@@ -100,7 +101,7 @@ def robustness(
         ratio = condition.ratio(loops[name], coupling)
         if ratio > worst:
             worst, where = ratio, name
-    return Robustness(percent, worst, where, worst < 1)
+    return Robustness(percent, worst, where, suffices(worst))
 
 
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:

@@ -14,7 +14,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table, write
 from haptic_loop.design.guarantees import CAVEATS
-from haptic_loop.design.result import Chosen, Requirement
+from haptic_loop.design.result import GUARD, Chosen, Requirement
 from haptic_loop.sim.limit_cycles import UNDECIDED, Plan
 from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import MARGINAL
@@ -251,8 +251,10 @@ class MapReport:
 
 def _ratio(sweep: Sweep, drawn: Map, name: str) -> _Ratio:
     ratio = drawn.ratio[name]
-    contradicted = int(((ratio < 1) & (drawn.growth > MARGINAL)).sum()) if name != MODEL_KEPT else None
-    return _Ratio(ratio.reshape(drawn.grid.shape), int((ratio < 1).sum()), contradicted, _nulls(sweep, drawn, name))
+    contradicted = int(((ratio < 1 - GUARD) & (drawn.growth > MARGINAL)).sum()) if name != MODEL_KEPT else None
+    return _Ratio(
+        ratio.reshape(drawn.grid.shape), int((ratio < 1 - GUARD).sum()), contradicted, _nulls(sweep, drawn, name)
+    )
 
 
 def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:

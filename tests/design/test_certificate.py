@@ -507,3 +507,17 @@ def test_a_long_delay_is_proved_stored_and_read_again(tmp_path):
     kept = Stored.of(loop, soft, prove(loop, soft, "this-environment"))
     save(kept, tmp_path / "late.json")
     assert load(tmp_path / "late.json").loop.theta == (1, 101)
+
+
+# the edge
+
+
+@pytest.mark.parametrize("condition", ["this-environment", "any-environment"])
+@pytest.mark.parametrize("theta", [(0, 0), (1, 2)])
+@pytest.mark.parametrize(("room", "certified"), [(0.0, False), (1e-15, False), (-1e-15, False), (1e-6, True)])
+def test_all_the_damping_is_never_enough(condition, theta, room, certified):
+    """No condition certifies at equality, where rounding alone would decide."""
+    loop = msgspec.structs.replace(PAIR, theta=theta, lam=theta)
+    need = required_damping(loop, SOFT, condition).required
+    edge = msgspec.structs.replace(loop, delta=tuple(each * (1 + room) for each in need))
+    assert required_damping(edge, SOFT, condition).certified is certified
