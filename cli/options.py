@@ -307,9 +307,11 @@ def _delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
     """'1,2' as one range for all channels, '1-2,0-3' as one per channel [samples]."""
     parts = _parts(text, int, expected := "LO,HI or LO-HI,LO-HI,.. in whole samples", "-")
     if [len(part) for part in parts] == [1, 1]:
-        return ((parts[0][0], parts[1][0]),)
+        parts = [(parts[0][0], parts[1][0])]
     if any(len(part) != 2 for part in parts):
         raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
+    if any(not 0 <= lo <= hi for lo, hi in parts):
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected 0 <= LO <= HI")
     return tuple((lo, hi) for lo, hi in parts)
 
 

@@ -127,9 +127,16 @@ def read(path: str | Path, named: str | None = None, most: int = _MOST_STORED, h
     named = str(path) if named is None else named
     with _opened(path, named, hint) as file:
         content = file.read(most + 1)
+    if content is None:  # a file of the kernel's that would wait for more, such as /proc/kmsg
+        raise InputError(f"{named}: has nothing to read, expected a file with content")
     if len(content) > most:
         raise InputError(f"{named}: is larger than {most / 1e6:g} MB, which is the most")
     return content
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a file so that no read waits, as that of /proc/kmsg would without end; regular files are read as always."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 @contextmanager
@@ -145,7 +152,7 @@ def _opened(path: str | Path, named: str, hint: str = "") -> Iterator[BinaryIO]:
             if option := _met(places, ledger.named):
                 raise InputError(f"{named}: is also the file of {option}; name another one there")
             ledger.read |= dict.fromkeys(places, named)
-        file = path.open("rb")
+        file = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  closed below
     except OSError as error:
         raise InputError(f"{named}: {error.strerror or error}{hint}") from None
     except InputError:

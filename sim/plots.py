@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from haptic_loop.controller.lti import Array
-from haptic_loop.design.files import printable, write
+from haptic_loop.design.files import InputError, printable, write
 from haptic_loop.design.guarantees import ANY
 from haptic_loop.design.result import CONDITIONS
 from haptic_loop.sim.trace import Trace
@@ -65,10 +65,20 @@ def _entries(axis: Axes) -> dict[str, Any]:
     return dict(zip(labels, handles, strict=True))
 
 
+_FORMATS = (".png", ".pdf", ".svg")
+
+
 def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
-    """The figure as a PNG, its texts taken literally; whole or not at all."""
+    """Write the figure in the format of the suffix, with its texts taken literally; the file is complete or absent.
+
+    Raises:
+        InputError: The suffix is none of .png, .pdf and .svg.
+    """
+    kind = Path(path).suffix.lower()
+    if kind not in _FORMATS:
+        raise InputError(f"picture {path}: the suffix is {kind!r}, allowed are {', '.join(_FORMATS)}")
     _literal(figure)
-    return write(path, lambda file: figure.savefig(file, format="png", dpi=dpi))
+    return write(path, lambda file: figure.savefig(file, format=kind[1:], dpi=dpi))
 
 
 def _literal(figure: Figure) -> None:

@@ -200,6 +200,7 @@ def _octaves(x: Array, T: float) -> tuple[Array, Array, Array]:
 # ---- how fast an oscillation grows
 
 _WINDOW = 1.0  # [s] at most
+_LEAST_SAMPLES = 10  # in a window
 _WINDOWS = 7  # in the second half of such a part, each half over the next, at least
 _NEEDED = 4  # of them, one after the other, that an oscillation is seen in
 _SHORTEST = 200  # ticks
@@ -244,6 +245,10 @@ def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
     n, stop = len(x), first + len(x)
     if n < _SHORTEST:
         return Growth(first, stop, reason=f"only {n} ticks; a growth rate needs {_SHORTEST}")
+    if T > _WINDOW / _LEAST_SAMPLES:
+        return Growth(
+            first, stop, reason=f"ticks of {T:g} s; a growth rate needs {_WINDOW / _LEAST_SAMPLES:g} s or less"
+        )
     begin = n // 2
     while not (lines := _lines(x[begin:], T, encoder_step)).found and n - begin >= 2 * _SHORTEST:
         begin = (begin + n) // 2

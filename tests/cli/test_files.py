@@ -3,6 +3,8 @@
 import errno
 import os
 import stat
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -47,3 +49,12 @@ def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path):
         write(path, content)
     assert path.read_text() == "old"
     assert sorted(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(not Path("/proc/kmsg").exists(), reason="a file of Linux")
+def test_files_that_would_wait_end_in_an_error():
+    """Reading /proc/kmsg would wait for the kernel's next message."""
+    code = "from haptic_loop.sim.scenario import load\nload('/proc/kmsg')"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 1
+    assert "InputError" in ended.stderr.splitlines()[-1]

@@ -196,3 +196,11 @@ def test_no_trace_of_a_random_loop_says_the_opposite_of_its_eigenvalues():
     assert found[11].not_excited
     assert found[11].exact_per_s > 100
     assert sum(row.not_excited for row in found) < 8 < sum(row.exact_per_s > 0 for row in found)
+
+
+@pytest.mark.parametrize("T", [0.11, 0.25, 0.6, 1.0, 1e3, 1e300])
+def test_ticks_too_long_for_a_window_give_a_reason(T):
+    x = np.sin(np.arange(400) / 7)[:, None]
+    found = growth(x, T, np.array([1e-9]))
+    assert found.growth_rate_per_s is None
+    assert "a growth rate needs 0.1 s or less" in found.words(T)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from haptic_loop.design.files import InputError
 from haptic_loop.design.result import CONDITIONS
 from haptic_loop.sim import map_plot, plots
 from haptic_loop.sim.trace import Trace
@@ -279,3 +280,19 @@ def test_a_map_of_an_environment_shows_what_was_designed_for(drawn):
 def test_lines_are_told_apart_without_colours():
     styles = [str(style["linestyle"]) for style in plots.STYLES]
     assert len(set(styles)) == len(styles)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "begin"), [("png", b"\x89PNG"), ("pdf", b"%PDF-"), ("svg", b"<?xml"), ("PDF", b"%PDF-")]
+)
+def test_a_picture_has_the_format_of_its_suffix(suffix, begin, tmp_path):
+    f = np.sin(np.arange(2000) / 20)[:, None]
+    path = plots.plot_run(trace(f), tmp_path / f"a.{suffix}", "t", 8.0)
+    assert path.read_bytes().startswith(begin)
+
+
+@pytest.mark.parametrize("name", ["a", "a.jpg", "a.pn"])
+def test_other_suffixes_of_pictures_are_refused(name, tmp_path):
+    with pytest.raises(InputError, match=r"the suffix is .*allowed are \.png, \.pdf, \.svg"):
+        plots.plot_run(trace(np.zeros((2000, 1))), tmp_path / name, "t", 8.0)
+    assert not list(tmp_path.iterdir())
