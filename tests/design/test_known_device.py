@@ -705,3 +705,53 @@ def test_periods_that_vary_lose_no_lossless_hand():
             product = np.linalg.multi_dot([steps[i] for i in pattern])
             worst = max(worst, np.abs(np.linalg.eigvals(product)).max())
     assert worst < 1 + 1e-9
+
+
+def pushed_and_limited(loop, delta, coupling, stiffness, limit, drawn, ticks=4000):
+    """Simulate lossless hands before a one-sided wall whose force is limited, from a speed of the hand, delay 0.
+
+    Return the energy of motor, transmission and hand at each tick, (ticks, hands). A limiter of rho = 0 before a spring
+    is a clip of the force that solves spring-damper and wall together.
+    """
+    (device,), T, n = loop.known_devices, loop.T, len(drawn)
+    m, k, b = device.motor_mass_min, device.transmission_stiffness_max, device.transmission_damping_max
+    mass = np.stack([np.full(n, m), drawn[:, 0, 0]], axis=1)
+    S = np.zeros((n, 2, 2)) + k * np.array([[1, -1], [-1, 1]])
+    S[:, 1, 1] += drawn[:, 0, 1]
+    D = b * np.array([[1, -1], [-1, 1]]) + np.diag([delta, 0.0])
+    G = np.zeros((n, 5, 5))
+    G[:, :2, 2:4], G[:, 2:4, :2], G[:, 2:4, 2:4], G[:, 2, 4] = (
+        np.eye(2),
+        -S / mass[..., None],
+        -D / mass[..., None],
+        -1 / m,
+    )
+    held = expm(G * T)[:, :4]
+    gain, rate = coupling.K[0] + coupling.B[0] / T, coupling.B[0] / T
+    s, across, energy = np.zeros((n, 4)), np.zeros(n), np.zeros((ticks, n))
+    s[:, 3] = np.sqrt(2 * 0.05 / mass[:, 1])  # 50 mJ
+    for t in range(ticks):
+        free = stiffness * (s[:, 0] - rate * across / gain) / (1 + stiffness / gain)
+        f = np.clip(free, 0.0, limit)
+        across = (f + rate * across) / gain
+        s = np.einsum("nij,nj->ni", held, np.concatenate([s, f[:, None]], axis=1))
+        energy[t] = (mass * s[:, 2:] ** 2).sum(axis=1) / 2 + np.einsum("ni,nij,nj->n", s[:, :2], S, s[:, :2]) / 2
+    return energy
+
+
+def test_walls_and_the_limiter_come_free_before_any_environment():
+    """Under known-device-any at 1.01 no lossless hand gains energy at a limited one-sided wall; at a tenth some do."""
+    T, rng = 1e-3, np.random.default_rng(4)
+    loop, coupling = one(T, 1.0), SpringDamper([3500.0], [5.0])
+    needed = required_damping(loop, coupling, "known-device-any").ratio
+    assert needed < 0.5 * required_damping(loop, coupling, "any-environment").ratio
+    drawn = ladders(rng, 300, 1, T)
+    grown = {}
+    for share in (1.01, 0.1):
+        energy = np.concatenate(
+            [pushed_and_limited(loop, share * needed, coupling, 10.0**p, 8.0, drawn) for p in (3, 4, 6)], axis=1
+        )
+        early, late = energy[1000:2000].max(axis=0), energy[3000:].max(axis=0)
+        grown[share] = int((late > early * (1 + 1e-6)).sum())
+    assert grown[1.01] == 0
+    assert grown[0.1] > 0
