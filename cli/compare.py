@@ -194,10 +194,15 @@ def _guarantees(report: Comparison) -> Table:
         if i == 0:
             cells["at 10 %"] = lambda c: _robust(c.nearby.robustness, scale)
     cells |= {
-        "sup dB": lambda c: render.optional(finite(c.transparency.mismatch_db), "{:.2f}", "-inf"),
-        "rms dB": lambda c: render.optional(finite(c.transparency.rms_mismatch_db), "{:.2f}", "-inf"),
+        "sup dB": lambda c: _mismatch(c, "mismatch_db"),
+        "rms dB": lambda c: _mismatch(c, "rms_mismatch_db"),
     }
     return render.columns(title, cells, report.couplings)
+
+
+def _mismatch(coupling: ComparedCoupling, of: str) -> str:
+    figures = coupling.assessment.transparency
+    return "-" if figures is None else render.optional(finite(getattr(figures, of)), "{:.2f}", "-inf")
 
 
 def _binds(part: ConditionCurve) -> str:

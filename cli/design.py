@@ -45,7 +45,10 @@ def main(argv: list[str]) -> int:
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
     report = _reported(args, loop, design, assessment, stored)
-    render.publish(args, report, _tables(scenario, report), verdict=verdicts.verdict(assessment, report.nearby))
+    said = verdicts.verdict(assessment, report.nearby)
+    if _is_useless(assessment):
+        said += " [red]Useless[/]: the coupling renders next to nothing."
+    render.publish(args, report, _tables(scenario, report), verdict=said)
     return options.exit_code(assessment.holds)
 
 
@@ -209,12 +212,17 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
 _USELESS = f"useless: {SOFTEST:g} N/m is the softest that the search tries, and it renders next to nothing"
 
 
+def _is_useless(assessment: Assessment) -> bool:
+    """Whether every spring is as soft as the search goes."""
+    return "K" in assessment.gains and max(assessment.gains["K"]) < 1.001 * SOFTEST
+
+
 def _assessment_rows(assessment: Assessment) -> render.Rows:
     gains, end = assessment.gains, f"{STIFFEST:g} N/m is where the search ends, no optimum of its own"
     if "K" in gains:
         yield "K [N/m]", listed(gains["K"])
         yield "", end if max(gains["K"]) > 0.999 * STIFFEST else None
-        yield "", _USELESS if max(gains["K"]) < 1.001 * SOFTEST else None
+        yield "", _USELESS if _is_useless(assessment) else None
         yield "B [N s/m]", listed(gains["B"])
     yield "stiffness, static [N/m]", listed(gains["stiffness"]) if "stiffness" in gains else None
     yield from render.certificate_rows(assessment.requirements, proof=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -51,17 +51,19 @@ class Curves:
     demands: dict[str, Array | None] = field(metadata={"json": "left out"})  # (k,) required over available damping
 
 
-def judge(loop: Loop, coupling: Coupling, own: Sequence[Condition] = ()) -> Demands:
+def judge(
+    loop: Loop, coupling: Coupling, own: Sequence[Condition] = (), known: Mapping[str, Requirement] | None = None
+) -> Demands:
     """Every condition of a coupling, as figures and over frequency; F while all walls touch. Raises SingularLoop.
 
-    `own` are conditions of the user's.
+    `own` are conditions of the user's; `known` are requirements of an assessment of this loop and coupling.
     """
-    F = loop.F(coupling)
+    F, known = loop.F(coupling), known or {}
     here = loop.at(loop.environment).switching(None)
     requirements: dict[str, Requirement] = {}
     demands: dict[str, Response | None] = {}
     for each in (*map(named, CONDITIONS), *own):
-        needs = requirements[each.name] = each.judge(here, coupling)
+        needs = requirements[each.name] = known.get(each.name) or each.judge(here, coupling)
         curve = each.over_frequency(here, coupling, needs.multiplier) if np.isfinite(needs.ratio) else None
         demands[each.name] = curve
     return Demands(F, requirements, demands)

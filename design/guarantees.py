@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.conditions import encoder_friction
-from haptic_loop.design.result import MAKING, Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # What may be said of a coupling: required against available damping, for which environments, and what is left out.
 
 
 ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
-
-
-_FROZEN = "each frozen contact state of this environment (with ranges, contact that makes and breaks is not covered)"
 
 
 #: What no certificate covers.
@@ -28,21 +24,6 @@ CAVEATS = (
     "not for periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
     "friction pays for, velocity filters or friction compensation."
 )
-
-
-def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_ranges: bool = False) -> str | None:
-    """The environments for which a coupling is certified, by its requirements; None where it is certified for none.
-
-    The multiplier that any-environment takes for psi >= 1 is of one environment. `whole_ranges`: this-environment is
-    proved at every vertex of the loop's ranges, and a search has found no violation between them.
-    """
-    held = [requirement.guarantee for requirement in requirements.values() if requirement.certified]
-    if ANY in held:
-        return ANY
-    if whole_ranges or RANGES in held:
-        return RANGES
-    found = next((words for words in held if words), None)
-    return _FROZEN if found == MAKING and not making_covered(loop) else found
 
 
 @dataclass(frozen=True)
@@ -72,12 +53,3 @@ class EncoderSteps:
         verdict = "are covered while forces stay below the limits" if covered else "are not covered"
         enough = f"friction of {amounts} N is enough for {widths} um, the devices declare {has} N"
         return cls(*given, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")
-
-
-# ----------------------------------------------------------------------------------------------------
-# A coupling in every environment of ranges: what the this-environment condition asks at each vertex of ranges.
-
-
-def making_covered(loop: Loop) -> bool:
-    """Whether this-environment covers walls that make and break contact: in one environment, not over ranges."""
-    return bool(loop.environment.walls) and not loop.ranges

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.design import compare
+from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table
 from haptic_loop.design.optimal import nearby as nearby_with_price
 from haptic_loop.design.result import CONDITIONS, Chosen, Requirement
 from haptic_loop.design.robustness import Nearby, robustness_nearby
-from haptic_loop.design.transparency import Transparency, transparency
+from haptic_loop.sim.couplings import assessed
 from haptic_loop.sim.scenario import Scenario
 
 
@@ -40,16 +40,18 @@ class ComparedCoupling:
     """One coupling, with all that the pictures show of it."""
 
     name: str
+    kind: str
     states: int
-    transparency: Transparency
+    assessment: Assessment
     nearby: Nearby = off_table("inlined")
     curves: compare.Curves = off_table("inlined")
-    kind: str = off_table()
-    gains: dict[str, Any] = off_table("inlined")
-    conditions: dict[str, ConditionCurve] = off_table("inlined")
+    conditions: dict[str, ConditionCurve] = off_table()
 
     @classmethod
-    def of(cls, loop: Loop, name: str, chosen: Chosen, judged: compare.Demands, hz: Array) -> ComparedCoupling:
+    def of(
+        cls, loop: Loop, name: str, chosen: Chosen, assessment: Assessment, judged: compare.Demands, hz: Array
+    ) -> ComparedCoupling:
+        """Draw the curves of one coupling in `loop` at the frequencies `hz` (k,)."""
         curves, conditions = compare.curves(loop, judged, hz), {}
         for key, requirement in judged.requirements.items():
             demand, reason = curves.demands[key], requirement.reason
@@ -58,12 +60,11 @@ class ComparedCoupling:
             conditions[key] = ConditionCurve(requirement, requirement.ratio, demand, reason)
         return cls(
             Path(name).name,
+            chosen.kind,
             judged.F.order,
-            transparency(judged.F, loop.E(), loop.lam),
+            assessment,
             nearby(loop, chosen.coupling),
             curves,
-            chosen.kind,
-            chosen.coupling.figures(loop.T),
             conditions,
         )
 
@@ -98,9 +99,16 @@ class Comparison:
         """Of the couplings chosen, by name; `failed` says what could not be designed."""
         loop = scenario.loop(case)
         own = {c.condition: c.own for c in chosen.values() if c.own}
-        judged = {name: compare.judge(loop, c.coupling, [*own.values()]) for name, c in chosen.items()}
+        alone = scenario.replace(ranges=None) if scenario.ranges else scenario  # the nominal environment is drawn
+        assessments = {name: assessed(alone, case, c) for name, c in chosen.items()}
+        judged = {
+            name: compare.judge(loop, c.coupling, [*own.values()], assessments[name].requirements)
+            for name, c in chosen.items()
+        }
         hz = compare.grid(loop, list(judged.values()))
-        couplings = [ComparedCoupling.of(loop, name, c, judged[name], hz) for name, c in chosen.items()]
+        couplings = [
+            ComparedCoupling.of(loop, name, c, assessments[name], judged[name], hz) for name, c in chosen.items()
+        ]
         notes = [
             *(f"{name}: {note}" for name, c in chosen.items() for note in c.remarks(judged[name].requirements)),
             *failed,

@@ -9,8 +9,8 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.certificate import named
 from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import ANY, MAKING, EncoderSteps
-from haptic_loop.design.result import Chosen
+from haptic_loop.design.guarantees import ANY, EncoderSteps
+from haptic_loop.design.result import MAKING, Chosen
 from haptic_loop.design.robustness import Nearby
 from haptic_loop.sim import accuracy
 from haptic_loop.sim.api import ScenarioRun

@@ -18,7 +18,7 @@ from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.controller.tick import Process
 from haptic_loop.design.audit import audit, requirement
 from haptic_loop.design.certificate import prove, requirements_of
-from haptic_loop.design.guarantees import MAKING
+from haptic_loop.design.result import MAKING
 from haptic_loop.models.device import CompliantDevice
 from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Population

@@ -5,6 +5,7 @@ import json
 import msgspec
 import pytest
 from haptic_loop.cli.audit import main as audit
+from haptic_loop.cli.compare import main as compare
 from haptic_loop.cli.run import main as run
 from haptic_loop.cli.validate import main as validate
 from haptic_loop.controller.coupling import SpringDamper
@@ -174,6 +175,10 @@ def test_one_wall_has_one_requirement(tmp_path, monkeypatch):
         command([*words, *more])
         report = json.loads((tmp_path / "r.json").read_text())
         assert needs(report, "this-environment")["required_damping"] == pytest.approx(expected, rel=1e-9)
+    given_to = ["--scenario", "one-wall", "--coupling", "wall.json", "--no-plot", "--json", "r.json", "--out", "out"]
+    compare(given_to)
+    (compared,) = json.loads((tmp_path / "r.json").read_text())["couplings"]
+    assert needs(compared, "this-environment")["required_damping"] == pytest.approx(expected, rel=1e-9)
     judged = comparison.judge(loop, coupling)
     assert judged.requirements["this-environment"].required == pytest.approx(expected, rel=1e-9)
 

@@ -133,11 +133,13 @@ def test_the_command_writes_pictures_and_curves(tmp_path, capsys):
     assert "published" in stderr
     assert [c["name"] for c in outcome["couplings"]] == ["none", "published"]
     published = outcome["couplings"][1]
-    assert published["this-environment"]["required_damping"][0] == pytest.approx(1.398716, abs=2e-6)
-    assert published["this-environment"]["demand"][0] < published["this-environment"]["ratio"]
+    assert published["conditions"]["this-environment"]["required_damping"][0] == pytest.approx(1.398716, abs=2e-6)
+    assert (
+        published["conditions"]["this-environment"]["demand"][0] < published["conditions"]["this-environment"]["ratio"]
+    )
     assert len(published["sigma_M"]) == len(outcome["frequency_hz"]) == len(published["perceived"]["damping"])
-    assert outcome["couplings"][0]["any-environment"]["demand"] is None
-    assert outcome["couplings"][0]["any-environment"]["reason"]
+    assert outcome["couplings"][0]["conditions"]["any-environment"]["demand"] is None
+    assert outcome["couplings"][0]["conditions"]["any-environment"]["reason"]
     assert json.loads((out / "report.json").read_text())["couplings"] == outcome["couplings"]
     for name in ("singular-values", "required-damping", "perceived"):
         assert (out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"

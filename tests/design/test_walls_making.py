@@ -17,8 +17,7 @@ from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.exact import find_storage
-from haptic_loop.design.guarantees import MAKING
-from haptic_loop.design.result import NotProved
+from haptic_loop.design.result import MAKING, NotProved
 from scipy.linalg import expm
 
 change = msgspec.structs.replace
