@@ -5,7 +5,8 @@
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on, and the slow pages: half an hour
 # make mutate  small mistakes in what verdicts rest on, and whether a test notices: about ten minutes
-# make kernels  the numerical tests under every kernel of OpenBLAS that this processor runs, and a table: an hour
+# make kernels  six designs under load, on one core and twice at once, byte by byte; then the numerical tests under every
+#   kernel of OpenBLAS that this processor runs, and a table: an hour
 # make oldest  the tests of models, blocks and files with the oldest packages that pyproject.toml allows, in .venv-oldest
 # make installed  the wheel in an empty environment, run beside a user's own models/, sim.py and cli.py
 # make figures  the pictures that README and docs show, and the output in their blocks
@@ -40,6 +41,7 @@ mutate: .venv/ready
 	$(PY) tests/mutate.py
 
 kernels: .venv/ready
+	$(PY) tests/tools/same_designs.py
 	$(PY) tests/tools/kernels.py
 
 # links from one folder, by which pyright finds haptic_loop.sim in the folder sim

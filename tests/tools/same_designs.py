@@ -1,0 +1,98 @@
+"""Design the same couplings under different conditions of the machine, and compare the stored files byte for byte.
+
+    python tests/tools/same_designs.py           six designs: idle, under load, on one core, twice at once (ten minutes)
+    python tests/tools/same_designs.py --quick   two designs: under load and on one core
+
+Exit code 1 if a file differs. Designs run through the public command, so each file is what a user stores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from hashlib import sha256
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+LOOPS = ROOT / "tests" / "loops"
+QUICK = {
+    "n3": ("--scenario", str(LOOPS / "n3-free1.toml"), "--coupling", "optimal"),
+    "n3 with ranges": ("--scenario", str(LOOPS / "n3-free1.toml"), "--coupling", "optimal", "--ranges", "10"),
+}
+DESIGNS = {
+    "case I": ("--case", "I", "--coupling", "optimal"),
+    "case II": ("--case", "II", "--coupling", "optimal"),
+    "n2 with ranges": ("--scenario", str(LOOPS / "n2-lab31.toml"), "--coupling", "optimal", "--ranges", "10"),
+    "n5": ("--scenario", str(LOOPS / "n5-three-psi1.toml"), "--coupling", "optimal"),
+    "o03, gains": ("--scenario", str(LOOPS / "o03-slow-sampling.toml"), "--condition", "this-environment"),
+    "o12, limiter": ("--scenario", str(LOOPS / "o12-free-mass-late.toml"), "--coupling", "optimal", "--limiter"),
+}
+
+
+def begun(words: tuple[str, ...], out: Path, core: int | None = None) -> subprocess.Popen[bytes]:
+    """Start a design that stores its coupling in `out`, on one core if `core` says which."""
+    command = [sys.executable, "-m", "design", *words, "--out", str(out)]
+    pinned = None if core is None else (lambda: os.sched_setaffinity(0, {core}))
+    return subprocess.Popen(command, cwd=ROOT, preexec_fn=pinned, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+
+def stored(process: subprocess.Popen[bytes], out: Path) -> bytes:
+    """The file of a design, once it has ended. Raises RuntimeError if it stored none."""
+    _, error = process.communicate()
+    if not out.exists():
+        raise RuntimeError(f"{' '.join(map(str, process.args))}\n{error.decode()}")
+    return out.read_bytes()
+
+
+@contextmanager
+def busy(count: int) -> Iterator[None]:
+    """Keep this many processes busy, which end with the block."""
+    with ExitStack() as stack:
+        for _ in range(count):
+            process = stack.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
+            stack.callback(process.kill)
+        yield
+
+
+def files(words: tuple[str, ...], folder: Path, quick: bool) -> dict[str, bytes]:
+    """What the design stores under each condition of the machine."""
+    found = {}
+
+    def once(name: str, core: int | None = None) -> None:
+        out = folder / f"{name}.json"
+        found[name] = stored(begun(words, out, core), out)
+
+    core = min(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else None
+    if not quick:
+        once("idle")
+    with busy(2 if quick else 8):
+        once("under load")
+    once("on one core", core)
+    if not quick:
+        outs = [folder / f"twice-{i}.json" for i in range(2)]
+        both = [begun(words, out) for out in outs]
+        found |= {f"at once, {i + 1}": stored(one, out) for i, (one, out) in enumerate(zip(both, outs, strict=True))}
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    quick, differ = parser.parse_args().quick, False
+    for name, words in (QUICK if quick else DESIGNS).items():
+        with tempfile.TemporaryDirectory() as folder:
+            found = files(words, Path(folder), quick)
+        same = len(set(found.values())) == 1
+        differ |= not same
+        digests = ", ".join(f"{how}: {sha256(data).hexdigest()[:12]}" for how, data in found.items())
+        print(f"{name}: {'the same bytes' if same else 'DIFFERENT BYTES'} ({digests})", flush=True)
+    return int(differ)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
