@@ -22,7 +22,7 @@ run: .venv/ready
 	$(PY) -m sim.run --case I
 
 test: .venv/ready
-	$(PY) -m pytest $(PARALLEL)
+	$(PY) -m pytest $(PARALLEL) --ignore=tests/benchmarks
 
 check: .venv/ready build/typed
 	@export CHECK_UNTIL=$$(($$(date +%s) + 50)); set -ex; \
