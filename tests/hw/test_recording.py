@@ -249,7 +249,7 @@ def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, 
     assert part["growth_rate_per_s"] == pytest.approx(exact.growth, abs=2e-3)
     assert part["frequency_hz"] == pytest.approx(exact.frequency_hz, abs=1.0)
     assert part["trend"] == "grows"
-    bridge._print_session(report, Console(width=200))
+    bridge._print_session(report, Console(width=200), details=False)
     assert re.search(r"growth at full gain, arming 1, ticks \d+ to \d+ .*: \+1.48", capsys.readouterr().out)
 
 

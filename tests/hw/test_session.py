@@ -358,7 +358,7 @@ def test_forces_at_the_cap_are_limited_under_the_guarantee_and_replay(scenario, 
     session.record = recorder
     Rehearsal(session, Emulator(scenario), lambda ages: rungs).run_until_armed(2.0)
     report = outcome("I", session, recorder, 0)
-    assert report.program.limiter.words.startswith("proved, also while forces are limited to 0.3, 0.2 N")
+    assert report.assessment.force_limits.words.startswith("proved, also while forces are limited to 0.3, 0.2 N")
     asked = np.abs(recorder.link()["asked"])
     assert (asked <= (0.3, 0.2)).all()
     assert (asked == (0.3, 0.2)).any(axis=1).mean() > 1 / 3

@@ -20,7 +20,7 @@ SAYS = {
     "neural_environment": [
         r"budget 1e\+09 J: limited 0 of 5000",
         r"budget 0.01 J: limited [34]\d{3} of 5000",
-        "holds for any passive environment",
+        "behind a coupling certified for any environment",
         "no passive hand is given more than 0.01 J",
     ],
     "simulate_and_plot": [r"no coupling: growth \+1.48. 1/s at 84.0 Hz", "designed coupling: growth -0.848 1/s"],

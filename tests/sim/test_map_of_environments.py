@@ -150,7 +150,7 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
     assert zwidth.main([*OPTIONS, "--out", str(tmp_path)]) == DONE
     report, text = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
     assert report["axes"] == "environment"
-    assert report["coupling"]["kind"] == "optimal"
+    assert report["kind"] == "optimal"
     assert report["assessment"]["guarantee"]["environments"] == "this environment"
     assert report["assessment"]["requirements"]["this-environment"]["proof"] == "rational"
     assert report["conditions"] == ["this-environment", "any-environment"]
