@@ -514,6 +514,9 @@ class KnownDevice(Condition):
         if reason := self.without(coupling):
             return refusal(self.name, loop.delta, reason)
         loops, m = self._loops(loop), loop.channels
+        if multiplier is not None and len(multiplier) != 3 * m:
+            reason = f"the multiplier has {len(multiplier)} numbers, expected beta and two bounds of q for {m} channels"
+            return refusal(self.name, loop.delta, reason)
         plain = [self.plain.required(each, coupling) for each in loops]
         hardest = max(range(len(loops)), key=lambda i: plain[i].ratio)
         most = plain[hardest]

@@ -495,6 +495,10 @@ def test_a_file_proves_it_again_and_forgeries_are_refused():
     for name, factor in (("beta", 3.0), ("q_below", 1.001), ("q_above", 0.999)):
         first, *others = known[name]  # another beta, q below that is too large, q above that is too small
         assert not forged(multipliers=known | {name: (first * factor, *others)}).proved
+    first, last = known["beta"]
+    for spoiled in ((first,), (first, last, last), (0.0, last), (-first, last), (1e30, last)):
+        assert not forged(multipliers=known | {"beta": spoiled}).proved
+    assert not forged(multipliers={"beta": known["beta"]}).proved
     assert not forged(required=(0.5, 0.5), margin=2.74).proved
     assert not forged(condition="this-environment", matrices={"P": certificate.matrices["P"]}).proved
     lighter = change(DEVICE, motor_mass_min=0.05)
@@ -755,3 +759,17 @@ def test_walls_and_the_limiter_come_free_before_any_environment():
         grown[share] = int((late > early * (1 + 1e-6)).sum())
     assert grown[1.01] == 0
     assert grown[0.1] > 0
+
+
+def test_every_device_within_the_bounds_is_covered():
+    """Heavier motors, softer and more or less damped transmissions, more motor damping: no lossless hand grows."""
+    T, rng = 1e-3, np.random.default_rng(11)
+    bounds = DeviceBounds(0.05, 12000.0, 0.4, 1.5)
+    loop, F = one(T, 1.0, 1, bounds), wall(800.0, 0.6, 1, T)
+    needed = required(F, loop, this_environment(F, loop.delta).ratio)
+    for _ in range(40):
+        mass, k = 0.05 * np.exp(rng.uniform(0, 3)), 12000.0 * np.exp(-rng.uniform(0, 3))
+        b, more = np.exp(rng.uniform(np.log(0.4), np.log(1.5))), np.exp(rng.uniform(0, 1))
+        member = one(T, 1.0, 1, DeviceBounds(mass, k, b, b))
+        drawn = ladders(rng, 120, int(rng.integers(1, 3)), T)
+        assert radii(F, member, 1.01 * more * needed, drawn).max() < 1 + 1e-9
