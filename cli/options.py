@@ -536,16 +536,6 @@ def _rows(
 # Running a command.
 
 
-def until_interrupted(rows: Iterable[_Given]) -> tuple[list[_Given], bool]:
-    """The rows that were finished, and whether Ctrl-C ended the work."""
-    done: list[_Given] = []
-    try:
-        done.extend(rows)
-    except KeyboardInterrupt:
-        return done, True
-    return done, False
-
-
 def exit_code(holds: bool, interrupted: bool = False) -> int:
     """The exit code of a command that has printed its report."""
     return INTERRUPTED if interrupted else DONE if holds else DOES_NOT_HOLD

@@ -37,7 +37,7 @@ from haptic_loop.design.transparency import BAND_HZ, decibels
 _GRID = 250  # points, even and even in the logarithm, on which H is given
 _KNOTS = {1: 60, 2: 40, 3: 24, 4: 20, 5: 16}  # of h, by channels
 MOST = max(_KNOTS)  # channels for which there is a bound
-NO_BOUND = f"no bound for more than {MOST} devices: half a minute for one that is 1 dB off"
+_NO_BOUND = f"no bound for more than {MOST} devices: half a minute for one that is 1 dB off"
 _NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the ends of the band
 _NEAR_MODE = 1.0  # of the width of a mode, from it: further knots
 _CLOSEST = 0.1  # of a step: nearer knots are one
@@ -325,7 +325,7 @@ class BoundBeside:
         cls, loop: Loop, best: Design, reached_db: float, band_hz: tuple[float, float], asked: Options
     ) -> BoundBeside:
         if loop.channels > MOST:
-            return cls(reason=NO_BOUND)
+            return cls(reason=_NO_BOUND)
         if best.objective == 0:
             return cls(reason="the mismatch is zero: there is nothing to bound")
         least = bound(loop, band_hz)

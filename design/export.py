@@ -43,7 +43,7 @@ class _Signal:
     size: float  # of a test vector's numbers, in that unit
 
 
-FORCE = _Signal("f", "force [N]", 1.0)
+_FORCE = _Signal("f", "force [N]", 1.0)
 _DISPLACEMENT = _Signal("x", "displacement [m]", 1e-3)
 _GIVEN_WAY = _Signal("d", "displacement [m]", 1e-3)
 
@@ -78,7 +78,7 @@ def coupling_block(stored: Stored) -> ExportedBlock:
     if V is None:
         raise NothingToExport("this coupling is no V in feedback around the environment; the whole process can be had")
     about = ("d = V f: what the coupling gives way by. In its loop the environment sees u = x - d, and f = Psi E u.",)
-    return ExportedBlock("coupling", _with_a_state(V), FORCE, _GIVEN_WAY, about)
+    return ExportedBlock("coupling", _with_a_state(V), _FORCE, _GIVEN_WAY, about)
 
 
 def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence[float] | None = None) -> ExportedBlock:
@@ -98,7 +98,7 @@ def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence
         "f = F x: the whole discrete process; the devices get -f, held for T. Forces are not limited here.",
         delays,
     )
-    return ExportedBlock("process", _with_a_state(loop.F(stored.built())), _DISPLACEMENT, FORCE, about)
+    return ExportedBlock("process", _with_a_state(loop.F(stored.built())), _DISPLACEMENT, _FORCE, about)
 
 
 def _limited_block(stored: Stored, loop: Loop, force_limit: Sequence[float], delays: str) -> ExportedBlock:
@@ -111,7 +111,7 @@ def _limited_block(stored: Stored, loop: Loop, force_limit: Sequence[float], del
         f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead, and the certificate holds there.",
         delays,
     )
-    return ExportedBlock("process", limiter.open, _DISPLACEMENT, FORCE, about, limiter)
+    return ExportedBlock("process", limiter.open, _DISPLACEMENT, _FORCE, about, limiter)
 
 
 def _with_a_state(system: Lti) -> Lti:

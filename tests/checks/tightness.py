@@ -8,13 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from haptic_loop.controller.coupling import Coupling, NoCoupling
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.environments import THIS_ENVIRONMENT
-from haptic_loop.sim import plots
 from haptic_loop.sim.adversary import Worst, search
 from haptic_loop.sim.couplings import choose
 from haptic_loop.sim.scenario import Scenario, load
@@ -88,23 +86,3 @@ def shortages(
 #: from a seed: at short delays, and at long ones
 usual = partial(shortages, couplings=("none", "spring-damper"), short=(0, 0.01, 0.02, 0.05, 0.1, 0.2), generations=25)
 delayed = partial(shortages, couplings=("none",), short=(0, 0.002, 0.005, 0.01, 0.02), generations=40, theta=(4, 9))
-
-
-def plot_tightness(rows: Sequence[Shortage], path: Path) -> Path:
-    """Growth rate with the first destabilising human found, over the share of the required damping that was missing."""
-    figure, axes = plots._panels("", 1, 1, (7, 4.2))
-    axis = axes[0, 0]
-    for name, style in zip(dict.fromkeys(row.loop for row in rows), plots.STYLES, strict=False):
-        mine = [row for row in rows if row.loop == name]
-        points = [(100 * row.short, row.growth_rate_per_s if row.found else 0.0) for row in mine]
-        axis.plot(*zip(*points, strict=True), label=name, **style)
-        for row, point in zip(mine, points, strict=True):
-            axis.plot(*point, "^" if row.found else "o", color=style["color"])
-    axis.plot([], [], "k^", label="unstable with the human found")
-    axis.plot([], [], "ko", label="no such human found")
-    axis.set(
-        xlabel="damping missing of what the condition for this environment requires [%]",
-        ylabel="growth with the first human found [1/s]",
-    )
-    axis.legend()
-    return plots.save(figure, path)
