@@ -7,33 +7,58 @@ and latencies within [t1, t2].
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Self
 
-from haptic_loop.hw.device_state import Device
+from haptic_loop.hw.device_state import RUNNING, Device
 from haptic_loop.hw.emulator import info_of
 from haptic_loop.hw.haptic_device import PortLost
-from haptic_loop.hw.protocol import NO_MARGIN, Ack, Config, Decoder, Force, Info, Phase, Reason, State, Stop, encode
+from haptic_loop.hw.protocol import (
+    NO_MARGIN,
+    Ack,
+    Config,
+    Decoder,
+    Force,
+    Info,
+    Phase,
+    Reason,
+    SafetyStop,
+    State,
+    Stop,
+    encode,
+)
 from haptic_loop.sim.scenario import InputError, Scenario
 
 FORCE_DIMENSION = "force-dimension"  # in place of a port
-_BINDINGS = "forcedimension_core.dhd"
+_PACKAGE = "forcedimension_core"
 _SATURATED = 2  # what setForce says of motors that cannot
 _WATCHDOG = 160  # times 125 us: after 20 ms without a force the device drops it by itself, where it can
 _SPIN = 2e-4  # [s] before a tick that are waited for awake: a sleep ends late
 _SHORTEST = 0.75  # of T, that a period after a late one may be
 
 
+class _Library:
+    """The calls of the package, of which some are in a module for experts; they give -1 for an error."""
+
+    def __init__(self) -> None:
+        self._modules = import_module(f"{_PACKAGE}.dhd"), import_module(f"{_PACKAGE}.dhd.expert")
+        self.Status = import_module(f"{_PACKAGE}.containers").Status
+        self.ForceOffCause = import_module(f"{_PACKAGE}.constants").ForceOffCause
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(next((m for m in self._modules if hasattr(m, name)), self._modules[0]), name)
+
+
 def library() -> Any:
-    """The package, which needs the maker's library; its calls give -1 for an error. Raises InputError without them."""
+    """Load the package, which needs the maker's library. Raises InputError without them."""
     try:
-        return import_module(_BINDINGS)
+        return _Library()
     except ImportError as error:
-        package = _BINDINGS.split(".")[0]
-        what = f"the Python package {package} and Force Dimension's SDK (https://www.forcedimension.com)"
+        what = f"the Python package {_PACKAGE} and Force Dimension's SDK (https://www.forcedimension.com)"
         raise InputError(f"--port {FORCE_DIMENSION} needs {what}: {error}") from None
 
 
@@ -57,14 +82,18 @@ class ForceDimension:
         self._where = _axes(axes, scenario.channels)
         self._sdk = sdk or library()
         self._clock, self._sleep, self._begun = clock, sleep, clock()
-        self._ids: dict[int, int] = {}
-        for index in dict.fromkeys(index for index, _ in self._where):
-            if (ID := self._sdk.openID(index)) < 0:
-                raise InputError(f"--port {FORCE_DIMENSION}: device {index}: {self._sdk.errorGetLastStr()}")
-            self._ids[index] = ID
+        self._ids: dict[str, int] = {}
+        for name in dict.fromkeys(name for name, _ in self._where):
+            sdk = self._sdk
+            ID = sdk.openSerial(int(name[2:])) if name.startswith("sn") else sdk.openID(int(name))
+            if ID < 0:
+                raise InputError(f"--port {FORCE_DIMENSION}: device {name}: {sdk.errorGetLastStr()}")
+            self._ids[name] = ID
+        self._status = {index: self._sdk.Status() for index in self._ids}
         first = next(iter(self._ids.values()))
         name = (self._sdk.getSystemName(ID=first) or "Force Dimension").encode("ascii", "replace").decode()[:16]
         self._info = info_of(scenario)._replace(firmware=name, serial=max(0, self._sdk.getSerialNumber(ID=first)))
+        self._sdk.enableExpertMode()  # which the watchdog needs
         self.guarded = {self._sdk.setWatchdog(_WATCHDOG, ID=ID) for ID in self._ids.values()} == {0}
         self._device, self._decoder = Device(self._info), Decoder()
         self._T = 1e-9 * self._info.period_ns
@@ -80,7 +109,8 @@ class ForceDimension:
         self._device.ack = b""
         assert isinstance(ack, Ack)
         if not ack.refused:
-            for ID in self._ids.values():
+            for index, ID in self._ids.items():
+                self._heeded(self._sdk.setMaxForce(self._strongest(config, index), ID=ID))
                 self._heeded(self._sdk.enableForce(True, ID=ID))
             self._write(self._device.zero)
         return ack.refused
@@ -95,6 +125,8 @@ class ForceDimension:
             self._sleep(left - _SPIN if left > 2 * _SPIN else 0.0)
         now = self._clock()
         self._due = max(self._due, now - (1 - _SHORTEST) * self._T) + self._T
+        if self._device.phase in RUNNING:
+            self._check_status()
         before = self._device.applied
         _, out = self._device.tick(self._now(), self._counts())
         if self._device.applied != before or force is None:
@@ -126,6 +158,28 @@ class ForceDimension:
         steps = zip(self._where, self._info.encoder_step, strict=True)
         return tuple(round(places[index][axis] / (1e-12 * step)) for (index, axis), step in steps)
 
+    def _strongest(self, config: Config, index: str) -> float:
+        """The length of the largest force [N] that a device may be asked for, with some room for rounding."""
+        each = zip(self._where, config.cap, self._info.force_step, strict=True)
+        return 1.01 * math.sqrt(sum((1e-6 * cap * step) ** 2 for (own, _), cap, step in each if own == index))
+
+    def _check_status(self) -> None:
+        """Raise SafetyStop where a device has an error, was reset or has switched its forces off."""
+        for index, ID in self._ids.items():
+            status = self._status[index]
+            self._heeded(self._sdk.getStatus(status, ID=ID))
+            troubles = {
+                "has no power": not status.power,
+                "is not connected": not status.connected,
+                "is in reset mode: calibrate it": status.reset,
+                f"reports error {status.error}": status.error,
+            }
+            if not status.force:
+                cause = self._sdk.ForceOffCause(status.forceoffcause).name.lower()
+                troubles[f"has switched its forces off, cause {cause}"] = 1
+            if wrong := next((words for words, there in troubles.items() if there), None):
+                raise SafetyStop(f"device {index} {wrong}")
+
     def _write(self, steps: tuple[int, ...]) -> None:
         forces = {index: [0.0, 0.0, 0.0] for index in self._ids}
         for (index, axis), n, step in zip(self._where, steps, self._info.force_step, strict=True):
@@ -140,16 +194,16 @@ class ForceDimension:
         return code
 
 
-def _axes(text: str | None, channels: int) -> list[tuple[int, int]]:
-    """Device index and axis of every channel. Raises InputError."""
+def _axes(text: str | None, channels: int) -> list[tuple[str, int]]:
+    """Device, by its index or "sn" and its serial number, and axis of every channel. Raises InputError."""
     parts = text.split(",") if text else [f"{i}x" for i in range(channels)]
-    if len(parts) != channels or not all(re.fullmatch(r"\d+[xyz]", part) for part in parts):
+    if len(parts) != channels or not all(re.fullmatch(r"(sn)?\d+[xyz]", part) for part in parts):
         example = ",".join(f"{i}x" for i in range(channels))
         raise InputError(
             f"--port {FORCE_DIMENSION}:{text}: expected a device's index and an axis for each of {channels} channels, "
             f"as in {FORCE_DIMENSION}:{example}"
         )
-    found = [(int(part[:-1]), "xyz".index(part[-1])) for part in parts]
-    if len(set(found)) != channels:
+    chosen = [(part[:-1], "xyz".index(part[-1])) for part in parts]
+    if len(set(chosen)) != channels:
         raise InputError(f"--port {FORCE_DIMENSION}:{text}: two channels have the same axis")
-    return found
+    return chosen

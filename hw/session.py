@@ -532,7 +532,11 @@ class Driver:
                 self.do(session.configured(answer, self.clock()))
         else:
             force, self._force = self._force, None
-            if (state := self.device.exchange(force)) is not None:
+            try:
+                state = self.device.exchange(force)
+            except wire.SafetyStop as fault:
+                return self.do(session.fail(str(fault), self.clock()))
+            if state is not None:
                 self.do(session.take(state, self.clock()))
         return None
 

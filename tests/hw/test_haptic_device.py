@@ -1,7 +1,7 @@
 """The four calls of a device: the Force Dimension SDK by a stand-in that plays a device, and the serial link."""
 
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -84,6 +84,20 @@ class StandIn:
     def close(self, ID):
         self.open.remove(ID)
         return 0
+
+    def enableExpertMode(self):
+        return 0
+
+    def setMaxForce(self, limit, ID):
+        self.limits = {**getattr(self, "limits", {}), ID: limit}
+        return 0
+
+    def getStatus(self, out, ID):
+        return 0
+
+    @staticmethod
+    def Status():
+        return SimpleNamespace(power=1, connected=1, reset=0, error=0, force=1, forceoffcause=0)
 
     def getSystemName(self, ID):
         return "omega.3"

@@ -1,0 +1,102 @@
+"""The adapter through the published package, with a C stub in the place of the maker's shared library."""
+
+import importlib.util
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = importlib.util.find_spec("forcedimension_core")
+pytestmark = pytest.mark.skipif(PACKAGE is None, reason="forcedimension-core is not for this Python")
+
+SESSION = """
+import ctypes, json, sys
+from haptic_loop.hw.force_dimension import ForceDimension, library
+from haptic_loop.hw.protocol import Command, Config, Force, SafetyStop
+from haptic_loop.sim.scenario import load
+stub, sdk, now = ctypes.CDLL(sys.argv[1]), library(), [0.0]
+stub.stub_force.restype = stub.stub_limit.restype = ctypes.c_double
+
+def clock():
+    now[0] += 1e-6
+    return now[0]
+
+def sleep(seconds):
+    now[0] += max(seconds, 0.0)
+
+said = {}
+with ForceDimension(load(), "sn4712x,0y", sdk, clock, sleep) as device:
+    info = device.info()
+    said |= {"serial": info.serial, "name": info.firmware, "guarded": device.guarded}
+    said["refused"] = device.configure(Config(0, 4, 5, 0, (5000, 2500), (5000, 5000)))
+    state, command = device.exchange(None), Command.ARM
+    for k in range(6):
+        force = (0, 0) if k < 2 else (1000, -500)
+        state = device.exchange(Force(Command.ARM if k < 2 else Command.RUN, state.tick, state.tick, force))
+    said["forces"] = [stub.stub_force(1, 0), stub.stub_force(0, 1)]
+    said["limits"] = [stub.stub_limit(1), stub.stub_limit(0)]
+    said["watchdogs"] = [stub.stub_watchdog(0), stub.stub_watchdog(1)]
+    for index, value in ((3, 1), (9, 7), (0, 0), (5, 0)):
+        stub.stub_status(1, index, value)
+        try:
+            device.exchange(Force(Command.RUN, state.tick, state.tick, (0, 0)))
+            said[index] = None
+        except SafetyStop as fault:
+            said[index] = str(fault)
+        stub.stub_status(1, index, int(index in (0, 5)))
+said["after"] = [stub.stub_force(1, 0), stub.stub_force(0, 1)]
+print(json.dumps(said))
+"""
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """What a session through the real binding says."""
+    folder = tmp_path_factory.mktemp("sdk") / "lib" / "release" / f"lin-{platform.machine()}-gcc"
+    folder.mkdir(parents=True)
+    sources = [path.read_text() for path in Path(PACKAGE.origin).parent.rglob("*.py")]
+    names = {name for text in sources for name in re.findall(r"_lib\w+\.((?:dhd|drd)\w+)", text)}
+    stub = (ROOT / "tests/firmware/dhd_stub.c").read_text()
+    others = sorted(name for name in names if not re.search(rf"\b{name}\(", stub))
+    (folder / "others.c").write_text("".join(f"int {name}(void) {{ return -1; }}\n" for name in others))
+    library = folder / "libdrd.so.3"
+    built = ["gcc", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror", "-o", str(library)]
+    subprocess.run([*built, str(ROOT / "tests/firmware/dhd_stub.c"), str(folder / "others.c")], check=True)
+    environment = os.environ | {"FDSDK": str(folder.parents[2])}
+    command = [sys.executable, "-c", SESSION, str(library)]
+    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_devices_are_opened_by_serial_number_or_index(session):
+    assert (session["serial"], session["name"]) == (4712, "omega.3")
+
+
+def test_the_watchdog_is_set_in_expert_mode(session):
+    assert session["guarded"]
+    assert session["watchdogs"] == [160, 160]  # times 125 us: 20 ms
+
+
+def test_forces_reach_the_axes_they_are_for(session):
+    assert session["refused"] == 0
+    assert session["forces"] == pytest.approx([0.4, -0.2])  # 1000 and -500 steps of 0.4 mN
+    assert session["limits"] == pytest.approx([2.02, 1.01])  # 1 % above the caps of 2 and 1 N
+
+
+@pytest.mark.parametrize(
+    ("index", "words"),
+    [("3", "is in reset mode"), ("9", "reports error 7"), ("0", "has no power"), ("5", "has switched its forces off")],
+)
+def test_a_status_that_is_not_well_stops_the_session(session, index, words):
+    assert session[index].startswith(f"device sn4712 {words}")
+
+
+def test_no_force_is_left_behind(session):
+    assert session["after"] == [0.0, 0.0]
