@@ -40,18 +40,12 @@ _SETTLED_DB = 0.05  # a rung that gains less ends the climb
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
 _LARGE, _PROMISING_DB = 26, 0.1  # taps: one of more is tried after one that gains so much, proved if it is worth it
 _FEWEST_TAPS = {True: 22, False: 14}  # of a rung that may end the climb; whether this-environment alone is asked
-_MOST_REFUSED = 2  # rungs without a proof, one after the other, after which a larger one has none either
 _KEPT_STIFFNESS = 0.5  # of the most static stiffness of a rung that was best: one that renders less is not taken
 _FELT_STIFFNESS = 0.02  # of the environment's: where a rung renders less than this, merit alone decides
 _LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # (beta, c) of a limiter to begin with: without psi the first alone
 _HOPELESS = 0.9  # relative mismatch from which on the climb is compared with other couplings
 _TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
-_MOST_STATES = 270  # of the loop, up to which a rung is tried
-_MOST_PROOFS = 30 * 112**2.7  # and (environments) states^2.7: a minute
 _SEARCHED = 0.2  # of --seconds, at least: the time of the search between the vertices of ranges
-_TRIED = 3  # rungs, the best first, until one is proved at every vertex of ranges
-_MOST_UNKNOWNS = 1600  # up to which a rung is tried: ten seconds
-_MOST_BESIDE = 3500  # unknowns by channels, the same where more than this-environment is asked, and no large rung
 
 
 @dataclass(frozen=True)
@@ -161,11 +155,13 @@ def design(
             best, floor = found, max(floor if best else 0.0, _felt(_KEPT_STIFFNESS * found.g))
             better.append(found)
         hurried = not settled and climb.over()
-        hopeless = len(rungs) >= _MOST_REFUSED and not any(each.proved for each in rungs[-_MOST_REFUSED:])
+        hopeless = len(rungs) >= budgets.UNPROVED_BASES and not any(
+            each.proved for each in rungs[-budgets.UNPROVED_BASES :]
+        )
         if settled or hurried or (hopeless and not loop.ranges):
             break
     if loop.ranges:
-        for found in better[: -_TRIED - 1 : -1]:
+        for found in better[: -budgets.RANGED_BASES - 1 : -1]:
             best = climb.between(found)
             hurried |= best.searched is not None and best.searched.ended and climb.over()
             if best.proved:
@@ -305,9 +301,9 @@ class _Search:
         states = own + (0 if full else len(span.used) - own // m)
         states += self.cases[0].E.order + sum(loop.theta) + sum(loop.psi)
         proofs = len(self.cases) * states**2.7  # what they take, in seconds
-        beside = taps <= _LARGE and m * span.unknowns <= _MOST_BESIDE
-        solved = span.unknowns <= _MOST_UNKNOWNS if full and self.simply else beside
-        return before < states <= _MOST_STATES and solved and proofs <= _MOST_PROOFS
+        beside = taps <= _LARGE and m * span.unknowns <= budgets.BASIS_BESIDE
+        solved = span.unknowns <= budgets.BASIS_UNKNOWNS if full and self.simply else beside
+        return before < states <= budgets.BASIS_STATES and solved and proofs <= budgets.BASIS_PROOFS
 
     def rung(self, taps: int, poles: int, before: Optimal | None, floor: float, least: float) -> tuple[Optimal, _Rung]:
         """The optimum over a basis, scaled until every sweep passes, and proved where it gains this much [dB].
