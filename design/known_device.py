@@ -315,7 +315,7 @@ class Sweep(ABC):
 
     def floor(self, beta: Array) -> float:
         """Return the share at which beta is the largest that is tried; inf where no damping allows it."""
-        if (beta > _LARGEST_ETA * self._highest).any():
+        if not ((beta > 0) & (beta <= _LARGEST_ETA * self._highest)).all():
             return np.inf
         return float((beta**2 * self._P / (4 * np.array(self.loop.delta))).max()) / _LARGEST_ETA**2
 
