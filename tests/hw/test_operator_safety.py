@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,10 +19,12 @@ from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
+from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Driver, Operator, Session, session_for
-from haptic_loop.hw.session_report import IncidentLog
+from haptic_loop.hw.session_report import IncidentLog, outcome
 from haptic_loop.sim.scenario import InputError
+from msgspec.structs import replace
 from worlds import FakePort
 
 ROOT = Path(__file__).parent.parent.parent
@@ -122,6 +125,37 @@ def test_a_first_session_is_gentle(scenario):
     args = _parser().parse_args(["--rehearse", "--force-cap", "12", "--max-speed", "0.5", "--continuous-force", "3"])
     limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
     assert (limits.cap, limits.speed, limits.continuous) == ((12.0, 12.0), 0.5, (3.0, 3.0))
+
+
+def test_a_session_stops_where_the_damping_is_no_longer_known(scenario):
+    """The speed that hw.identify wrote is the session's default limit, and no option exceeds it."""
+    slow = scenario.replace(device=tuple(replace(d, credible_speed=0.5) for d in scenario.device))
+    assert limits_from(_parser().parse_args(["--rehearse"]), slow)["speed"] == 0.5
+    assert limits_from(_parser().parse_args(["--rehearse", "--max-speed", "0.4"]), slow)["speed"] == 0.4
+    with pytest.raises(InputError, match=r"--max-speed is 0\.6 m/s, the least credible_speed of the devices is 0\.5"):
+        limits_from(_parser().parse_args(["--rehearse", "--max-speed", "0.6"]), slow)
+
+
+def test_a_live_device_asks_for_a_deadman(scenario, monkeypatch):
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    for options, asked in (([], "key"), (["--deadman", "device"], "device"), (["--no-dead-man"], None)):
+        args = _parser().parse_args(["--port", "x", *options])
+        limits_from(args, scenario)
+        assert args.deadman == asked
+
+
+def test_a_session_of_forces_that_were_cut_has_not_finished(scenario, rungs):
+    """A cap of 10 mN: more than half of the forces at full gain are at it."""
+    recorder, session = Recorder(2), Session(scenario, SafetyLimits((0.01, 0.01)), LinkSettings(measure=60))
+    session.record = recorder
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs)
+    rehearsal.run_until_armed(2.5)
+    session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.3)
+    report = outcome("I", session, recorder, 0)
+    assert session.stage == Stage.FINISHED
+    assert report.session.stage == "stopped"
+    assert "% of its forces were cut" in report.session.cause
 
 
 @pytest.mark.parametrize(

@@ -233,6 +233,7 @@ def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, 
     session.stop("enough", session.now)
     rehearsal.run(1e-6 * session.now + 0.2)
     report = outcome("I", session, recorder, 0)
+    assert report.session.stage == ("finished" if settles else "stopped")
     ((first, stop),) = report.run.steady_ticks
     gain = recorder.link()["gain"]
     assert (gain[first:stop] == 1.0).all()
