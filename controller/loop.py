@@ -115,14 +115,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
                 raise ValueError(
                     f"latency #{i} is {least:g} to {most:g} s, expected 0 <= least <= most < T = {self.T:g} s"
                 )
-        if self.varying_delay or self.environment.walls:
-            other = "varying_delay" if self.varying_delay else "environment.walls"
-            raise ValueError(f"latency and {other}: a latency is judged with constant delays in linear environments")
 
     def _check_varying_delay(self, span: DelayRange) -> None:
-        if self.ranges or self.environment.walls:
-            other = "ranges" if self.ranges else "environment.walls"
-            raise ValueError(f"varying_delay and {other}: switching delays are judged in one linear environment")
+        if self.ranges:
+            raise ValueError("varying_delay and ranges: switching delays are judged in one environment")
         if len(span.lo) != len(self.theta):
             raise ValueError(f"varying_delay has {len(span.lo)} ranges for {len(self.theta)} channels")
         if not span.contains(DelayRange(self.theta, self.theta)):

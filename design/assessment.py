@@ -247,7 +247,7 @@ def covered_limits(
     the same beta is searched. What `known` contains is not proved again (design.certificate.recheck).
     """
     if loop.varying_delay:
-        return ForceLimits(None, str(LIMITER.beyond(loop)))
+        return ForceLimits(None, "limited forces and delays that switch are not proved together here")
     for each in requirements.values():
         if each.certified and each.lag is not None:
             return ForceLimits(each.lag, f"{each.condition} covers limited forces")
@@ -486,7 +486,7 @@ def _force_limits(
     if limiter is False:
         return ForceLimits(None, "forces are clipped, as asked")
     if loop.varying_delay:
-        return ForceLimits(None, "limited forces are proved for constant delays")
+        return ForceLimits(None, "limited forces and delays that switch are not proved together here")
     return covered_limits(loop, coupling, requirements, proof, known)
 
 

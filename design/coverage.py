@@ -11,7 +11,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design.certificate import judged
 from haptic_loop.design.conditions import this_environment
-from haptic_loop.design.environments import SWITCHING
+from haptic_loop.design.environments import SWITCHING, THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
 from haptic_loop.design.result import Design, DesignFailed, Requirement
 from haptic_loop.design.transparency import decibels, transparency
@@ -53,7 +53,7 @@ class Switching:
         if found.reason:
             return cls(found, span.lo, span.hi)
         latest = loop.delayed(span.hi)
-        buffered = this_environment(latest.F(coupling), latest)
+        buffered = THIS_ENVIRONMENT.judge(latest, coupling)
         playout = _Playout(span.hi, buffered.required, buffered.certified)
         return cls(found, span.lo, span.hi, found.multiplier, playout, _NOT_COVERED)
 

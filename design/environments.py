@@ -352,14 +352,14 @@ def worst(requirements: Sequence[Requirement]) -> int:
 class SwitchingDelays(ThisEnvironment):
     """this-environment of a loop whose delays switch, under a name of its own."""
 
-    name, covers = "switching", ("psi", "T_max", "varying_delay")
+    name, covers = "switching", ("psi", "T_max", "latency", "varying_delay", "walls")
 
     @property
     def base(self) -> str:
         return ThisEnvironment.name if self.name == SwitchingDelays.name else self.name
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
-        return (Switching(),)
+        return (*super().facts(loop.switching(None)), Switching())
 
 
 SWITCHING = SwitchingDelays()
@@ -385,7 +385,7 @@ class LimitedForces(ThisEnvironment):
     beta: float = BETA
     lags: int = 1  # weights c_ij per channel
     held: tuple[float, ...] | None = None  # (m,) rho [N/m] where it is given, as by a certificate
-    name, covers = "limiter", ("psi", "T_max")
+    name, covers = "limiter", ("psi", "T_max", "latency", "varying_delay", "walls")
 
     def __post_init__(self) -> None:
         if not 0 <= self.beta < np.inf:
@@ -405,25 +405,29 @@ class LimitedForces(ThisEnvironment):
         return {"rho": self.rho(loop)}
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
-        return (Limiter(self.rho(loop), self.lags),)
+        return (*super().facts(loop), Limiter(self.rho(loop), self.lags))
 
     def rows(self, loop: Loop, multiplier: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
-        """c as a row per channel, of one entry per lag."""
-        return tuple(tuple(multiplier[i * self.lags : (i + 1) * self.lags]) for i in range(loop.channels))
+        """c as a row per channel, of one entry per lag: the last numbers, after those of walls and switching delays."""
+        c = tuple(multiplier)[len(multiplier) - loop.channels * self.lags :] if multiplier else ()
+        return tuple(c[i * self.lags : (i + 1) * self.lags] for i in range(loop.channels))
+
+    def not_designed(self, loop: Loop) -> str | None:
+        """Return why no design spends the damping on this condition, which judges more loops, or None."""
+        if loop.varying_delay:
+            return "limiter: designs for limited forces are made for constant delays, not for delays that switch"
+        if loop.environment.walls or loop.latency:
+            what = "walls" if loop.environment.walls else "a latency"
+            return f"limiter: designs for limited forces are made in linear environments without {what}"
+        return self.beyond(loop)
 
     def beyond(self, loop: Loop) -> str | None:
-        if loop.varying_delay:
-            return "limiter: forces that are limited are proved for constant delays, not for delays that switch"
-        if loop.environment.walls:
-            return "limiter: with walls only any-environment covers limited forces (no delay in the environment)"
         if loop.ranges:
             return "limiter: limited forces are proved for one environment, not for ranges"
-        if loop.latency:
-            return "limiter: limited forces are proved for forces that latch at ticks, not for a latency"
         return None
 
     def place(self, loop: Loop, matrix: str = "P") -> str:
-        return "limiter: "
+        return f"limiter: {switching_guarantee(loop.delays)}: " if loop.varying_delay else "limiter: "
 
 
 LIMITER = LimitedForces()

@@ -260,6 +260,8 @@ class SwitchingLoop(SampledLoop):
     _first = 0.5  # alpha T/delta that a search begins with where the start has none
 
     def __init__(self, loop: Loop, lo: Sequence[int], hi: Sequence[int]) -> None:
+        if loop.environment.walls or loop.latency:
+            raise ValueError("gains for delays that switch are designed in linear environments and without a latency")
         self.active = np.flatnonzero(np.subtract(hi, lo))
         super().__init__(loop.switching(DelayRange(tuple(lo), tuple(hi))))
 

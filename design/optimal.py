@@ -188,6 +188,8 @@ class _Search:
         started = time.perf_counter()
         if loop.environment.walls:
             raise ValueError("an optimal coupling holds a linear model of the environment: walls have none")
+        if loop.varying_delay and loop.latency:
+            raise ValueError("an optimal coupling for delays that switch is designed without a latency")
         cases: list[program.Case] = []
         for member in loop.members():
             there = at(loop, member.network)
@@ -200,7 +202,7 @@ class _Search:
             if options.objective == "sup" and not cases:
                 asked.append(program.worst_mismatch(there, options.band_hz))
             cases.append(program.Case(there, there.E(), tuple(asked), weight=0.0 if cases else 1.0))
-        if options.limiter and (reason := LIMITER.beyond(loop)):
+        if options.limiter and (reason := LIMITER.not_designed(loop)):
             raise ValueError(reason)
         needs = in_each(loop, NoCoupling(), loop.members())
         if not np.isfinite(bare := max(each.ratio for each in needs)):

@@ -253,7 +253,7 @@ def design_with(loop: Loop, condition: str, limiter: bool | None = None, **optio
         _require_few(loop, _MOST_LIMITED, "the limiter's block: leave the limiter out")
     if limiter is False or loop.channels > _MOST_LIMITED:
         return design(loop, condition, **options)
-    refusal = LIMITER.beyond(loop)
+    refusal = LIMITER.not_designed(loop)
     if limiter and refusal:
         raise ValueError(refusal)
     if refusal or options.get("switching"):

@@ -1,0 +1,160 @@
+"""Facts that hold together: digits of a separate computation, exact proofs, and hands that try to take energy."""
+
+import itertools
+
+import msgspec
+import numpy as np
+import pytest
+from haptic_loop.controller.coupling import NoCoupling, SpringDamper
+from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
+from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.design.certificate import prove, required_damping, verify
+from haptic_loop.design.conditions import FACTS
+from haptic_loop.design.coupling_file import Stored, sealed
+from haptic_loop.design.environments import THIS_ENVIRONMENT, LimitedForces
+from scipy.linalg import expm
+
+change = msgspec.structs.replace
+BARE, COUPLING = NoCoupling(), SpringDamper([1000.0], [0.5])
+
+
+def wall(stiffness, damping):
+    return Wall(("tip", GROUND), stiffness, damping)
+
+
+def held(*walls):
+    """A mass of 50 g on 20 N/m and 0.3 N s/m at the tip, with walls."""
+    return Network(("tip",), (Spring(("tip", GROUND), 20.0, 0.3),), {"tip": 0.05}, walls)
+
+
+def loop_of(network, T=1.2e-3, theta=0, delta=1.0, **further):
+    return Loop(T, (theta,), (0,), (0,), (delta,), network, **further)
+
+
+def need(loop, coupling, rho=None):
+    condition = LimitedForces(held=(rho,)) if rho else THIS_ENVIRONMENT
+    return required_damping(loop, coupling, condition).required[0]
+
+
+@pytest.mark.parametrize(
+    ("k", "damping", "theta", "latency", "most", "frozen"),
+    [
+        (1000.0, 0.0, 0, (0.0, 0.48e-3), 1.4213, 1.4213),
+        (1000.0, 3.6, 0, (0.0, 0.48e-3), 4.5544, 4.4170),
+        (1000.0, 3.6, 1, (0.0, 0.48e-3), 5.6832, 5.5083),
+        (3000.0, 2.4, 0, (0.12e-3, 0.6e-3), 5.3171, 4.8084),
+    ],
+)
+def test_latency_and_walls_need_the_known_damping(k, damping, theta, latency, most, frozen):
+    """Between the frozen contact alone and the figure with m = 0, both by separate code."""
+    loop = loop_of(Network(("tip",), walls=(wall(k, damping),)), theta=theta, latency=(latency,))
+    found = need(loop, BARE)
+    assert frozen * (1 - 5e-5) < found < most * (1 + 5e-5)
+
+
+@pytest.mark.parametrize(("theta", "known", "alone"), [(1, 1.2623, 1.2452), (0, 0.99051, 0.99051)])
+def test_limiter_and_walls_need_the_known_damping(theta, known, alone):
+    """rho is 0.01 of the requirement without limiter over T; the figures are those of m = 0."""
+    loop = loop_of(held(wall(3000.0, 2.0)), 1e-3, theta)
+    linear = need(loop, COUPLING)
+    assert alone * 0.999 < linear <= alone * (1 + 5e-5)
+    assert linear * (1 - 1e-6) < need(loop, COUPLING, 0.01 * linear / 1e-3) <= known * (1 + 5e-5)
+
+
+@pytest.mark.parametrize(
+    ("theta", "walls", "known"), [(1, (), 1.3905), (0, (), 0.8172), (1, (1,), 1.3910), (0, (1,), 0.8177)]
+)
+def test_limiter_and_latency_need_the_known_damping(theta, walls, known):
+    """rho = 13 N/m, 0.3 ms, without and with the wall; the figures with the wall are those of m = 0."""
+    loop = loop_of(held(*(wall(3000.0, 2.0) for _ in walls)), 1e-3, theta, latency=((0.3e-3, 0.3e-3),))
+    found = need(loop, COUPLING, 13.0)
+    assert known * (1 - 5e-4) < found < known * (1 + 5e-5)
+
+
+EVERY = {
+    "latency": {"latency": ((0.1e-3, 0.3e-3),)},
+    "walls": {"walls": (wall(3000.0, 2.0),)},
+    "limiter": {"rho": 13.0},
+    "switching": {"varying_delay": DelayRange((0,), (1,))},
+}
+SETS = [names for count in (2, 3, 4) for names in itertools.combinations(EVERY, count)]
+
+
+def combined(names, delta=10.0):
+    fields = {key: value for name in names for key, value in EVERY[name].items()}
+    rho, network = fields.pop("rho", None), held(*fields.pop("walls", ()))
+    return loop_of(network, 1e-3, 1, delta, **fields), rho
+
+
+@pytest.mark.parametrize("names", SETS, ids="-".join)
+def test_every_combination_is_proved_stored_and_verified(names):
+    """At 1.001 of the damping that the sweep finds, and not at 0.999; a file without a multiplier is refused."""
+    loop, rho = combined(names)
+    least = need(loop, COUPLING, rho)
+    condition = LimitedForces(held=(rho,)) if rho else THIS_ENVIRONMENT
+    enough = change(loop, delta=(1.001 * least,))
+    certificate = prove(enough, COUPLING, condition)
+    assert (certificate.condition, certificate.facts) == ("this-environment", tuple(f for f in FACTS if f in names))
+    stored = Stored.of(enough, COUPLING, certificate)
+    assert verify(msgspec.json.decode(msgspec.json.encode(stored), type=Stored)).proved
+    for name in certificate.multipliers:
+        fewer = {known: values for known, values in certificate.multipliers.items() if known != name}
+        assert not verify(change(stored, certificate=sealed(change(certificate, multipliers=fewer)))).proved
+    assert not required_damping(change(loop, delta=(0.999 * least,)), COUPLING, condition).certified
+
+
+HANDS, TICKS = 60, 12000
+
+
+def growing(loop, coupling, damping, rho, limit=3.0, seed=5):
+    """How many lossless hands have more energy at the end than in the middle, at worst ages and latencies.
+
+    At every tick the force of each age and each end of the latency is tried, and the one that gives most energy acts.
+    """
+    rng = np.random.default_rng(seed)
+    mass, stiff = 10 ** rng.uniform(-3, 0, HANDS), 10 ** rng.uniform(0, 3.5, HANDS)
+    A = np.zeros((HANDS, 3, 3))
+    A[:, 0, 1] = 1
+    A[:, 1, 0], A[:, 1, 1], A[:, 1, 2] = -stiff / mass, -damping / mass, -1 / mass
+    late = sorted(set(loop.latency[0])) if loop.latency else [0.0]
+    parts = [(expm(A * tau), expm(A * (loop.T - tau))) for tau in late]
+    bound = {} if rho is None else {"limit": [limit], "rho": [rho]}
+    lo, hi = loop.delays.lo[0], loop.delays.hi[0]
+    law = loop.switching(None).delayed((0,)).law(coupling, **bound)
+    tick = law.transition()
+    plant = rng.standard_normal((HANDS, 2)) * (1e-2, 0.1)
+    before, after = np.zeros((2, law.open.order + 1, HANDS))
+    forces, applied, energy = [np.zeros(HANDS)] * (hi + 1), np.zeros(HANDS), np.zeros((2, HANDS))
+    for k in range(TICKS):
+        before[-1] = plant[:, 0]
+        tick(before, after)
+        before[:-1] = after[1:]
+        forces = [after[0].copy(), *forces[:-1]]
+        best, most, used = None, np.full(HANDS, -np.inf), applied
+        for age in range(lo, hi + 1):
+            for first, second in parts:
+                now = (first @ np.column_stack([plant, applied])[..., None])[:, :2, 0]
+                now = (second @ np.column_stack([now, forces[age]])[..., None])[:, :2, 0]
+                gained = (mass * now[:, 1] ** 2 + stiff * now[:, 0] ** 2) / 2
+                better = gained > most
+                best = now if best is None else np.where(better[:, None], now, best)
+                used, most = np.where(better, forces[age], used), np.where(better, gained, most)
+        if most.max() > 1e6:  # [J] of hands that began with less than 0.02
+            return int((most > 1.0).sum())
+        plant, applied = best, used
+        at = 0 if 0.4 * TICKS < k < 0.5 * TICKS else 1 if k > 0.9 * TICKS else None
+        if at is not None:
+            energy[at] = np.maximum(energy[at], most)
+    return int((energy[1] > 1.02 * energy[0]).sum())
+
+
+@pytest.mark.parametrize("names", SETS, ids="-".join)
+def test_no_hand_gains_energy_at_the_requirement(names):
+    loop, rho = combined(names)
+    assert growing(loop, COUPLING, 1.01 * need(loop, COUPLING, rho), rho) == 0
+
+
+@pytest.mark.parametrize("names", [("latency", "walls"), ("latency", "switching")], ids="-".join)
+def test_some_hands_gain_energy_far_below_the_requirement(names):
+    loop, rho = combined(names)
+    assert growing(loop, COUPLING, 0.5 * need(loop, COUPLING, rho), rho) > 0
