@@ -17,6 +17,7 @@ SAYS = {
         "this-environment +1.36.. ",
         r"-17.6. .*-34.8. .*this environment",
     ],
+    "unstable_and_certified": ["without coupling: unstable", "guaranteed for .* and this environment: stable"],
     "neural_environment": [
         r"budget 1e\+09 J: limited 0 of 5000",
         r"budget 0.01 J: limited [34]\d{3} of 5000",
