@@ -438,7 +438,7 @@ def test_exact_arithmetic_that_takes_too_long_is_given_up_in_one_line(monkeypatc
     with pytest.raises(NotProved, match=words):
         prove(PAIR, STIFF, "this-environment")
     assert verify(stored) == Verdict(False, words)
-    assert {requirement.proof for requirement in design_certificate.assess(PAIR, SOFT).values()} == {"sampled"}
+    assert {requirement.proof for requirement in design_certificate.requirements_of(PAIR, SOFT).values()} == {"sampled"}
     with pytest.raises(NotProved, match=words):
         prove_limiter(PAIR, SpringDamper((3000.0, 2000.0), (0.1, 0.1)))
     with pytest.raises(NotProved, match=words):

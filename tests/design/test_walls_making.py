@@ -378,3 +378,36 @@ def test_a_design_before_a_wall_with_a_damper_spends_the_damping_and_is_proved()
     assert 1500 < made.coupling.K[0] < 1772
     assert prove(loop, made.coupling, "this-environment").proof == "rational"
     assert not any_environment(made.coupling.compliance(loop.T), loop.theta, loop.delta).certified
+
+
+@pytest.mark.parametrize("loop", [PAIR, DAMPED], ids=["springs", "dampers"])
+def test_frozen_walls_fall_to_a_nonnegative_value(loop):
+    """The step that bounds Z from below: x held, touched walls kept, also where they pull; from states of the loop."""
+    rng = np.random.default_rng(5)
+    delta = (1.01 * required_damping(loop, BOTH, "this-environment").ratio * np.array(loop.delta)).tolist()
+    G, block, P, S, _ = steps_of(loop, BOTH, delta)
+    there, frozen = Walled(loop, BOTH, block), 0
+    k, b, gap, m = there.k, there.b, there.gap, 2
+    x = np.cumsum(rng.standard_normal((400, m)) * rng.choice([1e-5, 3e-4], (400, 1)), axis=0)
+    for tick in range(400):
+        there.step(x[tick])
+        there.xi = block.A @ there.xi + block.B @ there.v
+        if tick % 40 != 39 or (there.s > 1e-12).any():
+            continue
+        on, xi, state, h = there.h > 0, there.xi, there.state[: G.order], there.h
+        solve = np.linalg.inv(np.eye(3) - np.where(on, k + b, 0)[:, None] * G.D[m:, m:])
+        last, frozen = np.inf, frozen + 1
+        for _ in range(3000):
+            X = np.concatenate([x[tick], h])
+            Z = xi @ P @ xi + X @ S @ X / 2 - (k * gap * h).sum()
+            assert last - Z >= -1e-9 * (abs(Z) + 1e-9)
+            free = G.C[m:] @ state + G.D[m:, :m] @ x[tick]  # the ways into the walls without their forces now
+            p = solve @ np.where(on, (k + b) * (free - gap) - b * h, 0)
+            after = np.where(on, free + G.D[m:, m:] @ p - gap, 0)
+            steps = zip(after - h, b, strict=True)
+            v = np.array([0.0, 0.0, *(value for u, damper in steps for value in ((u, 0.0) if damper else (u,)))])
+            state = G.A @ state + G.B @ np.concatenate([x[tick], p])
+            xi, h, last = block.A @ xi + block.B @ v, after, Z
+        assert last >= -1e-12
+        assert np.abs(v).max() < 1e-6 * (np.abs(h).max() + 1e-9)  # the frozen motion has come to rest
+    assert frozen > 4
