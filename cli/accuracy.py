@@ -13,6 +13,7 @@ from haptic_loop.sim.couplings import NAMES, assessed
 from haptic_loop.sim.engines import EXPONENTIAL
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import InputError, require_even_ticks, require_linear
+from haptic_loop.sim.world import require_no_world
 
 _MOST_STEPS = 3_000_000  # of a row: a minute or two
 _LEGEND = (
@@ -40,6 +41,7 @@ def main(argv: list[str]) -> int:
     """Measure every engine and step. 0: the default has the right verdict, 1: not, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
+    require_no_world(scenario, "sim.accuracy")
     require_linear(scenario, "sim.accuracy")
     require_even_ticks(scenario, "sim.accuracy")
     if args.duration is not None:

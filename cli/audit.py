@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from haptic_loop.cli import options, render
+from haptic_loop.cli import options, render, world
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
 from haptic_loop.controller.loop import DelayRange, Loop
@@ -22,9 +22,10 @@ from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import EncoderSteps
 from haptic_loop.design.result import Requirement, listed
 from haptic_loop.models.device import CATALOGUE, Listed, listed_device
-from haptic_loop.sim.couplings import fitted, from_file, own_of, read_coupling
+from haptic_loop.sim.couplings import choose, fitted, from_file, own_of, read_coupling
 from haptic_loop.sim.report import encoder_steps
 from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.world import is_world
 from rich.table import Table
 
 _EXAMPLES = (
@@ -65,6 +66,10 @@ def main(argv: list[str]) -> int:
         return _list_devices(args)
     args = _with_device(args)
     scenario = options.scenario_from(args)
+    if args.world:
+        scenario = options.in_world(scenario, args.world)
+    if is_world(scenario) and not args.rigid:
+        return _audited_world(args, scenario)
     loop = options.rigid_loop(args, scenario) if args.rigid else scenario.loop(args.case)
     coupling = _coupling(args, loop, scenario)
     asked = named(args.condition) if args.condition else None
@@ -114,6 +119,8 @@ def _parser() -> options.Parser:
     coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")
     parser.add_loop()
     parser.add_rigid()
+    scene = "a MuJoCo scene as the environment, touched at its named bodies without a joint, along x"
+    parser.add_argument("--world", metavar="FILE.xml", help=scene)
     switching = "also any switching of the forces' delays in this range [samples]; or LO-HI,LO-HI,.. per channel"
     parser.add_varying_delay(switching)
     parser.add_details()
@@ -164,6 +171,17 @@ def _list_devices(args: argparse.Namespace) -> int:
     lines.append("What is unknown is given beside `device` in a scenario, or with --delta: hw.identify measures it.")
     render.publish(args, {"devices": parts}, [render.grid(title, heads, rows)], lines)
     return options.DONE
+
+
+def _audited_world(args: argparse.Namespace, scenario: Scenario) -> int:
+    """Audit a coupling, by default the stiffest certified one, in a MuJoCo world."""
+    named_here = args.K or args.B or args.coupling or args.case == "none"
+    if named_here:
+        coupling, kind = _coupling(args, scenario.loop(args.case), scenario), args.coupling or "spring-damper"
+    else:
+        chosen = choose(scenario, args.case)
+        coupling, kind = chosen.coupling, chosen.kind
+    return world.audit(args, scenario, coupling, kind, options.out_folder(args, "audit"))
 
 
 def _is_own(args: argparse.Namespace) -> bool:

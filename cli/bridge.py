@@ -27,6 +27,7 @@ from haptic_loop.hw.session import session_for
 from haptic_loop.hw.session_report import SessionReport, outcome, save
 from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.world import require_no_world
 from rich.console import Console
 
 _LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
@@ -36,6 +37,7 @@ def main(argv: list[str]) -> int:
     """One session. 0: it ended as planned, 1: refused, stopped, lost or e-stop, 130: interrupted, after a ramp."""
     args = _parser().parse_args(argv)
     scenario, settings = session_cli.steady_scenario(args, "hw.bridge"), session_cli.check_link(args)
+    require_no_world(scenario, "hw.bridge")
     seconds = scenario.duration if args.duration is None else args.duration
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")

@@ -24,6 +24,7 @@ from haptic_loop.sim.compare_report import ComparedCoupling, Comparison, Conditi
 from haptic_loop.sim.couplings import NAMES, choose
 from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.stability import MARGINAL
+from haptic_loop.sim.world import require_no_world
 from rich.table import Table
 
 _MOST = 6  # curves that can be told apart in one panel
@@ -33,6 +34,7 @@ def main(argv: list[str]) -> int:
     """Compare. 0: done, 1: something could not be designed, 130: interrupted, with what was done until then."""
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
+    require_no_world(scenario, "design.compare")
     return _couplings(args, scenario) if args.coupling else _alternatives(args, scenario)
 
 

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 import msgspec
-from haptic_loop.cli import options, render
+from haptic_loop.cli import options, render, world
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design import coverage
@@ -28,6 +28,7 @@ from haptic_loop.design.result import Design, finite, listed
 from haptic_loop.design.robustness import Nearby, ranges_around
 from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.world import is_world
 from rich.table import Table
 
 
@@ -38,6 +39,9 @@ def main(argv: list[str]) -> int:
         raise InputError("--case none has no coupling to design: give I or II")
     out = out_file(args.out, f"out/design-{options.place(args)}.json", "the file of the coupling")
     scenario = options.scenario_from(args)
+    args.coupling = args.coupling or ("moving-average" if is_world(scenario) else "spring-damper")
+    if is_world(scenario):
+        return world.design(args, scenario, out)
     loop = _loop(args, scenario)
     if args.samples is not None and loop.ranges is None:
         raise InputError("--samples is only with ranges: give --ranges, or a scenario with [ranges]")
@@ -61,8 +65,9 @@ def _parser() -> options.Parser:
         first="scenario coupling condition reference ranges out",
     )
     parser.add_loop()
-    kinds = f"{', '.join(KINDS)}, or FILE.py:NAME of your own (default spring-damper)"
-    parser.add_argument("--coupling", metavar="NAME", default="spring-damper", help=kinds)
+    default = "default spring-damper; moving-average in a world"
+    kinds = f"{', '.join(KINDS)}, or FILE.py:NAME of your own ({default})"
+    parser.add_argument("--coupling", metavar="NAME", help=kinds)
     around = "certify for every stiffness and mass this much more or less, as [ranges] of a scenario does"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
     parser.add_condition("what to certify")

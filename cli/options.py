@@ -23,7 +23,17 @@ from haptic_loop.design.files import check_file, folder, read_text
 from haptic_loop.design.own import called, named, place_of
 from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, DesignFailed
 from haptic_loop.models.device import MOST_DAMPING, Device, Guaranteed
-from haptic_loop.sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, held_by, load, with_environment
+from haptic_loop.sim.scenario import (
+    CASES,
+    DEFAULT,
+    InputError,
+    Scenario,
+    built_in,
+    held_by,
+    load,
+    with_environment,
+    world_environment,
+)
 
 if TYPE_CHECKING:
     from haptic_loop.design.conditions import Condition
@@ -441,6 +451,18 @@ def _known_device(text: str) -> Guaranteed:
 
 def _with_bounds(device: Device, bounds: Guaranteed) -> Device:
     return msgspec.structs.replace(device, guaranteed=bounds)
+
+
+def in_world(scenario: Scenario, file: str) -> Scenario:
+    """The scenario with a MuJoCo scene as its environment, touched along x. Raises InputError."""
+    from haptic_loop.models.world import touchable_bodies
+
+    with refused("--world: "):
+        bodies = touchable_bodies(Path(file))
+    if len(bodies) != scenario.channels:
+        found = f"{len(bodies)} named bodies without a joint ({', '.join(bodies)})"
+        raise InputError(f"--world {file} has {found} for {scenario.channels} devices: write a scenario with contacts")
+    return scenario.replace(environment=world_environment({"world": str(Path(file).resolve()), "contacts": bodies}))
 
 
 def with_humans(args: argparse.Namespace, scenario: Scenario) -> Scenario:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from haptic_loop.cli import options, render
+from haptic_loop.cli import options, render, world
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.budget import BudgetFigures
@@ -32,6 +32,7 @@ from haptic_loop.sim.run import ENGINES, EngineSettings
 from haptic_loop.sim.run_report import Ran, RunReport, run_report
 from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.stability import ExactVerdict
+from haptic_loop.sim.world import is_world
 
 
 def main(argv: list[str]) -> int:
@@ -40,6 +41,8 @@ def main(argv: list[str]) -> int:
     if args.error is not None and (args.engine != "mujoco" or args.integrator or args.substeps):
         raise InputError("--error chooses integrator and substeps of MuJoCo: give no other --engine, --integrator, ..")
     scenario, out = _scenario(args), options.out_folder(args, "run")
+    if is_world(scenario):
+        return world.run(args, scenario, out)
     environment, simulated = _environment(args, scenario)
     chosen = chosen_by(args, scenario)  # V, Q or R
     budget = args.energy_budget[0] if args.energy_budget else None

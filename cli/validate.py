@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from haptic_loop.cli import options, render
+from haptic_loop.cli import options, render, world
 from haptic_loop.cli import verdict as verdicts_of
 from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.ranges import Member
@@ -31,7 +31,9 @@ from haptic_loop.sim.run import assemble, engine_name
 from haptic_loop.sim.scenario import InputError, Scenario, require_linear, save_humans
 from haptic_loop.sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
 from haptic_loop.sim.switching import DelaysCovered
+from haptic_loop.sim.world import is_world
 
+_HUMANS = 1000  # unless a user asks for others
 _ENVIRONMENTS = ("nominal", "ranges")
 _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
@@ -40,6 +42,9 @@ def main(argv: list[str]) -> int:
     """Test random humans. 0: what is claimed holds, 1: it does not, 3: workers were lost, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
+    args.humans = args.humans or (world.HUMANS if is_world(scenario) else _HUMANS)
+    if is_world(scenario):
+        return world.validate(args, scenario, out)
     chosen = chosen_by(args, scenario)
     assessment = assessment_of(args, scenario, chosen)
     question = _question(args, scenario, chosen, assessment)
@@ -75,7 +80,8 @@ def _parser() -> options.Parser:
     parser.add_coupling(", ".join(NAMES))
     parser.add_human(", or a population with draw(rng, n), in a .py")
     parser.add_limiter()
-    add("--humans", type=whole(1, 1_000_000), default=1000, metavar="N", help="random humans per device (default 1000)")
+    many = f"random humans per device (default {_HUMANS}, in a world {world.HUMANS})"
+    add("--humans", type=whole(1, 1_000_000), metavar="N", help=many)
     add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
     add("--engine", choices=ENGINES, default="both", help="who decides (default both)")
     seconds = "length of the traces (default 2; 0 for none)"

@@ -36,6 +36,7 @@ from haptic_loop.sim.view.stage import (
     save_film,
     show,
 )
+from haptic_loop.sim.world import require_no_world
 
 _EXAMPLES = (
     "python -m sim.view --coupling optimal",
@@ -50,6 +51,7 @@ def main(argv: list[str]) -> int:
     """Show the loop until the window is closed or the film is full. 0: shown; 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
+    require_no_world(scenario, "sim.view")
     require_even_ticks(scenario, "sim.view")
     if args.video:
         check_film(Path(args.video))

@@ -20,6 +20,7 @@ from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay
 from haptic_loop.sim.trace import SUSTAINED
+from haptic_loop.sim.world import require_no_world
 from haptic_loop.sim.zwidth_report import FixedCoupling, MapReport, Shown, save_csv
 
 _EXAMPLES = (
@@ -36,6 +37,7 @@ def main(argv: list[str]) -> int:
     args.grid = args.grid or (60 if of_coupling else 24)
     args.press = (3.0 if of_coupling else 0.0) if args.press is None else args.press
     scenario = options.scenario_from(args)
+    require_no_world(scenario, "sim.zwidth")
     require_constant_delay(scenario, "sim.zwidth")
     if scenario.period is not None:
         raise InputError("period: a map simulates even periods; give T_max alone, which its certificates are for")

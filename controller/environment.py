@@ -197,6 +197,7 @@ class Environment:
     contacts: Any  # tuple[str, ...], one a channel
     walls: tuple[Wall, ...] = ()
     here: Any = "this environment"  # str: how a guarantee names it
+    world: Any = None  # a MuJoCo scene that is known by its file alone
     one_period = False  # whether it is known for one T only
 
     def check(self, psi: Sequence[int], T: float) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 from haptic_loop.controller.lti import Array, Lti
 from numpy.typing import NDArray
 
@@ -59,7 +58,10 @@ def _balanced(G: Lti) -> Lti:
     """The same block with states scaled by powers of two, which is exact."""
     if not G.order:
         return G
-    A, scale = scipy.linalg.matrix_balance(G.A, permute=False)
+    import scipy.linalg  # no help has to wait for it
+
+    with np.errstate(invalid="ignore"):  # SciPy casts entries that it does not use where A is nilpotent
+        A, scale = scipy.linalg.matrix_balance(G.A, permute=False)
     size = np.diag(scale)
     return Lti(A, G.B / size[:, None], G.C * size, G.D, G.T)
 
@@ -91,6 +93,8 @@ def _norms(G: Lti) -> list[tuple[Array, Array]]:
 
     Any L gives a valid bound, and the better one counts: the states as they are, and states that are even under noise.
     """
+    import scipy.linalg  # no help has to wait for it
+
     one = np.eye(G.order)
     if not G.order:
         return [(one, one)]

@@ -229,16 +229,21 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     are far larger than the forces, and more yet where they cancel in decimals only.
     """
     try:
-        running, exact = loop.sent(coupling), loop.sent(coupling, exact=True)
+        if loop.environment.world:  # a tick computes V alone, the scene is solved with its direct part
+            running, exact = coupling.compliance(loop.T), coupling.compliance(loop.period(exact=True))
+        else:
+            running, exact = loop.sent(coupling), loop.sent(coupling, exact=True)
     except SingularLoop as error:
         return str(error)
+    if running is None or exact is None:
+        return "a world needs a coupling with a compliance V"
     z, meant = on_circle(frequencies(running)), exact.floats()
     response = running.at(z)
     if running.A.shape == meant.A.shape:
         lost = rounding(running, z, meant)
     else:  # rounding has kept a state that cancels
         lost = rounding(running, z) + float(np.abs(response - meant.at(z)).max())
-    scale = max(float(np.abs(response).max()), min(loop.delta) / loop.T)
+    scale = max(float(np.abs(response).max()), 0.0 if loop.environment.world else min(loop.delta) / loop.T)
     if lost <= _MOST_LOST * scale:
         return None
     return (

@@ -118,6 +118,11 @@ def check_contacts(path: Path, bodies: Sequence[str]) -> None:
     World(path, [Contact(body) for body in bodies], [np.eye(1)] * len(bodies), 1e-3)
 
 
+def touchable_bodies(path: Path) -> list[str]:
+    """Names of the bodies of a scene that may be contacts, in the order of the file. Raises ValueError."""
+    return _without_joints(_spec(path))
+
+
 # ----------------------------------------------------------------------------------------------------
 # The scene with its contacts
 
@@ -287,10 +292,14 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
+def _without_joints(spec: Any) -> list[str]:
+    return [body.name for body in spec.worldbody.bodies if body.name and not body.joints and not body.mocap]
+
+
 def _touchable(spec: Any, name: str, contacts: Sequence[str]) -> Any:
     """The body of a contact. Raises ValueError for a body that cannot be one."""
     body = spec.body(name)
-    free = [b.name for b in spec.worldbody.bodies if b.name and not b.joints and not b.mocap]
+    free = _without_joints(spec)
     if body is None:
         raise ValueError(f"contact {name!r}: the world has no such body; bodies without a joint: {', '.join(free)}")
     if body.parent.name != "world":

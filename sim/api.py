@@ -32,7 +32,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, require_linear
 from haptic_loop.sim.stability import stability_of
 from haptic_loop.sim.switching import Period, switching
 from haptic_loop.sim.trace import Trace
-from haptic_loop.sim.world import START_J, Claim, Touched, WorldFigures, WorldRecord, is_world
+from haptic_loop.sim.world import START_J, Claim, Touched, WorldFigures, WorldRecord, is_world, require_no_world
 
 if TYPE_CHECKING:
     from haptic_loop.sim import crowds
@@ -210,6 +210,7 @@ def validate(
 
     of_kind("scenario", scenario, Scenario, _SCENARIO)
     chosen = given(coupling)
+    require_no_world(scenario, "validate")
     require_linear(scenario, "validate", walls=True)
     humans, seed = whole("humans", humans, 1, _MOST_HUMANS), whole("seed", seed, 0)
     shards = whole("shards", shards, 1)

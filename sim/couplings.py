@@ -74,7 +74,7 @@ def _choose(
         if name not in (None, "none"):
             raise InputError(f"--coupling {name} with --case none: that case is the loop without coupling")
         name = "none"
-    name = name or "spring-damper"
+    name = name or ("moving-average" if scenario.environment.world else "spring-damper")
     if name == "none":
         return Chosen(NoCoupling(), condition or THIS_ENVIRONMENT.name, kind=name)
     if name == "published":

@@ -522,6 +522,14 @@ def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
     return raw | {"environment": rest | {"world": world}}
 
 
+def world_environment(table: dict[str, Any], folder: Path = Path()) -> Network:
+    """The environment of a table with `world`, as a file has it. Raises InputError."""
+    try:
+        return msgspec.convert(_with_world({"environment": table}, folder)["environment"], Network)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
 def _without_along(raw: dict[str, Any], given: Any) -> dict[str, Any]:
     """The file, if it does not speak of a world's steps and directions. Raises ValueError."""
     beside = [key for key in ("along", "every") if isinstance(given, dict) and key in given]

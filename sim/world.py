@@ -8,12 +8,14 @@ whatever the scene does, it lets no more energy out of the port than W0 and what
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 from haptic_loop.controller.budget import Shell, ShellFigures
 from haptic_loop.controller.coupling import Coupling
@@ -22,13 +24,16 @@ from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import Net, Process
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import InputError
-from haptic_loop.sim.run import Simulation
+from haptic_loop.models.human import Human
+from haptic_loop.sim.passivity_layer import netted
+from haptic_loop.sim.run import Simulation, assemble, outside_forces, run
 from haptic_loop.sim.scenario import Scenario
 
 if TYPE_CHECKING:  # MuJoCo, for which no other scenario and no help has to wait
     from haptic_loop.models.world import Contact, Port, World
 
 START_J = 2e-3  # W0, unless a run says otherwise
+_ROUNDING = 1e-9  # of differences of 1e-6 m
 _APART = 1e-12  # of D_V relatively: a smaller entry between two devices is rounding
 
 
@@ -95,9 +100,12 @@ def is_world(scenario: Scenario) -> bool:
 
 
 def require_no_world(scenario: Scenario, what: str) -> None:
-    """Raises InputError for commands that need an E(z)."""
+    """Raises InputError for commands that cannot use a world."""
     if is_world(scenario):
-        raise InputError(f"environment.world: {what} needs a linear model E(z); linearise(world, pose) gives one")
+        able = "sim.run, sim.validate, design and design.audit take worlds"
+        raise InputError(
+            f"environment.world: {what} takes networks only; {able}, linearise(world, pose) gives a network"
+        )
 
 
 def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> World:
@@ -108,8 +116,9 @@ def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> Wo
     world = scenario.environment.world
     assert world is not None
     V = coupling.compliance(scenario.T)
-    if V is None:
-        raise InputError(f"environment.world: a {coupling.kind} coupling has no compliance V; a world needs one")
+    if V is None or not V.D.any():
+        why = f"coupling {coupling.kind} has no compliance V with a direct part"
+        raise InputError(f"environment.world needs a coupling: {why}, so there is no spring to the devices")
     from haptic_loop.models.world import World
 
     contacts = contacts_of(scenario.environment)
@@ -215,6 +224,100 @@ class InWorld:
 
 
 # ----------------------------------------------------------------------------------------------------
+# Hands and adversaries
+
+RANDOM, LOSSLESS = "random hands", "lossless hands"
+_THROWN = 0.3  # [m/s] rms of the speeds with which hands begin
+_NEVER = 1e3  # [J] W0 of a shell that does not act, for measurements
+_STREAM = 11  # keeps these draws apart from those of the hands with the same seed
+
+
+@dataclass(frozen=True)
+class HandsInWorld:
+    """What one set of hands, thrown at a world and left alone, was given."""
+
+    kind: str
+    number: int
+    figures: WorldFigures
+
+    @property
+    def excess_J(self) -> float:
+        """What it was given beyond the account; the guarantee says that this is at most 0."""
+        return self.figures.given_J - self.figures.start_J - self.figures.released_J
+
+
+def thrown(
+    scenario: Scenario,
+    coupling: Coupling,
+    humans: int,
+    seed: int,
+    duration: float,
+    start: float = START_J,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[HandsInWorld]:
+    """Let hands of the scenario's population, thrown at random, move in the world for `duration` seconds.
+
+    Every second set is lossless: its dampers are taken out. `start` is W0 [J].
+    """
+    from haptic_loop.sim.crowds import Validation
+
+    links = getattr(scenario.population, "links", 1)
+    question = Validation(scenario, coupling, seed, humans, links, "exact", duration)
+    nobody, found = assemble(scenario, coupling), []
+    for i in range(humans):
+        crowd, rng = question.crowd(i), np.random.default_rng(np.random.SeedSequence((seed, _STREAM, i)))
+        hands, kind = crowd.humans(0), LOSSLESS if i % 2 else RANDOM
+        if i % 2:
+            hands = tuple(_lossless(hand) for hand in hands)
+        simulation = netted(nobody.held_by(hands, crowd.persons(0)), Touched(start))
+        states, n = len(simulation.plant.A), simulation.scene.model.nq
+        first = np.zeros((states, 1))
+        first[n : 2 * n, 0] = _THROWN * rng.normal(size=n)
+        quiet = partial(outside_forces, simulation.scenario, simulation.scene, voluntary=False)
+        engine = "mujoco" if simulation.friction else "exact"
+        trace = run(simulation, engine, quiet, round(duration / scenario.T), first)
+        figures = trace.net.figures() if trace.net else None
+        assert isinstance(figures, WorldFigures)
+        found.append(HandsInWorld(kind, i, figures))
+        progress(i + 1, humans)
+    return found
+
+
+def _lossless(hand: Any) -> Any:
+    """The hand without its dampers, if it is a chain; another one as it is."""
+    if not isinstance(hand, Human):
+        return hand
+    links = tuple(msgspec.structs.replace(link, damping=0.0) for link in hand.links)
+    return msgspec.structs.replace(hand, links=links, voluntary=None)
+
+
+def hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, runs: int = 10, seconds: float = 1.0) -> float:
+    """The least sum of f'(u - u_-) [J] that motions of the springs' ends reached: they run, stop and turn at random."""
+    scene, rng, least = scene_of(scenario, coupling), np.random.default_rng((seed, _STREAM)), 0.0
+    for _ in range(runs):
+        port, at_port = scene.port(), 0.0
+        goal, speed, left, before = np.zeros(scene.channels), np.zeros(scene.channels), 0, port.u
+        for _ in range(round(seconds / scenario.T)):
+            if left == 0:
+                left = int(rng.integers(2, 60))
+                speed = rng.normal(size=scene.channels) * rng.choice([0.0, 0.1, 0.5]) - goal / (100 * scenario.T)
+            left, goal = left - 1, goal + scenario.T * speed
+            force = port.step(goal)
+            at_port, before = at_port + float(force @ (port.u - before)), port.u
+            least = min(least, at_port)
+    return least
+
+
+def least_at_port(scenario: Scenario, coupling: Coupling, seed: int, humans: int = 20) -> dict[str, float]:
+    """The least energy at the port [J] by each adversary, while no shell acts: 0 where the scene gave nothing."""
+    found = {"hit and brake": hit_and_brake(scenario, coupling, seed)}
+    hands = thrown(scenario, coupling, humans, seed, 1.0, _NEVER)
+    for kind in (RANDOM, LOSSLESS):
+        found[f"thrown {kind}"] = min(each.figures.port_least_J for each in hands if each.kind == kind)
+    return found
+
+
+# ----------------------------------------------------------------------------------------------------
 # A linear model
 
 
@@ -244,7 +347,18 @@ def linearise(world: Scenario | str | Path, pose: Any = None, contacts: Sequence
         path, touched = str(world), [Contact(name) for name in contacts]
     unit = [np.eye(len(contact.along)) for contact in touched]
     try:
-        E = Lti(*World(path, touched, unit, T).linear(pose), T).inverse()
+        E = _joined(Lti(*World(path, touched, unit, T).linear(pose), T)).inverse()
         return Network(tuple(contact.body for contact in touched), block=Block.of(E))
     except ValueError as error:
         raise InputError(f"linearise: {error}") from None
+
+
+def _joined(G: Lti) -> Lti:
+    """The system without the states of bodies that do not touch a contact, directly or through others."""
+    size = np.abs(G.A).max(initial=1.0)
+    linked = np.abs(G.A) > _ROUNDING * size
+    driven, seen = (np.abs(G.B) > 0).any(axis=1), (np.abs(G.C) > 0).any(axis=0)
+    for _ in range(G.order):
+        driven, seen = driven | linked[:, driven].any(axis=1), seen | linked[seen].any(axis=0)
+    keep = np.flatnonzero(driven & seen)
+    return Lti(G.A[np.ix_(keep, keep)], G.B[keep], G.C[:, keep], G.D, G.T)

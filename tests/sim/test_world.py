@@ -1,5 +1,7 @@
 """MuJoCo worlds in a loop: the energy account, what it proves of hands, and what a scenario may say."""
 
+import json
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.sim.couplings import read_coupling
 from haptic_loop.sim.scenario import InputError, Scenario, load, parse
 from haptic_loop.sim.world import START_J, contacts_of, linearise, scene_of
 
@@ -197,7 +200,7 @@ def test_this_environment_says_nothing_of_a_world():
 @pytest.mark.parametrize(
     ("coupling", "message"),
     [
-        (NoCoupling(), "environment.world needs a coupling"),
+        (NoCoupling(), r"environment\.world needs a coupling"),
         (Compliance(Lti.constant([[1e-3, 1e-4], [1e-4, 1e-3]], T)), "couples devices"),
         (Compliance(Lti.constant([[1e-3, 0.0], [0.0, 0.0]], T)), "is not symmetric and positive definite"),
     ],
@@ -205,6 +208,56 @@ def test_this_environment_says_nothing_of_a_world():
 def test_a_coupling_that_no_world_can_use_is_one_line(coupling, message):
     with pytest.raises(InputError, match=message) as caught:
         simulate(load("world-peg"), coupling)
+    assert "\n" not in str(caught.value)
+
+
+# ---- commands
+
+
+def command(capsys, *words: str) -> tuple[int, str]:
+    code = import_module(f"haptic_loop.cli.{words[0]}").main([*words[1:]])
+    return code, capsys.readouterr().out
+
+
+def test_a_run_reports_the_account(tmp_path, capsys):
+    code, shown = command(
+        capsys, "run", "--scenario", "world-ball", "--duration", "0.2", "--no-plot", "--out", str(tmp_path)
+    )
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert code == 0
+    assert "The shell acted on 0 of 200 ticks" in " ".join(shown.split())
+    assert report["guaranteed"]
+    assert report["world"]["ticks"] == 200
+    assert report["assessment"]["requirements"]["any-environment"]["proof"] == "rational"
+    assert report["scene"]["active"] == []
+
+
+def test_a_validation_throws_both_kinds_of_hands(tmp_path, capsys):
+    code, shown = command(
+        capsys,
+        *("validate", "--scenario", "world-peg", "--humans", "4", "--duration", "0.3", "--no-plot"),
+        *("--out", str(tmp_path)),
+    )
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert code == 0
+    assert "2 random hands" in shown
+    assert "2 lossless hands" in shown
+    assert report["worst_excess_J"] <= 0
+
+
+def test_a_design_for_a_world_is_proved_exactly(tmp_path, capsys):
+    code, shown = command(capsys, "design", "--scenario", "world-door", "--out", str(tmp_path / "door.json"))
+    assert code == 0
+    assert "proof: rational" in shown
+    stored = read_coupling(tmp_path / "door.json")
+    assert stored.loop.environment.world.file == "door.xml"
+
+
+@pytest.mark.parametrize("words", ["view", "zwidth", "compare", "bridge --rehearse", "accuracy"])
+def test_other_commands_refuse_a_world_in_one_line(words):
+    name, *options = words.split()
+    with pytest.raises(InputError, match="takes networks only") as caught:
+        import_module(f"haptic_loop.cli.{name}").main([*options, "--scenario", "world-door"])
     assert "\n" not in str(caught.value)
 
 

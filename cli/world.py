@@ -1,0 +1,245 @@
+"""What commands say of a MuJoCo world: sim.run, sim.validate, design and design.audit, for scenarios with a world."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from haptic_loop.cli import options, render
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.design.api import proved, store
+from haptic_loop.design.assessment import Assessment
+from haptic_loop.design.designs import design_by_kind
+from haptic_loop.design.files import write
+from haptic_loop.design.lmi import ANY_ENVIRONMENT
+from haptic_loop.design.result import Chosen, listed
+from haptic_loop.sim.api import run_scenario
+from haptic_loop.sim.couplings import assessed, choose
+from haptic_loop.sim.run import EngineSettings
+from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.world import (
+    LOSSLESS,
+    RANDOM,
+    START_J,
+    Claim,
+    HandsInWorld,
+    Touched,
+    WorldFigures,
+    WorldRecord,
+    least_at_port,
+    scene_of,
+    thrown,
+)
+
+HUMANS = 100  # sets of hands that sim.validate throws at a world, unless it is asked for others
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """A scene as reports describe it."""
+
+    file: str
+    settings: str  # that the program forces on it
+    parts: list[dict[str, object]]  # of which kinds, how many, and what is known of each at the port
+    active: list[str]  # actuators, plugins, callbacks
+
+
+@dataclass(frozen=True)
+class _Report:
+    """What every command says of a coupling in a world; SI units."""
+
+    scenario: str
+    scenario_digest: str
+    kind: str  # of the coupling
+    coupling: dict[str, object]  # its figures
+    assessment: Assessment
+    guaranteed: bool
+    guarantee: str
+    scene: _Scene
+    world: WorldRecord | None = None
+    least_at_port_J: dict[str, float] = field(default_factory=dict)
+    peak_force_N: list[float] | None = None
+    hands: int = 0
+    worst_excess_J: float | None = None
+    wall_s: float = 0.0
+
+
+def _reported(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, start: float) -> _Report:
+    """The parts of a report that need no run."""
+    with render.progress("assessing the coupling"):
+        assessment = assessed(
+            scenario, args.case, chosen, energy_budget=start, limiter=False, seed=getattr(args, "seed", 0)
+        )
+    claim, scene = Claim.of(assessment), scene_of(scenario, chosen.coupling)
+    parts: list[dict[str, object]] = [
+        {"part": p.what, "count": p.count, "at_the_port": p.at_the_port} for p in scene.parts()
+    ]
+    return _Report(
+        scenario=scenario.name,
+        scenario_digest=scenario.digest,
+        kind=chosen.kind,
+        coupling=chosen.coupling.figures(scenario.T),
+        assessment=assessment,
+        guaranteed=claim.guaranteed,
+        guarantee=claim.words,
+        scene=_Scene(scene.path.name, scene.settings(), parts, scene.outside_the_lemma()),
+    )
+
+
+def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
+    with render.progress("designing"):
+        return choose(scenario, args.case, args.coupling, args.condition)
+
+
+def _start(args: argparse.Namespace) -> float:
+    """W0 [J] of --energy-budget. Raises InputError for a cap, which the account of a world does not have."""
+    if not args.energy_budget:
+        return START_J
+    start, *cap = args.energy_budget
+    if cap and np.isfinite(cap[0]):
+        raise InputError("--energy-budget: the account of a world has no cap, give W0 alone")
+    return float(start)
+
+
+def _common_rows(report: _Report) -> Iterator[tuple[str, str | None]]:
+    needs = report.assessment.requirements[ANY_ENVIRONMENT.name]
+    for name, unit in (("K", "N/m"), ("B", "N s/m"), ("stiffness", "N/m")):
+        values = report.coupling.get(name)
+        if isinstance(values, list) and values:
+            yield f"coupling, {name}", f"{listed(values, 5)} {unit}"
+    yield "any environment", f"{render.needs(needs)}: {render.certified(needs)}"
+
+
+def _energy(joules: float) -> str:
+    return f"{1e3 * joules:.3g} mJ"
+
+
+# ----------------------------------------------------------------------------------------------------
+# sim.run
+
+
+def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
+    """Run a scenario with a world and report it; 0, or 130 where it was interrupted."""
+    for name in ("paper", "cross_check", "error", "vertex"):
+        if getattr(args, name, None):
+            shown = name.replace("_", "-")
+            raise InputError(f"--{shown}: with environment.world there is no linear loop to compare with; leave it out")
+    start, chosen = _start(args), _chosen(args, scenario)
+    report = _reported(args, scenario, chosen, start)
+    settings = EngineSettings(args.engine, args.integrator, args.substeps)
+    began = time.perf_counter()
+    with render.progress("simulating") as move:
+        finished = run_scenario(scenario, chosen.coupling, None, settings, args.seed, Touched(start), move)
+    trace = finished.trace
+    figures = trace.net.figures() if trace.net else None
+    assert isinstance(figures, WorldFigures)
+    report = replace(
+        report,
+        world=WorldRecord.of(figures),
+        peak_force_N=np.abs(trace.f).max(axis=0, initial=0.0).tolist(),
+        wall_s=time.perf_counter() - began,
+    )
+    kept = replace(trace, meta=render.plain(report))
+    files = [kept.save_npz(out / "trace.npz"), kept.save_csv(out / "trace.csv")]
+    files.append(write(out / "scene.xml", finished.simulation.scene.xml))
+    files.append(write(out / "world.xml", scene_of(scenario, chosen.coupling).xml))
+    if not args.no_plot and trace.t.size > 1:
+        from haptic_loop.sim.plots import Contacts, plot_run
+
+        around = Contacts(scenario.environment.contacts)
+        files.append(plot_run(kept, out / "figure.png", f"{scenario.name}: a MuJoCo world", 1.0, None, None, around))
+    title = f"{report.guarantee} The shell acted on {figures.limited_ticks} of {figures.ticks} ticks."
+    render.publish(args, report, [render.facts(title, _run_rows(report, figures, scenario), left=True)], (), out, files)
+    return options.exit_code(True, trace.interrupted)
+
+
+def _run_rows(report: _Report, figures: WorldFigures, scenario: Scenario) -> Iterator[tuple[str, str | None]]:
+    yield "contacts", ", ".join(scenario.environment.contacts)
+    yield from _common_rows(report)
+    yield "given to hands and devices", f"{_energy(figures.given_J)} beyond what the devices dissipate"
+    yield "released", f"{_energy(figures.released_J)} by gravity and springs of the scene"
+    yield "least energy at the port", _energy(figures.port_least_J)
+    yield "created by contacts", _energy(figures.created_J)
+    yield "peak force", f"{listed(report.peak_force_N or (), 3)} N"
+    unsettled = figures.unsettled_ticks
+    yield "limited forces", f"{unsettled} ticks whose limited channels did not settle" if unsettled else None
+    yield "active parts", ", ".join(report.scene.active) or None
+    yield "scene", report.scene.settings
+
+
+# ----------------------------------------------------------------------------------------------------
+# sim.validate
+
+
+def validate(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
+    """Throw random and lossless hands at a world. 0: none was given more than the account, 1: one was."""
+    if args.adversary:
+        raise InputError("--adversary: of a world, `design.audit` reports what adversaries reached")
+    if args.duration == 0:
+        raise InputError("--duration 0: a world has no eigenvalues, give the seconds of the traces")
+    began, chosen = time.perf_counter(), _chosen(args, scenario)
+    report = _reported(args, scenario, chosen, START_J)
+    with render.progress("validating") as move:
+        hands = thrown(scenario, chosen.coupling, args.humans, args.seed, args.duration, START_J, move)
+    worst = max(hands, key=lambda each: each.excess_J)
+    holds = worst.excess_J <= 0
+    report = replace(
+        report,
+        world=WorldRecord.of(max(hands, key=lambda each: each.figures.limited_ticks).figures),
+        hands=len(hands),
+        worst_excess_J=worst.excess_J,
+        wall_s=time.perf_counter() - began,
+    )
+    whom = f"of {len(hands)} sets of hands none" if holds else f"hands {worst.number} ({worst.kind})"
+    title = f"{report.guarantee} Measured: {whom} was given more than that."
+    render.publish(args, report, [render.facts(title, _hands_rows(report, hands), left=True)], (), out)
+    return options.exit_code(holds)
+
+
+def _hands_rows(report: _Report, hands: list[HandsInWorld]) -> Iterator[tuple[str, str | None]]:
+    yield from _common_rows(report)
+    for kind in (RANDOM, LOSSLESS):
+        some = [each.figures for each in hands if each.kind == kind]
+        if some:
+            acted, ticks = sum(f.limited_ticks for f in some), sum(f.ticks for f in some)
+            most = max(f.given_J for f in some)
+            yield f"{len(some)} {kind}", f"shell acted on {acted} of {ticks} ticks; given at most {_energy(most)}"
+    yield "released", f"at most {_energy(max(each.figures.released_J for each in hands))}"
+    yield "created by contacts", f"at most {_energy(max(each.figures.created_J for each in hands))}"
+
+
+# ----------------------------------------------------------------------------------------------------
+# design and design.audit
+
+
+def design(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
+    """Design a coupling for a world and store it. 0: certified for any environment, 1: not."""
+    loop, kind = scenario.loop(args.case), args.coupling
+    condition = args.condition or ANY_ENVIRONMENT.name
+    with options.refused(args=args), render.designing(loop, kind, condition) as progress:
+        made = proved(loop, design_by_kind(loop, kind, condition, progress))
+    filed = store(loop, made, out)
+    report = _reported(args, scenario, replace(made, kind=kind), START_J)
+    rows = [*_common_rows(report), ("stored", f"{out} (proof: {filed.proof or 'none'})")]
+    render.publish(args, report, [render.facts(report.guarantee, rows, left=True)])
+    return options.exit_code(report.guaranteed)
+
+
+def audit(args: argparse.Namespace, scenario: Scenario, coupling: Coupling, kind: str, out: Path) -> int:
+    """Say what is in a scene and what adversaries reached. 0: the coupling is certified for any environment, 1: not."""
+    began = time.perf_counter()
+    report = _reported(args, scenario, Chosen(coupling, ANY_ENVIRONMENT.name, kind=kind), START_J)
+    with render.progress("attacking"):
+        least = least_at_port(scenario, coupling, args.seed)
+    report = replace(report, least_at_port_J=least, wall_s=time.perf_counter() - began)
+    rows = [*_common_rows(report), *((f"least energy, {name}", _energy(value)) for name, value in least.items())]
+    rows.append(("active parts", ", ".join(report.scene.active) or None))
+    parts = [(str(part["part"]), str(part["count"]), str(part["at_the_port"])) for part in report.scene.parts]
+    heads = ("part", "count", "at the port")
+    table = render.grid(f"{report.scene.file}: {report.scene.settings}", heads, parts, (0, 2))
+    render.publish(args, report, [render.facts(report.guarantee, rows, left=True), table], (), out)
+    return options.exit_code(report.guaranteed)
