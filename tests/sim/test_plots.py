@@ -10,8 +10,6 @@ from haptic_loop.design.result import CONDITIONS
 from haptic_loop.sim import map_plot, plots
 from haptic_loop.sim.trace import Trace
 
-from tests.checks.tightness import plot_tightness
-
 
 @pytest.fixture
 def drawn(monkeypatch, tmp_path):
@@ -157,17 +155,6 @@ def test_every_human_is_a_point(drawn):
     assert unstable == [[1.0, 2.0]]
 
 
-def test_who_was_found_is_told_from_who_was_not(drawn):
-    rows = [("a", 0.01, False, None), ("a", 0.05, True, 0.3), ("b", 0.02, True, 0.1)]
-    names = "loop", "short", "found", "growth_rate_per_s"
-    (axis,) = drawn(plot_tightness, [SimpleNamespace(**dict(zip(names, row, strict=True))) for row in rows]).axes
-    marks = [(line.get_marker(), *line.get_xydata()[0]) for line in axis.lines if len(line.get_xydata()) == 1]
-    assert ("o", 1.0, 0.0) in marks
-    assert ("^", 5.0, 0.3) in marks
-    assert ("^", 2.0, 0.1) in marks
-    np.testing.assert_array_equal(lines(axis)["a"], [(1.0, 0.0), (5.0, 0.3)])
-
-
 HZ = np.array([1.0, 10.0, 100.0])
 
 
@@ -268,9 +255,9 @@ def test_a_map_shows_verdicts_edges_and_points(drawn):
 
 
 def test_a_map_of_an_environment_shows_what_was_designed_for(drawn):
-    springs = SimpleNamespace(contact_springs=[SimpleNamespace(B=1.0, K=15.0), SimpleNamespace(B=9.0, K=15.0)])
+    springs = [SimpleNamespace(B=1.0, K=15.0), SimpleNamespace(B=9.0, K=15.0)]
+    fixed = SimpleNamespace(kind="spring-damper", contact_springs=springs)
     empty = SimpleNamespace(points=[], effects=told().simulation.effects, nonlinear=False)
-    fixed = SimpleNamespace(designed_for=springs)
     figure = drawn(map_plot.plot_zwidth, k_b_map(), told(fixed=fixed, simulation=empty))
     marks = [line.get_xydata().tolist() for line in figure.axes[0].lines if line.get_marker() == "P"]
     assert marks == [[[1.0, 15.0]]]  # the other one is not on the map

@@ -304,7 +304,7 @@ def test_hands_that_had_no_time_to_rest_are_no_verdict(duration):
     [
         (["--humans", "0"], "--humans is 0, allowed are 1 to 1000000"),
         (["--humans", "many"], "--humans is 'many', expected a whole number"),
-        (["--engine", "drake"], "--engine is 'drake', allowed are exact, mujoco, both and package"),
+        (["--engine", "drake"], "--engine is 'drake', allowed are exact, mujoco, both"),
         (["--links", "9"], "--links is '9', allowed are"),
         (["--shards", "2", "--dask", "here:8786"], "--shards 2 with --dask: the cluster decides"),
         (["--shards", "0"], "--shards is 0, allowed are 1 to 256"),
