@@ -57,8 +57,7 @@ def main(argv: list[str]) -> int:
     with render.progress("measuring") as move:
         measured = measure_all(coupled, uncoupled, default, move)
     report = _Report(args.case, scenario.name, chosen.kind, args.seed, default, *measured)
-    drawn = {"accuracy.png": "plot_accuracy"} if report.rows else {}
-    files = render.pictures(args, report.rows, out, drawn)
+    files = render.pictures(args, report.rows, out, {"accuracy.png": "plot_accuracy"}, bool(report.rows))
     table = render.columns(f"speed against error · {scenario.title(args.case)}, {chosen.kind}", _CELLS, report.rows)
     lines = [*(f"not measured: {reason}" for reason in report.skipped), *_LEGEND]
     render.publish(args, report, [table], lines, out, files)

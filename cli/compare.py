@@ -72,7 +72,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
     with render.progress("running every coupling") as move:
         made = alternatives(scenario, args.case, move, args.condition)
     files = []
-    if not args.no_plot and any(each.trace is not None for each in made):
+    if render.is_drawn(args, out / "couplings.png", any(each.trace is not None for each in made)):
         files.append(_side_by_side(made, out / "couplings.png", scenario.environment.contacts))
     report = _Alternatives(scenario.name, args.case, made)
     render.publish(args, report, [_beside(made, args.condition)], (), out, files)

@@ -84,7 +84,7 @@ def _parser() -> options.Parser:
     _add_optimal_options(parser, "optimal: the filter of the environment's forces with the least transparency error")
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
     parser.add_argument("--samples", type=options.whole(0, 10_000), metavar="N", help=samples)
-    parser.add_output("FILE.json", "the stored coupling (default out/design-<case or scenario>.json)")
+    parser.add_output("FILE.json", "the stored coupling (default out/design-<case or scenario>[-<coupling>].json)")
     return parser
 
 

@@ -13,6 +13,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -209,7 +210,7 @@ class Parser(argparse.ArgumentParser):
     def add_output(
         self,
         out: str = "DIR",
-        what: str = "folder for files, made if it is not there (default out/<command>-<case or scenario>)",
+        what: str = "folder for files, made if it is not there (default out/<command>-<case or scenario>[-<coupling>])",
         picture: bool = False,
     ) -> None:
         """Where results go, and the seed."""
@@ -476,10 +477,28 @@ def out_folder(args: argparse.Namespace, command: str) -> Path:
 
 
 def place(args: argparse.Namespace) -> str:
-    """The case, or the name of the user's own scenario, for file names."""
+    """Return the case or scenario, and the coupling and condition where options name them, for names of files.
+
+    A file stands there without its folder and suffix, as `run-I-stiff` for `--coupling couplings/stiff.json`.
+    """
     if args.scenario == DEFAULT:
-        return args.case
-    return Path(args.scenario).stem + ("" if args.case == "I" else f"-{args.case}")
+        loop = args.case
+    else:
+        loop = Path(args.scenario).stem + ("" if args.case == "I" else f"-{args.case}")
+    named_by_options = (getattr(args, option, None) for option in ("coupling", "condition"))
+    return "-".join([loop, *(_in_file_names(what) for what in named_by_options if what)])
+
+
+_LONGEST = 80  # characters of a coupling or a condition in the name of a file, which may have 255
+
+
+def _in_file_names(what: str | tuple[str, ...] | Condition) -> str:
+    """Return the names of couplings or of a condition as a part of a file name; the end of a long one is its digest."""
+    names = what if isinstance(what, tuple) else (what if isinstance(what, str) else what.name,)
+    words = [part for name in names for part in name.split(":")]
+    parts = (Path(word).name.removesuffix(".json").removesuffix(".py") for word in words)
+    text = re.sub(r"[^\w.-]+", "-", "-".join(parts)).strip("-.")
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}-{sha256(text.encode()).hexdigest()[:8]}"
 
 
 def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:

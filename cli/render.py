@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from haptic_loop.controller.loop import Loop
-from haptic_loop.design.files import InJson, nobody_reads, plain, printable, write_json
+from haptic_loop.design.files import InJson, nobody_reads, plain, printable, remove, write_json
 from haptic_loop.design.result import DesignFailed, Requirement, listed
 from rich.console import Console
 from rich.errors import MarkupError
@@ -158,13 +158,28 @@ def publish(
         write_json(args.json, outcome)
 
 
-def pictures(args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, str]) -> list[Path]:
-    """Pictures of a report, by file what of sim.plots draws it; with --no-plot none, and matplotlib is not loaded."""
-    if args.no_plot:
+def is_drawn(args: argparse.Namespace, picture: Path, content: bool = True) -> bool:
+    """Return whether a picture is to be drawn: not with --no-plot, nor without content.
+
+    A picture that is not drawn is removed: an earlier run drew it, and it would stand beside the results of this one.
+    Raises InputError where that cannot be.
+    """
+    if args.no_plot or not content:
+        remove(picture)
+        return False
+    return True
+
+
+def pictures(
+    args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, str], content: bool = True
+) -> list[Path]:
+    """Draw a report, by file what of sim.plots draws it; with --no-plot nothing, and matplotlib is not loaded."""
+    wanted = {folder / file: name for file, name in drawn.items() if is_drawn(args, folder / file, content)}
+    if not wanted:
         return []
     from haptic_loop.sim import plots
 
-    return [getattr(plots, name)(report, folder / file) for file, name in drawn.items()]
+    return [getattr(plots, name)(report, path) for path, name in wanted.items()]
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -144,7 +144,7 @@ def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunRepo
     result, stability = replace(run.trace, meta=render.plain(report)), report.stability
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", run.simulation.scene.xml))
-    if not args.no_plot and result.t.size:
+    if render.is_drawn(args, out / "figure.png", bool(result.t.size)):
         from haptic_loop.sim.plots import Contacts, Onset, plot_run
 
         apart = report.ideal_force.error_percent

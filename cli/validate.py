@@ -192,7 +192,7 @@ def _save(
     if worst:
         remark = f"found by the adversary, seed {question.seed}: growth {worst.growth:+.6g} 1/s"
         files.append(save_humans(out / "adversary.toml", worst.humans, remark, worst.persons))
-    if not args.no_plot and findings.index.size:
+    if render.is_drawn(args, out / "population.png", bool(findings.index.size)):
         from haptic_loop.sim.plots import plot_population
 
         coupling = "no coupling" if args.case == "none" else f"{kind} coupling"

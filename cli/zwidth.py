@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
     found = [] if drawn.interrupted else [zwidth.evaluate_point(sweep, crowd, K, B, grid.K) for K, B in marks]
     report = MapReport.of(scenario, sweep, drawn, plan, fixed, found, args.humans, args.seed)
     files = [save_csv(drawn, out / "map.csv")]
-    if not args.no_plot:
+    if render.is_drawn(args, out / "zwidth.png"):
         from haptic_loop.sim.map_plot import plot_zwidth
 
         files.append(plot_zwidth(drawn, report, out / "zwidth.png"))

@@ -301,6 +301,19 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
     return path
 
 
+def remove(path: Path) -> None:
+    """Remove a file that an earlier run wrote, if it is there.
+
+    Raises InputError where that cannot be, and where the command has read the file or has written it.
+    """
+    try:
+        if path.is_symlink() or path.is_file():
+            _spare(path)
+            path.unlink()
+    except OSError as error:
+        raise InputError(f"cannot remove {path}: {error.strerror or error}") from None
+
+
 def _spare(path: Path) -> None:
     """Raises InputError where a file must stay as it is."""
     if ledger := _ledger.get():

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from haptic_loop.controller.budget import BudgetFigures
 from haptic_loop.design.assessment import Assessment
-from haptic_loop.design.files import off_table, plain, write_json
+from haptic_loop.design.files import off_table, plain, remove, write_json
 from haptic_loop.hw.control import CertifiedCoupling
 from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.protocol import NO_MARGIN
@@ -195,7 +195,9 @@ def save(out: Path, session: Session, recorder: Recorder, report: SessionReport,
         replay = [Recipe.of(arming, session.limits, session.units) for arming in session.armings]
         result = recorder.trace(session.units, session.scenario.T, plain(report) | {"replay": replay})
         files += [recorder.save(out / "trace.npz", result), result.save_csv(out / "trace.csv")]
-        if plot:
+        if not plot:
+            remove(out / "figure.png")  # of an earlier session
+        else:
             from haptic_loop.sim.plots import plot_run
 
             title = f"{report.scenario}, case {report.case}: a session that ended {session.stage}"

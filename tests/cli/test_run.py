@@ -9,11 +9,13 @@ import forked
 import msgspec
 import numpy as np
 import pytest
-from haptic_loop.cli.run import main
+from haptic_loop.cli.options import place
+from haptic_loop.cli.run import _parser, main
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.design.designs import design_by_kind
+from haptic_loop.design.files import one_command, read, remove
 from haptic_loop.sim import couplings
 from haptic_loop.sim import run as loop
 from haptic_loop.sim.scenario import InputError, load
@@ -264,3 +266,58 @@ def test_an_error_that_is_asked_for_chooses_the_engine_and_a_cross_check_stands_
     assert "RK4 x 4" in capsys.readouterr().out
     with pytest.raises(InputError, match="--error chooses integrator and substeps"):
         main([*options, "--error", "1e-9", "--engine", "exact"])
+
+
+def test_two_couplings_do_not_share_a_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    stiffness = {"soft": 100.0, "stiff": 700.0}
+    (tmp_path / "couplings").mkdir()
+    for name, K in stiffness.items():
+        imported = "from haptic_loop.controller.coupling import SpringDamper"
+        text = f"{imported}\ndef {name}(loop): return SpringDamper([{K}] * 2, [1.0] * 2)\n"
+        Path(f"couplings/{name}.py").write_text(text)
+        assert main(["--coupling", f"couplings/{name}.py:{name}", "--duration", "0.01", "--no-plot"]) == 0
+    for name, K in stiffness.items():
+        report = json.loads(Path(f"out/run-I-{name}-{name}/report.json").read_text())
+        assert report["assessment"]["coupling"]["K"] == [K, K]
+
+
+@pytest.mark.parametrize(
+    ("options", "folder"),
+    [
+        ([], "I"),
+        (["--case", "none"], "none"),
+        (["--coupling", "none"], "I-none"),
+        (["--coupling", "a/b.json"], "I-b"),
+        (["--case", "II", "--coupling", "../x y.py:Soft_1"], "II-x-y-Soft_1"),
+        (["--condition", "any-environment"], "I-any-environment"),
+        (["--scenario", "three-rigid", "--coupling", "optimal"], "three-rigid-optimal"),
+    ],
+)
+def test_the_folder_names_loop_coupling_and_condition(options, folder):
+    assert place(_parser().parse_args(options)) == folder
+
+
+def test_long_names_of_couplings_stay_apart():
+    first, second = (place(_parser().parse_args(["--coupling", "x" * 240 + end])) for end in "ab")
+    assert first != second
+    assert len(first) < 100
+
+
+def test_a_trace_without_a_picture_removes_the_old_picture(tmp_path):
+    picture, options = tmp_path / "out" / "figure.png", ["--coupling", "none", "--duration", "0.01"]
+    run(tmp_path, *options)
+    assert picture.exists()
+    _, report = run(tmp_path, *options, "--no-plot")
+    assert not picture.exists()
+    assert str(picture) not in report["files"]
+
+
+def test_a_file_that_was_read_is_not_removed(tmp_path):
+    with one_command():
+        path = tmp_path / "figure.png"
+        path.write_text("a scenario of this name")
+        read(path)
+        with pytest.raises(InputError, match=r"cannot write .*figure\.png: it was read"):
+            remove(path)
+    assert path.exists()
