@@ -26,7 +26,7 @@ from haptic_loop.sim import verdicts
 from haptic_loop.sim.adversary import Worst, search, search_population
 from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.crowds import ENGINES, Findings, Table, Validation, validate, validate_on_cluster
-from haptic_loop.sim.report import DelaySpan, UnevenTicks, VaryingDelays
+from haptic_loop.sim.report import DelaySpan, UnevenTicks, VaryingDelays, friction_left_out
 from haptic_loop.sim.run import assemble, engine_name
 from haptic_loop.sim.scenario import InputError, Scenario, require_linear, save_humans
 from haptic_loop.sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
@@ -58,6 +58,7 @@ def main(argv: list[str]) -> int:
     lines = [
         *([f"Delays that vary: {report.switching.met.certified.covers}."] if report.switching else []),
         *report.remarks,
+        *friction_left_out(scenario.device),
     ]
     shown = [render.facts(title, render.rows_of(report))]
     render.publish(args, report, shown, lines, out, files, verdicts_of.verdict(assessment))

@@ -18,6 +18,7 @@ from haptic_loop.design.result import Chosen, Requirement
 from haptic_loop.sim import zwidth
 from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
+from haptic_loop.sim.report import friction_left_out
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay
 from haptic_loop.sim.trace import SUSTAINED
 from haptic_loop.sim.world import require_no_world
@@ -69,8 +70,9 @@ def main(argv: list[str]) -> int:
 
         files.append(plot_zwidth(drawn, report, out / "zwidth.png"))
     title = f"{_span(grid.K)} N/m, B {_span(grid.B)} N s/m, {report.cells} couplings"
+    unseen = friction_left_out(plan.effects.on(sweep.devices)) if report.simulation.points else ()
     table = render.facts(f"K {title}", _rows(report), left=True)
-    render.publish(args, report, [table], [*_marked(report), *_remarks(report)], out, files)
+    render.publish(args, report, [table], [*_marked(report), *_remarks(report), *unseen], out, files)
     return options.exit_code(report.holds, drawn.interrupted)
 
 

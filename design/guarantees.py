@@ -31,25 +31,41 @@ class EncoderSteps:
     """Whether declared Coulomb friction pays for encoder steps."""
 
     encoder_step: tuple[float, ...]  # (m,) [m]
-    friction: tuple[float, ...]  # (m,) [N]
+    friction: tuple[float, ...]  # (m,) [N] that the devices declare, which counts as a lower bound
+    friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which pay for nothing
     friction_needed: tuple[float, ...] | None  # (m,) [N]; None before walls, where nothing is proved
     covered: bool
     words: str
 
     @classmethod
     def of(
-        cls, loop: Loop, coupling: Coupling, steps: Sequence[float], friction: Sequence[float]
+        cls,
+        loop: Loop,
+        coupling: Coupling,
+        steps: Sequence[float],
+        friction: Sequence[float],
+        friction_max: Sequence[float | None] | None = None,
     ) -> EncoderSteps | None:
-        """None where encoders are ideal."""
+        """Compare the friction (m,) [N] that devices declare with what encoder steps (m,) [m] need.
+
+        `friction_max` (m,) [N] are published upper bounds: they are reported, and only `friction` pays for steps.
+        None where encoders are ideal.
+        """
         if not any(steps):
             return None
         widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
-        given = tuple(steps), tuple(friction)
+        published = tuple(friction_max or [None] * len(steps))
+        given = tuple(steps), tuple(friction), published
         if loop.environment.walls:
             return cls(*given, None, False, f"encoder steps of {widths} um: with walls nothing is proved of them")
         needed = encoder_friction(loop.F(coupling), steps)
         covered = bool((needed <= np.asarray(friction)).all())
         amounts, has = (", ".join(f"{f:.4g}" for f in some) for some in (needed, friction))
         verdict = "are covered while forces stay below the limits" if covered else "are not covered"
-        enough = f"friction of {amounts} N is enough for {widths} um, the devices declare {has} N"
+        if any(most is not None for most in published):
+            bounds = ", ".join("-" if most is None else f"{most:.4g}" for most in published)
+            has = f"at least {has} N (published: at most {bounds} N)"
+        else:
+            has += " N"
+        enough = f"friction of {amounts} N is enough for {widths} um, the devices declare {has}"
         return cls(*given, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")

@@ -77,6 +77,7 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     force_limit: float = 12.0  # [N] omega.3 in CHAI3D's device table
     encoder_step: float = 0.0  # [m] assumed 0: an ideal encoder
     friction: float = 0.0  # [N] Coulomb friction at the motor, assumed 0; only MuJoCo models it
+    friction_max: float | None = None  # [N] an upper bound that is published: never simulated, and no proof uses it
     delta: float | None = None  # [N s/m] guaranteed damping; `damping` unless an identification bounds it lower
     credible_force: float | None = None  # [N] in the transmission: more is the model's alone, see `most_credible_force`
     credible_speed: float = 2.0  # [m/s] likewise; assumed: three times the 0.7 m/s that teleoperation masters exceed
@@ -126,6 +127,7 @@ class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid",
     force_limit: float = 12.0  # [N] omega.3 in CHAI3D's device table
     encoder_step: float = 0.0  # [m] assumed 0: an ideal encoder
     friction: float = 0.0  # [N] Coulomb friction, assumed 0; only MuJoCo models it
+    friction_max: float | None = None  # [N] an upper bound that is published: never simulated, and no proof uses it
     delta: float | None = None  # [N s/m] guaranteed damping
     credible_speed: float = 2.0  # [m/s] as of a compliant device
     guaranteed: Guaranteed | None = None  # refused: there is no transmission to guarantee
@@ -155,6 +157,8 @@ def _check_common(device: Device, masses: tuple[str, ...]) -> None:
     require("force_limit", device.force_limit, 1e-3, 1e6, "N")
     require("encoder_step", device.encoder_step, 0.0, 1e-2, "m")
     require("friction", device.friction, 0.0, 1e3, "N")
+    if device.friction_max is not None:
+        require("friction_max", device.friction_max, device.friction, 1e3, "N")
     require("credible_speed", device.credible_speed, 1e-3, 1e3, "m/s")
     if device.delta is not None and not 0 < device.delta <= device.damping:
         raise ValueError(f"delta is {device.delta:g} N s/m, allowed are values in (0, damping = {device.damping:g}]")
@@ -196,9 +200,10 @@ class Listed:
 
     @property
     def known(self) -> dict[str, _Known]:
-        """The published fields of a RigidDevice. Friction is left out: what is published is an upper bound."""
+        """The published fields of a RigidDevice. Of friction an upper bound is published, which is no `friction`."""
         fields = ("damping", "mass", "force_limit", "encoder_step")
-        return {name: fact for name in fields if (fact := getattr(self, name))}
+        facts = {name: fact for name in fields if (fact := getattr(self, name))}
+        return facts | ({"friction_max": self.friction} if self.friction else {})
 
 
 _IDENTIFIED = _Known(1.37, "section 6 of the paper: a first-order model identified on an Omega")
@@ -269,6 +274,8 @@ def fields_of(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
     fields: dict[str, Any] = {"kind": "rigid"} | {field: fact.value for field, fact in device.known.items()}
     if given.get("kind") == "compliant":  # its mass is divided between motor and handle
         fields.pop("mass", None)
+    if "friction" in given:  # measured, so that the published bound says nothing more
+        fields.pop("friction_max", None)
     fields |= given
     if missing := [field for field in _NEEDED if field not in fields]:
         unknown = " and ".join(f"{field} [{'N' if field == 'force_limit' else 'N s/m'}]" for field in missing)

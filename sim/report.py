@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -14,6 +15,7 @@ from haptic_loop.design.certificate import requirements_of
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import EncoderSteps
 from haptic_loop.design.result import finite, listed
+from haptic_loop.models.device import Device
 from haptic_loop.sim.run import Simulation
 from haptic_loop.sim.scenario import Scenario, load
 from haptic_loop.sim.stability import Stability, close, dominant_mode, eigenvalues, linear_growth
@@ -26,11 +28,21 @@ from haptic_loop.sim.trace import Trace
 
 def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> EncoderSteps | None:
     """Whether the devices' friction pays for their encoders' steps."""
-    steps, friction = ([getattr(device, of) for device in scenario.device] for of in ("encoder_step", "friction"))
+    fields = ("encoder_step", "friction", "friction_max")
+    steps, friction, most = ([getattr(device, field) for device in scenario.device] for field in fields)
     try:
-        return EncoderSteps.of(scenario.loop(case), coupling, steps, friction)
+        return EncoderSteps.of(scenario.loop(case), coupling, steps, friction, most)
     except ValueError:  # no solution of the algebraic loop, which the conditions have said
         return None
+
+
+def friction_left_out(devices: Sequence[Device]) -> list[str]:
+    """Return a remark on the friction of each device of which only an upper bound is published."""
+    return [
+        f"Friction of device #{i}: at most {device.friction_max:g} N (published), not simulated and not relied upon."
+        for i, device in enumerate(devices, start=1)
+        if device.friction_max is not None and not device.friction
+    ]
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from haptic_loop.sim.report import (
     UnevenTicks,
     VaryingDelays,
     encoder_steps,
+    friction_left_out,
     switched_stability,
 )
 from haptic_loop.sim.run import beginnings, engine_name
@@ -146,7 +147,7 @@ def run_report(
         credible=accuracy.credible(simulation, trace),
         ideal_force=accuracy.force_error(run.ran, trace, loop.lam),
         energy_budget=budget and replace(budget, idle=idle(simulation, requirements.values(), budget)),
-        remarks=(*run.remarks, *chosen.remarks(requirements)),
+        remarks=(*run.remarks, *chosen.remarks(requirements), *friction_left_out(scenario.device)),
     )
     return replace(found, remarks=(*found.remarks, *found.notes()))
 

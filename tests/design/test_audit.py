@@ -373,7 +373,7 @@ def test_the_catalogue_has_a_source_for_every_number(run):
 def test_help_has_an_example(run):
     code, out, _ = run("--help")
     assert code == 0
-    assert "python -m design.audit --case I --K 2870,2320 --B 5.47,5.55" in out
+    assert "python -m design.audit --K 2870,2320 --B 5.47,5.55" in out
 
 
 def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):

@@ -8,6 +8,7 @@ from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.design.conditions import encoder_friction, l1_gain
+from haptic_loop.design.guarantees import EncoderSteps
 from worlds import FIGURE_4
 
 T, STEP = 1.2e-3, 1e-5
@@ -21,6 +22,17 @@ def test_the_friction_that_a_step_of_ten_micrometres_needs():
     assert encoder_friction(F, [0.0, 0.0]) == pytest.approx([0.0, 0.0])
     with pytest.raises(ValueError, match="expected 2 encoder steps"):
         encoder_friction(F, [STEP])
+
+
+def test_a_published_bound_pays_for_no_encoder_step():
+    coupling, steps = SpringDamper([879.0, 552.0], [0.39, 0.52]), [STEP, STEP]
+    needed = encoder_friction(F, steps)
+    bounded = EncoderSteps.of(LOOP, coupling, steps, [0.0, 0.0], [0.26, 0.26])
+    declared = EncoderSteps.of(LOOP, coupling, steps, [0.26, 0.26])
+    assert (needed < 0.26).all()
+    assert not bounded.covered
+    assert "published: at most 0.26, 0.26 N" in bounded.words
+    assert declared.covered
 
 
 def test_the_bound_is_above_the_sum_and_close_to_it():

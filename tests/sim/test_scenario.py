@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.sim.report import friction_left_out
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import SCENARIOS, InputError, built_in, load, parse
 from worlds import FIGURE_4
@@ -25,6 +26,11 @@ BAD = [
     ("motor_mass = 0.06 ", "motor_mas = 0.06", "unknown field `motor_mas` (did you mean `motor_mass`?)"),
     ("damping = 1.37 ", "damping = 1.37\ndelta = 2.0", "delta is 2 N s/m, allowed are values in (0, damping = 1.37]"),
     ('kind = "compliant" ', 'kind = "soft"', "device #1.kind = 'soft': invalid value 'soft', allowed are 'compliant'"),
+    (
+        "damping = 1.37 ",
+        "damping = 1.37\nfriction = 0.2\nfriction_max = 0.1",
+        "device #1: friction_max is 0.1, allowed are 0.2 to 1000 N",
+    ),
     ("mass = 0.3", "mass = 3e5", "human #1.links #1: mass is 300000, allowed are 0 to 1000 kg"),
     ("frequency = 0.6", "frequency = inf", "frequency is inf"),
     ("stiffness = 800.0", "stiffness = -800.0", "stiffness between contact 1 and mass is -800.0"),
@@ -205,6 +211,23 @@ def test_a_device_of_the_catalogue_with_overrides():
     ]
     assert (type(flexible).__name__, flexible.handle_mass, flexible.force_limit) == ("CompliantDevice", 0.19, 3.3)
     assert load().replace(device=[{"device": "falcon", "damping": 0.5}] * 2).delta == (0.5, 0.5)
+
+
+@pytest.mark.parametrize("kind", ["rigid", "compliant"])
+@pytest.mark.parametrize(("name", "most"), [("touch", 0.26), ("phantom-premium", 0.04)])
+def test_published_friction_reaches_a_scenario_as_a_bound(name, most, kind):
+    listed = f'{{ device = "{name}", kind = "{kind}", damping = 0.5 }}'
+    scenario = parse(FALCON.format(device=f'[{listed}, "omega.3"]'))
+    assert [(d.friction, d.friction_max) for d in scenario.device] == [(0.0, most), (0.0, None)]
+    remark = f"Friction of device #1: at most {most:g} N (published), not simulated and not relied upon."
+    assert friction_left_out(scenario.device) == [remark]
+
+
+def test_measured_friction_replaces_the_published_bound():
+    listed = '{ device = "touch", damping = 0.5, friction = 0.3 }'
+    device = parse(FALCON.format(device=f'[{listed}, "omega.3"]')).device[0]
+    assert (device.friction, device.friction_max) == (0.3, None)
+    assert friction_left_out([device]) == []
 
 
 @pytest.mark.parametrize(
