@@ -13,6 +13,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.design.files import InputError
 from haptic_loop.design.result import suffices
 
 #: Of more environments than _FEW every _THIN-th frequency is looked at; only those that ask for the most there, or for
@@ -58,7 +59,17 @@ def at(loop: Loop, network: Network) -> Loop:
 
 
 def vertices(network: Network, percent: float = 10.0) -> dict[str, Network]:
-    """Every spring, all springs at once, and every mass, this much more or less; by name."""
+    """Return networks with every spring, all springs at once, and every mass this much more or less, by name.
+
+    Raises InputError where a stiffness or a mass would then be above the largest that a network may have.
+    """
+    try:
+        return _vertices(network, percent)
+    except ValueError as error:
+        raise InputError(f"environment: no robustness to {percent:g} % can be computed: {error}") from None
+
+
+def _vertices(network: Network, percent: float) -> dict[str, Network]:
     found = {}
     stiff = [i for i, spring in enumerate(network.springs) if spring.stiffness > 0]
     for sign, factor in (("+", 1 + percent / 100), ("-", 1 - percent / 100)):

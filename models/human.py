@@ -262,6 +262,9 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return force
 
 
+_MOST_LINKS = 500  # of one hand: the eigenvalues of a loop around so many take five seconds, of 1000 half a minute
+
+
 class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A chain of masses and spring-dampers, from the handle to the equilibrium.
 
@@ -273,6 +276,8 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     voluntary: Voluntary | None = None
 
     def __post_init__(self) -> None:
+        if len(self.links) > _MOST_LINKS:
+            raise ValueError(f"links has {len(self.links)} entries, allowed are 1 to {_MOST_LINKS}")
         for i, link in enumerate(self.links[1:], start=2):
             if link.mass == 0:
                 raise ValueError(f"links #{i}.mass is 0: only the mass at the handle may be missing")

@@ -39,6 +39,7 @@ DEFAULT = "omega-pair"
 
 LONGEST_DELAY = MOST_SAMPLES
 _MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many states take ten seconds, of 2000 a minute
+_MOST_CHANNELS = 16  # a run without a coupling takes 13 s of a core, of 12 channels 6 s; a design takes longer
 _LONGEST_NAME = 200  # characters, that a table and a picture can show
 _TIMING_STREAM = 6  # keeps these draws apart from those of the humans with the same seed
 _Delays = tuple[int, ...]
@@ -89,6 +90,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def __post_init__(self) -> None:
         if len(self.name) > _LONGEST_NAME:
             raise ValueError(f"name has {len(self.name)} characters, allowed are {_LONGEST_NAME}")
+        if self.channels > _MOST_CHANNELS:
+            raise ValueError(f"environment.contacts has {self.channels} entries, allowed are 1 to {_MOST_CHANNELS}")
         require("T", self.T, 1e-6, 0.1, "s")
         require("duration", self.duration, self.T, 1e6, "s")
         if self.psi is _UNSAID:

@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.controller.environment import Spring
+from haptic_loop.design.robustness import vertices
+from haptic_loop.models.human import Human, Link
 from haptic_loop.sim.report import friction_left_out
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import SCENARIOS, InputError, built_in, load, parse
@@ -211,6 +214,45 @@ def test_a_device_of_the_catalogue_with_overrides():
     ]
     assert (type(flexible).__name__, flexible.handle_mass, flexible.force_limit) == ("CompliantDevice", 0.19, 3.3)
     assert load().replace(device=[{"device": "falcon", "damping": 0.5}] * 2).delta == (0.5, 0.5)
+
+
+def test_more_devices_than_a_run_can_take_are_refused():
+    text = """
+name = "many"
+T = 1e-3
+device = "omega.3"
+theta = {delays}
+psi = {delays}
+[environment]
+contacts = {contacts}
+springs = [{springs}]
+"""
+
+    def channels(n):
+        contacts = [f"c{i}" for i in range(n)]
+        springs = ", ".join(f'{{ between = ["{c}", "ground"], stiffness = 100.0 }}' for c in contacts)
+        return parse(text.format(delays=[0] * n, contacts=contacts, springs=springs)).channels
+
+    assert channels(16) == 16
+    with pytest.raises(InputError, match=r"environment\.contacts has 50 entries, allowed are 1 to 16"):
+        channels(50)
+
+
+def test_longer_hands_than_a_run_can_take_are_refused():
+    one = Link(mass=0.3, damping=3.0, stiffness=200.0)
+    assert len(Human(links=(one,) * 500).links) == 500
+    with pytest.raises(ValueError, match=r"links has 501 entries, allowed are 1 to 500"):
+        Human(links=(one,) * 501)
+    links = ", ".join(["{ mass = 0.3, damping = 3.0, stiffness = 200.0 }"] * 501)
+    human = f"{{ links = [{links}] }}"
+    with pytest.raises(InputError, match=r"human.*links has 501 entries, allowed are 1 to 500"):
+        parse(FALCON.format(device='"omega.3"').replace("human = [", f"human = [{human},", 1))
+
+
+def test_a_spring_at_its_limit_has_no_stiffer_neighbour():
+    network = FIGURE_4.__class__(contacts=("a",), springs=(Spring(("a", "ground"), 1e12),))
+    with pytest.raises(InputError, match=r"10 % can be computed: stiffness between a and ground is .*allowed are"):
+        vertices(network)
 
 
 @pytest.mark.parametrize("kind", ["rigid", "compliant"])
