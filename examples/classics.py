@@ -13,7 +13,7 @@ from haptic_loop.controller.coupling import NoCoupling
 from haptic_loop.models.hold import hold
 from haptic_loop.models.scene import Crowd, variants
 from haptic_loop.sim.accuracy import ForceError, force_error
-from haptic_loop.sim.couplings import given, limits_of
+from haptic_loop.sim.couplings import assessed, given
 from haptic_loop.sim.engines import ExactEngine
 from haptic_loop.sim.passivity_layer import EnergyNet, netted
 from haptic_loop.sim.run import assemble, run, run_blocks
@@ -118,7 +118,7 @@ def row(layer: Any) -> tuple[float | None, float, float, float, int, float]:
     scenario = load("omega-pair")
     design = design_coupling(scenario.loop("I"), *layer) if isinstance(layer, tuple) else None
     coupling = design.coupling if design else NoCoupling()
-    loop = assemble(scenario, coupling, limits_of(scenario, given(design)).rho if design else None)
+    loop = assemble(scenario, coupling, assessed(scenario, "I", given(design)).force_limits.rho if design else None)
     if layer and not design:
         loop = netted(loop, layer, max(scenario.samples, round(SECONDS / scenario.T)))
     trace = run(loop, "exact")
