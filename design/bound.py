@@ -12,9 +12,11 @@ weigh what the delays forbid,
 and then J >= -tr C_0 Delta - 2 <H, Lambda E> - <H, H/w>. With H = w |E| h this is
     1 - tr C_0 Delta - mean |h + Lambda E/|E||^2,
 the mean over log frequency in the band. H is piecewise linear, so that its sums over the circle are closed forms, and
-D is known at every frequency; what it lacks to be positive in a dense sweep is charged. Between the frequencies of the
-sweep D is not bounded, so the figure is an estimate: in the packaged case I it is .008 dB above the bound that remains
-after D is charged at every frequency, in case II .014 dB, and with light masses behind late devices nothing remains.
+D is bounded from below between any two frequencies (`dual_matrix`). What it lacks is added to C_0, which is charged:
+the bound that remains is one of every linear coupling.
+Where nothing remains, or where unequal psi make the forbidden sums known up to rounding only, there is an estimate: of
+a D that is positive at the frequencies of a sweep. The integrals over the band are by Gauss's rule; _QUADRATURE and the
+difference to the same rule in half the intervals are charged.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Complex, Lti
 from haptic_loop.design.barrier import EntryInequality, Program, centre, packed, towards
 from haptic_loop.design.conditions import even_damping
+from haptic_loop.design.dual_matrix import DualMatrix, dilogarithm
 from haptic_loop.design.files import off_table
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle
 from haptic_loop.design.program import Options
@@ -54,15 +57,18 @@ _FIRST, _STEEPER = 5.0, 6.0  # the barrier's first t, in degrees by the objectiv
 _GAP = 0.004  # of the bound, relatively, that the barrier leaves
 _LEAST = 1e-9  # mean square below which a bound says nothing
 _SWEEPS = 6
+_WANTED = 1e-3  # of the bound: what may be charged for the error of the bounds of D between frequencies
 _QUADRATURE = 1e-8  # of the mean square: what Gauss's rule may differ from the integral
 _LARGEST_CHARGE = 0.005  # of the bound, for what D lacks between the frequencies where it is imposed
 
 
 @dataclass(frozen=True)
 class _Bound:
-    """No linear coupling for this environment has less rms mismatch."""
+    """No linear coupling for this environment has less rms mismatch, if `proved`."""
 
     rms: float  # relative to the environment
+    proved: bool  # the dual matrix is nonnegative on the whole circle; otherwise it was looked at at samples only
+    sampled_rms: float  # the estimate: what the samples alone would charge
     seconds: float
 
     @property
@@ -79,8 +85,9 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
     even = tuple(even_damping(loop).tolist())
     loop = msgspec.structs.replace(loop, delta=even, T_max=None)
     dual = _Dual.of(loop, band_hz, knots or _KNOTS[loop.channels])
-    square = dual.best()
-    return _Bound(float(np.sqrt(max(square - _QUADRATURE, 0.0))), time.perf_counter() - started)
+    sampled, charged = (float(np.sqrt(max(square - _QUADRATURE, 0.0))) for square in dual.best())
+    proved = charged > 0 or sampled == 0  # no mismatch is below zero
+    return _Bound(charged if proved else sampled, proved, sampled, time.perf_counter() - started)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +103,8 @@ class _Dual:
     target: Array  # (2 inner, m^2): -Lambda E/|E| in the same units, real and then imaginary parts
     knots: Array
     forbidden: tuple[tuple[int, Array], ...]  # (row, weights (k, m)): sums over s_k[row] that are zero for every F
+    exact: bool  # those sums are zero exactly, and not but for rounding
+    band: tuple[float, float]  # [rad/sample]
 
     @classmethod
     def of(cls, loop: Loop, band_hz: tuple[float, float], count: int) -> _Dual:
@@ -111,21 +120,16 @@ class _Dual:
         heights = unit[:, None] * hats[:, 1:-1]  # h is zero at both ends of the band, else H_+ would be unbounded there
 
         # objective, by Gauss's rule between the points of the grid: mean |h + Lambda E/|E||^2
-        part, weight = np.polynomial.legendre.leggauss(3)
-        part = (1 + part[:, None]) / 2
-        width = np.diff(grid)
-        w = (grid[:-1] + part * width).ravel()
-        weight = (weight[:, None] / 2 * width).ravel() / (w * span)
-        H = np.concatenate([(1 - f) * heights[:-1] + f * heights[1:] for f in part.ravel()])
-        z = on_circle(w)
-        response = E.at(z)
-        size = np.linalg.norm(response, axis=(1, 2))
-        target = (z[:, None] ** -np.asarray(loop.lam))[:, :, None] * response / size[:, None, None]
+        w, weight, part = _gauss(grid)
+        weight = weight / (w * span)
+        H = np.concatenate([(1 - f) * heights[:-1] + f * heights[1:] for f in part])
+        size, target = _late(loop, E, w)
         target = np.sqrt(weight)[:, None] * target.reshape(w.size, -1)
         Q, R = np.linalg.qr((np.sqrt(weight) * span * w * size / np.pi)[:, None] * H)
         target = -np.vstack([Q.T @ target.real, Q.T @ target.imag])
         heights = scipy.linalg.solve_triangular(R, heights.T, trans=1).T
-        return cls(loop, grid, heights, target, knots, _forbidden(loop, E))
+        forbidden, exact = _forbidden(loop, E)
+        return cls(loop, grid, heights, target, knots, forbidden, exact, (low, high))
 
     @property
     def start(self) -> Array:
@@ -178,12 +182,55 @@ class _Dual:
         root = np.tile(np.diag(np.sqrt(self.loop.delta)).astype(complex), (w.size, 1, 1))
         return EntryInequality(np.zeros(further.shape[:2]), functions, root, root, np.ascontiguousarray(further))
 
-    def best(self) -> float:
-        """The bound on the mean square: along the barrier's path, with further frequencies where D fails between."""
+    def matrix(self, x: Array) -> DualMatrix:
+        """D of a point, as what can be bounded between frequencies."""
+        m, root = self.loop.channels, np.sqrt(np.asarray(self.loop.delta))
+        own, triangle = x[m * m * len(self.target) :], _triangle(m)
+        sums = np.zeros((1 + max((len(weights) for _, weights in self.forbidden), default=0), m, m))
+        for value, (i, j) in zip(own, triangle, strict=False):
+            sums[0, i, j] = value if i == j else 2 * value
+        for value, (i, weights) in zip(own[len(triangle) :], self.forbidden, strict=True):
+            sums[: len(weights), i] += value * weights
+        return DualMatrix.of(self.grid, self.h(x), 4 / self.loop.T * np.outer(root, root), sums)
+
+    def h(self, x: Array) -> Complex:
+        """H of a point at the grid, (k, m, m)."""
+        m, inner = self.loop.channels, self.heights.shape[1]
+        parts = x[: 2 * m * m * inner].reshape(m * m, 2 * inner)
+        return (self.heights @ (parts[:, :inner] + 1j * parts[:, inner:]).T).reshape(-1, m, m)
+
+    def objective_again(self, x: Array) -> float:
+        """The bound of a point by Gauss's rule in halves of the intervals, from H itself."""
+        low, high = self.band
+        grid = np.union1d(self.grid, (self.grid[1:] + self.grid[:-1]) / 2)
+        w, weight, _ = _gauss(grid)
+        H = self.h(x).reshape(self.grid.size, -1)
+        H = np.stack([np.interp(w, self.grid, column) for column in H.T], axis=1)
+        size, target = _late(self.loop, self.loop.E(), w)
+        h = (np.log(high / low) / np.pi * w * size)[:, None] * H
+        mean = weight / (w * np.log(high / low)) @ (2 * (np.conj(h) * target.reshape(h.shape)).real + np.abs(h) ** 2)
+        return float(-mean.sum() - self.start @ x)
+
+    def charged(self, x: Array, value: float, swept: Array) -> tuple[float, Array, Array]:
+        """The bound of a point after what D lacks anywhere is charged; where D was evaluated, and its eigenvalues.
+
+        A sum that is zero only but for rounding leaves no bound.
+        """
+        if not self.exact:
+            return 0.0, swept, np.zeros(swept.size)
+        m, again = self.loop.channels, self.objective_again(x)
+        lower, where, least = self.matrix(x).lower(swept, _WANTED * max(value, _LEAST) / m)
+        return min(value, again) - abs(value - again) + m * min(lower, 0.0), where, least
+
+    def best(self) -> tuple[float, float]:
+        """Two bounds on the mean square: with D at samples, and what remains after D is charged on the whole circle.
+
+        The points are along the barrier's path, with further frequencies where D fails between.
+        """
         imposed, swept = self.imposed(), self.swept()
         looked = self.block(swept)
         A, b, c = self.objective()
-        nothing, found, x, t = float(b @ b), 0.0, self.start, 0.0
+        nothing, found, remains, x, t = float(b @ b), 0.0, 0.0, self.start, 0.0
         for _ in range(_SWEEPS):
             program = Program(A, b, c, (self.block(imposed),))
             t, path = max(t, _FIRST * program.degree / nothing), [towards(self.start, x, program)]
@@ -197,12 +244,33 @@ class _Dual:
             rooms = [np.linalg.eigvalsh(looked.at(x))[:, 0] for x in path]
             kept = [_between(inner, room, path[-1], rooms[-1]) for inner, room in zip(path, rooms, strict=True)]
             kept.append(_between(self.start, np.ones(swept.size), path[-1], rooms[-1]))
-            found = max(found, *(nothing - program.value(x) for x in kept if x is not None))
-            if found >= (1 - _LARGEST_CHARGE) * value:
+            some = [(nothing - program.value(x), x) for x in kept if x is not None]
+            missing = _worst(-rooms[-1], swept)
+            if some:
+                best, point = max(some, key=lambda pair: pair[0])
+                charged, where, least = self.charged(point, best, swept)
+                found, remains = max(found, best), max(remains, charged)
+                missing = np.union1d(missing, _worst(-least, where))
+            if (remains if self.exact else found) >= (1 - _LARGEST_CHARGE) * value:
                 break
-            imposed = np.union1d(imposed, _worst(-rooms[-1], swept))
+            imposed = np.union1d(imposed, missing)
             x, t = path[-2], t / _STEEPER
-        return found
+        return found, remains
+
+
+def _gauss(grid: Array) -> tuple[Array, Array, Array]:
+    """Gauss's rule of three points in each interval: points, weights, and shares of an interval before them (3,)."""
+    part, weight = np.polynomial.legendre.leggauss(3)
+    part, width = (1 + part) / 2, np.diff(grid)
+    return (grid[:-1] + part[:, None] * width).ravel(), (weight[:, None] / 2 * width).ravel(), part
+
+
+def _late(loop: Loop, E: Lti, w: Array) -> tuple[Array, Complex]:
+    """|E| (k,), and Lambda E/|E| (k, m, m)."""
+    z = on_circle(w)
+    response = E.at(z)
+    size = np.linalg.norm(response, axis=(1, 2))
+    return size, (z[:, None] ** -np.asarray(loop.lam))[:, :, None] * response / size[:, None, None]
 
 
 def _between(inner: Array, room: Array, x: Array, lacking: Array) -> Array | None:
@@ -237,8 +305,10 @@ def _triangle(m: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(m) for j in range(i, m)]
 
 
-def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[int, Array], ...]:
+def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]:
     """What the delays forbid: (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E.
+
+    And whether these sums are exact: those of a null space are not but for rounding where the channels' psi differ.
 
     Row i of s_k is zero for 1 <= k <= theta_i. The next coefficients of F are those of R times those of Psi E: where
     the channels' psi differ they lie in a subspace, and v is from its complement. Of long delays the first steps are
@@ -253,7 +323,7 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[int, Array], ...]:
                 weights[k] = unit
                 found.append((i, weights))
     if not span:
-        return _first(found)
+        return _first(found), True
     G = delay(loop.psi, loop.T) @ E
     impulse = [G.D, *(G.C @ np.linalg.matrix_power(G.A, k) @ G.B for k in range(span - 1))]
     reach = np.zeros((span * m, span * m))  # coefficient l of R's row by step k of F's row
@@ -268,7 +338,7 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[int, Array], ...]:
                 if k:
                     weights[theta + k] -= row
             found.append((i, weights))
-    return _first(found)
+    return _first(found), not reach.any()
 
 
 def _first(sums: list[tuple[int, Array]]) -> tuple[tuple[int, Array], ...]:
@@ -286,20 +356,10 @@ def _causal(grid: Array, heights: Array, w: Array) -> Complex:
     slopes = np.diff(heights, axis=0) / np.diff(grid)[:, None]
     bends = np.diff(slopes, axis=0, prepend=0, append=0) / (2 * np.pi)
     mean = (np.diff(grid) @ (heights[1:] + heights[:-1])) / (2 * np.pi)
-    below, above = _dilogarithm(grid - w[:, None]), _dilogarithm(grid + w[:, None])
+    below, above = dilogarithm(grid - w[:, None]), dilogarithm(grid + w[:, None])
     back = np.exp(-1j * w)[:, None]
     cosine, sine = -((below + np.conj(above)) @ bends), -1j * ((below - np.conj(above)) @ bends)
     return np.hstack([(back - 1) * cosine + back * mean, (back - 1) * sine])
-
-
-def _dilogarithm(x: Array) -> Complex:
-    """Li2(e^jx) for |x| <= 2 pi."""
-    short = np.where(np.abs(x) > np.pi, x - 2 * np.pi * np.sign(x), x)
-    square, series = short**2, np.zeros_like(short)
-    for n in range(46, 0, -2):
-        series = (series + 2 * scipy.special.zeta(n) / ((2 * np.pi) ** n * n * (n + 1))) * square
-    clausen = short * (1 + series - np.log(np.where(short == 0, 1.0, np.abs(short))))
-    return np.pi**2 / 6 - np.abs(short) * (2 * np.pi - np.abs(short)) / 4 + 1j * clausen
 
 
 def _worst(lacking: Array, w: Array) -> Array:
@@ -321,6 +381,7 @@ class BoundBeside:
     reason: str | None = off_table("if given", None)
     even_without: tuple[str, ...] = ()  # what was asked and the bound does not know
     relative_mismatch_db: float | None = off_table("if given", None)  # of the supremum, where that was minimised
+    proved: bool = False  # otherwise an estimate: the matrix behind it was looked at at samples only
 
     @classmethod
     def of(
@@ -343,9 +404,13 @@ class BoundBeside:
         without = tuple(name for name, given in more.items() if given)
         if asked.objective == "sup":  # |M|_F <= sqrt(m) |M|, and |E|_F >= |E|
             return cls(
-                least.rms_db, even_without=without, relative_mismatch_db=least.rms_db - decibels(loop.channels) / 2
+                least.rms_db,
+                even_without=without,
+                relative_mismatch_db=least.rms_db - decibels(loop.channels) / 2,
+                proved=least.proved,
             )
-        return cls(least.rms_db, None if without else reached_db - least.rms_db, even_without=without)
+        gap = None if without else reached_db - least.rms_db
+        return cls(least.rms_db, gap, even_without=without, proved=least.proved)
 
     @property
     def words(self) -> str:
@@ -355,5 +420,8 @@ class BoundBeside:
         sup = f", nor than {self.relative_mismatch_db:.2f} dB at most" if self.relative_mismatch_db is not None else ""
         without = f", even without {' and '.join(self.even_without)}" if self.even_without else ""
         left = f": {self.gap_db:.2f} dB left" if self.gap_db is not None else ""
-        least = f"no linear coupling can be better than {self.rms_mismatch_db:.2f} dB rms"
-        return f"estimate, checked at sampled frequencies: {least}{sup}{without}{left}"
+        rest = f"{self.rms_mismatch_db:.2f} dB rms{sup}{without}{left}"
+        if self.proved:
+            return f"no linear coupling can be better than {rest}"
+        rest = rest.replace(", nor than", " and", 1)
+        return f"estimate, checked at sampled frequencies: the limit of linear couplings is {rest}"

@@ -1,0 +1,173 @@
+"""The matrix of a dual point, bounded from below on the whole circle and not only at samples.
+
+D(w) = He[(4/T) ((1/z - 1) H_+ + H_0) + sum_k C_k z^-k] + C_0 (see `bound`), scaled by root(delta) from both sides. H is
+piecewise linear with bends c_i at x_i, so that with H_0 = mean and a = 1/z - 1
+
+    (1/z - 1) H_+ + H_0 = mean - a g,     g(w) = sum_i c_i Li2(e^j(x_i - w)) + conj(c_i Li2(e^j(x_i + w))) - mean.
+
+Let an interval of length l hold no bend inside. The error of linear interpolation is there at most
+- l^2/8 max |f^(2)| for any f;
+- l^2/16 + min(l/e, l^2/(8 d)) for Li2(e^jx), d the distance of the interval from 0 modulo 2 pi, because
+  Li2^(2) = 1/(1 - e^-jx) = (1 - j cot(x/2))/2, |cot(x/2)|/2 <= 1/|x|, and because the error of x log x, whose second
+  derivative is 1/x, is largest on [0, l], where it is l/e;
+- l^2/8 (|f^(2)| + l/2 |f^(3)| + l^2/8 max |f^(4)|) with the derivatives in the middle: for the sum over the bends that
+  are far away, whose terms cancel. Li2^(3) = j/4 (1 + cot(x/2)^2), and |Li2^(4)| <= 1/(4 sin(d/2)^3);
+- |a| (that of g) + l^2/8 max |g| + l/4 |g(right) - g(left)| for a g: a times the interpolant of g is left, whose second
+  derivative is a^(2) times the interpolant and 2 a^(1) times its slope, |a^(1)| = |a^(2)| = 1.
+The line between two Hermitian matrices has no smaller eigenvalue than they have. So the least one in the interval is
+at least the smaller one of its ends less the Frobenius norm of these errors and of what rounding may add.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy  # its parts load when they are used
+from haptic_loop.controller.arithmetic import spend
+from haptic_loop.controller.lti import Array, Complex
+from haptic_loop.design.frequency import hermitian
+
+_UNIT = 2.0**-53
+_EVALUATION = 6e-8  # units of counted work for one bend at one frequency
+_MOST = 40_000_000  # bends times frequencies of one matrix: about two seconds
+_CHUNK = 2**18  # bends times frequencies at once, so that they stay in the cache
+_FAR = 2.0  # lengths of an interval, beyond which a bend counts as far away
+_COTANGENT = 1e-12  # relative rounding of a cotangent and of the sums over it, with room
+_SHARE = 8  # the error is at most this part of what is wanted, or of what is missing at the ends anyway
+
+
+@dataclass(frozen=True, eq=False)
+class DualMatrix:
+    """D of one dual point, for m channels, n bends, and sums of C_k up to the step K."""
+
+    points: Array  # (n,) x_i [rad/sample], in (0, pi)
+    bends: Complex  # (n, m, m) c_i times 4/T, scaled
+    slopes: Array  # (n, m, m) the absolute values of the two slopes beside each bend, in the units of the bends
+    mean: Array  # (m, m)
+    sums: Array  # (K + 1, m, m): C_0 and C_k
+
+    @classmethod
+    def of(cls, points: Array, heights: Complex, scale: Array, sums: Array) -> DualMatrix:
+        """Return D of an H that is piecewise linear with these heights (n, m, m) at the points, zero at both ends.
+
+        `scale` (m, m) is 4/T times the roots of the damping.
+        """
+        width, ends = np.diff(points)[:, None, None], ((1, 1), (0, 0), (0, 0))
+        slope = np.pad(scale / (2 * np.pi) * np.diff(heights, axis=0) / width, ends)
+        mean = scale / (2 * np.pi) * (width * (heights[1:] + heights[:-1]).real).sum(axis=0)
+        return cls(points, np.diff(slope, axis=0), np.abs(slope[1:]) + np.abs(slope[:-1]), mean, sums)
+
+    def at(self, w: Array) -> Complex:
+        """Return D at frequencies [rad/sample] in [0, pi], shape (k, m, m)."""
+        return self._parts(w)[1]
+
+    def lower(self, swept: Array, wanted: float) -> tuple[float, Array, Array]:
+        """Return a number below every eigenvalue of D on the circle, and where D was evaluated with what least one.
+
+        The intervals between the frequencies `swept` and the bends are halved until each has a bound above -wanted, or
+        one that is as low as D is at its ends, or until the counted work is spent.
+        """
+        w = np.unique(np.concatenate([[0.0, np.pi], swept, self.points]))
+        budget = _MOST // self.points.size - w.size
+        g, D = self._parts(w)
+        least = np.linalg.eigvalsh(D)[:, 0]
+        where, values = [w], [least]
+        left, right, g_left, g_right, end = w[:-1], w[1:], g[:-1], g[1:], np.stack([least[:-1], least[1:]])
+        bound = np.inf
+        while True:
+            error, lower, middle = self._error(left, right, g_left, g_right), end.min(axis=0), (left + right) / 2
+            rough = (lower - error < -wanted) & (error > np.maximum(wanted, -lower) / _SHARE)
+            rough &= (middle > left) & (middle < right)
+            if rough.sum() > budget:
+                rough[:] = False
+            bound = min(bound, (lower - error)[~rough].min(initial=np.inf))
+            if not rough.any():
+                break
+            left, right, middle = left[rough], right[rough], middle[rough]
+            budget -= middle.size
+            g, D = self._parts(middle)
+            least = np.linalg.eigvalsh(D)[:, 0]
+            where, values = [*where, middle], [*values, least]
+            left, right = np.append(left, middle), np.append(middle, right)
+            g_left, g_right = np.concatenate([g_left[rough], g]), np.concatenate([g, g_right[rough]])
+            before, after = end[:, rough]
+            end = np.stack([np.append(before, least), np.append(least, after)])
+        order = np.argsort(np.concatenate(where))
+        return float(bound) - self.rounding(), np.concatenate(where)[order], np.concatenate(values)[order]
+
+    def rounding(self) -> float:
+        """Return how far rounding may move an eigenvalue of D, at any frequency.
+
+        In units of u = 2^-53: a complex sum of n products is off by 3 (n + 6) of the sum of their absolute values, with
+        |Li2| <= 2; Li2 itself by 300, of which its argument's own rounding of 2 pi times the logarithm in its slope are
+        160; a bend by 8 of the slopes beside it; |a| is at most 2, and off by 2; a power z^-k by 7 (k + 2). An
+        eigenvalue is off by 20 m of the norm.
+        """
+        m, bends, slopes = len(self.mean), np.abs(self.bends).sum(axis=0), self.slopes.sum(axis=0)
+        steps = np.arange(len(self.sums))[:, None, None]
+        entries = 4 * bends * (3 * (self.points.size + 6) + 300) + 64 * slopes + 100 * np.abs(self.mean)
+        entries = entries + (np.abs(self.sums) * (7 * (steps + 2) + len(self.sums))).sum(axis=0)
+        size = np.linalg.norm(8 * bends + np.abs(self.sums).sum(axis=0) + 3 * np.abs(self.mean))
+        return float(_UNIT * (np.linalg.norm(entries) + 20 * m * size))
+
+    def _parts(self, w: Array) -> tuple[Complex, Complex]:
+        """Return g and D at these frequencies, (k, m, m) each."""
+        spend(_EVALUATION * w.size * self.points.size)
+        m = len(self.mean)
+        g, c = np.empty((w.size, m * m), dtype=np.complex128), self.bends.reshape(-1, m * m)
+        for part in self._chunks(w.size):
+            below, above = dilogarithm(self.points - w[part, None]), dilogarithm(self.points + w[part, None])
+            g[part] = below @ c + np.conj(above @ c)
+        g = g.reshape(-1, m, m) - self.mean
+        powers = np.exp(-1j * np.outer(w, np.arange(len(self.sums))))
+        polynomial = (powers @ self.sums.reshape(len(self.sums), -1)).reshape(-1, m, m)
+        return g, hermitian(self.mean - (np.exp(-1j * w) - 1)[:, None, None] * g + polynomial)
+
+    def _error(self, left: Array, right: Array, g_left: Complex, g_right: Complex) -> Array:
+        """Return a bound on the norm of D less its linear interpolant, interval by interval (k,)."""
+        spend(_EVALUATION * left.size * self.points.size)
+        m, length = len(self.mean), (right - left)[:, None, None]
+        g = np.empty((left.size, m * m))
+        for part in self._chunks(left.size):
+            g[part] = self._interpolation(left[part, None], right[part, None])
+        jump, size = np.abs(g_right - g_left), np.maximum(np.abs(g_left), np.abs(g_right))
+        modulus = np.minimum(right, 2.0)[:, None, None]  # |a| = 2 sin(w/2)
+        error = modulus * g.reshape(-1, m, m) + length**2 / 8 * size + length / 4 * jump
+        squares = np.arange(len(self.sums))[:, None, None] ** 2
+        error = error + length**2 / 8 * (squares * np.abs(self.sums)).sum(axis=0)
+        norm = np.linalg.norm((error + np.swapaxes(error, 1, 2)) / 2, axis=(1, 2))
+        return (1 + 1e-9) * norm  # these sums have no negative terms: they are off by far less
+
+    def _interpolation(self, left: Array, right: Array) -> Array:
+        """Return bounds on the errors of the entries of g, (k, m^2); left and right are (k, 1)."""
+        c, x, middle, length = self.bends.reshape(len(self.bends), -1), self.points, (left + right) / 2, right - left
+        below = np.maximum(np.maximum(x - right, left - x), 0.0)
+        above = np.maximum(np.minimum(x + left, 2 * np.pi - x - right), 0.0)
+        bend = turn = np.zeros((len(left), c.shape[1]), dtype=np.complex128)
+        rest = np.zeros((len(left), x.size))
+        for distance, angle, sign in ((below, x - middle, -1), (above, x + middle, 1)):
+            far = distance > _FAR * length
+            cot = np.where(far, 1 / np.tan(np.where(far, angle, 1.0) / 2), 0.0)
+            second, third = far @ c / 2 - 0.5j * (cot @ c), 0.25j * ((far + cot**2) @ c)
+            bend = bend + (second if sign < 0 else np.conj(second))
+            turn = turn + (-third if sign < 0 else np.conj(third))
+            fourth = length**2 / 32 / np.sin(np.where(far, distance, 1.0) / 2) ** 3
+            beyond = length**2 / 8 * (fourth + _COTANGENT * (1 + np.abs(cot)) ** 2)
+            near = length**2 / 16 + np.minimum(length / np.e, length**2 / (8 * np.maximum(distance, length / 100)))
+            rest += np.where(far, beyond, near)
+        return rest @ np.abs(c) + length**2 / 8 * (np.abs(bend) + length / 2 * np.abs(turn))
+
+    def _chunks(self, count: int) -> list[slice]:
+        step = max(_CHUNK // self.points.size, 1)
+        return [slice(start, start + step) for start in range(0, count, step)]
+
+
+def dilogarithm(x: Array) -> Complex:
+    """Li2(e^jx) for |x| <= 2 pi."""
+    short = np.where(np.abs(x) > np.pi, x - 2 * np.pi * np.sign(x), x)
+    square, series = short**2, np.zeros_like(short)
+    for n in range(46, 0, -2):
+        series = (series + 2 * scipy.special.zeta(n) / ((2 * np.pi) ** n * n * (n + 1))) * square
+    clausen = short * (1 + series - np.log(np.where(short == 0, 1.0, np.abs(short))))
+    return np.pi**2 / 6 - np.abs(short) * (2 * np.pi - np.abs(short)) / 4 + 1j * clausen
