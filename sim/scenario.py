@@ -385,8 +385,8 @@ def _load_humans(text: str, channels: int) -> _HumanFile:
 
     Raises InputError with one line that names the file and the field.
     """
+    own = ".py" in text
     try:
-        own = ".py" in text
         people = _own_humans(text) if own else _humans_of(read_text(text, f"--human {text}"), f"--human {text}")
         if len(people.human) != channels and not people.population:
             what = "hands" if own else "[[human]] tables"
@@ -395,9 +395,11 @@ def _load_humans(text: str, channels: int) -> _HumanFile:
     except InputError:
         raise
     except ValueError as error:
-        if place_of(error):  # in a class of the user's own
-            raise
         raise InputError(f"--human {text}: {error}") from None
+    except Exception as error:
+        if not own:
+            raise
+        raise InputError(f"--human {text}: {type(error).__name__}: {error}") from None  # raised in the user's file
     return people
 
 

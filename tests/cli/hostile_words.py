@@ -263,8 +263,7 @@ REFUSED = {
         --ranges 10 --varying-delay 0,2 | --limiter --no-limiter | --coupling optimal --order 2
         --method inner | --compare | --objective sup | --order 0 --coupling ccl
         --order 1e9 --coupling ccl | --high-gain 0 | --high-gain 2 | --seconds -1 --coupling optimal
-        --band 1,0 --coupling optimal | --best
-        --latency 1e-3 --varying-delay 0,2""",
+        --band 1,0 --coupling optimal | --best""",
     "audit": """--device nix | --devices --K 5 | --rigid | --rigid --K 5 --B 0 --theta 1,2 | --rigid --K 5 --B 0 --psi 1
         --rigid --K 0 --B 0 | --rigid --K 1e300 --B 0 | --K 1,2,3 --B 0 | --K 1,2 --B 0,0,0 | --K -1,2 --B 0
         --rigid --K 5 --B 0 --T-max 1e-9 | --K 1,2 --B 0 --coupling c.json""",

@@ -98,7 +98,6 @@ def test_the_proof_is_one_of_the_coupling_as_stored(name, tmp_path):
     stored = Stored.of(loop, found.coupling, found.certificate)
     save(stored, tmp_path / "best.json")
     read = load_file(tmp_path / "best.json")
-    assert read.version == 2
     assert verify(read).proved
     old = found.coupling
     doubled = Stored.of(loop, ForceFilter(old.poles, old.pairs, 2 * old.R), found.certificate)

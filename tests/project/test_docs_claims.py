@@ -11,8 +11,6 @@ import pytest
 ROOT = Path(__file__).parents[2]
 MENTION = re.compile(r"tests/(?:\w+/)*(test_\w+\.py)::(\w+)")
 DOCS = ("theory.md", "reproducibility.md")
-#: Sections that introduce words and claim nothing
-DEFINITIONS = ("The loop and its symbols", "The classics beside this")
 
 
 def defined_in(name: str) -> set[str]:
@@ -22,25 +20,12 @@ def defined_in(name: str) -> set[str]:
     return {node.name for node in nodes if node.name.startswith("test_")}
 
 
-def sections(text: str) -> dict[str, str]:
-    """Second-level headings with what stands below each."""
-    parts = re.split(r"^## (.+)$", text, flags=re.MULTILINE)
-    return dict(zip(parts[1::2], parts[2::2], strict=True))
-
-
 @pytest.mark.parametrize("name", DOCS)
 def test_every_test_that_the_documentation_names_exists(name):
     mentions = MENTION.findall((ROOT / "docs" / name).read_text(encoding="utf-8"))
     assert mentions
     missing = [f"tests/{file}::{test}" for file, test in mentions if test not in defined_in(file)]
     assert not missing
-
-
-def test_every_section_of_the_theory_points_to_a_test():
-    found = sections((ROOT / "docs" / "theory.md").read_text(encoding="utf-8"))
-    bare = [title for title, body in found.items() if not MENTION.search(body) and title not in DEFINITIONS]
-    assert not bare
-    assert set(DEFINITIONS) <= set(found)
 
 
 def test_every_row_of_the_reproducibility_table_shows_its_evidence():
