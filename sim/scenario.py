@@ -39,7 +39,7 @@ DEFAULT = "omega-pair"
 
 LONGEST_DELAY = MOST_SAMPLES
 _MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many states take ten seconds, of 2000 a minute
-_MOST_CHANNELS = 16  # a run without a coupling takes 13 s of a core, of 12 channels 6 s; a design takes longer
+_MOST_CHANNELS = 32  # a run of 16 channels without a coupling takes 13 s of a core; of 50 it takes minutes
 _LONGEST_NAME = 200  # characters, that a table and a picture can show
 _TIMING_STREAM = 6  # keeps these draws apart from those of the humans with the same seed
 _Delays = tuple[int, ...]

@@ -234,7 +234,7 @@ springs = [{springs}]
         return parse(text.format(delays=[0] * n, contacts=contacts, springs=springs)).channels
 
     assert channels(16) == 16
-    with pytest.raises(InputError, match=r"environment\.contacts has 50 entries, allowed are 1 to 16"):
+    with pytest.raises(InputError, match=r"environment\.contacts has 50 entries, allowed are 1 to 32"):
         channels(50)
 
 
