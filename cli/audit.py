@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rich.table import Table
+
 from haptic_loop.cli import options, render, world
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
@@ -26,7 +28,6 @@ from haptic_loop.sim.couplings import choose, fitted, from_file, own_of, read_co
 from haptic_loop.sim.report import encoder_steps
 from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.world import is_world
-from rich.table import Table
 
 _EXAMPLES = (
     "python -m design.audit --K 2870,2320 --B 5.47,5.55",

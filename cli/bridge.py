@@ -14,6 +14,8 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
+from rich.console import Console
+
 from haptic_loop.cli import options, render, session_cli
 from haptic_loop.design.certificate import named
 from haptic_loop.design.files import plain, write_json
@@ -28,7 +30,6 @@ from haptic_loop.hw.session_report import SessionReport, outcome, save
 from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.world import require_no_world
-from rich.console import Console
 
 _LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
 

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+from rich.table import Table
+
 from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.loop import Loop
@@ -29,7 +31,6 @@ from haptic_loop.design.known_device import described
 from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, listed, suffices, switching_guarantee
 from haptic_loop.design.worst_member import Searched, search, search_ranges
 from haptic_loop.sim.couplings import read_coupling
-from rich.table import Table
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from rich.table import Table
+
 from haptic_loop.cli import options, render
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.compare import FEEL_HZ
@@ -25,7 +27,6 @@ from haptic_loop.sim.couplings import NAMES, choose
 from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.stability import MARGINAL
 from haptic_loop.sim.world import require_no_world
-from rich.table import Table
 
 _MOST = 6  # curves that can be told apart in one panel
 

@@ -9,6 +9,8 @@ from functools import partial
 from typing import Any
 
 import msgspec
+from rich.table import Table
+
 from haptic_loop.cli import options, render, world
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.loop import Loop
@@ -29,7 +31,6 @@ from haptic_loop.design.robustness import Nearby, ranges_around
 from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.world import is_world
-from rich.table import Table
 
 
 def main(argv: list[str]) -> int:

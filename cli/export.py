@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from haptic_loop.cli import options, render
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.certificate import Verdict, named, verify

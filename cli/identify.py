@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from rich.table import Table
+
 from haptic_loop.cli import options, render
 from haptic_loop.cli.session_cli import add_link_options, check_link, hold_session, steady_scenario
 from haptic_loop.design.files import off_table, plain, write
@@ -25,7 +27,6 @@ from haptic_loop.hw.session import Session, session_for
 from haptic_loop.hw.session_report import SessionReport, outcome
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim.scenario import InputError, Scenario
-from rich.table import Table
 
 _LIMITS = (
     "The bound is a statement about these records: the least viscous friction of all laws that fit, less its scatter "

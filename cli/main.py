@@ -14,13 +14,14 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any, NoReturn
 
+from threadpoolctl import threadpool_limits
+
 from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, UNFINISHED, did_you_mean
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.design.files import nobody_reads, one_command, one_line
 from haptic_loop.design.own import is_refusal, place_of
 from haptic_loop.design.result import DesignFailed
 from haptic_loop.sim.scenario import InputError
-from threadpoolctl import threadpool_limits
 
 #: command -> what python -m calls it, and what it is for; it lives in the file of its name in this folder
 COMMANDS = {

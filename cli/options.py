@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import msgspec
+
 from haptic_loop.controller.delay import LOST, Periods, VaryingDelay
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.design.files import check_file, folder, read_text

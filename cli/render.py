@@ -16,14 +16,15 @@ from dataclasses import MISSING, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from haptic_loop.controller.loop import Loop
-from haptic_loop.design.files import InJson, nobody_reads, plain, printable, remove, write_json
-from haptic_loop.design.result import DesignFailed, Requirement, listed
 from rich.console import Console
 from rich.errors import MarkupError
 from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
+
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.files import InJson, nobody_reads, plain, printable, remove, write_json
+from haptic_loop.design.result import DesignFailed, Requirement, listed
 
 if TYPE_CHECKING:  # the reports' parts, which no command without them loads
     from haptic_loop.design.robustness import Nearby, Spread

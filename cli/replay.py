@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
 from haptic_loop.cli import options, render
 from haptic_loop.hw.recording import load, replay
 

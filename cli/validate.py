@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
 from haptic_loop.cli import options, render, world
 from haptic_loop.cli import verdict as verdicts_of
 from haptic_loop.cli.verdict import assessment_of, chosen_by

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+
 from haptic_loop.cli import options, render
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.design.api import proved, store

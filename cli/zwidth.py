@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import msgspec
+
 from haptic_loop.cli import options, render
 from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.lti import Array

@@ -40,8 +40,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from haptic_loop.controller.lti import Array, Lti
 from numpy.typing import ArrayLike, NDArray
+
+from haptic_loop.controller.lti import Array, Lti
 
 EPS = 0.05  # the share of the damping that a budget leaves alone
 _UNTOLD = 4096  # ticks that wait for the device's word; older ones stay booked as their largest loss

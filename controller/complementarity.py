@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.lti import Array, ReadOnly, frozen
 

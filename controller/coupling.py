@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from haptic_loop.controller.arithmetic import Number, numbers
 from haptic_loop.controller.lti import Array, Block, Complex, Lti, ReadOnly, Sampled, as_like, frozen, taps
-from numpy.typing import ArrayLike, NDArray
 
 _LARGEST_COEFFICIENT = 1e12  # largest coefficient of a stored coupling, SI units
 _MOST_TERMS = 2000  # longest moving average; each term is a state

@@ -9,9 +9,10 @@ from typing import Literal
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from haptic_loop.controller.arithmetic import Number
 from haptic_loop.controller.lti import Array, Lti, frozen, taps
-from numpy.typing import ArrayLike, NDArray
 
 # ----------------------------------------------------------------------------------------------------
 # Delays: constant ones as linear blocks, Theta (4), Psi (5) and Lambda (7); varying ones as a line that holds.

@@ -16,12 +16,13 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
+
 from haptic_loop.controller.arithmetic import Number, SingularLoop, eye, inverse, numbers, rational, solve, times
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.lti import Array, Complex, Lti, Sampled, as_like
 from haptic_loop.controller.passivity import hermitian_floor
-from numpy.typing import NDArray
 
 GROUND = "ground"
 NO_MODEL = "a MuJoCo world has no linear model E(z): any-environment needs none; linearise(world, pose) gives one"

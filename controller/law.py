@@ -9,11 +9,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Self, cast
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from haptic_loop.controller.complementarity import BoxProblem, Complementarity
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Wall
 from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen, taps
-from numpy.typing import ArrayLike, NDArray
 
 # ----------------------------------------------------------------------------------------------------
 # Walls: springs that push and never pull, so that contact is made and broken.

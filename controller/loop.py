@@ -15,6 +15,8 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike
+
 from haptic_loop.controller.arithmetic import Number, rational
 from haptic_loop.controller.coupling import Coupling, Strict
 from haptic_loop.controller.delay import delay
@@ -22,7 +24,6 @@ from haptic_loop.controller.environment import RIGID_WALL, Environment, Network,
 from haptic_loop.controller.law import Law, Limiter
 from haptic_loop.controller.lti import Block, Complex, Lti, Sampled, as_like
 from haptic_loop.controller.ranges import Member, Ranges, members
-from numpy.typing import ArrayLike
 
 MOST_SAMPLES = 1000  # of delay on a channel; every one is a state
 _Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=MOST_SAMPLES)], ...]

@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 import scipy  # its submodules are imported on first use
+from numpy.typing import ArrayLike, NDArray
+
 from haptic_loop.controller.arithmetic import (
     Array,
     Number,
@@ -32,7 +34,6 @@ from haptic_loop.controller.arithmetic import (
     spend,
     times,
 )
-from numpy.typing import ArrayLike, NDArray
 
 Complex = NDArray[np.complex128]
 

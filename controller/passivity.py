@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from haptic_loop.controller.lti import Array, Lti
 from numpy.typing import NDArray
+
+from haptic_loop.controller.lti import Array, Lti
 
 _FIRST = 64  # intervals of [0, pi]
 _EVALUATIONS = 1 << 15  # for up to 8 states, about half a second; fewer for more states

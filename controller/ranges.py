@@ -14,6 +14,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+
 from haptic_loop.controller.environment import GROUND, MOST_AMOUNT, Network, Spring
 from haptic_loop.controller.lti import Array
 

@@ -23,6 +23,7 @@ from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
+
 from haptic_loop.controller.budget import NetFigures
 from haptic_loop.controller.delay import HeldLine, Ticks, packet_delays
 from haptic_loop.controller.environment import Wall

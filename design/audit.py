@@ -11,6 +11,7 @@ from typing import Any, TypeVar, cast
 
 import msgspec
 import numpy as np
+
 from haptic_loop.controller.arithmetic import TooLong
 from haptic_loop.controller.coupling import (
     Coupling,

@@ -16,10 +16,11 @@ from functools import cached_property
 
 import numpy as np
 import scipy  # its parts load when they are used
+from numpy.typing import NDArray
+
 from haptic_loop.controller.arithmetic import spend
 from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design.frequency import hermitian
-from numpy.typing import NDArray
 
 _CENTRED = 0.5  # Newton decrement squared at which a point counts as central: 0.05/t above the best value
 _MOST_STEPS = 60

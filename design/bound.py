@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 import scipy  # its parts load when they are used
+
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Complex, Lti

@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import scipy
+
 from haptic_loop.controller.arithmetic import SingularLoop, TooLong, rational, within
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop, forget_exact

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
+
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
@@ -14,7 +16,6 @@ from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.frequency import Response, frequencies, on_circle
 from haptic_loop.design.result import CONDITIONS, Requirement
-from numpy.typing import NDArray
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling over frequency: singular values, the demand for damping, and what a hand perceives.

@@ -33,6 +33,7 @@ from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
+
 from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay, moving_sum

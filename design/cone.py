@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
+
 from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design.result import DesignFailed, Infeasible
 

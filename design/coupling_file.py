@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
+
 from haptic_loop.controller.coupling import Coupling, Form, Strict, require_channels
 from haptic_loop.controller.environment import Network
 from haptic_loop.controller.loop import Loop

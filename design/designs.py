@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy  # its parts load when they are used
+
 from haptic_loop.controller.arithmetic import spend
 from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design.frequency import hermitian

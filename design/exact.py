@@ -11,11 +11,12 @@ from typing import Any
 import flint
 import numpy as np
 import scipy  # its parts load when they are used
+from numpy.typing import NDArray
+
 from haptic_loop.controller.arithmetic import rational, spend
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, supremum
 from haptic_loop.design.result import NotProved, Requirement
-from numpy.typing import NDArray
 
 # ----------------------------------------------------------------------------------------------------
 # Matrices over the rationals: integers over one common denominator, and exact tests of definiteness.

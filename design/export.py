@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from string import Template
 
 import numpy as np
+
 from haptic_loop.controller.complementarity import GROUNDED, PIVOT_ROUNDING
 from haptic_loop.controller.law import Limiter
 from haptic_loop.controller.loop import Loop

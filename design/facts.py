@@ -9,6 +9,7 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+
 from haptic_loop.controller.arithmetic import Number, numbers
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Block, constant_like

@@ -16,6 +16,9 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from scipy.linalg import block_diag
+from scipy.optimize import minimize
+
 from haptic_loop.controller.coupling import Compliance, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.controller.loop import Loop
@@ -26,8 +29,6 @@ from haptic_loop.design.conditions import any_environment, any_environment_deman
 from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.frequency import on_circle
 from haptic_loop.design.result import Design, DesignFailed, Requirement
-from scipy.linalg import block_diag
-from scipy.optimize import minimize
 
 #: How such a coupling may be sought.
 _METHODS = ("complementarity", "inner", "fixed-poles")

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic
 
 import numpy as np
+
 from haptic_loop.controller.arithmetic import Number, numbers
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti, Sampled, as_like, vstack

@@ -6,10 +6,11 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 
 import numpy as np
+from numpy.typing import NDArray
+
 from haptic_loop.controller.arithmetic import spend, within
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design import budgets
-from numpy.typing import NDArray
 
 # ----------------------------------------------------------------------------------------------------
 # Integrals over frequency, by Gauss's rule on intervals that are halved until it no longer matters.

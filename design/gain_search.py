@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
+
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import DelayRange, Loop
@@ -26,7 +28,6 @@ from haptic_loop.design.known_device import KNOWN_DEVICE, device_rows, largest_b
 from haptic_loop.design.lmi import RESERVE
 from haptic_loop.design.result import Requirement
 from haptic_loop.design.transparency import BAND_HZ, transparency
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # slow to load
     from scipy.optimize import OptimizeResult

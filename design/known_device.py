@@ -25,6 +25,8 @@ from typing import Any, NamedTuple
 import flint
 import numpy as np
 import scipy  # its parts load when they are used
+from numpy.typing import NDArray
+
 from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers, rational
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay
@@ -37,7 +39,6 @@ from haptic_loop.design.exact import require_size
 from haptic_loop.design.frequency import Response, frequencies, hermitian, largest_eigenvalue, on_circle, supremum
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import Environments, NotProved, Requirement, from_ratio, refusal
-from numpy.typing import NDArray
 
 # ----------------------------------------------------------------------------------------------------
 # The least cost of a period.

@@ -20,6 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # its parts load when they are used
+from numpy.typing import NDArray
+
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
@@ -31,7 +33,6 @@ from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.exact import require_size
 from haptic_loop.design.frequency import Response, frequencies, on_circle, supremum
 from haptic_loop.design.result import DesignFailed, Environments, Infeasible, NotProved, Requirement, refusal
-from numpy.typing import NDArray
 
 #: Designs ask for (1 - RESERVE) of the available damping, so that they are certified as stored.
 RESERVE = 1e-4

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+
 from haptic_loop.controller.arithmetic import TooLong, spent, spent_after, units_since, within
 from haptic_loop.controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
 from haptic_loop.controller.loop import DelayRange, Loop

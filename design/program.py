@@ -15,6 +15,8 @@ from typing import Any, Literal
 
 import numpy as np
 import scipy  # its parts load when they are used
+from numpy.typing import NDArray
+
 from haptic_loop.controller.arithmetic import spend, spent
 from haptic_loop.controller.coupling import ForceFilter, basis
 from haptic_loop.controller.delay import delay
@@ -26,7 +28,6 @@ from haptic_loop.design.conditions import Demand, even_damping, this_environment
 from haptic_loop.design.environments import SWITCHING, LimitedForces
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, peaks
 from haptic_loop.design.transparency import BAND_HZ
-from numpy.typing import NDArray
 
 OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # share of the damping that stays unused: what an exact proof always finds room in

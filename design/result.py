@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
+
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Array

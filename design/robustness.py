@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.environment import Network
 from haptic_loop.controller.loop import Loop

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+
 from haptic_loop.controller.coupling import Compliance, Coupling, MovingAverage, SpringDamper
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti, hstack, taps, vstack

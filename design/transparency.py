@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design.frequency import frequencies, integral, on_circle, supremum
-from numpy.typing import NDArray
 
 BAND_HZ = (0.5, 80.0)
 _ROUNDING = 1e-10  # of the environment: two responses that differ by less are one

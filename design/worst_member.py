@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+
 from haptic_loop.controller.arithmetic import spent, spent_after
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop

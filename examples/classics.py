@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from haptic_loop import design_coupling, load
 from haptic_loop.controller.budget import NetFigures
 from haptic_loop.controller.coupling import NoCoupling
 from haptic_loop.models.hold import hold
@@ -17,8 +19,6 @@ from haptic_loop.sim.couplings import assessed, given
 from haptic_loop.sim.engines import ExactEngine
 from haptic_loop.sim.passivity_layer import EnergyNet, netted
 from haptic_loop.sim.run import assemble, run, run_blocks
-
-from haptic_loop import design_coupling, load
 
 PAIRS, SECONDS, SLOW = 100, 10.0, 0.1  # pairs of lossless hands, their time [s], their speed at the start [m/s]
 

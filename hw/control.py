@@ -17,6 +17,7 @@ from operator import sub
 from typing import NamedTuple, Protocol
 
 import numpy as np
+
 from haptic_loop.controller.budget import BudgetFigures, EnergyBudget, Packets
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.law import Law

@@ -22,6 +22,7 @@ from functools import lru_cache
 from typing import Self
 
 import numpy as np
+
 from haptic_loop.controller.lti import Array
 from haptic_loop.hw.device_state import RUNNING, Device
 from haptic_loop.hw.protocol import PROTOCOL, Force, Info, Phase, distance

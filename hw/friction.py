@@ -28,8 +28,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy  # its parts load when they are used
-from haptic_loop.controller.lti import Array
 from numpy.typing import NDArray
+
+from haptic_loop.controller.lti import Array
 
 _WINDOW = 0.012  # [s] least standard deviation of h: half the amplitude at 16 Hz
 _ACCELERATION_NOISE = 1.5e-3  # [m/s2] that rounding of the encoder may leave: a coarse one has a longer window

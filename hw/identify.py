@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
+from numpy.typing import NDArray
+
 from haptic_loop.controller.lti import Array, frozen
 from haptic_loop.hw.control import Controller
 from haptic_loop.hw.friction import Friction, dry_friction, friction
@@ -22,7 +24,6 @@ from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import Session
 from haptic_loop.hw.viscosity import Viscosity, doubt, viscosity
 from haptic_loop.sim.scenario import Scenario
-from numpy.typing import NDArray
 
 _SLOW_SPAN = 4.0  # of the slow sweeps' frequencies
 _LEVELS = (0.4, 0.6, 0.8, 1.0)  # amplitudes of the swing, as parts of its largest

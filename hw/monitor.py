@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy  # its parts load when they are used
+
 from haptic_loop.hw.limits import Units
 from haptic_loop.hw.protocol import NO_MARGIN, Config, Phase, SafetyStop, State, distance
 from haptic_loop.models.device import Device

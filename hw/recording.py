@@ -16,6 +16,8 @@ from typing import Annotated, Any, BinaryIO
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
+
 from haptic_loop.controller.coupling import Form
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.files import counted, read_arrays, write
@@ -24,7 +26,6 @@ from haptic_loop.hw.limits import SafetyLimits, Units
 from haptic_loop.hw.protocol import NO_MARGIN, SafetyStop
 from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.trace import Trace
-from numpy.typing import NDArray
 
 #: what the link adds, one entry per tick and name
 _LINK = ("tick", "arming", "received", "asked", "test", "gain", "sent", "margin_us", "status")

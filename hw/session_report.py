@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from haptic_loop.controller.budget import BudgetFigures
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table, plain, remove, write_json

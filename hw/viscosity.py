@@ -21,9 +21,10 @@ from itertools import pairwise, product
 
 import numpy as np
 import scipy  # its parts load when they are used
+from numpy.typing import NDArray
+
 from haptic_loop.controller.lti import Array
 from haptic_loop.hw.friction import Friction, dry_friction
-from numpy.typing import NDArray
 
 _FAST = 0.25  # part of the highest speed from which on a stroke counts: dry friction has reached its level there
 _FEW = 8  # strokes

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
-from haptic_loop.models.scene import Plant
 from numpy.typing import NDArray
+
+from haptic_loop.models.scene import Plant
 
 _Array = NDArray[np.floating[Any]]
 

@@ -16,8 +16,9 @@ from typing import Annotated, Any, Protocol, Self
 import msgspec
 import numpy as np
 import scipy  # its parts load when they are used
-from haptic_loop.models.device import require
 from numpy.typing import NDArray
+
+from haptic_loop.models.device import require
 
 _Array = NDArray[np.floating[Any]]
 _Range = tuple[float, float]

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
 from haptic_loop.models.device import Device
 from haptic_loop.models.human import (
     Cross,
@@ -23,7 +25,6 @@ from haptic_loop.models.human import (
     Port,
     check_holds,
 )
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions import it when they need it
     import mujoco

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import StepBuffer

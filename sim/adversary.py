@@ -18,6 +18,7 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.models.human import Hand, Person
 from haptic_loop.models.scene import Crowd, HumanSets, variants

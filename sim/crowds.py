@@ -32,6 +32,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import Timing
 from haptic_loop.controller.law import Law
@@ -57,8 +60,6 @@ from haptic_loop.sim.stability import (
     mujoco_loops,
 )
 from haptic_loop.sim.switching import Switched, switched_crowd
-from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -32,14 +32,15 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+
 from haptic_loop.controller.delay import Timing
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.tick import FusedTicks, RunBlock, StepBuffer
 from haptic_loop.design.files import InputError
 from haptic_loop.models.hold import HeldPlant, Product, expm_each, exponential_step, hold, latched, product_of
 from haptic_loop.models.scene import Plant, Scene, Variants
-from numpy.lib.stride_tricks import as_strided
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     import mujoco

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
+
 from haptic_loop.controller.delay import Timing
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import Process, StepBuffer
@@ -23,7 +25,6 @@ from haptic_loop.sim.engines import MujocoBatchEngine, pace, profiler_off, quiet
 from haptic_loop.sim.run import Progress, run_block
 from haptic_loop.sim.stability import close
 from haptic_loop.sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen
-from numpy.typing import NDArray
 
 Cells = NDArray[np.intp]
 

@@ -7,6 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.result import CONDITIONS
 from haptic_loop.sim import plots
@@ -14,11 +20,6 @@ from haptic_loop.sim.limit_cycles import UNDECIDED
 from haptic_loop.sim.stability import MARGINAL
 from haptic_loop.sim.zwidth import MODEL_KEPT, Map
 from haptic_loop.sim.zwidth_report import MapReport
-from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 _STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # areas
 

@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
+
 from haptic_loop.controller.budget import (
     EPS,
     BudgetFigures,

@@ -12,17 +12,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from haptic_loop.controller.lti import Array
-from haptic_loop.design.files import InputError, printable, write
-from haptic_loop.design.guarantees import ANY
-from haptic_loop.design.result import CONDITIONS
-from haptic_loop.sim.trace import Trace
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.text import Text
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
+
+from haptic_loop.controller.lti import Array
+from haptic_loop.design.files import InputError, printable, write
+from haptic_loop.design.guarantees import ANY
+from haptic_loop.design.result import CONDITIONS
+from haptic_loop.sim.trace import Trace
 
 if TYPE_CHECKING:  # whose figures are drawn
     from haptic_loop.sim.accuracy import Row

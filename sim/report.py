@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+
 from haptic_loop.controller.coupling import PUBLISHED, Coupling
 from haptic_loop.controller.delay import LOST, Timing, VaryingDelay, ages
 from haptic_loop.controller.loop import DelayRange

@@ -19,6 +19,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import Timing
 from haptic_loop.controller.law import Law

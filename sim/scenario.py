@@ -16,6 +16,7 @@ from typing import Any, Self, get_args
 
 import msgspec
 import numpy as np
+
 from haptic_loop.controller.delay import LOST, Periods, Timing, VaryingDelay, drawn
 from haptic_loop.controller.environment import (
     RIGID_WALL,

@@ -11,6 +11,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from haptic_loop.controller.delay import Timing
 from haptic_loop.controller.law import State
 from haptic_loop.controller.loop import Loop
@@ -22,7 +24,6 @@ from haptic_loop.models.scene import Scene, Variants
 from haptic_loop.sim.engines import Engine, MujocoBatchEngine, profiler_off, quiet_warnings
 from haptic_loop.sim.run import Simulation, beginnings, make_engine, run_blocks
 from haptic_loop.sim.trace import Trace
-from numpy.typing import ArrayLike, NDArray
 
 #: growth rates up to this [1/s] count as stable: eigenvalues at 1 (a free loop that drifts) come out at 1e-12
 MARGINAL = 1e-9

@@ -18,6 +18,8 @@ from functools import cache
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
+
 from haptic_loop.controller.delay import Ticks, Timing, VaryingDelay, realising
 from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Array, Lti
@@ -33,7 +35,6 @@ from haptic_loop.sim.engines import Engine, ExactEngine, ExactTimedEngine
 from haptic_loop.sim.run import Simulation
 from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import impulse_forces, impulse_growth
-from numpy.typing import NDArray
 
 _SEARCHED = 1600  # ticks of greedy switching in which the worst period is sought
 _LONGEST_PERIOD = 250  # [ticks]

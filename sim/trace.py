@@ -23,10 +23,11 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
+
 from haptic_loop.controller.lti import Array, ReadOnly, frozen
 from haptic_loop.controller.tick import Net
 from haptic_loop.design.files import InputError, read_arrays, write
-from numpy.typing import NDArray
 
 _MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep
 _STATES = {"z": 2, "s": 2}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
+
 from haptic_loop.controller.environment import Network
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.files import off_table

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
+
 from haptic_loop.controller.budget import Shell, ShellFigures
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.environment import Block, Network

@@ -20,6 +20,8 @@ from typing import TypeVar
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
+
 from haptic_loop.controller import environment
 from haptic_loop.controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from haptic_loop.controller.law import Law, Limiter
@@ -39,7 +41,6 @@ from haptic_loop.sim import limit_cycles
 from haptic_loop.sim.run import Progress
 from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.stability import MARGINAL
-from numpy.typing import NDArray
 
 # ----------------------------------------------------------------------------------------------------
 # What K and B are, and what is asked of the loop with them.

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
 from haptic_loop.controller.environment import RIGID_WALL, Network
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.assessment import Assessment

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import cvxpy as cp
 import numpy as np
+
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.lti import Array, Lti, taps
 from haptic_loop.design.conditions import dampings, regular_part

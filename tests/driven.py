@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+
 from haptic_loop.controller.tick import Process, StepBuffer
 from haptic_loop.models.scene import Scene, Variants
 from haptic_loop.sim.engines import Engine

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from haptic_loop.controller.coupling import ForceFilter, InternalModel, SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Network, Spring

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 
 import numpy as np
+
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.lti import Array

@@ -21,13 +21,14 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.files import InputError, check_file, write
 from haptic_loop.design.result import Requirement
 from haptic_loop.models.scene import APART, DRAWN, STEP, Scene
 from haptic_loop.sim.view.session import GIVEN, HISTORY, KEYS, Couple, Frame, Grip, LiveLoop, PreparedLoop, words
-from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 
 if TYPE_CHECKING:
     from mujoco import viewer

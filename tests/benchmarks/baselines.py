@@ -20,6 +20,8 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 import numpy as np
+
+from haptic_loop import design_coupling
 from haptic_loop.controller.budget import EnergyBounding, EnergyBudget, Packets, PassivityControl, Shell
 from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
 from haptic_loop.controller.delay import delay
@@ -29,8 +31,6 @@ from haptic_loop.models.hold import HeldPlant, hold
 from haptic_loop.models.scene import Crowd, variants
 from haptic_loop.sim.run import assemble, outside_forces
 from haptic_loop.sim.scenario import Scenario, load
-
-from haptic_loop import design_coupling
 
 STEP = 1e-5  # [m] of the encoders
 SLOW = 0.1  # [m/s] with which hands are started

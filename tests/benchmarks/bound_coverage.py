@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+
 from haptic_loop.hw.emulator import _EmulatedPlant, nobody
 from haptic_loop.hw.identify import Estimate, chirp, identify
 from haptic_loop.models.device import RigidDevice

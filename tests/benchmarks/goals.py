@@ -21,12 +21,13 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from test_engine_cost import SCENES, cpu_seconds, looped, raw
+
 from haptic_loop.sim.accuracy import position_error, simulated_growth
 from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.engines import EXPONENTIAL
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.stability import exact_growth
-from test_engine_cost import SCENES, cpu_seconds, looped, raw
 
 ROOT = Path(__file__).parents[2]
 PAGES = {"engines": "docs/accuracy.md", "cold": "docs/accuracy.md"}

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
+
 from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.bound import bound

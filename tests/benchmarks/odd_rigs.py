@@ -14,6 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+
 from haptic_loop.controller.lti import Array
 from haptic_loop.hw.friction import Friction
 from haptic_loop.hw.identify import Swing, chirp, identify

@@ -17,12 +17,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from haptic_loop.design.bound import MOST, bound
 from haptic_loop.design.optimal import design
 from haptic_loop.design.program import Options
 from haptic_loop.design.robustness import robustness
 from haptic_loop.sim.scenario import load
-from threadpoolctl import threadpool_limits
 
 T = TypeVar("T")
 PATIENT = Options(seconds=600)  # so that a busy machine climbs as far as an idle one

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+
 from haptic_loop.controller.coupling import PUBLISHED
 from haptic_loop.controller.lti import Array
 from haptic_loop.models.scene import _actuation, _tendon_jacobian

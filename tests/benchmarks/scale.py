@@ -15,6 +15,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from asked import prove_limiter
+
+from haptic_loop import certify, design_coupling
 from haptic_loop.controller.coupling import PUBLISHED, SpringDamper
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.result import Design, NotProved
@@ -23,8 +25,6 @@ from haptic_loop.sim.crowds import Validation, validate
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import load, parse
 from haptic_loop.sim.stability import exact_growth
-
-from haptic_loop import certify, design_coupling
 
 
 def star(n: int) -> str:

@@ -9,6 +9,7 @@ a step) and the force of a partner whom the hand resists: up to 6 N, at 0.3 to 8
 import sys
 
 import numpy as np
+
 from haptic_loop.hw.monitor import EncoderMonitor
 from haptic_loop.hw.protocol import SafetyStop
 

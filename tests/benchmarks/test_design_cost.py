@@ -4,6 +4,7 @@ make bench
 """
 
 import pytest
+
 from haptic_loop.controller.coupling import PUBLISHED
 from haptic_loop.design import fixed_order as ccl
 from haptic_loop.design import optimal, spring_damper

@@ -13,6 +13,7 @@ import time
 import mujoco
 import numpy as np
 import pytest
+
 from haptic_loop.controller.coupling import PUBLISHED
 from haptic_loop.controller.tick import StepBuffer
 from haptic_loop.models.device import CompliantDevice

@@ -7,6 +7,7 @@ import random
 import time
 
 import pytest
+
 from haptic_loop.hw.device_state import Device
 from haptic_loop.hw.protocol import Config, Decoder, Force, Info, State, encode
 

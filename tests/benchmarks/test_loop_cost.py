@@ -8,11 +8,12 @@ from functools import partial
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
+
 from haptic_loop.controller.complementarity import BoxProblem
 from haptic_loop.controller.coupling import PUBLISHED, SpringDamper
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import load
-from msgspec.structs import replace
 
 pytestmark = pytest.mark.benchmark(group="loop")
 

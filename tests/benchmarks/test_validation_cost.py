@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 from asked import this_environment
+
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.controller.tick import StepBuffer
 from haptic_loop.models.hold import hold
@@ -16,7 +17,6 @@ from haptic_loop.sim.engines import ExactEngine, MujocoBatchEngine, profiler_off
 from haptic_loop.sim.run import assemble, run_block
 from haptic_loop.sim.scenario import load
 from haptic_loop.sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
-
 from tests.checks.tightness import attempts
 
 pytestmark = pytest.mark.benchmark(group="validation")

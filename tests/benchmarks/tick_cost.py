@@ -27,7 +27,6 @@ from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import Operator, session_for
 from haptic_loop.hw.transport import Live, SerialPort
 from haptic_loop.sim.scenario import load
-
 from tests.checks.faults import _lively
 from tests.pseudo_terminal import Terminal
 

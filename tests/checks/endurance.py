@@ -11,6 +11,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
+
 from haptic_loop.hw.control import certified_couplings
 from haptic_loop.hw.emulator import Emulator
 from haptic_loop.hw.limits import Stage
@@ -21,7 +22,6 @@ from haptic_loop.sim.couplings import choose
 from haptic_loop.sim.crowds import Validation, _as_worker, validate
 from haptic_loop.sim.scenario import load
 from haptic_loop.sim.stability import unstable
-
 from tests.checks.faults import person
 
 

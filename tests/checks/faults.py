@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+
 from haptic_loop.hw.control import CertifiedCoupling, certified_couplings
 from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
 from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+
 from haptic_loop.controller.coupling import PUBLISHED, Coupling, SpringDamper
 from haptic_loop.models.device import CompliantDevice
 from haptic_loop.models.human import Human, Link

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+
 from haptic_loop.controller.coupling import Coupling, NoCoupling
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.environments import THIS_ENVIRONMENT

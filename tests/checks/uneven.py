@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring

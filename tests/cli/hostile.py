@@ -30,9 +30,10 @@ import hostile_files
 import hostile_words
 import matplotlib.figure  # noqa: F401 - once, before the forks
 import numpy as np
+from hostile_cases import BUT, Case, furnish, npz, put
+
 from haptic_loop.cli import options
 from haptic_loop.cli.main import COMMANDS, execute
-from hostile_cases import BUT, Case, furnish, npz, put
 
 SECONDS = 20  # of processor time that a case may take
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, save

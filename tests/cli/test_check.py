@@ -5,11 +5,12 @@ import subprocess
 import sys
 
 import pytest
+from worlds import PAIR, SOFT
+
 from haptic_loop.cli.check import main
 from haptic_loop.cli.main import execute
 from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, save
-from worlds import PAIR, SOFT
 
 
 def leave(monkeypatch, *argv: str) -> int:

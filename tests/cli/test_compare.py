@@ -3,6 +3,7 @@
 import json
 
 import pytest
+
 from haptic_loop.cli.compare import main
 from haptic_loop.cli.run import main as run_once
 from haptic_loop.sim.scenario import InputError

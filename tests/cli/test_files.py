@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 
 import pytest
+
 from haptic_loop.design.files import check_file, write
 from haptic_loop.sim.scenario import InputError
 

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from haptic_loop.cli.main import COMMANDS
 from haptic_loop.cli.options import Parser
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from haptic_loop.cli.main import execute
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.coupling_file import Stored, save

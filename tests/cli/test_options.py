@@ -4,6 +4,7 @@ import argparse
 from dataclasses import dataclass
 
 import pytest
+
 from haptic_loop.cli import options, render
 from haptic_loop.cli.run import _parser as run_parser
 from haptic_loop.controller.loop import DelayRange

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from haptic_loop.design.files import InputError
-from haptic_loop.hw.control import SafetyStop, certified_coupling
 
 from haptic_loop import certify, design_coupling, load
+from haptic_loop.design.files import InputError
+from haptic_loop.hw.control import SafetyStop, certified_coupling
 from tests.asked import decisive
 
 PAGE = (Path(__file__).parents[2] / "docs/architecture.md").read_text()

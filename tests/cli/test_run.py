@@ -9,6 +9,7 @@ import forked
 import msgspec
 import numpy as np
 import pytest
+
 from haptic_loop.cli.options import place
 from haptic_loop.cli.run import _parser, main
 from haptic_loop.controller.coupling import SpringDamper
@@ -20,7 +21,6 @@ from haptic_loop.sim import couplings
 from haptic_loop.sim import run as loop
 from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.trace import Trace
-
 from tests.asked import decisive, needs, safe_with
 
 SECTIONS = {"case", "scenario", "assessment", "stability"}

@@ -6,8 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
-from haptic_loop.cli.render import Screen
 from rich.table import Table
+
+from haptic_loop.cli.render import Screen
 
 ROOT = Path(__file__).parents[2]
 NUMBERS = ["7.8429", "18.895", "-11.19", "0.71449", "1.3699"]

@@ -4,6 +4,9 @@ import msgspec
 import numpy as np
 import pytest
 from hands import Hands
+from worlds import FIGURE_4
+
+from haptic_loop import design_coupling
 from haptic_loop.controller.budget import EnergyBudget, Packets, Shell
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.environment import Network, Networks, Spring, environment
@@ -11,9 +14,6 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.models.hold import hold as hold_input
 from haptic_loop.models.scene import Crowd, variants
 from haptic_loop.sim.scenario import load
-from worlds import FIGURE_4
-
-from haptic_loop import design_coupling
 
 T = 1.2e-3
 DELTA = np.array([1.37, 0.9])

@@ -4,6 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+
 from haptic_loop.controller.arithmetic import TooLong, solve, spend, spent, times, within
 from haptic_loop.controller.lti import Lti
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from haptic_loop.controller.environment import GROUND, Network, Networks, Spring, environment
 from worlds import FIGURE_4
+
+from haptic_loop.controller.environment import GROUND, Network, Networks, Spring, environment
 
 T = 1.2e-3
 W = np.geomspace(1e-3, np.pi, 80)

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 from driven import drive, wander
+from worlds import FIGURE_4, STIFF, T, loop_of
+
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.complementarity import BoxProblem
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
@@ -10,7 +12,6 @@ from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.law import Limiter
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.tick import Process, StepBuffer
-from worlds import FIGURE_4, STIFF, T, loop_of
 
 LIMITS = (12.0, 5.657)
 

@@ -5,6 +5,7 @@ from fractions import Fraction
 import control
 import numpy as np
 import pytest
+
 from haptic_loop.controller.arithmetic import SingularLoop, times
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.lti import Lti, Sampled, hstack, taps

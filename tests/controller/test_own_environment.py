@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 import pytest
+
+from haptic_loop import load
 from haptic_loop.controller.arithmetic import rational
 from haptic_loop.controller.environment import Block, Network, Spring, Wall, environment, parts_of
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.passivity import hermitian_floor
 from haptic_loop.design.exact import Matrix, definiteness
 from haptic_loop.sim.scenario import InputError
-
-from haptic_loop import load
 
 T = 1e-3
 SQUARE = np.exp(1j * np.array([1e-3, 0.01, 0.1, 1.0, 3.0]))

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from worlds import FIGURE_4, force_map, loop_of
+
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall, environment
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.tick import Process, StepBuffer
-from worlds import FIGURE_4, force_map, loop_of
 
 T = 1e-3
 NONE = np.zeros(1)

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from worlds import FIGURE_4, force_map
+
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import LOST, HeldLine, VaryingDelay, _newest, ages, packet_delays, realising
 from haptic_loop.controller.environment import environment
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.tick import Process, StepBuffer
-from worlds import FIGURE_4, force_map
 
 T = 1.2e-3
 COUPLING = SpringDamper([7806, 3137], [0.105, 1.68])

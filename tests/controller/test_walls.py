@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 from asked import this_environment
 from driven import drive, wander
+from scipy.optimize import brentq
+from worlds import FIGURE_4, SOFT, force_map, loop_of
+
 from haptic_loop.cli.accuracy import main as accuracy
 from haptic_loop.cli.run import main
 from haptic_loop.controller.arithmetic import SingularLoop
@@ -26,9 +29,6 @@ from haptic_loop.models.scene import crowds, variants
 from haptic_loop.sim.engines import ExactEngine, MujocoBatchEngine
 from haptic_loop.sim.run import assemble, run, run_blocks
 from haptic_loop.sim.scenario import SCENARIOS, InputError, load, parse
-from scipy.optimize import brentq
-from worlds import FIGURE_4, SOFT, force_map, loop_of
-
 from tests.asked import needs, safe_with
 
 T = 1e-3

@@ -4,6 +4,7 @@ import json
 
 import msgspec
 import pytest
+
 from haptic_loop.cli.audit import main as audit
 from haptic_loop.cli.compare import main as compare
 from haptic_loop.cli.run import main as run
@@ -21,7 +22,6 @@ from haptic_loop.design.guarantees import ANY, HERE
 from haptic_loop.sim.api import simulate
 from haptic_loop.sim.couplings import assessed, given
 from haptic_loop.sim.scenario import load
-
 from tests.asked import needs, safe_with
 
 LOOP = load("omega-pair").loop("I")

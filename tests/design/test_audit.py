@@ -7,6 +7,8 @@ import sys
 import msgspec
 import numpy as np
 import pytest
+from worlds import FIGURE_4, PAIR, SOFT
+
 from haptic_loop.cli.audit import main
 from haptic_loop.cli.main import execute
 from haptic_loop.controller.coupling import PUBLISHED, Compliance, Coupling, NoCoupling, SpringDamper
@@ -20,8 +22,6 @@ from haptic_loop.design.assessment import assess
 from haptic_loop.design.audit import MOST_EXTRA_SAMPLES, audit, edge, remedies, requirement, sensitivity, stiffest
 from haptic_loop.design.files import plain
 from haptic_loop.design.guarantees import ANY, CAVEATS
-from worlds import FIGURE_4, PAIR, SOFT
-
 from tests.asked import needs, safe_with
 
 CONDITIONS = ("this-environment", "any-environment")

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+import haptic_loop
 from haptic_loop.design import bound as module
 from haptic_loop.design.bound import BoundBeside, bound
 from haptic_loop.design.dual_matrix import DualMatrix
 from haptic_loop.design.frequency import hermitian
 from haptic_loop.sim.scenario import load
-
-import haptic_loop
 
 LOOPS = Path(__file__).parents[1] / "loops"
 POINTS = 2**20  # of the transform

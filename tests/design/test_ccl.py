@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 from asked import any_environment, this_environment
+from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
+
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
@@ -11,7 +13,6 @@ from haptic_loop.design import spring_damper
 from haptic_loop.design.conditions import any_environment_demand
 from haptic_loop.design.fixed_order import _START_ROOM, FixedOrder, FixedPoles, descend
 from haptic_loop.design.lmi import RESERVE, Shaping
-from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
 

@@ -7,6 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 from asked import prove_limiter, this_environment
+from worlds import FIGURE_4, PAIR, SOFT, SOFT_NETWORK, STIFF
+
 from haptic_loop.controller import coupling as controller_coupling
 from haptic_loop.controller.arithmetic import SingularLoop, numbers, rational, solve
 from haptic_loop.controller.coupling import (
@@ -31,8 +33,6 @@ from haptic_loop.design.frequency import frequencies, on_circle, rounding
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import NotProved, from_ratio
 from haptic_loop.sim.scenario import load as scenario
-from worlds import FIGURE_4, PAIR, SOFT, SOFT_NETWORK, STIFF
-
 from tests.checks.random_loops import proofs
 
 DEFAULT = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)

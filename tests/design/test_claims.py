@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 from asked import any_environment, this_environment
 from driven import driven
+from scipy.signal import dlsim, lfilter
+from worlds import FIGURE_4, SOFT, STIFF, force_map
+
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, environment
 from haptic_loop.controller.loop import Loop
@@ -24,8 +27,6 @@ from haptic_loop.sim.report import _PRINTED_TAU_DB
 from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.scenario import load
 from haptic_loop.sim.stability import close, dominant_mode
-from scipy.signal import dlsim, lfilter
-from worlds import FIGURE_4, SOFT, STIFF, force_map
 
 T, THETA, DELTA = 1.2e-3, (1, 2), 1.37
 W = np.unique(np.concatenate([np.geomspace(1e-5, np.pi, 40_001), np.linspace(1e-4, np.pi, 40_001)]))

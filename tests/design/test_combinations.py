@@ -5,6 +5,8 @@ import itertools
 import msgspec
 import numpy as np
 import pytest
+from scipy.linalg import expm
+
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.loop import DelayRange, Loop
@@ -12,7 +14,6 @@ from haptic_loop.design.certificate import prove, required_damping, verify
 from haptic_loop.design.conditions import FACTS
 from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.environments import THIS_ENVIRONMENT, LimitedForces
-from scipy.linalg import expm
 
 change = msgspec.structs.replace
 BARE, COUPLING = NoCoupling(), SpringDamper([1000.0], [0.5])

@@ -7,6 +7,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from analysis import solve
+
 from haptic_loop.design import cone
 from haptic_loop.design.cone import INTERIOR, LADDER, ConeProgram, Inequality
 from haptic_loop.design.lmi import symmetric_from

@@ -4,6 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from worlds import FIGURE_4, PAIR, SOFT
+
 from haptic_loop.cli.compare import main
 from haptic_loop.controller.coupling import PUBLISHED, Compliance, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring
@@ -11,7 +13,6 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.design.compare import curves, grid, ideal, judge
 from haptic_loop.design.result import DesignFailed
 from haptic_loop.sim.scenario import InputError
-from worlds import FIGURE_4, PAIR, SOFT
 
 T, DELTA = 1.2e-3, 1.37
 

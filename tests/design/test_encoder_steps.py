@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 from asked import this_environment
+from worlds import FIGURE_4
+
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.design.conditions import encoder_friction, l1_gain
 from haptic_loop.design.guarantees import EncoderSteps
-from worlds import FIGURE_4
 
 T, STEP = 1.2e-3, 1e-5
 LOOP = Loop(T, (0, 1), (0, 0), (0, 1), (1.37, 1.37), FIGURE_4)

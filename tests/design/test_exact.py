@@ -5,6 +5,8 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from worlds import FIGURE_4, force_map
+
 from haptic_loop.controller.arithmetic import SingularLoop, inverse, numbers, rational
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
 from haptic_loop.controller.delay import delay, moving_sum
@@ -12,7 +14,6 @@ from haptic_loop.controller.environment import Network, Spring, environment
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design import exact
 from haptic_loop.design.exact import Matrix, definiteness, find_storage, prove_positive_real, reached, strictly_positive
-from worlds import FIGURE_4, force_map
 
 T = 1.2e-3
 STAR = Network(

@@ -19,6 +19,9 @@ from asked import (
     this_environment_demand,
     walls_demand,
 )
+from scipy.optimize import minimize_scalar
+from worlds import FIGURE_4, SOFT, STIFF, T
+
 from haptic_loop.controller.arithmetic import rational
 from haptic_loop.controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import Network, Spring, Wall
@@ -32,8 +35,6 @@ from haptic_loop.design.coupling_file import Stored, digest, sealed
 from haptic_loop.design.environments import SWITCHING, LimitedForces
 from haptic_loop.design.exact import find_storage, prove_positive_real
 from haptic_loop.design.result import NotProved, from_ratio
-from scipy.optimize import minimize_scalar
-from worlds import FIGURE_4, SOFT, STIFF, T
 
 CLOSE = 1e-6  # relative, on either side of a limit
 change = msgspec.structs.replace

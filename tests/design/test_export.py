@@ -9,6 +9,8 @@ import sys
 import numpy as np
 import pytest
 from asked import prove_limiter
+from worlds import FIGURE_4, PAIR, SOFT, T
+
 from haptic_loop.cli.export import main
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
 from haptic_loop.controller.coupling import SpringDamper as Gains
@@ -21,7 +23,6 @@ from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, load, save
 from haptic_loop.design.export import process_block, sequential, trial
 from haptic_loop.design.files import InputError, one_command
-from worlds import FIGURE_4, PAIR, SOFT, T
 
 SPRINGS = SpringDamper((300.0, 200.0), (0.0, 0.0))  # no state at all
 FULL = Compliance(

@@ -8,6 +8,11 @@ import numpy as np
 import pytest
 from asked import loop as loop_of
 from asked import this_environment
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.optimize import minimize
+from worlds import PAIR
+
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring
 from haptic_loop.controller.loop import DeviceBounds, Loop
@@ -37,10 +42,6 @@ from haptic_loop.design.known_device import (
 from haptic_loop.design.result import NotProved
 from haptic_loop.design.spring_damper import design
 from haptic_loop.sim.scenario import load
-from scipy.integrate import solve_ivp
-from scipy.linalg import expm
-from scipy.optimize import minimize
-from worlds import PAIR
 
 DEVICE = DeviceBounds(0.06, 14500.0, 0.5, 0.5)
 KNOWN = msgspec.structs.replace(PAIR, known_devices=(DEVICE, DEVICE))

@@ -5,6 +5,9 @@ import numpy as np
 import pytest
 from asked import latency_demand, this_environment, this_environment_demand
 from driven import growing
+from scipy.linalg import expm
+from worlds import FIGURE_4
+
 from haptic_loop.controller.arithmetic import numbers
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
@@ -19,8 +22,6 @@ from haptic_loop.design.environments import THIS_ENVIRONMENT, ThisEnvironment
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle
 from haptic_loop.design.lmi import LATE
 from haptic_loop.design.result import NotProved
-from scipy.linalg import expm
-from worlds import FIGURE_4
 
 T, TAU, K = 1.2e-3, 0.13e-3, 1000.0
 SOFT = SpringDamper([879.0, 552.0], [0.39, 0.52])

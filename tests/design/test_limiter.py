@@ -6,6 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 from asked import limiter, limiter_demand, prove_limiter, this_environment
+from worlds import DELTA, PAIR, STIFF, T
+
 from haptic_loop.cli.design import main as design_main
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.lti import Lti, Sampled, taps
@@ -22,7 +24,6 @@ from haptic_loop.design.result import NotProved
 from haptic_loop.design.spring_damper import design
 from haptic_loop.design.transparency import transparency
 from haptic_loop.sim.scenario import InputError
-from worlds import DELTA, PAIR, STIFF, T
 
 LAG = LIMITER.rho(PAIR)
 BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # designed with the limiter's block

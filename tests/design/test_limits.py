@@ -2,14 +2,14 @@
 
 import pytest
 from asked import this_environment
+from worlds import force_map
+
+from haptic_loop import certify, load, transparency_of
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.controller.environment import environment
 from haptic_loop.design.bound import bound
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.program import LADDER
-from worlds import force_map
-
-from haptic_loop import certify, load, transparency_of
 
 LOOP = load().loop("I")
 

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from analysis import analysis, e_hat_regular, solve, theta_hat, unit_coupling, v_hat_ports
 from asked import any_environment
+from worlds import DELTA, FIGURE_4, T
+
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Network, Spring, environment
@@ -19,7 +21,6 @@ from haptic_loop.design.lmi import (
     lemma3,
     unit_environment,
 )
-from worlds import DELTA, FIGURE_4, T
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
 

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 from asked import any_environment, any_environment_demand, any_environment_per_channel, this_environment
+from scipy.linalg import eig, eigh
+from worlds import FIGURE_4, STIFF, force_map
+
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, environment
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design.conditions import least_multiple, least_scale, regular_part
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, supremum
-from scipy.linalg import eig, eigh
-from worlds import FIGURE_4, STIFF, force_map
 
 T, THETA, DELTA = 1.2e-3, (1, 2), (1.37, 1.37)
 E = environment(FIGURE_4, T)

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 from asked import any_environment
+
+from haptic_loop import certify, design_coupling, simulate, transparency_of
+from haptic_loop import load as scenario_of
 from haptic_loop.controller.coupling import MovingAverage, SpringDamper
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.design.certificate import prove, verify
 from haptic_loop.design.coupling_file import Stored, load, save
 from haptic_loop.design.transparency import decibels
-
-from haptic_loop import certify, design_coupling, simulate, transparency_of
-from haptic_loop import load as scenario_of
 
 T = 1e-3
 

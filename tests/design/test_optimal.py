@@ -11,6 +11,8 @@ import msgspec
 import numpy as np
 import pytest
 from asked import this_environment
+from scipy.optimize import minimize_scalar
+
 from haptic_loop.cli.compare import main as compare_main
 from haptic_loop.cli.design import main
 from haptic_loop.controller.coupling import ForceFilter, NoCoupling, SpringDamper, basis
@@ -30,8 +32,6 @@ from haptic_loop.design.program import MARGIN, Options, Problem, Span, span_of, 
 from haptic_loop.design.robustness import ranges_around, robustness, vertices
 from haptic_loop.design.transparency import transparency
 from haptic_loop.sim.scenario import load
-from scipy.optimize import minimize_scalar
-
 from tests.benchmarks.hostile_loops import hostile
 
 LOOPS = Path(__file__).parents[1] / "loops"

@@ -5,6 +5,8 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from worlds import PAIR, SOFT, STIFF
+
 from haptic_loop.cli import check
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
@@ -16,7 +18,6 @@ from haptic_loop.design.coupling_file import Stored, save, sealed
 from haptic_loop.design.environments import LimitedForces, Multiplied
 from haptic_loop.design.facts import Unknowns
 from haptic_loop.design.result import MAKING
-from worlds import PAIR, SOFT, STIFF
 
 change = msgspec.structs.replace
 

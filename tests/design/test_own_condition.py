@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 import pytest
+
+from haptic_loop import load
 from haptic_loop.controller.coupling import Compliance, Coupling, SpringDamper
 from haptic_loop.controller.loop import DelayRange
 from haptic_loop.controller.lti import Lti, as_like, constant_like, numbers, taps
@@ -17,8 +19,6 @@ from haptic_loop.design.environments import SWITCHING, SwitchingDelays
 from haptic_loop.design.files import InputError
 from haptic_loop.design.result import NotProved
 from haptic_loop.sim.zwidth import CouplingSweep, EnvironmentSweep
-
-from haptic_loop import load
 
 PAIR = load("omega-pair").loop("I")
 SOFT = SpringDamper([400.0, 300.0], [0.1, 0.1])

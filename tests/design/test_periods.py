@@ -9,6 +9,9 @@ import pytest
 from asked import any_environment, any_environment_demand, prove_limiter, this_environment_demand
 from asked import loop as loop_of
 from driven import growing
+from scipy.linalg import expm
+from worlds import FIGURE_4
+
 from haptic_loop.cli.design import main as cli_design
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.environment import Network, Spring
@@ -18,8 +21,6 @@ from haptic_loop.design.conditions import even_damping
 from haptic_loop.design.coupling_file import Stored, digest
 from haptic_loop.design.environments import LIMITER, SWITCHING
 from haptic_loop.design.spring_damper import design
-from scipy.linalg import expm
-from worlds import FIGURE_4
 
 T, LONG = 1e-3, 1.6e-3
 LOOP = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)

@@ -7,6 +7,8 @@ from itertools import combinations, pairwise, product
 import msgspec
 import numpy as np
 import pytest
+from worlds import FIGURE_4, environment_by_hand, filter_by_hand, force_map
+
 from haptic_loop.cli.audit import main as audit_main
 from haptic_loop.cli.check import main as check_main
 from haptic_loop.cli.design import main as design_main
@@ -24,8 +26,6 @@ from haptic_loop.design.coupling_file import Stored, digest, load, sealed
 from haptic_loop.design.program import Options
 from haptic_loop.design.result import NotProved
 from haptic_loop.sim.scenario import SCENARIOS, InputError, parse
-from worlds import FIGURE_4, environment_by_hand, filter_by_hand, force_map
-
 from tests.asked import decisive, safe_with
 
 T, THETA = 1.2e-3, (1, 2)

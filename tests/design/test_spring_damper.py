@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 from analysis import analysis, solve
 from asked import any_environment, this_environment
+from scipy.optimize import brentq
+from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
+
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Network, Spring
@@ -24,8 +27,6 @@ from haptic_loop.design.result import DesignFailed, Infeasible
 from haptic_loop.design.spring_damper import GainSet, design
 from haptic_loop.design.transparency import decibels
 from haptic_loop.sim.scenario import load
-from scipy.optimize import brentq
-from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
 
 CASES = {"I": (1, 2), "II": (0, 0)}
 WALL = Network(("c",), (Spring(("c", "ground"), 100.0),))

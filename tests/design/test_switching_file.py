@@ -7,6 +7,9 @@ import msgspec
 import numpy as np
 import pytest
 from asked import switching_demand, switching_sweep, this_environment
+from worlds import DELTA, FIGURE_4, PAIR, SOFT, STIFF, T, force_map
+
+from haptic_loop import certify
 from haptic_loop.cli.audit import main as audit_main
 from haptic_loop.cli.check import main as check_main
 from haptic_loop.cli.design import main as design_main
@@ -29,9 +32,6 @@ from haptic_loop.design.frequency import hermitian
 from haptic_loop.design.result import NotProved
 from haptic_loop.hw.control import certified_couplings
 from haptic_loop.sim.scenario import load as scenario_of
-from worlds import DELTA, FIGURE_4, PAIR, SOFT, STIFF, T, force_map
-
-from haptic_loop import certify
 
 RANGE = DelayRange((1, 1), (2, 2))
 LOOP = PAIR.switching(RANGE)

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from analysis import solve
 from asked import switching_demand, switching_sweep, this_environment
+from worlds import DELTA, FIGURE_4, SOFT, STIFF, T, force_map
+
 from haptic_loop.cli.audit import main
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, environment
@@ -20,7 +22,6 @@ from haptic_loop.design.exact import find_storage
 from haptic_loop.design.frequency import hermitian
 from haptic_loop.design.result import NotProved
 from haptic_loop.sim.scenario import InputError
-from worlds import DELTA, FIGURE_4, SOFT, STIFF, T, force_map
 
 
 def sent(coupling=STIFF, T=T) -> Lti:

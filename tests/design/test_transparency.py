@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
+from worlds import FIGURE_4, SOFT, STIFF, force_map
+
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, environment
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design.frequency import integral
 from haptic_loop.design.transparency import decibels, transparency
-from scipy.integrate import quad
-from worlds import FIGURE_4, SOFT, STIFF, force_map
 
 T, THETA = 1.2e-3, (1, 2)
 E = environment(FIGURE_4, T)

@@ -6,6 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 from asked import any_environment, this_environment
+from scipy.linalg import expm
+
 from haptic_loop.controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.loop import Loop
@@ -18,7 +20,6 @@ from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.exact import find_storage
 from haptic_loop.design.result import MAKING, NotProved
-from scipy.linalg import expm
 
 change = msgspec.structs.replace
 

@@ -6,6 +6,8 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
+from worlds import FIGURE_4, VERTICES_ONLY, environment_by_hand, filter_by_hand
+
 from haptic_loop.cli.check import main as check_main
 from haptic_loop.controller.coupling import ForceFilter, InternalModel
 from haptic_loop.controller.environment import Network, Spring
@@ -20,7 +22,6 @@ from haptic_loop.design.result import Design
 from haptic_loop.design.worst_member import search
 from haptic_loop.sim import scenario
 from haptic_loop.sim.scenario import SCENARIOS
-from worlds import FIGURE_4, VERTICES_ONLY, environment_by_hand, filter_by_hand
 
 T, THETA, DELTA = 1.2e-3, (1, 2), 1.37
 RANGED = scenario.load(SCENARIOS / "omega-pair-ranges.toml").loop("I")

@@ -1,9 +1,9 @@
 """The scenario that sessions are held with, and couplings for its links: made once."""
 
 import pytest
+
 from haptic_loop.hw.control import certified_couplings
 from haptic_loop.sim.scenario import load as scenario_of
-
 from tests.checks.faults import _lively
 
 

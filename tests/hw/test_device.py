@@ -1,6 +1,7 @@
 """The device's rules, as docs/protocol.md states them: when a force acts, what stops it, what never starts it again."""
 
 import pytest
+
 from haptic_loop.hw.device_state import Device
 from haptic_loop.hw.protocol import (
     NO_MARGIN,

@@ -4,6 +4,8 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
+from worlds import FakePort
+
 from haptic_loop.design.files import plain
 from haptic_loop.hw.device_state import Device
 from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
@@ -39,7 +41,6 @@ from haptic_loop.hw.session import Driver, Session, _check_state
 from haptic_loop.hw.session_report import outcome
 from haptic_loop.sim.scenario import load as scenario_of
 from haptic_loop.sim.trace import growths
-from worlds import FakePort
 
 T_US = 1200
 CONFIG = Config(2, 4, 5, 50, (20000, 20000), (600, 600))

@@ -5,6 +5,8 @@ from runpy import run_path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
+
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
 from haptic_loop.hw.limits import SafetyLimits, Stage, Units
 from haptic_loop.hw.monitor import EncoderMonitor, EncoderNoise, EncoderTest, Expected, LinkSettings
@@ -16,7 +18,6 @@ from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Human, Link
 from haptic_loop.models.scene import build
 from haptic_loop.sim.scenario import InputError, load
-from msgspec.structs import replace
 
 T = 1.2e-3
 STEP = 4e-4  # [N]

@@ -11,6 +11,7 @@ from pathlib import Path
 from zlib import crc32
 
 import pytest
+
 from haptic_loop.hw.device_state import Device
 from haptic_loop.hw.protocol import (
     _LAYOUTS,

@@ -5,6 +5,9 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
+from worlds import FakePort
+
 from haptic_loop.cli import bridge, replay
 from haptic_loop.cli.session_cli import check_link
 from haptic_loop.controller.coupling import SpringDamper
@@ -23,8 +26,6 @@ from haptic_loop.hw.transport import Live
 from haptic_loop.models.scene import build, plant
 from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.scenario import load as scenario_of
-from scipy.linalg import expm
-from worlds import FakePort
 
 T = 1.2e-3
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+
 from haptic_loop.cli import bridge
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.transport import SerialPort, _no_collections
-
 from tests.checks.faults import CASES, _rehearse_case
 
 PAGE = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")

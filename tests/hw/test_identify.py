@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
+
 from haptic_loop.cli.identify import main as identify_command
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
 from haptic_loop.hw.identify import Estimate, Swing, capped, chirp, estimate, held, identify, settled

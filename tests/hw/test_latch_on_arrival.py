@@ -5,6 +5,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
+
+from haptic_loop import load
 from haptic_loop.cli.bridge import _overlong_tick
 from haptic_loop.cli.bridge import main as bridge
 from haptic_loop.cli.replay import main as replay
@@ -18,9 +21,6 @@ from haptic_loop.hw.session import Stage, session_for
 from haptic_loop.models.scene import plant
 from haptic_loop.sim.run import outside_forces
 from haptic_loop.sim.scenario import InputError
-from scipy.linalg import expm
-
-from haptic_loop import load
 
 LAB = load("omega-pair").replace(theta=(0, 0))
 TAU = 130  # [us] of an emulated link

@@ -3,6 +3,9 @@
 import math
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
 from haptic_loop.hw.limits import (
     DRIVING,
     ENDED,
@@ -19,8 +22,6 @@ from haptic_loop.hw.monitor import CommandMonitor
 from haptic_loop.hw.protocol import MAX_RELEASE_NS, PROTOCOL, Config, Force, Info, Phase, SafetyStop, State, encode
 from haptic_loop.hw.session import _check_state
 from haptic_loop.sim.scenario import load
-from hypothesis import given
-from hypothesis import strategies as st
 
 LIMITS = SafetyLimits((12.0, 6.0))
 T = 1.2e-3

@@ -20,6 +20,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
 from haptic_loop.cli import bridge, identify, replay
 from haptic_loop.cli.options import Parser
 from haptic_loop.cli.session_cli import add_link_options, check_link
@@ -32,7 +33,6 @@ from haptic_loop.hw.session import Operator, Session
 from haptic_loop.hw.session_report import IncidentLog
 from haptic_loop.hw.transport import Live, SerialPort
 from haptic_loop.sim.scenario import InputError
-
 from tests.asked import decisive
 from tests.pseudo_terminal import emulated
 

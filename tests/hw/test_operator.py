@@ -1,6 +1,7 @@
 """Who arms a session, and when: the live rule, in virtual time."""
 
 import pytest
+
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings

@@ -11,6 +11,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
+from worlds import FakePort
+
 from haptic_loop.cli import bridge, replay
 from haptic_loop.cli.bridge import _parser
 from haptic_loop.cli.session_cli import limits_from, touched
@@ -24,8 +27,6 @@ from haptic_loop.hw.rehearsal import Rehearsal
 from haptic_loop.hw.session import Driver, Operator, Session, session_for
 from haptic_loop.hw.session_report import IncidentLog, outcome
 from haptic_loop.sim.scenario import InputError
-from msgspec.structs import replace
-from worlds import FakePort
 
 ROOT = Path(__file__).parent.parent.parent
 

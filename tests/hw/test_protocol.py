@@ -6,6 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
 from haptic_loop.hw.device_state import Device
 from haptic_loop.hw.protocol import (
     Ack,
@@ -24,8 +27,6 @@ from haptic_loop.hw.protocol import (
     encode,
     wire_bytes,
 )
-from hypothesis import given
-from hypothesis import strategies as st
 
 DOC = Path(__file__).parent.parent.parent / "docs/protocol.md"
 

@@ -6,6 +6,9 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
+from rich.console import Console
+from sessions import FAST, rehearsal_of
+
 from haptic_loop.cli import bridge
 from haptic_loop.cli import replay as replay_command
 from haptic_loop.cli import trace as trace_command
@@ -23,9 +26,6 @@ from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.scenario import load as scenario_of
 from haptic_loop.sim.stability import close, dominant_mode
 from haptic_loop.sim.trace import Trace
-from rich.console import Console
-from sessions import FAST, rehearsal_of
-
 from tests.asked import decisive
 
 

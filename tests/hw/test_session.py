@@ -4,6 +4,10 @@ import re
 
 import numpy as np
 import pytest
+from rich.console import Console
+from sessions import AT_REST, FAST, rehearsal_of, session_with
+from worlds import FakePort
+
 from haptic_loop.cli import bridge
 from haptic_loop.controller.law import Law
 from haptic_loop.design.coupling_file import Stored
@@ -22,10 +26,6 @@ from haptic_loop.models.hold import hold
 from haptic_loop.models.scene import plant
 from haptic_loop.sim.run import assemble, outside_forces, run
 from haptic_loop.sim.scenario import InputError
-from rich.console import Console
-from sessions import AT_REST, FAST, rehearsal_of, session_with
-from worlds import FakePort
-
 from tests.checks.faults import CASES, Fault, _rehearse_case, at, person
 
 # faults

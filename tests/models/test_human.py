@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from haptic_loop.models.device import CompliantDevice, RigidDevice
 from haptic_loop.models.human import Cross, Human, Impedance, Link, Person, Port, state_space
 from haptic_loop.models.scene import Crowd, HumanSets, build, from_mjcf, plant, variants
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 DEVICE = RigidDevice(mass=0.2, damping=0.9)
 

@@ -3,10 +3,11 @@
 import mujoco
 import numpy as np
 import pytest
+from scipy.linalg import expm
+
 from haptic_loop.models.device import CompliantDevice, RigidDevice
 from haptic_loop.models.human import Cross, Human, Link, Person, Population, Voluntary
 from haptic_loop.models.scene import _FILES, build, plant
-from scipy.linalg import expm
 
 HAND = Human((Link(0.3, 3.0, 200.0),))
 ARM = Human((Link(0.1, 5.0, 800.0), Link(1.0, 8.0, 150.0)))

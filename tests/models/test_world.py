@@ -5,11 +5,12 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from worlds import environment_by_hand
+
 from haptic_loop.controller.coupling import MovingAverage, SpringDamper
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.lti import Lti
 from haptic_loop.models.world import Contact, Rows, World, digest_of, files_of
-from worlds import environment_by_hand
 
 T = 1e-3
 FREE = '<geom type="sphere" size="0.005" contype="0" conaffinity="0"/>'

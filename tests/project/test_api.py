@@ -9,14 +9,6 @@ from inspect import isfunction, signature
 
 import numpy as np
 import pytest
-from haptic_loop.cli.design import main as design_command
-from haptic_loop.cli.run import main as run_command
-from haptic_loop.cli.validate import main as validate_command
-from haptic_loop.controller.coupling import NoCoupling, SpringDamper
-from haptic_loop.controller.environment import Spring
-from haptic_loop.design.designs import KINDS
-from haptic_loop.models.device import RigidDevice
-from haptic_loop.sim.scenario import SCENARIOS
 from msgspec.structs import replace
 from worlds import SOFT
 
@@ -36,6 +28,14 @@ from haptic_loop import (
     transparency_of,
     validate,
 )
+from haptic_loop.cli.design import main as design_command
+from haptic_loop.cli.run import main as run_command
+from haptic_loop.cli.validate import main as validate_command
+from haptic_loop.controller.coupling import NoCoupling, SpringDamper
+from haptic_loop.controller.environment import Spring
+from haptic_loop.design.designs import KINDS
+from haptic_loop.models.device import RigidDevice
+from haptic_loop.sim.scenario import SCENARIOS
 from tests.asked import safe_with
 
 SHORT = load().replace(duration=0.3)

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from haptic_loop.controller.coupling import NoCoupling
-from haptic_loop.sim.passivity_layer import netted
-from haptic_loop.sim.run import assemble, run
 
 from examples.classics import ROWS, Classic, EnergyBounding, PassivityControl, row
 from haptic_loop import load
+from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.sim.passivity_layer import netted
+from haptic_loop.sim.run import assemble, run
 
 T = 1e-3
 

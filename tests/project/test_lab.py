@@ -7,7 +7,6 @@ from pathlib import Path
 
 from haptic_loop.cli.main import COMMANDS, _command
 from haptic_loop.cli.options import DOES_NOT_HOLD, DONE
-
 from tests.asked import decisive
 
 LAB = str(Path(__file__).parents[2] / "examples/lab.toml")

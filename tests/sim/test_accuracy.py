@@ -5,6 +5,7 @@ import json
 import msgspec
 import numpy as np
 import pytest
+
 from haptic_loop.cli.accuracy import main
 from haptic_loop.controller.coupling import NoCoupling
 from haptic_loop.models.device import RigidDevice

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from haptic_loop.cli import run as run_command
 from haptic_loop.cli.validate import main
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
@@ -18,7 +19,6 @@ from haptic_loop.sim.adversary import _DESTABILISED, search
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import load
 from haptic_loop.sim.stability import close, dominant_mode
-
 from tests.checks.tightness import attempts, shortages
 
 SCENARIO = load()

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from haptic_loop.cli.validate import main
 from haptic_loop.controller.coupling import PUBLISHED
 from haptic_loop.models.scene import MIXED

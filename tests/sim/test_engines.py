@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from driven import alike, driven
+
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.models.scene import plant
 from haptic_loop.sim import engines as mujoco_engine

@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 from driven import Driven, alike, driven, tick_by_tick
+from scipy.linalg import expm, expm_cond
+
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.controller.tick import Process, StepBuffer
 from haptic_loop.models.device import CompliantDevice
@@ -40,7 +42,6 @@ from haptic_loop.sim.passivity_layer import EnergyNet
 from haptic_loop.sim.run import EngineSettings, assemble, make_engine, run
 from haptic_loop.sim.scenario import InputError, VaryingDelay, load
 from haptic_loop.sim.stability import exact_growth
-from scipy.linalg import expm, expm_cond
 
 SCENARIO = load()
 RUBBING = SCENARIO.replace(device=(CompliantDevice(friction=0.5),) * 2)

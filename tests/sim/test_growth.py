@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+
 from haptic_loop.cli import run as command
 from haptic_loop.cli import trace
 from haptic_loop.controller.coupling import NoCoupling
@@ -12,7 +13,6 @@ from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.stability import close, dominant_mode, stability_of
 from haptic_loop.sim.trace import Trace, growth, growths
-
 from tests.checks.random_loops import traces
 
 T, STEP = 1.2e-3, np.full(2, 1e-6)

@@ -6,6 +6,8 @@ from functools import partial
 import numpy as np
 import pytest
 from driven import driven
+from worlds import STIFF
+
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.design.certificate import requirements_of
 from haptic_loop.models.device import CompliantDevice
@@ -15,8 +17,6 @@ from haptic_loop.sim.engines import EXPONENTIAL
 from haptic_loop.sim.run import assemble, make_engine, outside_forces, run, run_blocks
 from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.stability import exact_growth
-from worlds import STIFF
-
 from tests.checks.hard import cases, devices, measure, nominal
 
 

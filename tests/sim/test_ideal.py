@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+
 from haptic_loop.cli.run import main
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.design.files import plain

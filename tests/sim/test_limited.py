@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from asked import prove_limiter
 from driven import tick_by_tick
+from worlds import SOFT, STIFF
+
 from haptic_loop.cli.run import main
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.assessment import covered_limits
@@ -16,7 +18,6 @@ from haptic_loop.sim.api import simulate
 from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.scenario import load
-from worlds import SOFT, STIFF
 
 BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # covered with limited forces in this environment
 

@@ -6,6 +6,8 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from worlds import VERTICES_ONLY
+
 from haptic_loop.cli import zwidth
 from haptic_loop.cli.options import DONE
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
@@ -20,7 +22,6 @@ from haptic_loop.sim.limit_cycles import HeldDevices
 from haptic_loop.sim.scenario import load
 from haptic_loop.sim.stability import dominant_mode, exact_loops
 from haptic_loop.sim.zwidth import EnvironmentSweep
-from worlds import VERTICES_ONLY
 
 PAIR, STAR = load("omega-pair"), load("three-rigid")
 WALL = Network(("tip",), (Spring(("tip", GROUND), 2000.0, 0.2),))

@@ -10,6 +10,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from worlds import VERTICES_ONLY
+
 from haptic_loop.cli import export, run, validate
 from haptic_loop.controller.coupling import ForceFilter, InternalModel
 from haptic_loop.controller.delay import delay
@@ -31,7 +33,6 @@ from haptic_loop.sim.run import run as close_loop
 from haptic_loop.sim.scenario import load
 from haptic_loop.sim.view import session as live
 from haptic_loop.sim.view.session import GIVEN, Menu, first_loop
-from worlds import VERTICES_ONLY
 
 FREE_MASS = next((Path(__file__).parents[1] / "loops").glob("n4*.toml"))
 SMALL = ((4, 3),)

@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+
 from haptic_loop.controller.coupling import Coupling, NoCoupling
 from haptic_loop.models.scene import Crowd, Variants, draw, variants
 from haptic_loop.sim.adversary import _DESTABILISED, search

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 import pytest
+
+from haptic_loop import design_coupling, load, simulate, validate
 from haptic_loop.cli.run import main
 from haptic_loop.cli.validate import main as validate_command
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
@@ -18,8 +20,6 @@ from haptic_loop.sim.crowds import Validation
 from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.scenario import InputError, _load_humans
 from haptic_loop.sim.stability import close, dominant_mode
-
-from haptic_loop import design_coupling, load, simulate, validate
 
 AGREE = 1e-6  # RK4 at 0.2 rad of the fastest mode in a step: 0.2^5/120 in each, of which most decays
 SCENARIO = load().replace(duration=1.5)

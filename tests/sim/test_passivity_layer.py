@@ -6,13 +6,13 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+
+from haptic_loop import design_coupling, load, simulate
 from haptic_loop.cli.run import main as run_command
 from haptic_loop.controller.coupling import NoCoupling
 from haptic_loop.controller.delay import packet_delays
 from haptic_loop.sim.passivity_layer import EnergyNet, Plugged, netted
 from haptic_loop.sim.run import assemble, run
-
-from haptic_loop import design_coupling, load, simulate
 
 SHORT = load().replace(duration=1.5)
 

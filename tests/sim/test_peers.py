@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from haptic_loop.controller.coupling import PUBLISHED
 from haptic_loop.sim.run import assemble, outside_forces
 from haptic_loop.sim.scenario import load

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
 from haptic_loop.design.files import InputError
 from haptic_loop.design.result import CONDITIONS
 from haptic_loop.sim import map_plot, plots

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from worlds import FIGURE_4
+
 from haptic_loop.controller.coupling import NoCoupling
 from haptic_loop.controller.environment import Spring
 from haptic_loop.design.robustness import vertices
@@ -9,7 +11,6 @@ from haptic_loop.models.human import Human, Link
 from haptic_loop.sim.report import friction_left_out
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import SCENARIOS, InputError, built_in, load, parse
-from worlds import FIGURE_4
 
 TEXT = (SCENARIOS / "omega-pair.toml").read_text()
 

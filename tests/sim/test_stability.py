@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import load

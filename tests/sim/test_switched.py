@@ -6,6 +6,9 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
+from worlds import STIFF
+
 from haptic_loop.cli.run import main
 from haptic_loop.cli.validate import main as validate
 from haptic_loop.controller.delay import VaryingDelay, ages, realising
@@ -26,9 +29,6 @@ from haptic_loop.sim.switching import (
     switched_crowd,
     switching,
 )
-from scipy.linalg import expm
-from worlds import STIFF
-
 from tests.asked import decisive
 
 ASSEMBLY = assemble(load(), STIFF)

@@ -7,6 +7,9 @@ import weakref
 import numpy as np
 import pytest
 from driven import alike
+from scipy.linalg import expm
+
+from haptic_loop import load
 from haptic_loop.cli.run import main
 from haptic_loop.cli.validate import main as validate
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
@@ -18,9 +21,6 @@ from haptic_loop.sim.crowds import Validation, _examine
 from haptic_loop.sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
 from haptic_loop.sim.run import assemble, make_engine, run
 from haptic_loop.sim.stability import close, dominant_mode
-from scipy.linalg import expm
-
-from haptic_loop import load
 from tests.asked import needs
 from tests.checks import uneven
 

@@ -11,6 +11,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from driven import driven
+
 from haptic_loop.cli import run as run_command
 from haptic_loop.cli.validate import main
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper

@@ -10,6 +10,10 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
 from haptic_loop.cli import view as command
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.result import Chosen
@@ -53,9 +57,6 @@ from haptic_loop.sim.view.stage import (
     _typed,
     keys_help,
 )
-from hypothesis import given
-from hypothesis import strategies as st
-from PIL import Image
 
 SCENARIO = load()
 

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hands import Hands
+
+from haptic_loop import simulate
 from haptic_loop.controller.budget import Shell
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import Network, Spring
@@ -16,8 +18,6 @@ from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.sim.couplings import read_coupling
 from haptic_loop.sim.scenario import InputError, Scenario, load, parse
 from haptic_loop.sim.world import START_J, contacts_of, linearise, scene_of
-
-from haptic_loop import simulate
 
 T = 1e-3
 NAMES = ("cube", "ball", "peg", "door", "stack")

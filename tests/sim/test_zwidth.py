@@ -7,6 +7,8 @@ import msgspec
 import mujoco
 import numpy as np
 import pytest
+from worlds import force_map, loop_of
+
 from haptic_loop.cli import zwidth
 from haptic_loop.cli.main import execute
 from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED
@@ -26,7 +28,6 @@ from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.stability import dominant_mode, exact_loops
 from haptic_loop.sim.trace import oscillation, slowest_seen
 from haptic_loop.sim.zwidth import CouplingSweep, Grid, draw_map, make_grid, one_sided
-from worlds import force_map, loop_of
 
 DELTA, T = 1.37, 1e-3
 PAIR, STAR = load("omega-pair"), load("three-rigid")
