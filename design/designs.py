@@ -128,9 +128,10 @@ def design_by_kind(
     if asked not in able:
         raise ValueError(f"condition is {asked!r}, for {kind} allowed are {', '.join(able)}")
     made_for = able[asked]
-    if loop.varying_delay and made_for is ANY_ENVIRONMENT:
-        # The coupling is designed for the constant delays theta. Its assessment says which delays it covers.
-        loop = msgspec.structs.replace(loop, varying_delay=None)
+    constant = msgspec.structs.replace(loop, varying_delay=None)
+    if made_for.beyond(loop) and not made_for.beyond(constant):
+        # Design for the constant delays where the condition does not cover delays that switch. The assessment says so.
+        loop = constant
     if chosen.model and loop.environment.walls:
         reason = f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls"
         raise ValueError(f"{reason}{_before_walls(loop)}")

@@ -222,7 +222,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             "period",
         }  # left out where they are not given: scenarios keep their digest
         contents = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in newer or value}
-        contents["device"] = [_without_guaranteed(device) for device in self.device]
+        contents["device"] = [_given_fields(device) for device in self.device]
         if self.environment.world:  # the contents of its files count, not where they are
             contents["environment"] = _nowhere(self.environment)
         content = msgspec.json.encode(contents, order="sorted", enc_hook=_contents)
@@ -638,11 +638,12 @@ def _kept(value: Any) -> Any:
     return tuple(value)
 
 
-def _without_guaranteed(device: Device) -> dict[str, Any]:
-    """The fields of a device, `guaranteed` only where there is something: other devices keep their digest."""
+def _given_fields(device: Device) -> dict[str, Any]:
+    """Return the fields of a device without newer ones that are not given: such devices keep their digest."""
     fields = msgspec.to_builtins(device)
-    if fields["guaranteed"] is None:
-        del fields["guaranteed"]
+    for name in ("guaranteed", "friction_max"):
+        if fields.get(name) is None:
+            fields.pop(name, None)
     return fields
 
 

@@ -255,7 +255,7 @@ def test_a_scenario_keeps_it_and_says_what_is_none():
 
 
 def test_the_command_takes_hands_from_a_python_file(tmp_path, capsys):
-    hands = tmp_path / "hands.py"
+    hands = tmp_path / "my_hands.py"
     hands.write_text(
         "from haptic_loop.models.human import Port\n"
         "class Soft:\n"
