@@ -47,6 +47,8 @@ def add_link_options(parser: options.Parser) -> None:
     fault = "KIND[=VALUE][@START[+DURATION]], times in seconds after arming, for --rehearse; in front up: or down: for "
     fault += f"one direction, axis2: for an axis; KIND is {', '.join(KINDS)}"
     add("--fault", action="append", default=[], metavar="FAULT", help=fault)
+    clamp = f"with --port {FORCE_DIMENSION}: a mechanical clamp holds the axes that no channel drives (default: ask)"
+    add("--clamped", action="store_true", help=clamp)
     # for tests that drive an emulator behind a pseudo-terminal in slow motion
     add("--pace", type=number(0.01, 1), default=1.0, help=argparse.SUPPRESS)
     add("--arm", action="store_true", help="arm without being asked (default: when the key a is pressed)")
@@ -60,6 +62,7 @@ def add_link_options(parser: options.Parser) -> None:
     add("--guard", type=number(0.0, 0.1), default=1e-4, metavar="SECONDS", help=guard)
     parser.only("with --rehearse: a device has faults of its own", lambda args: args.rehearse, "fault")
     parser.only("with --port: a rehearsal arms by itself", lambda args: args.port, "arm")
+    parser.only(f"with --port {FORCE_DIMENSION}", host_clocked, "clamped")
     parser.only("without --rehearse, whose time is virtual", lambda args: not args.rehearse, "pace")
 
 
@@ -238,10 +241,22 @@ def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> Hap
         adapter = stack.enter_context(ForceDimension(session.scenario, args.port.partition(":")[2] or None))
         if not adapter.guarded:
             console(args).print("the device has no watchdog of its own: were this program killed, its force would stay")
+        if adapter.unused_axes and not args.clamped:
+            _ask_for_clamp("; ".join(adapter.unused_axes))
         return adapter
     with progress("opening the port"):
         port = stack.enter_context(SerialPort(args.port, session.settings.baud))
     return SerialDevice(port, lambda: args.pace * time.monotonic())
+
+
+def _ask_for_clamp(axes: str) -> None:
+    """Ask whether a mechanical clamp holds these axes. Raises InputError where it does not, or nobody can answer."""
+    library = "the library's regulation (drd) locks x, y and z of a device together and cannot hold them"
+    if sys.stdin.isatty():
+        answer = input(f"No channel drives {axes}; {library}. Does a mechanical clamp hold them? [y/n] ")
+        if answer.strip().lower() in ("y", "yes"):
+            return
+    raise InputError(f"--port: no channel drives {axes}; {library}: clamp them mechanically and give --clamped")
 
 
 def _rehearsed(

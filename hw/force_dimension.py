@@ -1,4 +1,4 @@
-"""Devices of Force Dimension, by their maker's library and its Python package: devices without a clock.
+"""Drive devices of Force Dimension by their maker's library and its Python package. They have no clock.
 
 The host is the clock: it reads the position, computes, and writes the force, which acts at once, a fraction of a period
 after the sample (theta = 0). The certificate is for what the host keeps, measured at zero force: periods up to T_max,
@@ -35,14 +35,14 @@ from haptic_loop.sim.scenario import InputError, Scenario
 
 FORCE_DIMENSION = "force-dimension"  # in place of a port
 _PACKAGE = "forcedimension_core"
-_SATURATED = 2  # what setForce says of motors that cannot
-_WATCHDOG = 160  # times 125 us: after 20 ms without a force the device drops it by itself, where it can
-_SPIN = 2e-4  # [s] before a tick that are waited for awake: a sleep ends late
-_SHORTEST = 0.75  # of T, that a period after a late one may be
+_SATURATED = 2  # setForce returns this code when the motors cannot give the force
+_WATCHDOG = 160  # times 125 us: the device drops a force after 20 ms without a new one, if it has a watchdog
+_SPIN = 2e-4  # [s] the end of a wait is spent awake, because a sleep ends late
+_SHORTEST = 0.75  # a period that follows a late one lasts at least this share of T
 
 
 class _Library:
-    """The calls of the package, of which some are in a module for experts; they give -1 for an error."""
+    """Look up the package's calls, some of which are in a module for experts. They return -1 for an error."""
 
     def __init__(self) -> None:
         self._modules = import_module(f"{_PACKAGE}.dhd"), import_module(f"{_PACKAGE}.dhd.expert")
@@ -78,7 +78,7 @@ class ForceDimension:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """`axes` are indices with axes, "0x,1x" (the default: x of the first ones). Raises InputError."""
+        """Open the devices that `axes` names, such as "0x,1x" (default: x of the first ones). Raises InputError."""
         self._where = _axes(axes, scenario.channels)
         self._sdk = sdk or library()
         self._clock, self._sleep, self._begun = clock, sleep, clock()
@@ -99,8 +99,20 @@ class ForceDimension:
         self._T = 1e-9 * self._info.period_ns
         self._due = clock()
 
+    @property
+    def unused_axes(self) -> list[str]:
+        """The translations that no channel drives, one entry per device, such as "y and z of device 0".
+
+        The library's own regulation cannot hold them: drdRegulatePos locks x, y and z of the base together.
+        """
+        return [
+            f"{' and '.join(axis for i, axis in enumerate('xyz') if (name, i) not in self._where)} of device {name}"
+            for name in self._ids
+            if sum(name == used for used, _ in self._where) < 3
+        ]
+
     def info(self) -> Info:
-        """What the library does not tell, damping and step of the encoder among it, is the scenario's."""
+        """Return INFO; the library does not tell damping and encoder step, so these are the scenario's."""
         return self._info
 
     def configure(self, config: Config) -> int:
@@ -142,7 +154,7 @@ class ForceDimension:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Zero force, and the motors off, whatever came before."""
+        """Set zero force and switch the motors off, whatever came before."""
         for ID in self._ids.values():
             self._sdk.setForce([0.0, 0.0, 0.0], ID=ID)
             self._sdk.enableForce(False, ID=ID)
@@ -159,7 +171,7 @@ class ForceDimension:
         return tuple(round(places[index][axis] / (1e-12 * step)) for (index, axis), step in steps)
 
     def _strongest(self, config: Config, index: str) -> float:
-        """The length of the largest force [N] that a device may be asked for, with some room for rounding."""
+        """Return the length [N] of the largest force that a device may be asked for, plus 1 % for rounding."""
         each = zip(self._where, config.cap, self._info.force_step, strict=True)
         return 1.01 * math.sqrt(sum((1e-6 * cap * step) ** 2 for (own, _), cap, step in each if own == index))
 
@@ -195,7 +207,7 @@ class ForceDimension:
 
 
 def _axes(text: str | None, channels: int) -> list[tuple[str, int]]:
-    """Device, by its index or "sn" and its serial number, and axis of every channel. Raises InputError."""
+    """Parse the device (its index, or "sn" and its serial number) and the axis of every channel. Raises InputError."""
     parts = text.split(",") if text else [f"{i}x" for i in range(channels)]
     if len(parts) != channels or not all(re.fullmatch(r"(sn)?\d+[xyz]", part) for part in parts):
         example = ",".join(f"{i}x" for i in range(channels))

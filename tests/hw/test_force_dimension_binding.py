@@ -33,7 +33,7 @@ def sleep(seconds):
 said = {}
 with ForceDimension(load(), "sn4712x,0y", sdk, clock, sleep) as device:
     info = device.info()
-    said |= {"serial": info.serial, "name": info.firmware, "guarded": device.guarded}
+    said |= {"serial": info.serial, "name": info.firmware, "guarded": device.guarded, "unused": device.unused_axes}
     said["refused"] = device.configure(Config(0, 4, 5, 0, (5000, 2500), (5000, 5000)))
     state, command = device.exchange(None), Command.ARM
     for k in range(6):
@@ -77,6 +77,10 @@ def session(tmp_path_factory):
 
 def test_devices_are_opened_by_serial_number_or_index(session):
     assert (session["serial"], session["name"]) == (4712, "omega.3")
+
+
+def test_axes_without_channel_are_named(session):
+    assert session["unused"] == ["y and z of device sn4712", "x and z of device 0"]
 
 
 def test_the_watchdog_is_set_in_expert_mode(session):

@@ -1,6 +1,7 @@
 """The four calls of a device: the Force Dimension SDK by a stand-in that plays a device, and the serial link."""
 
 import sys
+from contextlib import ExitStack, nullcontext
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from scipy.linalg import expm
 from worlds import FakePort
 
-from haptic_loop.cli import bridge, replay
+from haptic_loop.cli import bridge, replay, session_cli
 from haptic_loop.cli.session_cli import check_link
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.hw.control import certified_coupling, certified_couplings, timed
@@ -341,8 +342,26 @@ def test_axes_that_are_none_are_refused(scenario, axes, words):
 
 def test_two_axes_of_one_device(scenario):
     sdk = StandIn(scenario)
-    with ForceDimension(scenario, "0x,0y", sdk, sdk.clock, sdk.sleep):
+    with ForceDimension(scenario, "0x,0y", sdk, sdk.clock, sdk.sleep) as device:
         assert sdk.open == [0]
+        assert device.unused_axes == ["z of device 0"]
+
+
+@pytest.mark.parametrize(
+    ("terminal", "answer", "passes"), [(False, "y", False), (True, "n", False), (True, "", False), (True, "Y", True)]
+)
+def test_unused_axes_need_a_mechanical_clamp(scenario, monkeypatch, terminal, answer, passes):
+    sdk = StandIn(scenario)
+    monkeypatch.setattr(session_cli, "ForceDimension", lambda *args: ForceDimension(*args, sdk, sdk.clock, sdk.sleep))
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: terminal))
+    monkeypatch.setattr("builtins.input", lambda question: answer)
+    args = bridge._parser().parse_args(["--port", "force-dimension:0x,1x", "--arm"])
+    session = SimpleNamespace(scenario=scenario)
+    with ExitStack() as stack, nullcontext() if passes else pytest.raises(InputError, match="y and z of device 0"):
+        session_cli._device(args, session, stack)
+    args.clamped = True
+    with ExitStack() as stack:
+        session_cli._device(args, session, stack)
 
 
 def test_a_host_clock_has_no_baud_rate(scenario):
