@@ -146,6 +146,16 @@ def inverse(M: Array) -> Array:
     return np.linalg.inv(M)
 
 
+def positive_definite(M: Any) -> bool:
+    """Whether a symmetric matrix of Fractions is positive definite: all pivots of its elimination are."""
+    left = M.copy()
+    for i in range(len(left)):
+        if left[i, i] <= 0:
+            return False
+        left[i + 1 :] -= np.outer(left[i + 1 :, i] / left[i, i], left[i])
+    return True
+
+
 def times(left: Array, right: Array) -> Array:
     """left @ right; of Fractions only the entries that are not zero are multiplied, since next to all are.
 

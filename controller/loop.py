@@ -11,13 +11,14 @@ It computes nothing in time: the tick is controller.tick.
 
 from __future__ import annotations
 
+from fractions import Fraction
 from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from haptic_loop.controller.arithmetic import Number, rational
+from haptic_loop.controller.arithmetic import Number, numbers, positive_definite, rational
 from haptic_loop.controller.coupling import Coupling, Strict
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_environment
@@ -28,6 +29,7 @@ from haptic_loop.controller.ranges import Member, Ranges, members
 MOST_SAMPLES = 1000  # of delay on a channel; every one is a state
 _Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=MOST_SAMPLES)], ...]
 _Positive = Annotated[float, msgspec.Meta(gt=0)]
+Rows = tuple[tuple[float, ...], ...]  # of a matrix
 
 
 class DelayRange(Strict, frozen=True):
@@ -80,6 +82,8 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
     latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] least and most by which forces latch after kT
     T_min: _Positive | None = None  # [s] the shortest period there is; only the known-device condition asks for it
     known_devices: tuple[DeviceBounds, ...] | None = None  # (m,) bounds of the devices, where they are guaranteed
+    axes: tuple[int, ...] | None = None  # how many channels each device has; None: every device has one
+    levels: tuple[Rows, ...] | None = None  # Delta_i per device [N s/m], its diagonal in delta; None: diag(delta)
 
     def __post_init__(self) -> None:
         m = len(self.environment.contacts)
@@ -107,6 +111,40 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
             raise ValueError(f"known_devices has {len(self.known_devices)} entries for {m} channels")
         if self.latency is not None:
             self._check_latency(self.latency)
+        self._check_axes()
+
+    def _check_axes(self) -> None:
+        """Raise ValueError unless the axes share the channels and each Delta_i is a level; drop what is the default."""
+        m, axes = self.channels, (1,) * self.channels if self.axes is None else self.axes
+        if sum(axes) != m or min(axes) < 1:
+            raise ValueError(f"axes is {list(axes)}, expected numbers of axes >= 1 with the sum {m}, one per contact")
+        for name in ("theta", "psi", "latency", "known_devices"):
+            each = getattr(self, name) or ()
+            if any(len(set(each[own])) > 1 for own in self.devices):
+                raise ValueError(f"{name} is {list(each)}, expected one value for all axes of a device")
+        spans = [*zip(self.delays.lo, self.delays.hi, strict=True)]
+        if any(len(set(spans[own])) > 1 for own in self.devices):
+            raise ValueError(f"varying_delay is {self.varying_delay}, expected one range for all axes of a device")
+        if self.levels is not None:
+            self._check_levels(self.levels)
+        if set(axes) == {1}:
+            msgspec.structs.force_setattr(self, "axes", None)
+
+    def _check_levels(self, levels: tuple[Rows, ...]) -> None:
+        if len(levels) != len(self.devices):
+            raise ValueError(f"levels has {len(levels)} matrices for {len(self.devices)} devices")
+        for i, (level, own) in enumerate(zip(levels, self.devices, strict=True), start=1):
+            n, words = own.stop - own.start, f"level #{i} is {[list(row) for row in level]}"
+            if len(level) != n or any(len(row) != n for row in level):
+                raise ValueError(f"{words}, expected a {n} x {n} matrix [N s/m]")
+            if any(level[j][k] != level[k][j] for j in range(n) for k in range(j)):
+                raise ValueError(f"{words}, expected a symmetric matrix")
+            if any(level[j][j] != d for j, d in enumerate(self.delta[own])):
+                raise ValueError(f"{words}, expected delta = {list(self.delta[own])} on its diagonal")
+            if not positive_definite(numbers(level, Fraction(1))):
+                raise ValueError(f"{words}, expected a positive definite matrix")
+        if not any(value for level in levels for j, row in enumerate(level) for value in (*row[:j], *row[j + 1 :])):
+            msgspec.structs.force_setattr(self, "levels", None)
 
     def _check_latency(self, latency: tuple[tuple[float, float], ...]) -> None:
         if len(latency) != len(self.theta):
@@ -128,6 +166,20 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
     @property
     def channels(self) -> int:
         return len(self.theta)
+
+    @property
+    def devices(self) -> tuple[slice, ...]:
+        """The channels of every device."""
+        ends = np.cumsum(self.axes or (1,) * self.channels).tolist()
+        return tuple(slice(first, last) for first, last in zip([0, *ends[:-1]], ends, strict=True))
+
+    def Delta(self, exact: bool = False) -> Any:
+        """Delta_D = blockdiag(Delta_1, ..) (3) [N s/m], (m, m), which the devices guarantee."""
+        T = self.period(exact)
+        out = np.diag(numbers(self.delta, T))
+        for own, level in zip(self.devices, self.levels or (), strict=self.levels is not None):
+            out[own, own] = numbers(level, T)
+        return out
 
     def period(self, exact: bool = False) -> Number:
         """T, whose type decides the arithmetic of what is built with it."""
