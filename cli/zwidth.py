@@ -15,7 +15,7 @@ from haptic_loop.cli import options, render
 from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.designs import name_and_own
-from haptic_loop.design.result import Chosen, Requirement
+from haptic_loop.design.result import MAKING, Chosen, Requirement
 from haptic_loop.sim import zwidth
 from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
@@ -36,7 +36,6 @@ def main(argv: list[str]) -> int:
     """Draw a map. 0: nothing contradicts it and every mark is certified, 1: else, 130: interrupted."""
     args = _parser().parse_args(argv)
     of_coupling = args.coupling is None
-    args.grid = args.grid or (60 if of_coupling else 24)
     args.press = (3.0 if of_coupling else 0.0) if args.press is None else args.press
     scenario = options.scenario_from(args)
     require_no_world(scenario, "sim.zwidth")
@@ -55,6 +54,7 @@ def main(argv: list[str]) -> int:
         fixed = FixedCoupling.of(chosen, assessment, scenario.loop(args.case).network, notes)
         sweep = replace(sweep, lag=assessment.force_limits.rho)
     marks = tuple(args.mark)
+    args.grid = args.grid or (60 if of_coupling and not sweep.walls else 24)
     grid = zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, marks)
     plan, out = _plan(args, sweep), options.out_folder(args, "zwidth")
 
@@ -87,7 +87,7 @@ def _parser() -> options.Parser:
     names = f"{', '.join(NAMES)} or FILE.json (default: K and B of the coupling)"
     of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed}: {names}")
     parser.add_condition("that such a coupling is designed for; one of your own is drawn in every map", to=of_map)
-    rows = "rows and columns (default 60; 24 with --coupling)"
+    rows = "rows and columns (default 60; 24 with --coupling, and before walls)"
     of_map.add_argument("--grid", type=options.whole(4, 400), metavar="N", help=rows)
     K, B = "[N/m]; default from delta, theta and T", "[N s/m]; default from delta"
     of_map.add_argument("--K-range", type=options.pair, metavar="LOW,HIGH", help=K)
@@ -255,8 +255,8 @@ def _remarks(report: MapReport) -> Iterator[str]:
         yield "The velocity filter is in all maps: it is linear, and part of the coupling."
     if report.one_sided:
         yield (
-            "One-sided contact: this-environment and the population are about each frozen contact state, "
-            "any-environment (psi = 0) and the simulated points about contact made and broken."
+            f"One-sided contact: this-environment covers {MAKING}; so does any-environment where psi = 0. The random "
+            "humans meet each frozen contact state, the simulated points contact made and broken."
         )
     if simulation.points:
         yield (

@@ -202,7 +202,7 @@ def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> flo
     inside, step = loop.T, 0.1
     while inside < _LONGEST_PERIOD:
         outside = min(inside * (1 + step), _LONGEST_PERIOD)
-        if ratio(outside) >= 1:
+        if not suffices(ratio(outside)):
             return edge(ratio, inside, outside)
         inside, step = outside, 2 * step
     return None

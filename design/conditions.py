@@ -474,7 +474,7 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
     V1 = demand.static["V(1)"]
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
-    if phi is not None and uncovered(loop.E(), loop.psi, phi)[0] > _ROUNDING * max(even_damping(loop)):
+    if phi is not None and uncovered(loop.E(), loop.psi, phi)[0] > 0:
         return refused("E-hat + Phi is not passive for this multiplier")
     least = partial(least_scale, demand) if phi is not None else partial(_scale_beside_zeros, V, demand)
     ratio, w = supremum(least, np.concatenate([[0.0], frequencies(V)]))
@@ -483,8 +483,6 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
     return from_ratio("any-environment", ratio, available, w / (2 * np.pi * V.T))
 
 
-#: What a sweep may find uncovered of an environment, relatively to the damping: rounding.
-_ROUNDING = 1e-6
 #: V is taken to vanish in a direction in which it is smaller than this, beside V(1): nearer to a zero is rounding.
 _VANISHES = 1e-5
 #: What stands there in place of its passivity, beside V(1), and the ratio from which on nothing else does.

@@ -13,7 +13,7 @@ from haptic_loop.design.certificate import judged
 from haptic_loop.design.conditions import this_environment
 from haptic_loop.design.environments import SWITCHING, THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
-from haptic_loop.design.result import Design, DesignFailed, Requirement
+from haptic_loop.design.result import Design, DesignFailed, Requirement, suffices
 from haptic_loop.design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------
@@ -95,7 +95,7 @@ class OverRanges:
         largest = max(f.relative_mismatch for f in figures.values())
         return cls(
             name,
-            sum(ratio >= 1 for ratio in ratios),
+            sum(not suffices(ratio) for ratio in ratios),
             NominalWorst(ratios[0], max(ratios)),
             NominalWorst(nominal.rms_mismatch_db, figures[worst].rms_mismatch_db),
             NominalWorst(nominal.mismatch_db, decibels(largest)),

@@ -38,7 +38,7 @@ from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.exact import require_size
 from haptic_loop.design.frequency import Response, frequencies, hermitian, largest_eigenvalue, on_circle, supremum
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
-from haptic_loop.design.result import Environments, NotProved, Requirement, from_ratio, refusal
+from haptic_loop.design.result import Environments, NotProved, Requirement, from_ratio, refusal, suffices
 
 # ----------------------------------------------------------------------------------------------------
 # The least cost of a period.
@@ -540,7 +540,7 @@ class KnownDevice(Condition):
         bounds = (0.0,) * 2 * m
         if multiplier is not None:
             bounds = tuple(multiplier[m:])
-        elif share < 1:
+        elif suffices(share):
             below, above = q_bounds(loop, [rational(b) for b in beta])
             bounds = below + above
         requirement = from_ratio(self.name, share, loop.delta, w / (2 * np.pi * loop.T))

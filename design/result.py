@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import DelayRange
@@ -43,7 +44,11 @@ C = TypeVar("C", bound=str)  # a ConditionName, "switching" or "limiter"
 GUARD = 1e-7
 
 
-def suffices(ratio: float) -> bool:
+@overload
+def suffices(ratio: float) -> bool: ...
+@overload
+def suffices(ratio: Array) -> NDArray[np.bool_]: ...
+def suffices(ratio: float | Array) -> bool | NDArray[np.bool_]:
     """Return whether devices have enough damping, which required over available damping tells."""
     return ratio < 1 - GUARD
 

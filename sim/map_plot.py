@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from haptic_loop.controller.lti import Array
-from haptic_loop.design.result import CONDITIONS
+from haptic_loop.design.result import CONDITIONS, GUARD, suffices
 from haptic_loop.sim import plots
 from haptic_loop.sim.limit_cycles import UNDECIDED
 from haptic_loop.sim.stability import MARGINAL
@@ -80,10 +80,10 @@ def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
         style = _LINES.get(name, _OWN_LINE)
         # the edge is where required damping is what is available; far from it the figure is only kept finite
         height = np.ma.masked_invalid(np.clip(ratio, 0, 4).reshape(drawn.grid.shape))
-        safe, unsafe = bool((ratio < 1).any()), bool((ratio >= 1).any())
+        safe, unsafe = bool(suffices(ratio).any()), bool((ratio >= 1 - GUARD).any())
         if safe and unsafe:
             drawing = {"colors": style["color"], "linestyles": style["linestyle"], "linewidths": style["linewidth"]}
-            axes.contour(drawn.grid.B, drawn.grid.K, height, [1], **drawing)
+            axes.contour(drawn.grid.B, drawn.grid.K, height, [1 - GUARD], **drawing)
         side = "inside this edge" if about_environment else "below this edge"
         where = side if safe and unsafe else "everywhere here" if safe else "nowhere here"
         label = f"{environments.get(name, name)}: certified {where}"

@@ -34,7 +34,7 @@ from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.guarantees import ANY
-from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Requirement, refusal
+from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Requirement, refusal, suffices
 from haptic_loop.models.device import Device
 from haptic_loop.models.human import Population
 from haptic_loop.sim import limit_cycles
@@ -69,6 +69,16 @@ class _Sweep(ABC):
         """The conditions by their names."""
         known = KNOWN_CONDITIONS if self.loop.known_devices else ()
         return {each.name: each for each in (*map(named, (*CONDITIONS, *known)), *([self.own] if self.own else []))}
+
+    @property
+    @abstractmethod
+    def simulated(self) -> Loop:
+        """The loop of the simulated points."""
+
+    @property
+    def walls(self) -> bool:
+        """Whether contact is made and broken."""
+        return bool(self.simulated.environment.walls)
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -122,14 +132,15 @@ class CouplingSweep(_Sweep):
     @cached_property
     def _multipliers(self) -> dict[str, tuple[Array | None, str | None]]:
         """What a condition needs beside every coupling, (m,); or why it says nothing of this loop."""
-        return {name: each.least_multiplier(self.loop) for name, each in self.asked.items()}
+        return {name: each.least_multiplier(self.simulated) for name, each in self.asked.items()}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """F of every coupling, a stack for each frozen contact state of the environment, all walls touching first.
 
-        Off a rigid wall the device is free, which is safe by itself.
+        Off a rigid wall the device is free, which is safe by itself. Random hands meet these states; a certificate is
+        about walls that make and break contact.
         """
-        return tuple(state.F(self._couplings(K, B)) for state in self._states)
+        return tuple(state.F(self._couplings(K, B)) for state in self.loop.frozen()[::-1])
 
     def processes(self, K: Array, B: Array, devices: Sequence[Device]) -> list[Process]:
         """What the computer does every T with each coupling; limits and encoder steps are those of `devices`.
@@ -151,15 +162,17 @@ class CouplingSweep(_Sweep):
         return force_limit, np.array(rho)
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Required over available damping, (n,); inf where no damping is enough. Of walls, in the worst state."""
+        """Required over available damping, (n,); inf where no damping is enough. Walls make and break contact."""
         asked, (given, reason) = self.asked[condition], self._multipliers[condition]
         if reason:
             return np.full(K.size, np.inf)
-        couplings, loops = self._couplings(K, B), [(state, None) for state in self._states]
+        couplings, loops = self._couplings(K, B), [(self.loop, None)]
         if asked.separable:
             each = [None] * self.loop.channels if given is None else [(p,) for p in given.tolist()]
             loops = [*set(zip(map(self.loop.channel, range(self.loop.channels)), each, strict=True))]
             couplings = self._couplings(K, B, 1)
+        elif self.walls and asked.guarantee(self.simulated) != ANY:  # every coupling has multipliers of its own
+            return self._one_by_one(condition, K, B)
         found = [asked.ratios(loop, couplings, multiplier) for loop, multiplier in loops]
         known = [ratios for ratios in found if ratios is not None]
         return np.max(known, axis=0) if known else self._one_by_one(condition, K, B)
@@ -169,8 +182,7 @@ class CouplingSweep(_Sweep):
         asked, (given, reason), coupling = self.asked[condition], self._multipliers[condition], self._coupling(K, B)
         if reason:
             return refusal(condition, self.loop.delta, reason)
-        states = (self.loop,) if asked.separable else self._states
-        return max((asked.judge(state, coupling, given) for state in states), key=lambda requirement: requirement.ratio)
+        return asked.judge(self.simulated, coupling, given)
 
     def _coupling(self, K: float, B: float) -> SpringDamper:
         return SpringDamper([K] * self.loop.channels, [B] * self.loop.channels, self.cutoff)
@@ -179,11 +191,6 @@ class CouplingSweep(_Sweep):
         m = channels or self.loop.channels
         each = np.ones(m)
         return SpringDamper(np.multiply.outer(K, each), np.multiply.outer(B, each), self.cutoff)
-
-    @cached_property
-    def _states(self) -> tuple[Loop, ...]:
-        """The loop in each frozen contact state, all walls touching first."""
-        return self.loop.frozen()[::-1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,7 +422,8 @@ def _check(name: str, low: float, high: float, allowed: _Range, scale: str) -> N
 # The map: both certificates and the population over the whole grid, MuJoCo at a sparse part of it.
 
 
-_SLICE, _SAMPLE = 60, 25  # cells in one pass of a condition; cells that tell which humans are the leading ones
+_SLICE = 60  # cells in one pass of a condition; before walls one
+_SAMPLE = 25  # cells that tell which humans are the leading ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -457,7 +465,7 @@ def draw_map(
 
     begin = time.perf_counter()
     _ = sweep.refusals  # once, before threads ask for it
-    done, stopped = _in_slices(ratios, n, _SLICE, lambda k, of: progress("certificates", k, of))
+    done, stopped = _in_slices(ratios, n, 1 if sweep.walls else _SLICE, lambda k, of: progress("certificates", k, of))
     for part, values in done:
         for name, value in zip(sweep.conditions, values, strict=True):
             ratio[name][part] = value
@@ -564,7 +572,7 @@ def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: fl
     tried = np.geomspace(min(grid_K[0], K), max(grid_K[-1], K), _STEPS)
     stiffest: dict[str, float | None] = {}
     for name in sweep.conditions:
-        safe = sweep.ratios(name, tried, np.full(_STEPS, float(B))) < 1
+        safe = suffices(sweep.ratios(name, tried, np.full(_STEPS, float(B))))
         stiffest[name] = _last(tried, safe, lambda low, high, name=name: _edge(sweep, name, low, high, B))
     settled = np.array([calm(k) for k in tried])
     stiffest["population"] = _last(tried, settled, lambda low, high: _bisected(calm, low, high))
@@ -575,7 +583,7 @@ def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: fl
 def map_error(sweep: Sweep, drawn: Map, condition: str) -> MapError | None:
     """Columns of the map that cross the edge, evenly chosen; None where there is none."""
     grid, ratio = drawn.grid, drawn.ratio[condition].reshape(drawn.grid.shape)
-    inside = ratio < 1
+    inside = suffices(ratio)
     crossing = inside[:-1] & ~inside[1:] & np.isfinite(ratio[1:])
     columns = np.flatnonzero(crossing.any(axis=0))
     if not columns.size:

@@ -15,7 +15,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table, write
 from haptic_loop.design.guarantees import CAVEATS
-from haptic_loop.design.result import GUARD, Chosen, Requirement
+from haptic_loop.design.result import Chosen, Requirement, suffices
 from haptic_loop.sim.limit_cycles import UNDECIDED, Plan
 from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import MARGINAL
@@ -151,11 +151,11 @@ class _Simulated:
             [device.encoder_step for device in devices],
             [device.friction for device in devices],
             [d.force_limit for d in devices] if plan.effects.saturation else None,
-            bool(sweep.simulated.environment.walls),
+            sweep.walls,
         )
         return cls(
             effects,
-            plan.effects.nonlinear(sweep.devices) or bool(sweep.simulated.environment.walls),
+            plan.effects.nonlinear(sweep.devices) or sweep.walls,
             plan.trials,
             plan.duration,
             plan.start,
@@ -229,7 +229,7 @@ class MapReport:
             loop.psi,
             loop.delta,
             sweep.cutoff,
-            bool(sweep.simulated.environment.walls),
+            sweep.walls,
             list(drawn.ratio),
             _Grid(drawn.grid.K, drawn.grid.B, drawn.grid.scale),
             _population(drawn, humans, seed),
@@ -252,10 +252,8 @@ class MapReport:
 
 def _ratio(sweep: Sweep, drawn: Map, name: str) -> _Ratio:
     ratio = drawn.ratio[name]
-    contradicted = int(((ratio < 1 - GUARD) & (drawn.growth > MARGINAL)).sum()) if name != MODEL_KEPT else None
-    return _Ratio(
-        ratio.reshape(drawn.grid.shape), int((ratio < 1 - GUARD).sum()), contradicted, _nulls(sweep, drawn, name)
-    )
+    contradicted = int((suffices(ratio) & (drawn.growth > MARGINAL)).sum()) if name != MODEL_KEPT else None
+    return _Ratio(ratio.reshape(drawn.grid.shape), int(suffices(ratio).sum()), contradicted, _nulls(sweep, drawn, name))
 
 
 def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:

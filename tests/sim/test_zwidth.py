@@ -17,6 +17,7 @@ from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spri
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.frequency import on_circle, suprema
 from haptic_loop.models.device import CompliantDevice, RigidDevice
 from haptic_loop.models.human import Human, Link
@@ -96,6 +97,30 @@ def test_no_cell_of_the_widest_plane_is_lost(scenario):
     K, B = (axis.ravel() for axis in np.meshgrid(np.geomspace(1e-3, 1e9, 5), np.geomspace(1e-5, 1e6, 4)))
     true = [sweep.requirement("this-environment", k, b).ratio for k, b in zip(K, B, strict=True)]
     np.testing.assert_allclose(sweep.ratios("this-environment", K, B), true, rtol=2e-9)
+
+
+@pytest.mark.parametrize(("theta", "least"), [(0, 1.6154), (1, 1.8630), (2, 2.3639)])
+def test_before_a_wall_a_map_asks_what_designs_ask(theta, least):
+    """K = 2000, B = 2 before 3000 N/m, 2 N s/m: the figures of docs/theory.md; the frozen contact asks less."""
+    network = Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, 2.0),))
+    sweep = CouplingSweep(PAIR.device[:1], PAIR.population, Loop(T, (theta,), (0,), (0,), (DELTA,), network))
+    K, B = np.array([2000.0, 400.0]), np.array([2.0, 0.5])
+    drawn = sweep.ratios("this-environment", K, B)
+    assert drawn[0] * DELTA == pytest.approx(least, abs=1e-4)
+    for cell in range(2):
+        coupling = SpringDamper([K[cell]], [B[cell]])
+        audited = THIS_ENVIRONMENT.judge(sweep.loop, coupling)
+        assert sweep.requirement("this-environment", K[cell], B[cell]) == audited
+        assert drawn[cell] == audited.ratio
+    frozen = THIS_ENVIRONMENT.judge(sweep.loop.frozen()[-1], SpringDamper([2000.0], [2.0]))
+    assert frozen.required[0] < least - 5e-3 or theta == 0
+
+
+def test_a_rigid_wall_that_only_pushes_is_no_frozen_one():
+    """It lets go: a sample late 3000 N/m, 2 N s/m need 4.1392 and not the 4.0625 N s/m of the contact that stays."""
+    asked = [rigid(1, one_sided=one_sided).requirement("this-environment", 3000.0, 2.0) for one_sided in (False, True)]
+    assert [need.required[0] for need in asked] == pytest.approx([4.0625, 4.1392], abs=1e-4)
+    assert "make and break contact" in asked[1].guarantee
 
 
 def test_a_wall_without_delay_needs_half_the_stiffness_times_T_plus_the_damping():
