@@ -7,8 +7,9 @@ Walls, delays that switch and limited forces weigh an error with a multiplier, i
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -34,7 +35,7 @@ from haptic_loop.design.conditions import (
 from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.exact import require_size
-from haptic_loop.design.facts import Fact, Limiter, Switching, Unknowns, Walls, compose
+from haptic_loop.design.facts import Fact, HandsSide, Limiter, Switching, Unknowns, Walls, compose, hands_side
 from haptic_loop.design.files import InputError
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, peaks, supremum, sweeping
 from haptic_loop.design.result import MAKING, DesignFailed, Requirement, from_ratio, refusal, switching_guarantee
@@ -67,10 +68,26 @@ class Multiplied(Condition):
         """The multiplier that a search begins with; the one of a block of many rows, whose search would take long."""
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
+    def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
+        """`block` in the unknowns of a search, in which s and they are affine: the same, unless `hands` has some."""
+        return self.block(G, loop, multiplier)
+
+    def hands(self, loop: Loop) -> HandsSide | None:
+        """The hands' side whose multipliers are among the unknowns."""
+        return None
+
+    def named(self, loop: Loop, multiplier: Sequence[Any]) -> dict[str, Sequence[Any]]:
+        """The numbers of the multipliers by name. Raises ValueError where there are too few or too many."""
+        unknowns = self.unknowns(loop)
+        return {each.name: part for each, part in zip(unknowns, _parted(unknowns, multiplier), strict=True)}
+
     def check(self, loop: Loop, multiplier: Sequence[Any]) -> None:
         """Raise ValueError unless the numbers are multipliers."""
-        for each, values in zip(self.unknowns(loop), _parted(self.unknowns(loop), multiplier), strict=True):
-            each.check(values)
+        values = self.named(loop, multiplier)
+        for each in self.unknowns(loop):
+            each.check(values[each.name])
+        if (hands := self.hands(loop)) and (reason := hands.excess(loop, values)):
+            raise ValueError(reason)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """At this multiplier, or at the best one: `multiplier` and `bound` of the requirement say which."""
@@ -94,7 +111,7 @@ class Multiplied(Condition):
         asked = self.is_demand(self.block(G, loop, values))
         if reason := unsound(asked.free, delta) or self.unsound_static(G, loop, asked):
             return replace(refusal(self.name, delta, reason), multiplier=values)
-        search, bound = _Search(lambda x: self.block(G, loop, x), unknowns, asked), None
+        search, bound = _Search(self, G, loop, asked), None
         if multiplier is None and search.pays:
             bound, values = search.best(values)
         ratio, w = search.swept(values)
@@ -138,10 +155,10 @@ _DIGITS, _NOTHING = 8, 1e-6  # of a number of the multiplier; what counts as 0, 
 class _Search:
     """The multiplier at which a block asks least, by cutting planes."""
 
-    def __init__(
-        self, block: Callable[[Sequence[float]], Demand[Lti]], unknowns: Sequence[Unknowns], asked: Demand[Lti]
-    ) -> None:
-        system, self._block = asked.free, block
+    def __init__(self, condition: Multiplied, G: Lti, loop: Loop, asked: Demand[Lti]) -> None:
+        system, self._block, unknowns = asked.free, partial(condition.block, G, loop), condition.unknowns(loop)
+        self._scaled, self._named = partial(condition.scaled, G, loop), partial(condition.named, loop)
+        self._hands, self._loop = condition.hands(loop), loop
         self._names = ", ".join(each.name for each in unknowns)
         self._units = np.array([unit for each in unknowns for unit in each.units])
         self._searched = np.flatnonzero(self._units)
@@ -165,12 +182,12 @@ class _Search:
         """(a ratio that no multiplier is below, the best one), beginning with these values."""
         count, bound = self._searched.size, 0.0
         units = np.eye(self._units.size)[self._searched] * self._units
-        self._plain = [self._block(tuple(x)) for x in (0 * self._units, *units)]
+        self._plain = [self._scaled(tuple(x)) for x in (0 * self._units, *units)]
         by = np.abs(np.diagonal(self._parts(self._grid[[0, -1]])[1], axis1=2, axis2=3)).max(axis=1)
         self._root = 1 / np.sqrt(np.where(by[-1] > 0, by[-1], np.maximum(by.max(axis=0), 1e-300)))
         low = [Inequality.least([i], float(v)) for i, v in enumerate(self._least)]
         high = [Inequality.most([i], float(v)) for i, v in enumerate(self._most)]
-        blocks = [*low, Inequality.least([count], 0.0), *high]
+        blocks = [*low, Inequality.least([count], 0.0), *high, *self._rooms(count)]
         top, w = self._worst(values, bound)
         best, least, stalled = values, top, 0
         for _ in range(_MOST_ROUNDS):
@@ -182,17 +199,35 @@ class _Search:
             except DesignFailed:  # none within the bounds makes the block positive, however large the damping
                 break
             stalled = 0 if found[-1] > bound + _SETTLED * max(bound, 1.0) else stalled + 1
-            bound, values = max(bound, float(found[-1])), self._values(found[:-1])
+            bound, values = max(bound, float(found[-1])), self._values(found)
             top, w = self._worst(values, bound)
             best, least = min((best, least), (values, top), key=lambda one: one[1])
         return bound, tuple(best)
 
+    def _rooms(self, count: int) -> list[Inequality]:
+        """What the multipliers of the hands' side must satisfy, in the unknowns of the search and s."""
+        if self._hands is None:
+            return []
+        hands, values = self._hands, np.zeros(self._units.size)
+
+        def room(j: int, x: Array) -> Array:
+            values[self._searched] = x[:-1] * self._units[self._searched]
+            return hands.room(self._loop, self._named(tuple(values)), x[-1])[j]
+
+        rooms = len(hands.room(self._loop, self._named(tuple(values)), 1.0))
+        return [Inequality.of(partial(room, j), range(count + 1)) for j in range(rooms)]
+
     def _values(self, x: Array) -> tuple[float, ...]:
-        """The multiplier of x, in units, in few digits."""
-        values = np.zeros(self._units.size)
+        """The multiplier of x, in units, in few digits; the last of x is s."""
+        values, x, s = np.zeros(self._units.size), x[:-1], float(x[-1])
         x = np.where((self._least == 0) & (x < _NOTHING), 0.0, np.clip(x, self._least, self._most))
         values[self._searched] = [float(f"{v:.{_DIGITS}g}") for v in x * self._units[self._searched]]
-        return tuple(values.tolist())
+        if not self._hands:
+            return tuple(values.tolist())
+        found = self._named(values.tolist())
+        own = {each.name for each in self._hands.unknowns(self._loop)}
+        parts = {name: [v / max(s, _NOTHING) for v in part] if name in own else part for name, part in found.items()}
+        return tuple(v for part in self._hands.allowed(self._loop, parts).values() for v in part)
 
     def _worst(self, values: Sequence[float], bound: float) -> tuple[float, Array]:
         """(the most that these values ask, with something to spare, the worst few frequencies): none at the bound."""
@@ -240,7 +275,11 @@ class ThisEnvironment(Multiplied):
         return (*walls, Switching()) if loop.varying_delay else walls
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
-        return tuple(each for fact in self.facts(loop) for each in fact.unknowns(loop))
+        return tuple(each for part in (hands_side(loop), *self.facts(loop)) for each in part.unknowns(loop))
+
+    def hands(self, loop: Loop) -> HandsSide | None:
+        hands = hands_side(loop)
+        return hands if hands.unknowns(loop) else None
 
     def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
         """The start of each multiplier; alpha is half the width times a device's largest own force per displacement.
@@ -270,9 +309,14 @@ class ThisEnvironment(Multiplied):
 
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
         """The block of a map from [x; p] to [f_e; y], with the numbers of its multipliers one after the other."""
-        facts, unknowns = self.facts(loop), self.unknowns(loop)
-        parts = _parted(unknowns, () if multiplier is None else multiplier)
-        return compose(G, loop, facts, {each.name: part for each, part in zip(unknowns, parts, strict=True)})
+        return self._composed(G, loop, multiplier)
+
+    def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
+        return self._composed(G, loop, multiplier, scaled=True)
+
+    def _composed(self, G: Block, loop: Loop, multiplier: Any, scaled: bool = False) -> Demand[Block]:
+        values = self.named(loop, () if multiplier is None else multiplier)
+        return compose(G, loop, self.facts(loop), values, scaled=scaled)
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         """With its multipliers; without them as if all walls touched and delays were constant."""
@@ -284,13 +328,30 @@ class ThisEnvironment(Multiplied):
         return this_environment_demand(F, loop)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """The most that any member asks."""
+        """The most that any member asks, all of them with one multiplier."""
+        if loop.ranges and self.unknowns(loop) and not self.beyond(loop):
+            return self._of_members(loop, coupling, multiplier)
         if self.unknowns(loop) or self.beyond(loop):
             return super().required(loop, coupling, multiplier)
         if loop.ranges is None:
             return this_environment(loop.F(coupling), loop)
         requirements = in_each(loop, coupling, loop.members())
         return requirements[worst(requirements)]
+
+    def _of_members(self, loop: Loop, coupling: Coupling, multiplier: Any) -> Requirement:
+        """With the multiplier given, or the usual one, or the best one where the usual one asks most."""
+        loops = [loop.at(member.network) for member in loop.members()]
+
+        def most(values: Any) -> tuple[Requirement, Loop]:
+            each = [super(ThisEnvironment, self).required(one, coupling, values) for one in loops]
+            i = worst(each)
+            return each[i], loops[i]
+
+        if multiplier is not None:
+            return most(multiplier)[0]
+        usual, hardest = most(tuple(v for each in self.unknowns(loop) for v in each.start or each.units))
+        best, _ = most(super().required(hardest, coupling).multiplier)
+        return min(usual, best, key=lambda requirement: requirement.ratio)
 
     def beyond(self, loop: Loop) -> str | None:
         if loop.environment.walls and loop.ranges:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from haptic_loop.controller.arithmetic import Number, numbers
+from haptic_loop.controller.arithmetic import Number, numbers, rational
 from haptic_loop.controller.loop import Loop
-from haptic_loop.controller.lti import Block, constant_like
+from haptic_loop.controller.lti import Array, Block, constant_like
 from haptic_loop.design.frame import Collected, Demand, Input, Weights, even_damping, less_advance
 
 Values = Mapping[str, Sequence[Any]]  # of the multipliers, by name
@@ -30,10 +30,16 @@ class Unknowns:
     start: tuple[float, ...] | None = None  # (n,) where a search begins; the units if None
 
     def check(self, values: Sequence[Any]) -> None:
-        """Raise ValueError unless the values may be a multiplier: 0 without a unit, else at least 0, or positive."""
+        """Raise ValueError unless the values may be a multiplier.
+
+        A value without a unit is 0; others are of any sign where `least` is negative, else at least 0, or positive.
+        """
+
+        def allowed(v: Any) -> bool:
+            return abs(v) < np.inf and (self.least < 0 or (v >= 0 if self.least == 0 else v > 0))
+
         right = len(values) == len(self.units) and all(
-            (v >= 0 if self.least == 0 else v > 0) and v < np.inf if unit else v == 0
-            for v, unit in zip(values, self.units, strict=True)
+            allowed(v) if unit else v == 0 for v, unit in zip(values, self.units, strict=True)
         )
         if not right:
             raise ValueError(f"{self.name} is {[float(v) for v in values]}, expected {self.expected}")
@@ -66,8 +72,20 @@ class HandsSide(ABC):
         return ()
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
-        """Its multipliers."""
+        """Its multipliers. A search takes s times each of them as unknown, s the factor on the damping."""
         return ()
+
+    def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
+        """Matrices (k, n, n), linear in s and in s times the multipliers: semidefinite where these are allowed."""
+        return []
+
+    def allowed(self, loop: Loop, values: Values) -> Values:
+        """The multipliers, made smaller until they are allowed."""
+        return values
+
+    def excess(self, loop: Loop, values: Values) -> str | None:
+        """Why the multipliers are not allowed, in exact arithmetic, or None."""
+        return None
 
 
 class EvenPeriods(HandsSide):
@@ -86,7 +104,8 @@ class Latency(HandsSide):
     """Forces that latch at kT + tau, with any tau in [t1, t2] at every tick and on every channel.
 
     The device moves by xa under f[k-1] and then by xb under f[k]. A channel with t2 = 0 has no xa. The shortest
-    period must be longer than t2.
+    period must be longer than t2. Where t1 < t2 the multiplier Q weighs the squares of both parts together: any
+    symmetric Q <= diag(1/tau, 1/(T_max - tau)) for all tau in [t1, t2].
     """
 
     name = "latency"
@@ -96,10 +115,107 @@ class Latency(HandsSide):
         before = [Input("xa", i, moved=(0, 1), slips=False) for i in late]
         return before + [Input("xb", i) for i in range(loop.channels)]
 
+    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
+        if not _varies(loop):
+            return ()
+        q11, q22 = (tuple(each) for each in zip(*(_separate(loop, i) for i in range(loop.channels)), strict=True))
+        q12 = tuple(float(np.sqrt(a * b)) for a, b in zip(q11, q22, strict=True))
+        said = "an entry of Q [1/s] of each channel, 0 where the latency does not vary"
+        return (
+            Unknowns("q11", q11, said, 0.0, 1e6),
+            Unknowns("q12", q12, said, -1e6, 1e6, start=(0.0,) * len(q12)),
+            Unknowns("q22", q22, said, 0.0, 1e6),
+        )
+
     def damping(self, loop: Loop, T: Number, values: Values) -> Any:
         first, last = (numbers([row[i] for row in loop.latency or ()], T) for i in (0, 1))
         late, damping = [i for i, t in enumerate(last) if t], numbers(loop.delta, T)
-        return np.diag(np.concatenate([damping[late] / last[late], damping / (longest(loop, T) - first)]))
+        form = np.diag(np.concatenate([damping[late] / last[late], damping / (longest(loop, T) - first)]))
+        for a, i in enumerate(late):
+            if first[i] < last[i] and "q11" in values:
+                q11, q12, q22 = (numbers(values[name][i], T) for name in ("q11", "q12", "q22"))
+                b = len(late) + i
+                form[a, a], form[a, b], form[b, a], form[b, b] = (damping[i] * q for q in (q11, q12, q12, q22))
+        return form
+
+    def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
+        """s - D Q D with D = diag(tau, T_max - tau)^(1/2), at latencies of the range."""
+        found = []
+        for i in _varies(loop):
+            tau = np.linspace(*(loop.latency or ())[i], _LATENCIES)
+            D, Q = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, _entries(values, i)
+            found.append(s * np.eye(2) - D[:, :, None] * Q * D[:, None, :])
+        return found
+
+    def allowed(self, loop: Loop, values: Values) -> Values:
+        shrunk = {name: list(values[name]) for name in ("q11", "q12", "q22")}
+        for i in _varies(loop):
+            tau = np.linspace(*(loop.latency or ())[i], _CLOSER)
+            D, Q = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, _entries(values, i)
+            most = np.linalg.eigvalsh(D[:, :, None] * Q * D[:, None, :]).max()
+            for less in _LESS:  # than what rounding of entries and latencies in between cost
+                entries = [float(f"{(1 - less) / most * Q[a, b]:.{_DIGITS}g}") for a, b in ((0, 0), (0, 1), (1, 1))]
+                if _admits(loop, i, entries):
+                    break
+            else:
+                entries = [*_separate(loop, i)[:1], 0.0, *_separate(loop, i)[1:]]
+            for name, entry in zip(shrunk, entries, strict=True):
+                shrunk[name][i] = entry
+        return {**values, **shrunk}
+
+    def excess(self, loop: Loop, values: Values) -> str | None:
+        for i in _varies(loop):
+            entries = [float(values[name][i]) for name in ("q11", "q12", "q22")]
+            if not _admits(loop, i, entries):
+                first, last = (loop.latency or ())[i]
+                between = f"the latency of channel {i + 1}, {first:g} to {last:g} s"
+                return f"q11, q12, q22 are {entries} 1/s, more than {between}, allows"
+        return None
+
+
+_LATENCIES, _CLOSER = 9, 400  # of a range: in a search, and where its result is made smaller
+_DIGITS = 10  # of an entry of Q
+_LESS = 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4
+
+
+def _varies(loop: Loop) -> list[int]:
+    """The channels whose latency lies in a range."""
+    return [i for i, (first, last) in enumerate(loop.latency or ()) if first < last]
+
+
+def _separate(loop: Loop, i: int) -> tuple[float, float]:
+    """Decimals of at most 1/t2 and 1/(T_max - t1) [1/s], which charge both parts of a period apart; 0, 0 without Q."""
+    if i not in _varies(loop):
+        return 0.0, 0.0
+    (first, last), T = (loop.latency or ())[i], rational(loop.T_max or loop.T)
+    found = []
+    for longest_part in (rational(last), T - rational(first)):
+        q = float(1 / longest_part)
+        found.append(q if rational(q) * longest_part <= 1 else float(np.nextafter(q, 0)))
+    return found[0], found[1]
+
+
+def _entries(values: Values, i: int) -> Array:
+    """Q (2, 2) of a channel."""
+    q11, q12, q22 = (values[name][i] for name in ("q11", "q12", "q22"))
+    return np.array([[q11, q12], [q12, q22]])
+
+
+def _admits(loop: Loop, i: int, entries: Sequence[float]) -> bool:
+    """Whether Q <= diag(1/tau, 1/(T_max - tau)) for all tau of channel i, over the rationals.
+
+    That is q11 tau <= 1, q22 (T_max - tau) <= 1, and a quadratic in tau, the determinant, that is nowhere negative.
+    """
+    (t1, t2), T = map(rational, (loop.latency or ())[i]), rational(loop.T_max or loop.T)
+    q11, q12, q22 = map(rational, entries)
+    ends = (t1, t2)
+    if any(q11 * tau > 1 or q22 * (T - tau) > 1 for tau in ends):
+        return False
+    constant, slope, curve = 1 - q22 * T, q22 - q11 * (1 - q22 * T) - q12**2 * T, q12**2 - q11 * q22
+    least = [constant + slope * tau + curve * tau**2 for tau in ends]
+    if curve > 0 and t1 < -slope / (2 * curve) < t2:
+        least.append(constant - slope**2 / (4 * curve))
+    return min(least) >= 0
 
 
 def hands_side(loop: Loop) -> HandsSide:
@@ -252,13 +368,19 @@ class Limiter(Fact):
 
 
 def compose(
-    G: Block, loop: Loop, facts: Sequence[Fact] = (), values: Values | None = None, late: bool = True
+    G: Block,
+    loop: Loop,
+    facts: Sequence[Fact] = (),
+    values: Values | None = None,
+    late: bool = True,
+    scaled: bool = False,
 ) -> Demand[Block]:
     """The block of the loop's hands' side with these facts, at these values of their multipliers.
 
     Args:
         G: [x; p], displacements (m,) and wall forces, to [f_e; y], forces as they leave and ways into the walls.
         late: whether the delays Theta are still to come; False where G has them.
+        scaled: whether the values of the hands' side are s times its multipliers, which makes the block affine in both.
 
     Raises ValueError for values that are no multipliers.
     """
@@ -273,7 +395,7 @@ def compose(
     block: Collected[Block] = Collected(T, path, walls, hands.inputs(loop, T))
     if any(isinstance(fact, Limiter) for fact in facts):
         block.limit()
-    block.take(hands.damping(loop, T, values), hands.rest(loop, T, values))
+    _take(block, hands, loop, values, scaled)
     for fact in facts:
         fact.enter(block, loop, values)
     S, free, gain = block.build(G)
@@ -285,3 +407,13 @@ def compose(
         static |= {"-Y(1)": -Y1, "the static map of devices and walls": S[..., every, :][..., :, every]}
         least = ("F(1)", "-Y(1)")
     return Demand(free, constant_like(G, gain), static, least, block.spare)
+
+
+def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, scaled: bool) -> None:
+    """Enter what the hands' side takes; where `scaled`, what its multipliers weigh does not grow with s."""
+    damping, rest = hands.damping(loop, block.T, values), list(hands.rest(loop, block.T, values))
+    if scaled and (unknowns := hands.unknowns(loop)):
+        idle = hands.damping(loop, block.T, {**values, **{each.name: (0,) * len(each.units) for each in unknowns}})
+        rest[:1] = [damping - idle + (rest[0] if rest else 0)]
+        damping = idle
+    block.take(damping, rest)
