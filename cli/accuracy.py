@@ -12,8 +12,7 @@ from haptic_loop.sim.accuracy import Row, default_substeps, measure_all
 from haptic_loop.sim.couplings import NAMES, assessed
 from haptic_loop.sim.engines import EXPONENTIAL
 from haptic_loop.sim.run import assemble
-from haptic_loop.sim.scenario import InputError, require_even_ticks, require_linear
-from haptic_loop.sim.world import require_no_world
+from haptic_loop.sim.scenario import InputError, require_even_ticks, require_linear, require_no_world
 
 _MOST_STEPS = 3_000_000  # of a row: a minute or two
 _LEGEND = (

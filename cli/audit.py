@@ -8,26 +8,21 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
-
-from haptic_loop.cli import options, render, world
+from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
 from haptic_loop.controller.loop import DelayRange, Loop
-from haptic_loop.design.audit import LONGEST_DELAY, Audit, Help, Margins, audit
-from haptic_loop.design.certificate import named
-from haptic_loop.design.coverage import Switching
-from haptic_loop.design.designs import KINDS, name_and_own
 from haptic_loop.design.files import off_table
-from haptic_loop.design.guarantees import EncoderSteps
 from haptic_loop.design.result import Requirement, listed
 from haptic_loop.models.device import CATALOGUE, Listed, listed_device
-from haptic_loop.sim.couplings import choose, fitted, from_file, own_of, read_coupling
-from haptic_loop.sim.report import encoder_steps
-from haptic_loop.sim.scenario import InputError, Scenario
-from haptic_loop.sim.world import is_world
+from haptic_loop.sim.scenario import InputError, Scenario, is_world
+
+if TYPE_CHECKING:
+    from haptic_loop.design.audit import Audit, Help, Margins
+    from haptic_loop.design.coverage import Switching
+    from haptic_loop.design.guarantees import EncoderSteps
 
 _EXAMPLES = (
     "python -m design.audit --K 2870,2320 --B 5.47,5.55",
@@ -60,6 +55,12 @@ class _Report:
 def main(argv: list[str]) -> int:
     """Audit a coupling. 0: safe in this environment and at every vertex of its ranges, 1: not."""
     args = _parser().parse_args(argv)
+    from haptic_loop.design.audit import audit
+    from haptic_loop.design.certificate import named
+    from haptic_loop.design.designs import name_and_own
+    from haptic_loop.sim.couplings import from_file, read_coupling
+    from haptic_loop.sim.report import encoder_steps
+
     if args.devices:
         beside = [name for name in ("K", "B", "coupling", "device", "rigid") if getattr(args, name)]
         if beside:
@@ -176,6 +177,9 @@ def _list_devices(args: argparse.Namespace) -> int:
 
 def _audited_world(args: argparse.Namespace, scenario: Scenario) -> int:
     """Audit a coupling, by default the stiffest certified one, in a MuJoCo world."""
+    from haptic_loop.cli import world
+    from haptic_loop.sim.couplings import choose
+
     named_here = args.K or args.B or args.coupling or args.case == "none"
     if named_here:
         coupling, kind = _coupling(args, scenario.loop(args.case), scenario), args.coupling or "spring-damper"
@@ -191,6 +195,9 @@ def _is_own(args: argparse.Namespace) -> bool:
 
 
 def _coupling(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> Coupling:
+    from haptic_loop.design.designs import KINDS
+    from haptic_loop.sim.couplings import fitted, own_of, read_coupling
+
     gains = [name for name in ("K", "B") if getattr(args, name) is not None]
     given = [f"--{name}" for name in (*gains, *(["coupling"] if args.coupling else []))]
     if args.case == "none":
@@ -221,6 +228,8 @@ def _coupling(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> Coupl
 
 def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
     """The range of --varying-delay, or that of the scenario; it must contain theta. Raises InputError."""
+    from haptic_loop.design.audit import LONGEST_DELAY
+
     if args.varying_delay is None:
         return loop.varying_delay
     span = options.delay_range(args.varying_delay, loop.channels, LONGEST_DELAY)
@@ -233,7 +242,9 @@ def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
 # The report as a table, and what it does not cover.
 
 
-def _tables(found: Audit) -> list[Table]:
+def _tables(found: Audit) -> list[render.Table]:
+    from rich.table import Table
+
     assessment, needs = found.assessment, found.assessment.requirements
     gains = assessment.gains
     title = f" K {listed(gains['K'])} N/m, B {listed(gains['B'])} N s/m" if "K" in gains else ""

@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
-from rich.console import Console
 
 from haptic_loop.cli import options, render, session_cli
 from haptic_loop.design.certificate import named
@@ -28,8 +27,7 @@ from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import session_for
 from haptic_loop.hw.session_report import SessionReport, outcome, save
 from haptic_loop.sim.couplings import NAMES
-from haptic_loop.sim.scenario import InputError, Scenario
-from haptic_loop.sim.world import require_no_world
+from haptic_loop.sim.scenario import InputError, Scenario, require_no_world
 
 _LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
 
@@ -107,7 +105,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _print_certificate(
-    ages: Ages, link: int, programs: Sequence[CertifiedCoupling], caps: Sequence[float], console: Console
+    ages: Ages, link: int, programs: Sequence[CertifiedCoupling], caps: Sequence[float], console: render.Screen
 ) -> None:
     """What was measured, and what is certified for it: printed before anything is armed."""
     at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
@@ -166,7 +164,7 @@ def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
     return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
 
 
-def _print_session(report: SessionReport, console: Console, details: bool) -> None:
+def _print_session(report: SessionReport, console: render.Screen, details: bool) -> None:
     """The log, then what the link did."""
     cells = {"after": "{r.t_s:.3f} s", "stage": lambda r: _colour(r.stage), "cause": "{r.cause}"}
     console.print(render.columns(f"case {report.case} · {report.scenario}", cells, report.session.log, left=(1, 2)))

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-from rich.table import Table
-
 from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.loop import Loop
@@ -166,7 +164,7 @@ def _checked(
     )
 
 
-def _table(checked: _Checked) -> Table:
+def _table(checked: _Checked) -> render.Table:
     title = "not proved"
     if checked.proved:
         between = ", at every vertex; between them searched, not proved" if checked.between else ""

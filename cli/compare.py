@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.table import Table
 
 from haptic_loop.cli import options, render
 from haptic_loop.controller.lti import Array
@@ -24,9 +23,8 @@ from haptic_loop.design.robustness import Nearby, Robustness
 from haptic_loop.sim.alternatives import Alternative, alternatives
 from haptic_loop.sim.compare_report import ComparedCoupling, Comparison, ConditionCurve
 from haptic_loop.sim.couplings import NAMES, choose
-from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.scenario import InputError, Scenario, require_no_world
 from haptic_loop.sim.stability import MARGINAL
-from haptic_loop.sim.world import require_no_world
 
 _MOST = 6  # curves that can be told apart in one panel
 
@@ -80,7 +78,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
     return options.exit_code(True)
 
 
-def _beside(made: Sequence[Alternative], own: Condition | None) -> Table:
+def _beside(made: Sequence[Alternative], own: Condition | None) -> render.Table:
     names, cells = [*CONDITIONS, *([own.name] if own else [])], []
     for each in made:
         if each.reason:
@@ -181,7 +179,7 @@ def _named(name: str) -> tuple[str, str | Condition | None]:
         return name, None  # a file may have a colon in its name
 
 
-def _guarantees(report: Comparison) -> Table:
+def _guarantees(report: Comparison) -> render.Table:
     """Required damping [N s/m] where all devices have the same, else as a multiple of what each has."""
     available = report.available_damping
     alike = len(set(available)) == 1
@@ -231,7 +229,7 @@ def _price(name: str, part: Nearby) -> Iterable[str]:
         yield f"{name}, designed for 10 % more or less of every spring and mass: {render.price_words(price)}"
 
 
-def _feel(report: Comparison) -> Table:
+def _feel(report: Comparison) -> render.Table:
     columns = [(what, unit, hz) for what, unit in (("stiffness", "N/m"), ("damping", "N s/m")) for hz in FEEL_HZ]
     heads = ["coupling", *(f"{what}\n{unit}, {hz:g} Hz" for what, unit, hz in columns)]
     named = {"ideal (E)": report.ideal, **{c.name: c.curves.perceived for c in report.couplings}}

@@ -6,42 +6,43 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
-from rich.table import Table
 
-from haptic_loop.cli import options, render, world
+from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.loop import Loop
-from haptic_loop.design import coverage
-from haptic_loop.design.api import Filed, proved, store
 from haptic_loop.design.assessment import SAMPLES, Assessment, assess
-from haptic_loop.design.audit import LONGEST_DELAY
-from haptic_loop.design.bound import BoundBeside
 from haptic_loop.design.certificate import named
 from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_condition
 from haptic_loop.design.files import out_file
 from haptic_loop.design.gain_search import SOFTEST, STIFFEST
-from haptic_loop.design.optimal import Optimal
-from haptic_loop.design.optimal import nearby as nearby_of
 from haptic_loop.design.program import DEFAULT, OBJECTIVES, Options
 from haptic_loop.design.result import Design, finite, listed
 from haptic_loop.design.robustness import Nearby, ranges_around
 from haptic_loop.design.transparency import BAND_HZ
-from haptic_loop.sim.scenario import InputError, Scenario
-from haptic_loop.sim.world import is_world
+from haptic_loop.sim.scenario import InputError, Scenario, is_world
+
+if TYPE_CHECKING:
+    from haptic_loop.design import coverage
+    from haptic_loop.design.api import Filed
+    from haptic_loop.design.bound import BoundBeside
 
 
 def main(argv: list[str]) -> int:
     """Design, prove and store. 0: certified, 1: not."""
     args = _parser().parse_args(argv)
+    from haptic_loop.design.api import store
+
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
     out = out_file(args.out, f"out/design-{options.place(args)}.json", "the file of the coupling")
     scenario = options.scenario_from(args)
     args.coupling = args.coupling or ("moving-average" if is_world(scenario) else "spring-damper")
     if is_world(scenario):
+        from haptic_loop.cli import world
+
         return world.design(args, scenario, out)
     loop = _loop(args, scenario)
     if args.samples is not None and loop.ranges is None:
@@ -110,6 +111,8 @@ def _percent(text: str) -> float:
 
 def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     """The scenario's loop with the range of delays that --varying-delay gives. Raises InputError."""
+    from haptic_loop.design.audit import LONGEST_DELAY
+
     loop = scenario.loop(args.case)
     if args.ranges is not None:
         if loop.ranges or loop.environment.walls:
@@ -152,6 +155,8 @@ def _asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 
 def _design(args: argparse.Namespace, loop: Loop) -> Design:
     """Design and prove. Raises InputError for options that contradict each other, DesignFailed without a coupling."""
+    from haptic_loop.design.api import proved
+
     asked = _asked_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
         asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
@@ -182,6 +187,11 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
 
 
 def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: Assessment, stored: Filed) -> _Report:
+    from haptic_loop.design import coverage
+    from haptic_loop.design.bound import BoundBeside
+    from haptic_loop.design.optimal import Optimal
+    from haptic_loop.design.optimal import nearby as nearby_of
+
     band, best = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None
     known = assessment.requirements.get("switching")
     switching = coverage.Switching.of(loop, design.coupling, known) if loop.varying_delay else None
@@ -310,7 +320,7 @@ class _Report:
         return _OBJECTIVE_WORDS[self.objective_name]
 
 
-def _tables(scenario: Scenario, report: _Report) -> list[Table]:
+def _tables(scenario: Scenario, report: _Report) -> list[render.Table]:
     title = f"{scenario.title(report.case)}: {report.kind} for {report.assessment.condition}"
     rows = [render.channel_row(scenario.environment.contacts), *render.rows_of(report)]
     shown = [render.facts(title, rows)]

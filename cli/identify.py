@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from rich.table import Table
 
 from haptic_loop.cli import options, render
 from haptic_loop.cli.session_cli import add_link_options, check_link, hold_session, steady_scenario
@@ -198,7 +197,7 @@ def _table(e: Estimate, scenario: Scenario, i: int) -> str:
     return "\n".join([*lines, 'kind = "compliant"', *masses, f"transmission_stiffness = {stiffness:.6g}", ""])
 
 
-def _figures(report: _Report) -> Table:
+def _figures(report: _Report) -> render.Table:
     cells = []
     for i, axis in enumerate(report.axes, start=1):
         found = axis.friction

@@ -9,77 +9,35 @@ from __future__ import annotations
 
 import argparse
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from rich.console import Console
-from rich.errors import MarkupError
-from rich.progress import Progress
-from rich.table import Table
-from rich.text import Text
-
 from haptic_loop.controller.loop import Loop
-from haptic_loop.design.files import InJson, nobody_reads, plain, printable, remove, write_json
+from haptic_loop.design.files import InJson, plain, remove, write_json
 from haptic_loop.design.result import DesignFailed, Requirement, listed
 
-if TYPE_CHECKING:  # the reports' parts, which no command without them loads
+if TYPE_CHECKING:  # rich, and the reports' parts, which no command without them loads
+    from rich.table import Table
+
+    from haptic_loop.cli.screen import Screen
     from haptic_loop.design.robustness import Nearby, Spread
     from haptic_loop.design.transparency import Transparency
     from haptic_loop.sim.report import UnevenTicks, VaryingDelays
 
 # ----------------------------------------------------------------------------------------------------
-# The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
+# The terminal, and progress on it. Rich is imported where it prints: --help does without it.
 
 
-_CUT = "…"  # what stands in a table for the end of a word that did not fit
-_WIDEST = 400  # characters
-_STEP = 2
 _SHORT_NAME = 24  # characters of a row's name that are never broken
-_OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # what opens no tag of our reports: a unit, a name
-
-
-class Screen(Console):
-    """A console that cuts nothing off: words may be broken, numbers are not; a table may be wider than the terminal."""
-
-    def print(self, *objects: Any, **how: Any) -> None:
-        """Print as rich does, but widen until no table loses a character."""
-        own = self._width
-        self._width = max([self.width, *(self._needed(one) for one in objects if isinstance(one, Table))])
-        try:
-            super().print(*objects, **how)
-        finally:
-            self._width = own
-
-    def render_str(self, text: str, **how: Any) -> Text:
-        """As rich's, but a file `[/b].npz` or a device that calls itself `:x:` is printed as it is."""
-        how, text = how | {"emoji": False}, printable(text)
-        if how.get("markup") is not False:
-            try:
-                return super().render_str(_OTHER_BRACKET.sub(r"\\[", text), **how)
-            except MarkupError:  # one of our own tags, closed too often
-                how |= {"markup": False}
-        return super().render_str(text, **how)
-
-    def on_broken_pipe(self) -> None:  # rich itself would leave with 1, our "it does not hold"
-        """Go on without output where its reader has gone (`| head -1`); the exit code stays the same."""
-        self.quiet = True
-        nobody_reads()
-
-    def _needed(self, table: Table) -> int:
-        least = 4 * len(table.columns) + 1  # frames and padding, and one character for each column
-        for width in range(max(self.width, least), _WIDEST, _STEP):
-            lines = self.render_lines(table, self.options.update(width=width), pad=False)
-            if not any(_CUT in part.text for line in lines for part in line):
-                return width
-        return _WIDEST
 
 
 def console(args: argparse.Namespace) -> Screen:
     """Where tables go: standard error when standard output is taken by --json -."""
+    from haptic_loop.cli.screen import Screen
+
     return Screen(stderr=args.json == "-", highlight=False)
 
 
@@ -95,8 +53,15 @@ class Move(Protocol):
 @contextmanager
 def progress(description: str) -> Iterator[Move]:
     """A bar on standard error that shows only on a terminal; yields the function that moves it."""
+    from rich.console import Console
+
     terminal = Console(stderr=True)
-    with Progress(transient=True, console=terminal, disable=not terminal.is_terminal) as bar:
+    if not terminal.is_terminal:
+        yield lambda done, total, what=description: None
+        return
+    from rich.progress import Progress
+
+    with Progress(transient=True, console=terminal) as bar:
         task = bar.add_task(description, total=None)
 
         def move(done: int, total: int, what: str = description) -> None:
@@ -193,6 +158,8 @@ _Form = str | Callable[[Any], str | None]
 
 def facts(title: str, rows: Rows, left: bool = False) -> Table:
     """A table of names and texts; a text of None is left out."""
+    from rich.table import Table
+
     table = Table(title=title, title_justify="left" if left else "center", show_header=False)
     for name, text in rows:
         if text is not None:
@@ -202,6 +169,8 @@ def facts(title: str, rows: Rows, left: bool = False) -> Table:
 
 def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (0,)) -> Table:
     """A table of figures, aligned to the right except in the columns `left`."""
+    from rich.table import Table
+
     table, rows = Table(title=title), list(rows)
     short = all(len(row[0]) <= _SHORT_NAME for row in rows)
     for i, head in enumerate(heads):

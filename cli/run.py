@@ -6,42 +6,45 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from haptic_loop.cli import options, render, world
+from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.cli.verdict import assessment_of, chosen_by
-from haptic_loop.controller.budget import BudgetFigures
 from haptic_loop.controller.environment import GROUND
 from haptic_loop.controller.loop import Loop
-from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.certificate import named
 from haptic_loop.design.files import write
 from haptic_loop.design.guarantees import CAVEATS
-from haptic_loop.design.optimal import nearby
 from haptic_loop.design.result import Chosen, finite
-from haptic_loop.design.robustness import Nearby
 from haptic_loop.sim import accuracy
 from haptic_loop.sim.accuracy import MOST
-from haptic_loop.sim.api import ScenarioRun, run_scenario
 from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.engines import INTEGRATORS
-from haptic_loop.sim.passivity_layer import EnergyNet, claim
-from haptic_loop.sim.report import PaperRow, beside_the_paper
 from haptic_loop.sim.run import ENGINES, EngineSettings
-from haptic_loop.sim.run_report import Ran, RunReport, run_report
-from haptic_loop.sim.scenario import InputError, Scenario
-from haptic_loop.sim.stability import ExactVerdict
-from haptic_loop.sim.world import is_world
+from haptic_loop.sim.scenario import InputError, Scenario, is_world
+
+if TYPE_CHECKING:
+    from haptic_loop.controller.budget import BudgetFigures
+    from haptic_loop.design.assessment import Assessment
+    from haptic_loop.design.robustness import Nearby
+    from haptic_loop.sim.api import ScenarioRun
+    from haptic_loop.sim.report import PaperRow
+    from haptic_loop.sim.run_report import Ran, RunReport
+    from haptic_loop.sim.stability import ExactVerdict
 
 
 def main(argv: list[str]) -> int:
     """Simulate and report. 0: the run was completed, stable or not; 130: interrupted."""
     args = _parser().parse_args(argv)
+    from haptic_loop.sim.run_report import run_report
+
     if args.error is not None and (args.engine != "mujoco" or args.integrator or args.substeps):
         raise InputError("--error chooses integrator and substeps of MuJoCo: give no other --engine, --integrator, ..")
     scenario, out = _scenario(args), options.out_folder(args, "run")
     if is_world(scenario):
+        from haptic_loop.cli import world
+
         return world.run(args, scenario, out)
     environment, simulated = _environment(args, scenario)
     chosen = chosen_by(args, scenario)  # V, Q or R
@@ -116,6 +119,9 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
 
 def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -> ScenarioRun:
     """Close the loop as the options say. Raises InputError for settings that cannot be."""
+    from haptic_loop.sim.api import run_scenario
+    from haptic_loop.sim.passivity_layer import EnergyNet, claim
+
     net = EnergyNet(*args.energy_budget, guarantee=claim(assessment)) if args.energy_budget else None
     settings = EngineSettings(args.engine, args.integrator, args.substeps, args.error)
     coupling, lag = assessment.coupling, assessment.force_limits.rho
@@ -125,6 +131,8 @@ def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -
 
 def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> tuple[PaperRow, ...]:
     """The figures of the paper beside those of this run. Raises InputError for a loop that is not the paper's."""
+    from haptic_loop.sim.report import beside_the_paper
+
     rows = beside_the_paper(scenario, args.case, report.stability, report.assessment.coupling)
     if not rows:
         raise InputError("--paper: the paper prints figures of its own two cases only; leave the loop as it is")
@@ -133,6 +141,9 @@ def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> t
 
 def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Nearby:
     """The damping needed where the environment is not as modelled; empty where no guarantee depends on that."""
+    from haptic_loop.design.optimal import nearby
+    from haptic_loop.design.robustness import Nearby
+
     guarantee = assessment.guarantee
     if guarantee is None or guarantee.energy_J is not None or guarantee.any_environment:
         return Nearby()

@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from haptic_loop.cli import options, render, world
 from haptic_loop.cli import verdict as verdicts_of
 from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.ranges import Member
-from haptic_loop.design.assessment import Assessment, RangesResult
 from haptic_loop.design.conditions import this_environment
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
@@ -24,15 +24,16 @@ from haptic_loop.design.result import CONDITIONS, Chosen
 from haptic_loop.models.human import Human, Population
 from haptic_loop.models.scene import MIXED
 from haptic_loop.sim import verdicts
-from haptic_loop.sim.adversary import Worst, search, search_population
 from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.crowds import ENGINES, Findings, Table, Validation, validate, validate_on_cluster
 from haptic_loop.sim.report import DelaySpan, UnevenTicks, VaryingDelays, friction_left_out
 from haptic_loop.sim.run import assemble, engine_name
-from haptic_loop.sim.scenario import InputError, Scenario, require_linear, save_humans
+from haptic_loop.sim.scenario import InputError, Scenario, is_world, require_linear, save_humans
 from haptic_loop.sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
-from haptic_loop.sim.switching import DelaysCovered
-from haptic_loop.sim.world import is_world
+
+if TYPE_CHECKING:
+    from haptic_loop.design.assessment import Assessment, RangesResult
+    from haptic_loop.sim.adversary import Worst
 
 _HUMANS = 1000  # unless a user asks for others
 _ENVIRONMENTS = ("nominal", "ranges")
@@ -159,6 +160,8 @@ _OF_HERE = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, assessment: Assessment) -> _Searched:
     """The worst humans, in the environment that needs the most damping; what was found before Ctrl-C is kept."""
+    from haptic_loop.sim.adversary import search, search_population
+
     asked = [need for need in assessment.requirements.values() if need.condition in _OF_HERE]
     scenario, ratio = question.scenario, min(need.ratio for need in asked)
     if question.environments and assessment.ranges:
@@ -277,6 +280,8 @@ def _varying(
     question: Validation, chosen: Chosen, assessment: Assessment, findings: Findings, certified: bool
 ) -> tuple[verdicts.Growing[VaryingDelays] | None, verdicts.Growing[UnevenTicks] | None]:
     """How many hands grow while delays vary, and while ticks do; None where they do not vary."""
+    from haptic_loop.sim.switching import DelaysCovered
+
     scenario, switching, timing = question.scenario, None, None
     if scenario.varying_delay:
         covered = DelaysCovered.of(scenario, assessment, chosen.switching)

@@ -8,11 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from math import inf, isfinite
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from haptic_loop.cli import options, render
-from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table, write_json
-from haptic_loop.sim.scenario import InputError, require_even_ticks
+from haptic_loop.sim.scenario import InputError, require_even_ticks, require_no_world
 from haptic_loop.sim.view.session import (
     COUPLINGS,
     GIVEN,
@@ -24,19 +24,13 @@ from haptic_loop.sim.view.session import (
     PreparedLoop,
     Script,
     first_loop,
+    keys_help,
     parse_script,
 )
-from haptic_loop.sim.view.stage import (
-    FlatPictures,
-    NoWindow,
-    Picture,
-    ShownScene,
-    check_film,
-    keys_help,
-    save_film,
-    show,
-)
-from haptic_loop.sim.world import require_no_world
+
+if TYPE_CHECKING:
+    from haptic_loop.design.assessment import Assessment
+    from haptic_loop.sim.view.stage import Picture
 
 _EXAMPLES = (
     "python -m sim.view --coupling optimal",
@@ -50,6 +44,8 @@ _LONGEST = 3600  # [s]
 def main(argv: list[str]) -> int:
     """Show the loop until the window is closed or the film is full. 0: shown; 130: interrupted."""
     args = _parser().parse_args(argv)
+    from haptic_loop.sim.view.stage import check_film
+
     scenario = options.scenario_from(args)
     require_no_world(scenario, "sim.view")
     require_even_ticks(scenario, "sim.view")
@@ -213,6 +209,8 @@ def _names() -> list[str]:
 
 def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
     """Film the session by its own clock, so that the film is the same every time; after Ctrl-C it is shorter."""
+    from haptic_loop.sim.view.stage import FlatPictures, save_film
+
     seconds = args.duration or (session.script_ends + _AFTER)
     count, interrupted = round(seconds * args.fps) + 1, False
     simulation = session.prepared.simulation
@@ -235,6 +233,8 @@ def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
 
 
 def _window(session: LiveLoop, duration: float | None) -> _Ended:
+    from haptic_loop.sim.view.stage import NoWindow, ShownScene, show
+
     stage = ShownScene(session.prepared.simulation.scene, session.prepared.simulation.process.force_limit)
     interrupted = False
     try:

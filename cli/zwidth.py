@@ -20,9 +20,8 @@ from haptic_loop.sim import zwidth
 from haptic_loop.sim.couplings import NAMES
 from haptic_loop.sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from haptic_loop.sim.report import friction_left_out
-from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay
+from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_no_world
 from haptic_loop.sim.trace import SUSTAINED
-from haptic_loop.sim.world import require_no_world
 from haptic_loop.sim.zwidth_report import FixedCoupling, MapReport, Shown, save_csv
 
 _EXAMPLES = (

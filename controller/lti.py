@@ -19,7 +19,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
-import scipy  # its submodules are imported on first use
 from numpy.typing import ArrayLike, NDArray
 
 from haptic_loop.controller.arithmetic import (
@@ -247,6 +246,8 @@ class Lti(ReadOnly):
     @cached_property
     def _schur(self) -> tuple[Complex, Complex]:
         """The Schur form A = U S U* of the core states, with S upper triangular."""
+        import scipy
+
         core = self._lines[0]
         if not core.size:
             return np.zeros((0, 0), dtype=np.complex128), np.zeros((0, 0), dtype=np.complex128)

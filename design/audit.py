@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # before the imports, which --help does without
+    from haptic_loop.cli.main import door
+
+    door("audit")
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -395,9 +400,3 @@ def _helps(loop: Loop, coupling: Coupling, condition: Condition) -> list[Help]:
     found = _in_time(loop, coupling, lambda: remedies(loop, coupling, condition), lambda why: [])
     asked = ((remedy.change, remedy.requirement) for remedy in found)
     return [Help(change, condition.name, after.required, after.certified) for change, after in asked]
-
-
-if __name__ == "__main__":
-    from haptic_loop.cli.main import door
-
-    door("audit")

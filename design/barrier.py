@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
 from haptic_loop.controller.arithmetic import spend
@@ -73,6 +72,8 @@ class MatrixInequality:
 
     def changed(self, U: Array) -> MatrixInequality:
         """The same of y where x = U^-1 y."""
+        import scipy
+
         slope = scipy.linalg.solve_triangular(U, self.slope.reshape(-1, len(U)).T, trans=1).T
         return MatrixInequality(self.constant, np.ascontiguousarray(slope).reshape(self.slope.shape))
 
@@ -199,6 +200,8 @@ class Program:
         U is the triangle of the stacked rows of both, so that no inner product is ever formed in the ill-conditioned
         coordinates of a basis of filters.
         """
+        import scipy
+
         dense = [block for block in self.blocks if isinstance(block, MatrixInequality)]
         assert len(dense) == len(self.blocks)
         rows = [block.directions(x) for block in dense]
@@ -242,6 +245,8 @@ def towards(start: Array, x: Array, program: Program, reserve: float = 0.9) -> A
 
 
 def _solved(hessian: Array, right: Array) -> Array:
+    import scipy
+
     scale = 1 / np.sqrt(np.diag(hessian))
     unit = scale[:, None] * hessian * scale
     ridge = 0.0

@@ -26,7 +26,6 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-import scipy  # its parts load when they are used
 
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
@@ -109,6 +108,8 @@ class _Dual:
 
     @classmethod
     def of(cls, loop: Loop, band_hz: tuple[float, float], count: int) -> _Dual:
+        import scipy
+
         E = loop.E()
         low, high = 2 * np.pi * band_hz[0] * loop.T, min(2 * np.pi * band_hz[1] * loop.T, 0.999 * np.pi)
         span = np.log(high / low)
@@ -315,6 +316,8 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
     the channels' psi differ they lie in a subspace, and v is from its complement. Of long delays the first steps are
     taken: any part of all leaves a bound.
     """
+    import scipy
+
     m, span = E.inputs, min(max(loop.psi), _MOST_FORBIDDEN // E.inputs)
     found: list[tuple[int, Array]] = []
     for i, theta in enumerate(loop.theta):

@@ -10,7 +10,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import scipy
 
 from haptic_loop.controller.arithmetic import SingularLoop, TooLong, rational, within
 from haptic_loop.controller.coupling import Coupling
@@ -101,6 +100,8 @@ def prove(
     environment the limiter has no lag and needs no further proof. `swept` is what `required_damping` gives, of a caller
     who has just asked. Raises NotProved with the reason.
     """
+    import scipy
+
     asked, coupling = named(condition), filed(loop, coupling)
     requirement, proof = _proof(asked, loop, coupling, multiplier, swept)
     certificate = sealed(

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # before the imports, which --help does without
+    from haptic_loop.cli.main import door
+
+    door("compare")
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -106,9 +111,3 @@ def perceived(G: NDArray[np.complex128], hz: Array) -> Perceived:
     """The diagonal of displacement-to-force responses (k, m, m) at `hz` (k,) > 0 as stiffness and damping."""
     own = np.diagonal(G, axis1=1, axis2=2)
     return Perceived(own.real, own.imag / (2 * np.pi * hz)[:, None])
-
-
-if __name__ == "__main__":
-    from haptic_loop.cli.main import door
-
-    door("compare")

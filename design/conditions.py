@@ -32,7 +32,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import scipy  # its parts load when they are used
 
 from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers
 from haptic_loop.controller.coupling import Coupling
@@ -540,6 +539,8 @@ def l1_gain(F: Lti) -> Array:
     Ticks are summed until what is left is small, and the rest is bounded: with A'PA <= r^2 P, r < 1,
     |c A^k b| <= r^k sqrt(c P^-1 c' b'P b).
     """
+    import scipy
+
     A, X = F.A, F.B
     radius = float(np.abs(F.poles()).max(initial=0.0))
     if radius >= 1:

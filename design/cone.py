@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import scipy  # its parts load when they are used
 
 from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design.result import DesignFailed, Infeasible
@@ -168,6 +167,7 @@ class ConeProgram:
 def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, str]:
     """(x, the status that Clarabel reports): minimise cost'x with constant - s = -slopes x and every s in its cone."""
     import clarabel
+    import scipy
 
     constants, slopes, cones = [], [], []
     for block in problem.blocks:
@@ -248,6 +248,8 @@ class _Newton:
     """
 
     def __init__(self, problem: ConeProgram, S: _Parts, Z: _Parts, missing: _Parts, wrong: Array) -> None:
+        import scipy
+
         self._problem, self._Z, self._missing, self._wrong = problem, Z, missing, wrong
         self._roots = [[np.linalg.inv(np.linalg.cholesky(part)) for part in parts] for parts in (S, Z)]
         self._inverse = [_adjoint(root) @ root for root in self._roots[0]]
@@ -262,6 +264,8 @@ class _Newton:
 
     def direction(self, mu: float, left: _Parts) -> tuple[Array, _Parts, _Parts, float, float]:
         """(dx, dS, dZ, the longest steps in S and Z, up to 1) towards S Z = mu I, where dZ dS will be `left`."""
+        import scipy
+
         right = _inner(self._problem, self._change(self._missing, mu, left)) - self._wrong
         dx = self._scale * scipy.linalg.cho_solve(self._factor, self._scale * right)
         blocks = zip(self._problem.blocks, self._missing, strict=True)

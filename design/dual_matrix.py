@@ -23,7 +23,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # its parts load when they are used
 
 from haptic_loop.controller.arithmetic import spend
 from haptic_loop.controller.lti import Array, Complex
@@ -166,6 +165,8 @@ class DualMatrix:
 
 def dilogarithm(x: Array) -> Complex:
     """Li2(e^jx) for |x| <= 2 pi."""
+    import scipy
+
     short = np.where(np.abs(x) > np.pi, x - 2 * np.pi * np.sign(x), x)
     square, series = short**2, np.zeros_like(short)
     for n in range(46, 0, -2):

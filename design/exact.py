@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-import flint
 import numpy as np
-import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
 from haptic_loop.controller.arithmetic import rational, spend
@@ -87,6 +85,8 @@ def _congruence(X: _Integers, M: _Integers) -> _Integers:
 
     Args: X (n, m), M (n, n), Python integers. Returns (m, m). Raises TooLong if the budget of `within` is spent.
     """
+    import flint
+
     (n, m) = X.shape
     bits = sum(max((int(v).bit_length() for v in part.flat), default=0) for part in (X, M))
     spend(n * m * (n + m) * (_LIMBS + _BIT * bits))
@@ -247,6 +247,8 @@ def _floats(W: _Integers) -> Floats:
 
 def _whitening(W: Floats) -> _Integers | None:
     """R such that R'WR is nearly a multiple of the identity, or None where W is far from definite."""
+    import scipy
+
     diagonal = np.diag(W)
     if not (diagonal > 0).all():
         return None

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # before the imports, which --help does without
+    from haptic_loop.cli.main import door
+
+    door("export")
+
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -509,9 +514,3 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
     return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; " + (
         "also while forces are limited." if limited else "linear forces only."
     )
-
-
-if __name__ == "__main__":
-    from haptic_loop.cli.main import door
-
-    door("export")

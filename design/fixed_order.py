@@ -16,8 +16,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from scipy.linalg import block_diag
-from scipy.optimize import minimize
 
 from haptic_loop.controller.coupling import Compliance, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring
@@ -369,6 +367,7 @@ class FixedPoles:
 
     def search(self, start: Sequence[float], evaluations: int = 60) -> tuple[Lti, float]:
         """`best` over one pole per channel, by a simplex search from `start`."""
+        import scipy
 
         def norm(x: Array) -> float:
             try:
@@ -377,16 +376,18 @@ class FixedPoles:
                 return np.inf
 
         options = {"maxfev": evaluations, "xatol": 1e-3, "fatol": 1e-4}
-        found = minimize(norm, np.arctanh(start), method="Nelder-Mead", options=options)
+        found = scipy.optimize.minimize(norm, np.arctanh(start), method="Nelder-Mead", options=options)
         return self.best([[a] for a in np.tanh(found.x)])
 
     def _solve(self, poles: Sequence[Sequence[float]]) -> tuple[Lti, float]:
+        import scipy
+
         N, ends = len(poles), np.cumsum([len(a) for a in poles])
         A = np.diag(np.concatenate(poles))
-        B = np.asarray(block_diag(*(np.sqrt(1 - np.square(a))[:, None] for a in poles)))
+        B = np.asarray(scipy.linalg.block_diag(*(np.sqrt(1 - np.square(a))[:, None] for a in poles)))
 
         def unit(x: Array) -> Lti:
-            F = np.asarray(block_diag(*(row[None] for row in np.split(x[N : N + ends[-1]], ends[:-1]))))
+            F = np.asarray(scipy.linalg.block_diag(*(row[None] for row in np.split(x[N : N + ends[-1]], ends[:-1]))))
             return Lti.with_rest(A, B, F, np.diag(x[:N]), 1.0)
 
         gains = N + ends[-1]

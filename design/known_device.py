@@ -22,9 +22,7 @@ from fractions import Fraction
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import flint
 import numpy as np
-import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
 from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers, rational
@@ -131,6 +129,8 @@ def q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], t
 
     q = T tanh(y)/y with y^2 = c0 T^2/(4 c2) at the damping of the loop. Raises NotProved for a beta that is too large.
     """
+    import flint
+
     below, above = [], []
     with flint.ctx.workprec(_BITS):
         for short, long in _enclosed(loop, beta):
@@ -141,6 +141,8 @@ def q_bounds(loop: Loop, beta: Sequence[Fraction]) -> tuple[tuple[float, ...], t
 
 def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> float:
     """The nearest double whose shortest decimal lies beyond the ball."""
+    import flint
+
     value = float(ball.mid())
     for _ in range(_MOST_ULPS):
         if beyond(flint.arb(_fmpq(rational(value))), ball):
@@ -151,6 +153,8 @@ def _beside(ball: Any, towards: float, beyond: Callable[[Any, Any], bool]) -> fl
 
 def check_q(loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], above: Sequence[Fraction]) -> None:
     """Raise NotProved unless below < q(T1) and q(T2) < above on every channel, by balls that contain q."""
+    import flint
+
     m = loop.channels
     if not len(beta) == len(below) == len(above) == m:
         raise NotProved(f"q has {len(below)} and {len(above)} bounds, expected {m} each")
@@ -164,6 +168,8 @@ def check_q(loop: Loop, beta: Sequence[Fraction], below: Sequence[Fraction], abo
 
 def _enclosed(loop: Loop, beta: Sequence[Fraction]) -> list[tuple[Any, Any]]:
     """q of the shortest and of the longest period as balls, channel by channel. Raises NotProved."""
+    import flint
+
     exact = loop.period(True)
     short, long = (rational(T) for T in (shortest_period(loop) or exact, loop.T_max or exact))
 
@@ -189,6 +195,8 @@ def _row(values: Sequence[Fraction]) -> Any:
 
 
 def _fmpq(value: Fraction) -> Any:
+    import flint
+
     return flint.fmpq(value.numerator, value.denominator)
 
 
@@ -829,6 +837,8 @@ def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None)
 
 def _stable_with_held_ends(F: Lti, loop: Loop, share: float) -> bool:
     """Whether the loop is stable at `share` of the damping with the far end of every transmission held."""
+    import scipy
+
     m, known = loop.channels, loop.known_devices or ()
     generator = np.zeros((3 * m, 3 * m))
     for i, (device, delta) in enumerate(zip(known, loop.delta, strict=True)):

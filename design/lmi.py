@@ -19,7 +19,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
 from haptic_loop.controller.coupling import Coupling
@@ -158,6 +157,8 @@ def balanced(G: Lti, negligible: float = 1e-11) -> Lti:
     Square-root method. Only states that no input reaches or no output shows to rounding are left out, so the
     response is unchanged: this is not a model reduction.
     """
+    import scipy
+
     if G.order == 0:
         return G
     reach, show = _root(G.A, G.B), _root(G.A.T, G.C.T)
@@ -171,6 +172,8 @@ def balanced(G: Lti, negligible: float = 1e-11) -> Lti:
 
 def reachability_scaled(G: Lti) -> Array:
     """S (n, n) such that the states S^-1 x of G have the identity as reachability Gramian (regularised)."""
+    import scipy
+
     W = scipy.linalg.solve_discrete_lyapunov(G.A, G.B @ G.B.T)
     size = max(np.trace(W) / max(G.order, 1), 1e-300)
     return scipy.linalg.cholesky((W + W.T) / 2 + 1e-9 * size * np.eye(G.order), lower=True)
@@ -178,6 +181,8 @@ def reachability_scaled(G: Lti) -> Array:
 
 def _root(A: Array, B: Array) -> Array:
     """R with R R' = the Gramian of (A, B), defined for singular ones too."""
+    import scipy
+
     W = scipy.linalg.solve_discrete_lyapunov(A, B @ B.T)
     values, basis = np.linalg.eigh((W + W.T) / 2)
     return basis * np.sqrt(np.maximum(values, 0.0))

@@ -14,7 +14,6 @@ from itertools import accumulate, pairwise
 from typing import Any, Literal
 
 import numpy as np
-import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
 from haptic_loop.controller.arithmetic import spend, spent
@@ -439,6 +438,8 @@ class Problem:
         self, A: Array, b: Array, c: Array, asked: _Asked, imposed: list[Array], start: Array, x: Array
     ) -> _Posed:
         """(the program in other coordinates y, x there or what is feasible towards it, the way back)."""
+        import scipy
+
         parts = [self.block(*one, own, w) for one, own, w in zip(asked, self.own, imposed, strict=True)]
         program = Program(A, b, c, joined([*parts, self._positive(0)]))
         x = towards(start, x, program)
@@ -455,6 +456,8 @@ class Problem:
         self, A: Array, b: Array, c: Array, asked: _Asked, imposed: list[Array], start: Array, x: Array
     ) -> _Posed:
         """The same as `_dense` for R entry by entry, its functions balanced, and then g."""
+        import scipy
+
         n, m, _ = self.span.used.shape
         z = on_circle(np.unique(np.concatenate(imposed)))
         functions = self.span.responses(z)

@@ -27,7 +27,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array
@@ -84,11 +83,15 @@ def _window(order: int, sigma: float, T: float) -> Array:
 
 
 def _filtered(signal: Array, order: int, sigma: float, T: float) -> Array:
+    import scipy
+
     return scipy.signal.fftconvolve(signal, _window(order, sigma, T), mode="same")
 
 
 def _held(force: Array, sigma: float, T: float) -> tuple[Array, Array, Array]:
     """A force held for each tick, filtered, and its two derivatives."""
+    import scipy
+
     n = round(_REACH * sigma / T)
     t = np.arange(-n, n + 1) * T
     step = (scipy.special.erf(t / (np.sqrt(2) * sigma)) - scipy.special.erf((t - T) / (np.sqrt(2) * sigma))) / 2
@@ -128,6 +131,8 @@ class _Balance:
     """The rows of the balance where the axis moves."""
 
     def __init__(self, x: Array, force: Array, T: float, step: float) -> None:
+        import scipy
+
         noise = 3 * step**2 * T / (96 * np.sqrt(np.pi) * _ACCELERATION_NOISE**2)  # sigma^5, of white rounding
         self.T, self.sigma, self.force = T, max(_WINDOW, 3 * T, noise**0.2), force
         self.x = x - x[0]
@@ -210,6 +215,8 @@ class _Fit:
 
 def _solve(columns: Array, force: Array) -> Array:
     """Least squares where some parameters are not negative."""
+    import scipy
+
     scale = np.linalg.norm(columns, axis=0) + 1e-300
     q, r = np.linalg.qr(columns / scale)
     low = np.full(columns.shape[1], -np.inf)

@@ -8,13 +8,17 @@ comes from the spectra of what force is left and of the motion: least squares ov
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # before the imports, which --help does without
+    from haptic_loop.cli.main import door
+
+    door("identify")
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
 import numpy as np
-import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array, frozen
@@ -217,6 +221,8 @@ class _Spectrum:
 
     def model(self, p: Array, every: int = 1) -> NDArray[np.complex128]:
         """The motion by this model, at every so many frequencies; between ticks it is exact for a held force."""
+        import scipy
+
         m1, b, m2, k = np.exp(p)
         a = np.zeros((5, 5))
         a[0, 2] = a[1, 3] = 1.0
@@ -252,6 +258,8 @@ class _Spectrum:
 
 def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmission | None:
     """The transmission that explains a record, None where there is none."""
+    import scipy
+
     spectrum, fits = _Spectrum(x, force - dry_friction(x, T, found), T), []
     for start in spectrum.starts(found):
         robust: dict[str, Any] = {"loss": "soft_l1", "f_scale": _OUTLIER, "max_nfev": _STEPS}
@@ -350,9 +358,3 @@ def estimate(
         except ValueError as error:
             raise ValueError(f"axis {i + 1}: {error}") from None
     return estimates
-
-
-if __name__ == "__main__":
-    from haptic_loop.cli.main import door
-
-    door("identify")

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # its parts load when they are used
 
 from haptic_loop.hw.limits import Units
 from haptic_loop.hw.protocol import NO_MARGIN, Config, Phase, SafetyStop, State, distance
@@ -443,6 +442,8 @@ class Expected:
 
     def __init__(self, device: Device, T: float) -> None:
         """`device` is its model, T [s] the time for which a force is held."""
+        import scipy
+
         masses, link = list(device.bodies.values()), device.transmission or (0.0, 0.0)
         n = len(masses)
         a = np.zeros((2 * n + 1, 2 * n + 1))

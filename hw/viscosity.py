@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from itertools import pairwise, product
 
 import numpy as np
-import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array
@@ -79,6 +78,8 @@ def doubt(found: Viscosity, friction: Friction) -> str | None:
 
 def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
     """Highest speed [m/s], the damping that is lost up to it, at least 0, and its standard error [N s/m]."""
+    import scipy
+
     n = max(3, round(6e-3 / T) | 1)  # a cubic over 6 ms: its error in a stroke of 3 Hz is far below an encoder's count
     smooth = scipy.signal.savgol_filter(x, n + 2, 3)
     v = scipy.signal.savgol_filter(x, n + 2, 3, deriv=1, delta=T)
@@ -156,6 +157,8 @@ class _Spectra:
 
 def _memory(x: Array, force: Array, T: float, friction: Friction) -> tuple[float | None, float]:
     """The damping [N s/m] beside the memory that explains a record best, and its time constant; None without one."""
+    import scipy
+
     spectra = _Spectra(x, force - dry_friction(x, T, friction), T)
     low = np.array([-20.0] * 4 + [0.0] * 4)
     high = np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T, np.inf])

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
 from haptic_loop.models.scene import Plant
@@ -39,6 +38,8 @@ def hold(plant: Plant, T: float, late: Sequence[float] | None = None) -> HeldPla
     If forces latch `late` (m,) [s] after the tick, the state is [s; forces that the actuators hold], and the held
     forces act until then: s+ = A(T) s + B(T) [w; held] + B(T - late) (f - held).
     """
+    import scipy
+
     if late is not None:
         return latched(partial(hold, plant), T, late)
     *many, n, inputs = plant.B.shape
@@ -177,6 +178,8 @@ def _blocks(pattern: NDArray[np.bool_]) -> tuple[_Which, _Which]:
 
     Their shapes are (blocks, rows) and (blocks, columns). Smaller blocks are padded with -1.
     """
+    import scipy
+
     n, width = pattern.shape
     graph = np.zeros((width, width), dtype=bool)
     graph[:n] = pattern

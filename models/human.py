@@ -15,7 +15,6 @@ from typing import Annotated, Any, Protocol, Self
 
 import msgspec
 import numpy as np
-import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
 from haptic_loop.models.device import require
@@ -74,6 +73,8 @@ def _check_positive_real(A: _Array, B: _Array, C: _Array, D: _Array) -> None:
     Re Z(jw) = D - C A (w^2 I + A^2)^-1 B is a rational function of w^2. Its sign can only change at its real zeros,
     which are eigenvalues of a pencil. So one sample between each two neighbouring zeros decides all frequencies.
     """
+    import scipy
+
     n = A.shape[0]
     if n and not np.linalg.eigvals(A).real.max() < 0:
         raise ValueError("impedance: A has an eigenvalue on or right of the imaginary axis, expected a stable A")

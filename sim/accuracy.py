@@ -6,6 +6,11 @@ engine and the step that keep an error that is asked for on a scene of one's own
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # before the imports, which --help does without
+    from haptic_loop.cli.main import door
+
+    door("accuracy")
+
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -646,9 +651,3 @@ def simulated_growth(
     if not all(np.isfinite(part).all() for part in (held.A, held.B)):
         raise InputError(f"engine {engine_name(engine)}: a tick from rest leaves the range of numbers")
     return max(float(dominant_mode(close(held, F)).growth) for F in simulation.process.law.frozen().values())
-
-
-if __name__ == "__main__":
-    from haptic_loop.cli.main import door
-
-    door("accuracy")

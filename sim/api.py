@@ -28,11 +28,11 @@ from haptic_loop.sim.run import (
     make_engine,
     run,
 )
-from haptic_loop.sim.scenario import InputError, Scenario, require_linear
+from haptic_loop.sim.scenario import InputError, Scenario, is_world, require_linear, require_no_world
 from haptic_loop.sim.stability import stability_of
 from haptic_loop.sim.switching import Period, switching
 from haptic_loop.sim.trace import Trace
-from haptic_loop.sim.world import START_J, Claim, Touched, WorldFigures, WorldRecord, is_world, require_no_world
+from haptic_loop.sim.world import START_J, Claim, Touched, WorldFigures, WorldRecord
 
 if TYPE_CHECKING:
     from haptic_loop.sim import crowds

@@ -8,6 +8,11 @@ controller.tick for the order of these steps and sim.engines for what advances t
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # before the imports, which --help does without
+    from haptic_loop.cli.main import door
+
+    door("run")
+
 import shutil
 import tempfile
 from bisect import bisect_left
@@ -371,9 +376,3 @@ def _own_engine(simulation: Simulation, engine: Engine | Callable[[Simulation], 
     if simulation.timing and not type(made).__module__.startswith("haptic_loop."):
         raise InputError(f"{name}: uneven ticks (period, latency) run in {' and '.join(ENGINES)}")
     return made
-
-
-if __name__ == "__main__":
-    from haptic_loop.cli.main import door
-
-    door("run")

@@ -337,6 +337,20 @@ def built_in() -> list[str]:
     return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
 
 
+def is_world(scenario: Scenario) -> bool:
+    """Whether the scenario's environment is a MuJoCo scene."""
+    return scenario.environment.world is not None
+
+
+def require_no_world(scenario: Scenario, what: str) -> None:
+    """Raises InputError for commands that cannot use a world."""
+    if is_world(scenario):
+        able = "sim.run, sim.validate, design and design.audit take worlds"
+        raise InputError(
+            f"environment.world: {what} takes networks only; {able}, linearise(world, pose) gives a network"
+        )
+
+
 def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
     """Raises InputError where a loop has Coulomb friction or, unless `walls` are decided too, walls."""
     for i, device in enumerate(scenario.device, start=1):

@@ -16,6 +16,11 @@ growth        how fast does it grow? An oscillation that grows like exp(g t) is 
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # before the imports, which --help does without
+    from haptic_loop.cli.main import door
+
+    door("trace")
+
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -334,9 +339,3 @@ def growths(trace: Trace) -> list[Growth]:
     if not np.abs(np.diff(trace.t) - T).max(initial=0.0) <= _EVEN * T:
         raise InputError(f"the trace's samples are not evenly spaced: t steps by {T:g} s at first, not everywhere")
     return [growth(trace.x[first:stop], T, steps, first) for first, stop in ends.tolist()]
-
-
-if __name__ == "__main__":
-    from haptic_loop.cli.main import door
-
-    door("trace")

@@ -95,20 +95,6 @@ def _energy(joules: float) -> str:
 # The scene behind a coupling
 
 
-def is_world(scenario: Scenario) -> bool:
-    """Whether the scenario's environment is a MuJoCo scene."""
-    return scenario.environment.world is not None
-
-
-def require_no_world(scenario: Scenario, what: str) -> None:
-    """Raises InputError for commands that cannot use a world."""
-    if is_world(scenario):
-        able = "sim.run, sim.validate, design and design.audit take worlds"
-        raise InputError(
-            f"environment.world: {what} takes networks only; {able}, linearise(world, pose) gives a network"
-        )
-
-
 def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> World:
     """The compiled scene with a spring G = D_V^-1 at each contact.
 

@@ -9,6 +9,11 @@ part of the cells, MuJoCo with the effects that no theory covers.
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # before the imports, which --help does without
+    from haptic_loop.cli.main import door
+
+    door("zwidth")
+
 import os
 import time
 from abc import ABC, abstractmethod
@@ -630,9 +635,3 @@ def _last(tried: Array, safe: NDArray[np.bool_], between: Callable[[float, float
         return None
     last = int(np.flatnonzero(safe)[-1])
     return np.inf if last == tried.size - 1 else between(float(tried[last]), float(tried[last + 1]))
-
-
-if __name__ == "__main__":
-    from haptic_loop.cli.main import door
-
-    door("zwidth")

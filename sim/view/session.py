@@ -93,6 +93,13 @@ KEYS: dict[int, tuple[str, _Event]] = {
     259: ("Backspace", _Restart()),
 }
 
+
+def keys_help(given: bool) -> list[tuple[str, str]]:
+    """The keys and what they ask for; `given` where there is a coupling from a file. The mouse comes last."""
+    keys = [(name, words(event)) for name, event in KEYS.values() if given or event != Couple(GIVEN)]
+    return [*keys, ("double click", "take a body"), ("Ctrl+right", "draw it")]
+
+
 Script = tuple[tuple[float, _Event], ...]  # (time [s], event), in order of time
 
 

@@ -28,7 +28,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.design.files import InputError, check_file, write
 from haptic_loop.design.result import Requirement
 from haptic_loop.models.scene import APART, DRAWN, STEP, Scene
-from haptic_loop.sim.view.session import GIVEN, HISTORY, KEYS, Couple, Frame, Grip, LiveLoop, PreparedLoop, words
+from haptic_loop.sim.view.session import HISTORY, KEYS, Frame, Grip, LiveLoop, PreparedLoop, keys_help
 
 if TYPE_CHECKING:
     from mujoco import viewer
@@ -143,12 +143,6 @@ def _needs(requirement: Requirement) -> str:
     worst = int(np.argmax(np.divide(requirement.required, requirement.available)))
     need, have = requirement.required[worst], requirement.available[worst]
     return f"needs {need:.3f} of {have:g} N s/m: {'certified' if requirement.certified else 'NOT certified'}"
-
-
-def keys_help(given: bool) -> _Lines:
-    """The keys and what they ask for; `given` where there is a coupling from a file. The mouse comes last."""
-    keys = [(name, words(event)) for name, event in KEYS.values() if given or event != Couple(GIVEN)]
-    return [*keys, ("double click", "take a body"), ("Ctrl+right", "draw it")]
 
 
 def _apart(lines: _Lines) -> tuple[_Lines, _Lines]:

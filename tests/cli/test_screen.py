@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.table import Table
 
-from haptic_loop.cli.render import Screen
+from haptic_loop.cli.screen import Screen
 
 ROOT = Path(__file__).parents[2]
 NUMBERS = ["7.8429", "18.895", "-11.19", "0.71449", "1.3699"]
