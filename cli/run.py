@@ -156,7 +156,7 @@ def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunRepo
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", run.simulation.scene.xml))
     if render.is_drawn(args, out / "figure.png", bool(result.t.size)):
-        from haptic_loop.sim.plots import Contacts, Onset, plot_run
+        from haptic_loop.sim.plots import Contacts, Onset, draw_run, save
 
         apart = report.ideal_force.error_percent
         ideal = None if apart is None else (report.ideal_force.ideal, apart)
@@ -166,7 +166,7 @@ def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunRepo
         around = Contacts(run.simulation.scenario.environment.contacts, *_walls(run))
         title = _title(run.simulation.scenario.title(args.case), report)
         hertz = stability.exact_frequency_hz
-        files.append(plot_run(result, out / "figure.png", title, hertz, ideal, onset, around))
+        files.append(save(draw_run(result, title, hertz, ideal, onset, around), out / "figure.png"))
     return files
 
 

@@ -33,10 +33,10 @@ def main(argv: list[str]) -> int:
     if not result.t.size:
         raise InputError(f"{args.trace}: it has no ticks")
     if args.plot:
-        from haptic_loop.sim.plots import plot_run
+        from haptic_loop.sim.plots import draw_run, save
 
         strongest = next((one.frequency_hz for one in found if one.frequency_hz), _ZOOM_HZ)
-        plot_run(result, Path(args.plot), args.trace, strongest)
+        save(draw_run(result, args.trace, strongest), Path(args.plot))
     traced = _Traced(args.trace, result.t.size, float(result.t[-1]), found)
     T = traced.duration_s / max(1, traced.ticks - 1)
     lines = [f"growth, {one.words(T)}" for one in found]

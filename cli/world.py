@@ -149,10 +149,10 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
     files.append(write(out / "scene.xml", finished.simulation.scene.xml))
     files.append(write(out / "world.xml", scene_of(scenario, chosen.coupling).xml))
     if not args.no_plot and trace.t.size > 1:
-        from haptic_loop.sim.plots import Contacts, plot_run
+        from haptic_loop.sim.plots import Contacts, draw_run, save
 
         around = Contacts(scenario.environment.contacts)
-        files.append(plot_run(kept, out / "figure.png", f"{scenario.name}: a MuJoCo world", 1.0, None, None, around))
+        files.append(save(draw_run(kept, f"{scenario.name}: a MuJoCo world", 1.0, around=around), out / "figure.png"))
     title = f"{report.guarantee} The shell acted on {figures.limited_ticks} of {figures.ticks} ticks."
     render.publish(args, report, [render.facts(title, _run_rows(report, figures, scenario), left=True)], (), out, files)
     return options.exit_code(True, trace.interrupted)

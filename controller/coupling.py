@@ -91,8 +91,15 @@ class Coupling:
         """Return its form in a file."""
         raise ValueError(f"a coupling of class {type(self).__name__} has no form in a file")
 
+    def __repr__(self) -> str:
+        """Name the class, with the order of its filter."""
+        try:
+            return f"{type(self).__name__}(order {self.figures(1.0)['order']})"
+        except (ValueError, TypeError):  # of a user's own class, which needs not have a compliance
+            return f"{type(self).__name__}()"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class NoCoupling(Coupling):
     """V = 0: the devices touch the environment directly."""
 
@@ -105,7 +112,7 @@ class NoCoupling(Coupling):
         return _NoForm()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SpringDamper(ReadOnly, Coupling):
     """V = [K + B (z-1)/(Tz)]^-1, one spring and damper per channel (26). Leading axes hold many couplings.
 
@@ -153,6 +160,12 @@ class SpringDamper(ReadOnly, Coupling):
     def compliance(self, T: Number) -> Lti:
         """Return the diagonal V(z)."""
         return Lti.diag(*self.channels(T))
+
+    def __repr__(self) -> str:
+        rows = [gains.tolist() if gains.ndim == 1 else None for gains in (self.K, self.B)]
+        shown = [f"[{', '.join(f'{value:.6g}' for value in row)}]" if row else f"{self.K.shape}" for row in rows]
+        cutoff = "" if self.cutoff is None else f", cutoff={self.cutoff:g}"
+        return f"SpringDamper(K={shown[0]}, B={shown[1]}{cutoff})"
 
     def figures(self, T: float) -> dict[str, Any]:
         return {"K": self.K.tolist(), "B": self.B.tolist()} | super().figures(T)
@@ -204,7 +217,7 @@ PUBLISHED = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MovingAverage(ReadOnly, Coupling):
     """V_i = weight_i (1 + 1/z + ... + z^-(terms_i - 1)) + constant_i: a moving sum of the forces and a plain spring.
 
@@ -252,7 +265,7 @@ class MovingAverage(ReadOnly, Coupling):
         return _MovingAverageForm(tuple(self.weight.tolist()), self.terms, tuple(self.constant.tolist()))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Compliance(Coupling):
     """A general V(z), as a state-space block."""
 
@@ -270,7 +283,7 @@ class Compliance(Coupling):
         return _ComplianceForm(*(_rows(getattr(self.V, name)) for name in "ABCD"))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class InternalModel(ReadOnly, Coupling):
     """Internal model control with a parameter Q(z): u = x - Q y, where y = Psi E x is the output of the model.
 
@@ -325,7 +338,7 @@ class InternalModel(ReadOnly, Coupling):
         return _InternalModelForm(tuple(self.poles.tolist()), tuple(_rows(q) for q in self.Q))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ForceFilter(ReadOnly, Coupling):
     """A filter R(z) of the environment's forces: F = Theta R Psi E, with one copy of the environment.
 

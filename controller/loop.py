@@ -163,6 +163,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         if not span.contains(DelayRange(self.theta, self.theta)):
             raise ValueError(f"theta is {list(self.theta)}, outside of its varying_delay, {span}")
 
+    def __repr__(self) -> str:
+        shown = f"T = {1e3 * self.T:g} ms, theta = {list(self.theta)}, psi = {list(self.psi)}"
+        return f"Loop({shown}, damping {list(self.delta)} N s/m, contacts {', '.join(self.environment.contacts)})"
+
     @property
     def channels(self) -> int:
         return len(self.theta)

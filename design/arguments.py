@@ -55,6 +55,6 @@ def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:
 def shown(value: Any) -> str:
     """The value, shortened, with its type."""
     text = repr(value)
-    if len(text) > 60 or "\n" in text:
+    if len(text) > 60 or "\n" in text or type(value).__module__.startswith("haptic_loop"):
         return f"a {type(value).__name__}"
     return text if value is None else f"{text} ({type(value).__name__})"

@@ -289,17 +289,32 @@ def _by_its_own_block(
 
 @dataclass(frozen=True)
 class Guarantee:
-    """For whom, and while what, a coupling keeps its loop safe."""
+    """For whom, and while what, a coupling keeps its loop safe.
 
-    condition: str  # the condition by which it holds, or "energy-budget"
-    proof: str  # "rational": exact arithmetic; "sampled": a refined sweep; "account": an energy account at every tick
-    facts: tuple[str, ...]  # of the loop that the condition covers beside a linear environment (Assessment.facts)
+    Attributes:
+        condition: The condition by which it holds, or "energy-budget".
+        proof: "rational": exact arithmetic; "sampled": a refined sweep; "account": an energy account at every tick.
+        facts: What the condition covers beside a linear environment (Assessment.facts).
+        hands: For which hands it holds, in words.
+        environments: "any passive environment", "these ranges", "this environment", ..
+        forces: "also while they are limited", or the restriction.
+        delays: The delays of the forces [samples], lo and hi (m,); any of them at every tick.
+        periods: The longest period [s].
+        energy_J: The energy [J] that a hand may be given beyond what the devices dissipate; None: it comes to rest.
+    """
+
+    condition: str
+    proof: str
+    facts: tuple[str, ...]
     hands: str
-    environments: str  # "any passive environment", "these ranges", "this environment", ..
-    forces: str  # "also while they are limited", or the restriction
-    delays: DelayRange  # of the forces [samples]; any of them at every tick
-    periods: float  # the longest period [s]
-    energy_J: float | None = None  # what a hand may be given beyond what the devices dissipate; None: it comes to rest
+    environments: str
+    forces: str
+    delays: DelayRange
+    periods: float
+    energy_J: float | None = None
+
+    def __repr__(self) -> str:
+        return f"Guarantee({self.condition}, {self.proof}: {self.hands}, {self.environments}, {self.forces})"
 
     @property
     def any_environment(self) -> bool:
@@ -326,19 +341,36 @@ class Guarantee:
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """A coupling in a loop: every report of a coupling, and every run, begins with this record."""
+    """A coupling in a loop: every report of a coupling, and every run, begins with this record.
+
+    Attributes:
+        loop: All that the conditions know of devices, delays and environment.
+        coupling: The coupling as it runs.
+        requirements: Per condition the required and the available damping (m,) [N s/m], and where it binds [Hz].
+        environment: What really runs: a network, or a function that is plugged in.
+        ranges: Every vertex of the ranges, and the search between them; None without ranges.
+        force_limits: The limiter (rho (m,) [N/m], with its proof) or clipping, and the energy budget [J].
+        transparency: The mismatch; None where the environment has no E(z), or the loop no solution.
+        certificate: The exact proof, if one was given or made for the ranges.
+        guarantee: For whom the loop is safe; None where nothing is guaranteed.
+        reason: Why there is no guarantee.
+        condition: The name of the condition that must hold, beside which the others are reported.
+    """
 
     loop: Loop
     coupling: Coupling
-    requirements: Mapping[str, Requirement]  # per condition: required and available damping, where it binds
-    environment: Environment | PluggedEnvironment  # what really runs
-    ranges: RangesResult | None  # every vertex of the ranges, and the search between them
-    force_limits: ForceLimits  # limiter (with its proof) or clipping, energy budget
-    transparency: Transparency | None  # None where the environment has no E(z), or the loop no solution
-    certificate: Certificate | None  # the exact proof, if one was given or made for the ranges
+    requirements: Mapping[str, Requirement]
+    environment: Environment | PluggedEnvironment
+    ranges: RangesResult | None
+    force_limits: ForceLimits
+    transparency: Transparency | None
+    certificate: Certificate | None
     guarantee: Guarantee | None
-    reason: str | None  # why there is no guarantee
-    condition: str  # the one that must hold, beside which the others are reported
+    reason: str | None
+    condition: str
+
+    def __repr__(self) -> str:
+        return f"Assessment({self.coupling!r}: {self.guarantee or f'no guarantee, {self.reason}'})"
 
     @property
     def facts(self) -> tuple[str, ...]:

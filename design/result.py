@@ -55,18 +55,36 @@ def suffices(ratio: float | Array) -> bool | NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Requirement(Generic[C]):
-    """The damping that a condition asks of the devices, against what they have."""
+    """The damping that a condition asks of the m devices, against what they have.
+
+    Attributes:
+        condition: The name of the condition.
+        required: (m,) required damping [N s/m]; inf where no damping helps.
+        available: (m,) damping that the devices guarantee [N s/m].
+        frequency_hz: The frequency [Hz] at which the condition binds; None where there is none.
+        reason: Why `required` is infinite.
+        proof: "rational" where exact arithmetic confirms it, "sampled" where a refined sweep says so.
+        multiplier: The multiplier at which so much is required, of a condition that has one.
+        bound: No multiplier asks a smaller ratio, on the frequencies that the search has looked at; no unit.
+        guarantee: For which environments the condition is, in words, where it has judged a loop.
+        lag: (m,) rho [N/m] of a limiter that the condition covers without further proof.
+    """
 
     condition: C
-    required: tuple[float, ...]  # (m,) [N s/m]; inf when no damping helps
-    available: tuple[float, ...]  # (m,) [N s/m]
-    frequency_hz: float | None  # where it binds
-    reason: str | None = None  # why the figure is infinite
+    required: tuple[float, ...]
+    available: tuple[float, ...]
+    frequency_hz: float | None
+    reason: str | None = None
     proof: str = "sampled"
-    multiplier: tuple[Any, ...] | None = None  # at which it asks so much, of a condition that has one
-    bound: float | None = None  # no multiplier asks a smaller ratio, on the frequencies that its search has looked at
-    guarantee: str | None = None  # for which environments it is, in words, where a condition has judged a loop
-    lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of a limiter that it covers without further proof
+    multiplier: tuple[Any, ...] | None = None
+    bound: float | None = None
+    guarantee: str | None = None
+    lag: tuple[float, ...] | None = None
+
+    def __repr__(self) -> str:
+        verdict = f"certified, {self.proof}" if self.certified else "not certified"
+        shown = f"needs {listed(self.required)} of {listed(self.available)} N s/m"
+        return f"Requirement({self.condition}: {shown}, {verdict})"
 
     @property
     def ratio(self) -> float:
@@ -165,17 +183,29 @@ def listed(values: Iterable[float | None], digits: int = 6) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """A coupling, the condition that it was made for or is judged by, and how it came about."""
+    """A coupling, the condition that it was made for or is judged by, and how it came about.
+
+    Attributes:
+        coupling: The coupling; a SpringDamper has K (m,) [N/m] and B (m,) [N s/m].
+        condition: The name of the condition.
+        kind: The kind of the coupling in reports.
+        phi: (m,) multiplier Phi_E of Theorem 4 [N s/m], if it needs one.
+        certificate: The Certificate of the file, where it was proved in this process.
+        limiter: The Certificate for limited forces that comes with it.
+        own: The condition of the user's own (design.conditions.Condition), if it is one.
+        switching: The delays [samples] within which its file proves any switching.
+        notes: What a reader should know of its origin.
+    """
 
     coupling: Coupling
     condition: str
     kind: str = field(kw_only=True, default="given")
-    phi: Array | None = field(kw_only=True, default=None)  # (m,) multiplier Phi_E [N s/m] of Theorem 4, if it needs one
-    certificate: Any = field(kw_only=True, default=None)  # the file's Certificate, where it was proved in this process
-    limiter: Any = field(kw_only=True, default=None)  # Certificate with which it comes for limited forces
-    own: Any = field(kw_only=True, default=None)  # the design.conditions.Condition, where that is one of the user's own
-    switching: DelayRange | None = field(kw_only=True, default=None)  # its file proves any switching within it
-    notes: tuple[str, ...] = field(kw_only=True, default=())  # what a reader should know of its origin
+    phi: Array | None = field(kw_only=True, default=None)
+    certificate: Any = field(kw_only=True, default=None)
+    limiter: Any = field(kw_only=True, default=None)
+    own: Any = field(kw_only=True, default=None)
+    switching: DelayRange | None = field(kw_only=True, default=None)
+    notes: tuple[str, ...] = field(kw_only=True, default=())
 
     @property
     def asked(self) -> Any:
@@ -193,13 +223,36 @@ class Chosen:
 
 @dataclass(frozen=True, eq=False)
 class Design(Chosen):
-    """A coupling, what it was designed for and what was verified from the coupling alone."""
+    """A coupling, what it was designed for and what was verified from the coupling alone.
 
-    figure: str  # what was minimised: "loop-norm" (23), "rms" (mismatch), "stiffness" (maximised)
-    objective: float  # its value, of the coupling as returned
-    requirement: Requirement  # by `condition`, on a refined sweep
-    sdps: int = 0  # convex problems solved (local searches count their runs)
+    Attributes:
+        coupling: The coupling; a SpringDamper has K (m,) [N/m] and B (m,) [N s/m].
+        condition: The name of the condition that it was designed for.
+        figure: What was optimised: "loop-norm" (23) and "rms" (mismatch) are minimised, "stiffness" is maximised.
+        objective: Its value for the coupling as returned; a ratio, or [N/m] for "stiffness".
+        requirement: What `condition` requires, on a refined sweep.
+        sdps: The number of convex problems that were solved; local searches count their runs.
+        wall_s: The duration of the design [s].
+        c: The multiplier of the limiter, one row per channel, where its search is long.
+        searched: The search between the vertices of ranges (design.worst_member.Searched).
+        hurried: Whether `seconds` ended the search, so that more time may find a better coupling.
+        kind: The kind of the coupling in reports.
+        phi: (m,) multiplier Phi_E of Theorem 4 [N s/m], if it needs one.
+        certificate: The Certificate, where it was proved in this process.
+        limiter: The Certificate for limited forces that comes with it.
+        own: The condition of the user's own (design.conditions.Condition), if it is one.
+        switching: The delays [samples] within which any switching is proved.
+        notes: What a reader should know of its origin.
+    """
+
+    figure: str
+    objective: float
+    requirement: Requirement
+    sdps: int = 0
     wall_s: float = 0.0
-    c: Sequence[Sequence[float]] | None = field(kw_only=True, default=None)  # of the limiter, where its search is long
-    searched: Any = field(kw_only=True, default=None)  # design.worst_member.Searched, between the vertices of ranges
-    hurried: bool = field(kw_only=True, default=False)  # --seconds ended the search: more time may find a better one
+    c: Sequence[Sequence[float]] | None = field(kw_only=True, default=None)
+    searched: Any = field(kw_only=True, default=None)
+    hurried: bool = field(kw_only=True, default=False)
+
+    def __repr__(self) -> str:
+        return f"Design({self.coupling!r} for {self.requirement!r})"

@@ -20,14 +20,27 @@ _ROUNDING = 1e-10  # of the environment: two responses that differ by less are o
 
 @dataclass(frozen=True)
 class Transparency:
-    """Figures of the mismatch M = F - Lambda E; ratios, not decibels: 1 (0 dB) is as wrong as feeling nothing."""
+    """Figures of the mismatch M = F - Lambda E; ratios, not decibels: 1 (0 dB) is as wrong as feeling nothing.
 
-    tau: float  # (25): sup sigma_max(M) / inf sigma_min(E) up to band_hz[1]
-    relative_mismatch: float  # sup over the band of sigma_max(M) / sigma_max(E)
-    rms_mismatch: float  # rms over log frequency in the band of ||M||_F / ||E||_F
-    dc_ratio: float  # sigma_max F(1) / sigma_max E(1): the share of the static stiffness that is felt
-    high_frequency_gain: float  # sup above 100 Hz of sigma_max(F) / sigma_max(E)
+    Attributes:
+        tau: Ratio (25): sup sigma_max(M) / inf sigma_min(E) up to band_hz[1].
+        relative_mismatch: Ratio: sup over the band of sigma_max(M) / sigma_max(E).
+        rms_mismatch: Ratio: rms over log frequency in the band of ||M||_F / ||E||_F.
+        dc_ratio: sigma_max F(1) / sigma_max E(1), the share of the static stiffness that is felt.
+        high_frequency_gain: Ratio: sup above 100 Hz of sigma_max(F) / sigma_max(E).
+        band_hz: The band [Hz], lowest and highest frequency.
+    """
+
+    tau: float
+    relative_mismatch: float
+    rms_mismatch: float
+    dc_ratio: float
+    high_frequency_gain: float
     band_hz: tuple[float, float]
+
+    def __repr__(self) -> str:
+        mismatch = f"mismatch {self.rms_mismatch_db:.2f} dB rms, {self.mismatch_db:.2f} dB at most"
+        return f"Transparency({mismatch}, {100 * self.dc_ratio:.3g} % of the stiffness)"
 
     @property
     def mismatch_db(self) -> float:

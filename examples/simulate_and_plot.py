@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from haptic_loop import Trace, design_coupling, load, plot_run, simulate
+from haptic_loop import Trace, design_coupling, load, simulate
 
 SECONDS = 8.0
 
@@ -16,7 +16,7 @@ def show(name: str, result: Trace, out: Path) -> None:
     last = result.f[result.t > SECONDS - 1]
     loudest = np.sqrt(np.mean(last**2, axis=0)).max()
     print(f"{name}: growth {growth:+.3f} 1/s at {hertz:.1f} Hz; {loudest:.2f} N rms in the last second")
-    plot_run(result, out / f"{name.replace(' ', '-')}.png", f"{name}: growth {growth:+.3f} 1/s", hertz)
+    result.plot(out / f"{name.replace(' ', '-')}.png", f"{name}: growth {growth:+.3f} 1/s")
 
 
 def main(out: Path = Path("out/simulate-and-plot")) -> None:

@@ -12,7 +12,7 @@ simulate(scenario, coupling)        Return a Trace: a run with the people of the
 validate(scenario, coupling)        Return Findings: the growth of the loop with many random people.
 linearise(world, pose)              Return the Network that a MuJoCo scene is near a pose.
 rehearse(scenario)                  Return a Rehearsed: a whole session with an emulated device, in virtual time.
-plot_run(trace, path)               Write a picture of a Trace.
+trace.plot(path), trace.to_frame()  Draw a Trace; return it as a pandas data frame.
 
 Couplings: SpringDamper, NoCoupling. Devices: RigidDevice, CompliantDevice. Environments: Network, with Spring
 and Wall, and RIGID_WALL. InputError and DesignFailed are ValueErrors. Names are imported on first use, so that no
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from haptic_loop.models.device import CompliantDevice, RigidDevice
     from haptic_loop.sim.api import simulate, validate
     from haptic_loop.sim.crowds import Findings
-    from haptic_loop.sim.plots import plot_run
     from haptic_loop.sim.scenario import InputError, Scenario, load, parse
     from haptic_loop.sim.trace import Trace
     from haptic_loop.sim.world import linearise
@@ -72,7 +71,6 @@ _HOMES = {
     "linearise": "sim.world",
     "load": "sim.scenario",
     "parse": "sim.scenario",
-    "plot_run": "sim.plots",
     "rehearse": "hw.rehearsal",
     "simulate": "sim.api",
     "transparency_of": "design.api",

@@ -226,17 +226,33 @@ class Rehearsal:
 
 @dataclass(frozen=True, eq=False)
 class Rehearsed:
-    """The result of a session."""
+    """The result of a session.
 
-    stage: str  # "finished" where all went well; else "refused", "stopped", "lost", "e-stop"
-    cause: str  # of the end
-    delay: float | None  # median from a sample to its force [s]; None where it was not measured
-    theta: tuple[int, ...] | None  # delays that the coupling is certified for [samples]; None where there is none
-    latency: tuple[float, float] | None  # [s] between which forces latch after their tick; None where at ticks
-    coupling: Coupling | None  # that the device was armed with, or would have been
-    assessment: Assessment | None  # of that coupling in the loop with the measured delay
-    result: Trace | None  # t, x and f of every tick, as `simulate` gives them; handles are not measured
-    zero_after: float | None  # from the wish to stop until no motor does anything [s]; None where it never ran
+    Attributes:
+        stage: "finished" where all went well, otherwise "refused", "stopped", "lost" or "e-stop".
+        cause: Why the session ended.
+        delay: The median time from a sample to its force [s]; None where it was not measured.
+        theta: (m,) delays for which the coupling is certified [samples]; None where there is none.
+        latency: Least and most time by which forces latch after their tick [s]; None where they latch at ticks.
+        coupling: The coupling with which the device was armed, or would have been.
+        assessment: The assessment of that coupling in the loop with the measured delay.
+        result: A Trace with t, x and f of every tick; handles are not measured.
+        zero_after: The time from the wish to stop until no motor does anything [s]; None where it never ran.
+    """
+
+    stage: str
+    cause: str
+    delay: float | None
+    theta: tuple[int, ...] | None
+    latency: tuple[float, float] | None
+    coupling: Coupling | None
+    assessment: Assessment | None
+    result: Trace | None
+    zero_after: float | None
+
+    def __repr__(self) -> str:
+        delay = "" if self.delay is None else f", delay {1e6 * self.delay:.0f} us"
+        return f"Rehearsed({self.stage}: {self.cause}{delay}, {self.coupling!r})"
 
 
 def rehearse(

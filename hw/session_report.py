@@ -199,10 +199,10 @@ def save(out: Path, session: Session, recorder: Recorder, report: SessionReport,
         if not plot:
             remove(out / "figure.png")  # of an earlier session
         else:
-            from haptic_loop.sim.plots import plot_run
+            from haptic_loop.sim.plots import draw_run, save
 
             title = f"{report.scenario}, case {report.case}: a session that ended {session.stage}"
-            files.append(plot_run(result, out / "figure.png", title, 10.0))
+            files.append(save(draw_run(result, title, 10.0), out / "figure.png"))
     files.append(out / "report.json")
     write_json(files[-1], plain(report) | {"files": [str(p) for p in files]})
     return files

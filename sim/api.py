@@ -6,15 +6,16 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.arguments import number, of_kind, one_of, whole
 from haptic_loop.design.files import plain
-from haptic_loop.design.result import Design
+from haptic_loop.design.result import Chosen, Design
 from haptic_loop.sim.accuracy import MOST, EngineChoice, compare_engines, pick, settle
-from haptic_loop.sim.couplings import assessed, given
+from haptic_loop.sim.couplings import assessed, choose, given
 from haptic_loop.sim.engines import INTEGRATORS, Engine
 from haptic_loop.sim.passivity_layer import EnergyNet, Plugged, Wanted, claim, netted
 from haptic_loop.sim.run import (
@@ -97,9 +98,16 @@ def run_scenario(
     return ScenarioRun(simulation, ran, period, choices, settled, remarks, trace, wall, seed)
 
 
+def _chosen(scenario: Scenario, coupling: Coupling | Design | str | Path | None) -> Chosen:
+    """Return the coupling of a script's argument, with its proofs. Raises InputError for a file that does not fit."""
+    if isinstance(coupling, str | Path) and Path(coupling).suffix == ".json":
+        return choose(scenario, "I", str(coupling))
+    return given(coupling)
+
+
 def simulate(
     scenario: Scenario,
-    coupling: Coupling | Design | None = None,
+    coupling: Coupling | Design | str | Path | None = None,
     engine: AnyEngine = "mujoco",
     integrator: str | None = None,
     substeps: int | None = None,
@@ -110,10 +118,10 @@ def simulate(
 ) -> Trace:
     """The scenario's run, from rest, for `scenario.duration` seconds.
 
-    `coupling` None is the loop without one; `engine` is "mujoco", "exact" (the linear loop, no Coulomb friction) or
-    of your own (sim.engines.Engine), as it is or as what makes it of a sim.run.Simulation;
-    `integrator` of MuJoCo, None for "exponential", or "RK4" where a device has Coulomb friction; `substeps` steps per
-    period, None for what the plant asks; `seed` draws delays, periods and latencies that vary.
+    `coupling` None is the loop without one, "design.json" the file of a design; `engine` is "mujoco", "exact" (the
+    linear loop, no Coulomb friction) or of your own (sim.engines.Engine), as it is or as what makes it of a
+    sim.run.Simulation; `integrator` of MuJoCo, None for "exponential", or "RK4" where a device has Coulomb friction;
+    `substeps` steps per period, None for what the plant asks; `seed` draws delays, periods and latencies that vary.
     Forces leave through the limiter that the coupling's guarantee covers, where there is one; elsewhere, and with
     `limiter` False, they are clipped (`meta["assessment"]["force_limits"]`).
 
@@ -132,7 +140,7 @@ def simulate(
     coupling has no solution.
     """
     of_kind("scenario", scenario, Scenario, _SCENARIO)
-    chosen, seed = given(coupling), whole("seed", seed, 0)
+    chosen, seed = _chosen(scenario, coupling), whole("seed", seed, 0)
     if isinstance(engine, str) or not (callable(engine) or hasattr(engine, "start")):
         one_of("engine", engine, ENGINES)
     if integrator is not None:
@@ -180,7 +188,7 @@ def simulate(
 
 def validate(
     scenario: Scenario,
-    coupling: Coupling | Design | None = None,
+    coupling: Coupling | Design | str | Path | None = None,
     humans: int = 1000,
     seed: int = 0,
     engine: str | Callable[[Simulation], Engine] = "both",
@@ -209,7 +217,7 @@ def validate(
     from haptic_loop.sim.crowds import validate as validate_all
 
     of_kind("scenario", scenario, Scenario, _SCENARIO)
-    chosen = given(coupling)
+    chosen = _chosen(scenario, coupling)
     require_no_world(scenario, "validate")
     require_linear(scenario, "validate", walls=True)
     humans, seed = whole("humans", humans, 1, _MOST_HUMANS), whole("seed", seed, 0)

@@ -104,12 +104,12 @@ def own_of(name: str, loop: Loop) -> Chosen:
     return given(found, name)
 
 
-def given(coupling: Coupling | Design | None, kind: str = "given") -> Chosen:
+def given(coupling: Any, kind: str = "given") -> Chosen:
     """A coupling, or that of a design with its proofs; None is the loop without one."""
     if isinstance(coupling, Design):
         proof = (coupling.certificate and coupling.certificate.limiter) or None
         return replace(coupling, kind=kind, limiter=proof)
-    alone = NoCoupling() if coupling is None else bare(coupling, f"{COUPLING}, or None for the loop without one")
+    alone = NoCoupling() if coupling is None else bare(coupling, f"{COUPLING}, FILE.json, or None for no coupling")
     return Chosen(alone, THIS_ENVIRONMENT.name, kind=kind)
 
 

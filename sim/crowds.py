@@ -150,27 +150,53 @@ class Validation:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """One entry per set of humans, sorted by index; nan where an engine or a trace was not asked for."""
+    """One entry per set of humans, sorted by index; nan where an engine or a trace was not asked for.
 
-    index: NDArray[np.intp]  # (n,)
-    radius: Array  # (n,) spectral radius of the exact loop
-    exact: Array  # (n,) [1/s] growth, exact loop
-    frequency: Array  # (n,) [Hz] of that mode
-    mujoco: Array  # (n,) [1/s] growth, the period map of MuJoCo, or of a user's own engine
-    trace: Array  # (n,) [1/s] growth on its trace, or on the exact one where no other is asked
-    trace_error: Array  # (n,) [1/s] by which that may be off; a rate within it does not vote
-    clipped: NDArray[np.int64]  # (n,) ticks with a force at its limit, on that trace
-    energy: Array  # (n,) [J] least W(N) on the exact trace
-    audited: Array  # (n,) [J] magnitudes that W adds up
-    settling: Array  # (n,) rms speed of the handles, last quarter over second quarter, exact trace
-    contacts: NDArray[np.int64]  # (n,) how often a wall was touched on the exact trace
-    mass: Array  # (n,) [kg] per set: geometric mean over channels of all mass
-    damping: Array  # (n,) [N s/m] likewise of the least damping
-    switching: Array  # (n,) [1/s] growth of the linear loop under delays or ticks that vary; nan where they do not
-    switching_mujoco: Array  # (n,) [1/s] the same on MuJoCo's trace; nan also where that was clipped
-    simulated: float  # [s] in all traces
+    Attributes:
+        index: (n,) number of each set, which together with the seed draws it.
+        radius: (n,) spectral radius of the exact loop, no unit.
+        exact: (n,) growth rate of the exact loop [1/s]; above zero the set makes the loop unstable.
+        frequency: (n,) frequency of that mode [Hz].
+        mujoco: (n,) growth rate [1/s] of the period map of MuJoCo, or of a user's own engine.
+        trace: (n,) growth rate [1/s] on its trace, or on the exact one where no other is asked.
+        trace_error: (n,) error of that rate [1/s]; a rate within it does not vote.
+        clipped: (n,) number of ticks with a force at its limit, on that trace.
+        energy: (n,) least energy W(N) on the exact trace [J].
+        audited: (n,) sum of the magnitudes that W adds up [J].
+        settling: (n,) rms speed of the handles, last quarter over second quarter of the exact trace, no unit.
+        contacts: (n,) how often a wall was touched on the exact trace.
+        mass: (n,) geometric mean over channels of all mass of a hand [kg].
+        damping: (n,) geometric mean over channels of the least damping of a hand [N s/m].
+        switching: (n,) growth rate [1/s] of the linear loop under delays or ticks that vary; nan where they do not.
+        switching_mujoco: (n,) the same on MuJoCo's trace [1/s]; nan also where that was clipped.
+        simulated: The duration of all traces together [s].
+        interrupted: Whether the keyboard interrupted the validation.
+        lost: Why batches are missing that nobody interrupted.
+    """
+
+    index: NDArray[np.intp]
+    radius: Array
+    exact: Array
+    frequency: Array
+    mujoco: Array
+    trace: Array
+    trace_error: Array
+    clipped: NDArray[np.int64]
+    energy: Array
+    audited: Array
+    settling: Array
+    contacts: NDArray[np.int64]
+    mass: Array
+    damping: Array
+    switching: Array
+    switching_mujoco: Array
+    simulated: float
     interrupted: bool = False
-    lost: str = ""  # why batches are missing that nobody interrupted
+    lost: str = ""
+
+    def __repr__(self) -> str:
+        worst = f", worst {np.nanmax(self.exact):+.3g} 1/s" if np.isfinite(self.exact).any() else ""
+        return f"Findings({self.index.size} sets of hands: {int((self.exact > 0).sum())} unstable{worst})"
 
     @property
     def disagreements(self) -> NDArray[np.bool_]:

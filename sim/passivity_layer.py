@@ -168,6 +168,20 @@ class _Budgeted(_InLoop):
         return replace(self._budget.figures(self._guarantee), dropped_ticks=self._dropped)
 
 
+def _answer(forces: Any, channels: int) -> Array:
+    """Check the answer of a user's environment function: one finite force [N] per channel. Raises InputError."""
+    try:
+        answer = np.asarray(forces, dtype=float)
+    except (TypeError, ValueError):
+        answer = np.empty(0)
+    if answer.shape != (channels,) or not np.isfinite(answer).all():
+        text = " ".join(repr(forces).split())
+        expected = f"an array of {channels} finite forces [N], shape ({channels},)"
+        shape = f", shape {forces.shape}" if isinstance(forces, np.ndarray) else ""
+        raise InputError(f"environment returned {text[:60]}{shape}, expected {expected}")
+    return answer
+
+
 class _Shelled(_InLoop):
     """An environment of the user's own, its force within the actuators' limits, and the shell."""
 
@@ -177,7 +191,7 @@ class _Shelled(_InLoop):
 
     def send(self, x: Array, force: Array, /) -> None:
         free = self._shell.free(x)
-        wanted = np.stack([np.asarray(self._asked.force(u), dtype=float) for u in free.T], axis=1)
+        wanted = np.stack([_answer(self._asked.force(u), len(free)) for u in free.T], axis=1)
         force[...], _ = self._shell.limit(self._within(wanted))
 
     def apply(self, k: int, force: Array, /) -> None:

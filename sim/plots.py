@@ -1,7 +1,7 @@
 """Pictures that commands write, in one style: readable in black and white and by the colour-blind.
 
-Each function takes what its command reports (a Trace, a Map, or the report as it stands in JSON), writes one PNG and
-returns its path.
+Each function takes what its command reports (a Trace, a Map, or the report as it stands in JSON), writes one picture
+and returns its path.
 """
 
 from __future__ import annotations
@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
+from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
@@ -23,11 +24,22 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.design.files import InputError, printable, write
 from haptic_loop.design.guarantees import ANY
 from haptic_loop.design.result import CONDITIONS
-from haptic_loop.sim.trace import Trace
 
-if TYPE_CHECKING:  # whose figures are drawn
-    from haptic_loop.sim.accuracy import Row
-    from haptic_loop.sim.compare_report import Comparison
+Row = Comparison = Any  # sim.accuracy.Row, sim.compare_report.Comparison: they import traces, which import this file
+
+
+class Run(Protocol):
+    """What a picture needs of a sim.trace.Trace; N samples, m channels."""
+
+    @property
+    def t(self) -> Array: ...  # (N,) [s]
+    @property
+    def x(self) -> Array: ...  # (N, m) [m]
+    @property
+    def f(self) -> Array: ...  # (N, m) [N]
+    @property
+    def x_handle(self) -> Array: ...  # (N, m) [m]
+
 
 # ----------------------------------------------------------------------------------------------------
 # The style.
@@ -72,6 +84,9 @@ _FORMATS = (".png", ".pdf", ".svg")
 def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     """Write the figure in the format of the suffix, with its texts taken literally; the file is complete or absent.
 
+    A .png is for the screen. A .pdf or .svg is for a paper: as wide as a page of two columns, with letters to be read
+    there.
+
     Raises:
         InputError: The suffix is none of .png, .pdf and .svg.
     """
@@ -79,7 +94,30 @@ def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     if kind not in _FORMATS:
         raise InputError(f"picture {path}: the suffix is {kind!r}, allowed are {', '.join(_FORMATS)}")
     _literal(figure)
+    if kind != ".png":
+        _fit_paper(figure)
     return write(path, lambda file: figure.savefig(file, format=kind[1:], dpi=dpi))
+
+
+_PAGE = 7.16  # [inch] both columns of an IEEE page, which other two-column papers hardly miss
+_LEGEND = 0.8  # columns of a legend: this share of those on the screen
+_LETTERS = (6.5, 9.0)  # [pt] least and most size of letters in a figure of such a paper
+
+
+def _fit_paper(figure: Figure) -> None:
+    """Make a figure at most as wide as a page, its lines thinner in proportion."""
+    width, height = figure.get_size_inches()
+    share = min(1.0, _PAGE / width)
+    figure.set_size_inches(share * width, share * height)
+    for text in figure.findobj(Text):
+        text.set_fontsize(min(max(share * float(text.get_fontsize()), _LETTERS[0]), _LETTERS[1]))
+    for line in figure.findobj(Line2D):
+        line.set_linewidth(max(share * line.get_linewidth(), 0.4))
+    for old in tuple(figure.legends):  # its letters shrink less than the page, so that fewer columns fit
+        entries = dict(zip([text.get_text() for text in old.get_texts()], old.legend_handles, strict=True))
+        columns = max(1, int(_LEGEND * share * len(entries)))
+        old.remove()
+        _legend(figure, entries, min(columns, 4), fontsize=_LETTERS[0])
 
 
 def _literal(figure: Figure) -> None:
@@ -127,16 +165,15 @@ class Onset:
     until: float | None = None  # [s] from here on the motion leaves what the devices declare credible
 
 
-def plot_run(
-    result: Trace,
-    path: Path,
+def draw_run(
+    result: Run,
     title: str,
     frequency_hz: float,
     ideal: tuple[Array, float | None] | None = None,
     onset: Onset | None = None,
     around: Contacts | None = None,
-) -> Path:
-    """Displacements and forces over the whole run, and six periods of `frequency_hz` where forces turn most sharply.
+) -> Figure:
+    """Draw displacements and forces of a run, and six periods of `frequency_hz` where forces turn most sharply.
 
     The zoom is left out of a run whose forces turn as sharply everywhere. `around` names the curves and shows walls.
 
@@ -182,7 +219,7 @@ def plot_run(
     for axis in axes[1]:
         axis.set_xlabel("time [s]")
         axis.margins(x=0.01)
-    return save(figure, path)
+    return figure
 
 
 def _ordered(entries: dict[str, Any], around: Contacts) -> dict[str, Any]:
@@ -196,7 +233,7 @@ def _ordered(entries: dict[str, Any], around: Contacts) -> dict[str, Any]:
     return dict(sorted(entries.items(), key=lambda entry: place(entry[0])))
 
 
-def _two_points(result: Trace) -> bool:
+def _two_points(result: Run) -> bool:
     """Whether handles and encoders move apart by what can be seen in a picture."""
     return bool(np.abs(result.x_handle - result.x).max(initial=0.0) > 0.02 * np.abs(result.x).max(initial=0.0))
 
@@ -221,7 +258,7 @@ def _coinciding(values: Array, around: Contacts) -> list[str]:
 _SHARPER = 4.0  # times the run's mean: what is to be seen in a zoom
 
 
-def _stands_out(result: Trace, near: slice, ticks: int) -> bool:
+def _stands_out(result: Run, near: slice, ticks: int) -> bool:
     """Whether the forces turn more sharply in this part than in the whole of the first `ticks`."""
     if 10 * (near.stop - near.start) > result.t.size:
         return False  # nearly the whole is no zoom
@@ -229,14 +266,14 @@ def _stands_out(result: Trace, near: slice, ticks: int) -> bool:
     return bool(bend[near.start : near.stop].mean() > _SHARPER * bend.mean())
 
 
-def _one_point(result: Trace) -> str:
+def _one_point(result: Run) -> str:
     """The axis of displacements where one curve stands for the handle, which the user holds, and for the encoder."""
     apart = 1e3 * float(np.abs(result.x_handle - result.x).max(initial=0.0))
     beside = f"within {apart:.1g} mm of the encoder" if apart > 1e-9 else "where the encoder is"
     return f"displacement of the handle [mm],\n{beside}"
 
 
-def _draw_walls(axes: Array, result: Trace, around: Contacts) -> None:
+def _draw_walls(axes: Array, result: Run, around: Contacts) -> None:
     """Where walls stand, in the panel of displacements, and when they were touched, in both."""
     for i, place, name in around.walls:
         colour = STYLES[i % len(STYLES)]["color"]
@@ -251,7 +288,7 @@ def _draw_walls(axes: Array, result: Trace, around: Contacts) -> None:
             axis.axvspan(*span, color="#F0E442", alpha=0.35, zorder=0, linewidth=0, label=label)
 
 
-def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], around: Contacts) -> None:
+def _draw_displacements(axes: Array, result: Run, parts: tuple[slice, ...], around: Contacts) -> None:
     """Handles over encoders, in millimetres; the handle alone where a picture shows them as one point."""
     two, alike = _two_points(result), _coinciding(result.x, around)
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
@@ -269,7 +306,7 @@ def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], ar
                 axis.plot(result.t[part], handle, label=label, linewidth=2.2 * width, **style)
 
 
-def _grey_out(axes: Array | list[Axes], result: Trace, until: float) -> None:
+def _grey_out(axes: Array | list[Axes], result: Run, until: float) -> None:
     """Grey out the part of the run that no real device could follow."""
     for axis in axes:
         axis.axvspan(until, result.t[-1], color="0.85", alpha=0.75, zorder=5, linewidth=0)
@@ -278,7 +315,7 @@ def _grey_out(axes: Array | list[Axes], result: Trace, until: float) -> None:
     axes[0].annotate(text, (1.0, 1.0), (-6, -5), fontsize=8, zorder=6, **where)
 
 
-def _draw_onset(axis: Axes, result: Trace, hertz: float, onset: Onset, around: Contacts) -> None:
+def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Contacts) -> None:
     """The amplitude of the oscillation at the encoders over time, up to the first clipped tick, and its prediction."""
     assert onset.growth is not None
     t, sizes = _amplitudes(result, hertz, onset.steady)
@@ -301,7 +338,7 @@ def _draw_onset(axis: Axes, result: Trace, hertz: float, onset: Onset, around: C
     axis.legend(fontsize=8, loc="lower right")
 
 
-def _amplitudes(result: Trace, hertz: float, ticks: int) -> tuple[Array, Array]:
+def _amplitudes(result: Run, hertz: float, ticks: int) -> tuple[Array, Array]:
     """(t (k,), amplitude (k, m) [m]) of the encoders' oscillation at `hertz` in Hann windows of twelve periods."""
     T = float(result.t[1] - result.t[0]) if result.t.size > 1 else 1.0
     width = max(8, round(12 / (max(hertz, 1.0) * T)))
@@ -316,7 +353,7 @@ def _amplitudes(result: Trace, hertz: float, ticks: int) -> tuple[Array, Array]:
     return result.t[starts] + 0.5 * width * T, 2 * np.abs(sums) / (window.sum() * factor)
 
 
-def _draw_ideal(axes: Array, result: Trace, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
+def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
     """The ideal forces, broad and pale in each device's colour; cut where they are more than three times as large."""
     forces, percent = ideal
     label = "pale: what the object itself gives for this motion"
@@ -331,7 +368,7 @@ def _draw_ideal(axes: Array, result: Trace, ideal: tuple[Array, float | None], p
         axis.set_ylim(max(low, -most), min(high, most))
 
 
-def _sharpest(result: Trace, frequency_hz: float, ticks: int | None = None) -> slice:
+def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> slice:
     """Six periods where the forces of the first `ticks` turn most sharply; more where they turn less than six times."""
     n = result.t.size if ticks is None else ticks
     T = result.t[1] - result.t[0] if n > 1 else 1.0
@@ -357,7 +394,7 @@ class Panel:
     """One of several runs with the same hands."""
 
     title: str
-    trace: Trace
+    trace: Run
     ideal: Array  # (N, m) forces of the ideal environment [N]
     until: float | None = None  # [s] as of an onset
 
@@ -497,7 +534,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
             at = max(part.requirement.frequency_hz or 0.0, hz[0]), min(binds, top)
             axis.plot(*at, "o" if binds <= top else "^", color=style["color"])
         axis.axhspan(scale, 1.12 * top, color="black", alpha=0.06, linewidth=0)
-        words, holds = CONDITIONS.get(condition, condition), parts[0].requirement.guarantee
+        words, holds = CONDITIONS.get(str(condition), str(condition)), parts[0].requirement.guarantee
         words += " (with a multiplier of this one)" if words == ANY != holds else ""
         axis.set(xscale="log", title=words, xlabel="frequency [Hz]", ylim=(-0.5 * scale, 1.12 * top))
         axis.legend(fontsize=8)

@@ -147,6 +147,10 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             if not lo <= n <= hi:
                 raise ValueError(f"theta #{i} is {n}, outside of its varying_delay, {lo} to {hi} samples")
 
+    def __repr__(self) -> str:
+        timing = f"T = {1e3 * self.T:g} ms, theta = {list(self.theta)}, {self.duration:g} s"
+        return f"Scenario({self.name!r}: {timing}, contacts {', '.join(self.environment.contacts)})"
+
     @property
     def channels(self) -> int:
         return len(self.environment.contacts)

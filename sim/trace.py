@@ -36,6 +36,7 @@ from haptic_loop.design.files import InputError, read_arrays, write
 
 _MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep
 _STATES = {"z": 2, "s": 2}
+_UNITS = {"x": "m", "f": "N", "x_handle": "m", "v_handle": "m/s"}
 
 
 def _real(name: str, values: NDArray[Any]) -> Array:
@@ -53,23 +54,37 @@ def _is_frozen(value: Any, ndim: int) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Trace(ReadOnly):
-    """What every tick saw, and under which settings. Arrays are read-only.
+    """What every tick saw, and under which settings: N samples of m channels. Arrays are read-only.
 
     The states z and s have no columns where nobody recorded them, as in a file or on a real device.
+
+    Attributes:
+        t: (N,) times [s]; sample k is taken at k T.
+        x: (N, m) displacements of the devices as the encoders gave them [m].
+        f: (N, m) forces fed back, within the limits [N]; the devices feel -f.
+        x_handle: (N, m) displacements of the handles [m].
+        v_handle: (N, m) velocities of the handles [m/s].
+        w: (N, outside) forces from outside on the hands [N].
+        meta: Settings and verdicts of the run, as in its JSON; `meta["stability"]`, `meta["assessment"]`.
+        z: (N, order) states of the controller.
+        s: (N, 2 n) states of the plant: positions [m], then velocities [m/s].
+        diverged: Whether the engine gave up, or a number stopped being finite, soon after the last tick.
+        interrupted: Whether the run was stopped from the keyboard.
+        net: The passivity layer that stood under the controller, as the run left it; None without one.
     """
 
-    t: Array  # (N,) [s], sample k at k T
-    x: Array  # (N, m) device displacements as the encoders gave them [m]
-    f: Array  # (N, m) forces fed back, within the limits [N]; the device feels -f
-    x_handle: Array  # (N, m) [m]
-    v_handle: Array  # (N, m) [m/s]
-    w: Array  # (N, outside) outside forces [N]
+    t: Array
+    x: Array
+    f: Array
+    x_handle: Array
+    v_handle: Array
+    w: Array
     meta: dict[str, Any] = field(default_factory=dict)
-    z: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, order) states of the process
-    s: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, 2n) of the plant: positions [m], velocities [m/s]
-    diverged: bool = False  # the engine gave up, or a number stopped being finite, soon after the last tick
-    interrupted: bool = False  # stopped from the keyboard
-    net: Net | None = None  # that stood under the controller, as the run left it
+    z: Array = field(default_factory=lambda: np.empty((0, 0)))
+    s: Array = field(default_factory=lambda: np.empty((0, 0)))
+    diverged: bool = False
+    interrupted: bool = False
+    net: Net | None = None
 
     def __post_init__(self) -> None:
         for name, ndim in (_MEASURED | _STATES).items():
@@ -81,6 +96,14 @@ class Trace(ReadOnly):
                 raise ValueError(f"{name} has {len(value)} samples, t has {self.t.shape[0]}")
         if self.f.shape != self.x.shape:
             raise ValueError(f"f has {self.f.shape[1]} channels, x has {self.x.shape[1]}")
+
+    def __repr__(self) -> str:
+        n, m = self.x.shape
+        largest = [np.abs(values).max(initial=0.0) for values in (self.x, self.f)]
+        sizes = ", |x| <= {:.3g} m, |f| <= {:.3g} N".format(*largest)
+        stability = self.meta.get("stability") if isinstance(self.meta, dict) else None
+        verdict = f", {stability['verdict']}" if isinstance(stability, dict) and stability.get("verdict") else ""
+        return f"Trace({n} samples of {m} channels{f', {self.t[-1]:.4g} s' if n else ''}{sizes}{verdict})"
 
     def clipped(self, force_limit: Array) -> NDArray[np.bool_]:
         """(N,) whether any force was at its limit, (m,) [N], at a tick."""
@@ -101,6 +124,48 @@ class Trace(ReadOnly):
         frequency = np.fft.rfftfreq(tail.shape[0], float(self.t[1]))
         spectrum[frequency < 10.0] = 0.0
         return float(frequency[np.argmax(spectrum)]) if spectrum.any() else None
+
+    def to_frame(self) -> Any:
+        """Return a pandas data frame: samples at index "t [s]", columns "x1 [m]", "f1 [N]", "x_handle1 [m]", ..
+
+        Raises:
+            ImportError: pandas is not installed; the program itself does not need it.
+        """
+        try:
+            import pandas  # pyright: ignore[reportMissingImports]
+        except ImportError:
+            raise ImportError("Trace.to_frame needs pandas, which is not installed: pip install pandas") from None
+        columns = {
+            f"{name}{i} [{unit}]": column
+            for name, unit in _UNITS.items()
+            for i, column in enumerate(getattr(self, name).T, start=1)
+        }
+        return pandas.DataFrame(columns, index=pandas.Index(self.t, name="t [s]"))
+
+    def plot(self, path: str | Path | None = None, title: str = "") -> Any:
+        """Draw displacements and forces over time, and write the picture where a path is given.
+
+        Args:
+            path: A file ending in .png, .pdf or .svg; .pdf and .svg are as wide as the page of a two-column paper.
+            title: The title, else the name of the scenario with the verdict.
+
+        Returns:
+            The matplotlib figure, which a notebook shows.
+
+        Raises:
+            InputError: Another suffix, or the file cannot be written.
+        """
+        from haptic_loop.sim.plots import draw_run, save
+
+        figure = draw_run(self, title or self._title(), self.dominant_frequency_hz() or 10.0)
+        if path is not None:
+            save(figure, Path(path))
+        return figure
+
+    def _title(self) -> str:
+        stability = self.meta.get("stability") or {}
+        words = (self.meta.get("scenario"), stability.get("verdict"))
+        return ": ".join(word for word in words if word) or "run"
 
     def save_npz(self, path: Path) -> Path:
         """What was measured and the metadata (as JSON text), compressed, without pickle."""

@@ -2,9 +2,10 @@
 
 import json
 import pydoc
+import re
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from inspect import isfunction, signature
 
 import numpy as np
@@ -31,7 +32,7 @@ from haptic_loop import (
 from haptic_loop.cli.design import main as design_command
 from haptic_loop.cli.run import main as run_command
 from haptic_loop.cli.validate import main as validate_command
-from haptic_loop.controller.coupling import NoCoupling, SpringDamper
+from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import Spring
 from haptic_loop.design.designs import KINDS
 from haptic_loop.models.device import RigidDevice
@@ -240,6 +241,87 @@ def test_an_argument_of_another_type_is_named(call, message):
     with pytest.raises(TypeError) as caught:
         call()
     assert message in str(caught.value)
+
+
+def test_every_field_of_a_result_has_its_line_in_help():
+    results = [value for name in haptic_loop.__all__ if is_dataclass(value := getattr(haptic_loop, name))]
+    results = [kind for kind in results if not issubclass(kind, Coupling)]
+    assert {kind.__name__ for kind in results} == {
+        *("Assessment", "Design", "Findings", "Guarantee", "Rehearsed", "Requirement", "Trace", "Transparency")
+    }
+    for kind in results:
+        described = dict(re.findall(r"^\s+(\w+): (.+)$", kind.__doc__.split("Attributes:")[1], re.MULTILINE))
+        assert set(described) == {field.name for field in fields(kind)}, kind
+        for field in fields(kind):
+            if "Array" in str(field.type):
+                assert described[field.name].startswith(("(N", "(n", "(m")), (kind, field.name)
+
+
+def test_results_are_shown_in_one_line():
+    design = design_coupling(LOOP)
+    trace = simulate(SHORT, design)
+    shown = [SHORT, LOOP, design, assess(LOOP, design), assess(LOOP, design).guarantee, trace]
+    shown += [transparency_of(LOOP, design), validate(SHORT, design, 5, engine="exact", duration=0), NoCoupling()]
+    for one in shown:
+        assert repr(one).startswith(f"{type(one).__name__}(")
+        assert "\n" not in repr(one)
+        assert len(repr(one)) < 250
+    assert repr(SpringDamper([2870, 120.5], [5.47, 0])) == "SpringDamper(K=[2870, 120.5], B=[5.47, 0])"
+    assert repr(trace).startswith("Trace(250 samples of 2 channels")
+
+
+def test_a_stored_design_runs_as_the_design(tmp_path):
+    path = tmp_path / "design.json"
+    assert design_command(["--out", str(path)]) == 0
+    stored, made = simulate(SHORT, str(path)), simulate(SHORT, design_coupling(LOOP))
+    np.testing.assert_array_equal(stored.f, made.f)
+    assert stored.meta["assessment"]["guarantee"] == made.meta["assessment"]["guarantee"]
+    assert (validate(SHORT, path, 5, engine="exact", duration=0).exact < 0).all()
+    with pytest.raises(InputError, match=r"none\.json"):
+        simulate(SHORT, "none.json")
+
+
+def test_a_trace_is_a_data_frame_where_pandas_is():
+    trace = simulate(SHORT)
+    pandas = pytest.importorskip("pandas")
+    frame = trace.to_frame()
+    assert isinstance(frame, pandas.DataFrame)
+    assert list(frame.columns[:4]) == ["x1 [m]", "x2 [m]", "f1 [N]", "f2 [N]"]
+    np.testing.assert_array_equal(frame["f2 [N]"].to_numpy(), trace.f[:, 1])
+    np.testing.assert_array_equal(frame.index.to_numpy(), trace.t)
+
+
+def test_without_pandas_one_line_says_so(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"^Trace.to_frame needs pandas, .*: pip install pandas$"):
+        simulate(SHORT).to_frame()
+
+
+def test_a_trace_draws_itself(tmp_path):
+    trace = simulate(SHORT)
+    screen, paper = trace.plot(), trace.plot(tmp_path / "run.pdf")
+    assert (screen.get_size_inches()[0], paper.get_size_inches()[0]) == (11, 7.16)
+    assert (tmp_path / "run.pdf").read_bytes().startswith(b"%PDF-")
+    np.testing.assert_array_equal(screen.axes[1].lines[0].get_ydata(), trace.f[:, 0])
+    with pytest.raises(InputError, match=r"the suffix is '.jpg', allowed are .png, .pdf, .svg"):
+        trace.plot(tmp_path / "run.jpg")
+
+
+@pytest.mark.parametrize(
+    ("answer", "shown"),
+    [
+        (0.0, "returned 0.0,"),
+        (None, "returned None,"),
+        ("ab", "returned 'ab',"),
+        (np.zeros(3), r"shape \(3,\),"),
+        (np.zeros((2, 1)), r"shape \(2, 1\),"),
+        (np.full(2, np.nan), r"array\(\[nan, nan\]\), shape \(2,\),"),
+    ],
+)
+def test_a_wrong_answer_of_an_environment_is_one_line(answer, shown):
+    design = design_coupling(LOOP, condition="any-environment")
+    with pytest.raises(InputError, match=rf"^environment .*{shown} expected an array of 2 finite forces \[N\], shape"):
+        simulate(SHORT, design, environment=lambda u: answer)
 
 
 def test_numbers_of_numpy_are_numbers():

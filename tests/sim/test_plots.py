@@ -66,7 +66,7 @@ def test_every_sample_of_a_run_is_on_the_picture(drawn):
     steps[60:] *= 1e-3
     f = steps.cumsum(axis=0)  # turns sharply in its first ticks only: there is something to zoom into
     f[:, 1] = 0.01 * np.arange(1200)  # calm: drawn last, so that it stays visible
-    figure = drawn(plots.plot_run, trace(f), title="t", frequency_hz=80.0, ideal=(2 * f, 12.34))
+    figure = plots.draw_run(trace(f), title="t", frequency_hz=80.0, ideal=(2 * f, 12.34))
     whole = lines(figure.axes[2])
     for i in range(3):
         np.testing.assert_array_equal(whole[f"device {i + 1}"][:, 1], f[:, i])
@@ -84,7 +84,7 @@ def test_every_sample_of_a_run_is_on_the_picture(drawn):
 def test_a_handle_near_its_encoder_is_drawn_and_says_how_near(drawn):
     x = np.sin(np.arange(3000) / 300)[:, None]
     run = replace(trace(1e3 * x, x), x_handle=1.004 * x)  # 4 mm beside 1 m: one line in the picture
-    (axis, _) = drawn(plots.plot_run, run, title="t", frequency_hz=80.0).axes
+    (axis, _) = plots.draw_run(run, title="t", frequency_hz=80.0).axes
     assert axis.get_ylabel() == "displacement of the handle [mm],\nwithin 4 mm of the encoder"
     np.testing.assert_allclose(lines(axis)["device 1"][:, 1], 1004 * x[:, 0])
 
@@ -96,7 +96,7 @@ def test_names_walls_and_curves_that_coincide(drawn):
     f = np.stack([wave, wave, 2 * wave], axis=1)
     touching = wave > 0.5
     around = plots.Contacts(("left", "right", "top"), [(0, 0.0005, "wall 1")], touching)
-    figure = drawn(plots.plot_run, trace(f), title="t", frequency_hz=80.0, around=around)
+    figure = plots.draw_run(trace(f), title="t", frequency_hz=80.0, around=around)
     displacement, force = figure.axes
     assert legend(figure) == [
         "left",
@@ -123,7 +123,7 @@ def test_an_onset_is_drawn_at_its_size_and_slope_and_what_is_not_credible_is_gre
     np.testing.assert_allclose(sizes[:, 0], 1e-6 * np.exp(1.4 * middle), rtol=0.02)
     assert middle[-1] < 5.0  # up to the first clipped tick
     onset = plots.Onset(1.4, 5000, 4.0)
-    figure = drawn(plots.plot_run, result, title="t", frequency_hz=84.0, onset=onset)
+    figure = plots.draw_run(result, title="t", frequency_hz=84.0, onset=onset)
     curve = lines(figure.axes[1])["slope predicted: +1.4 1/s"]
     assert np.diff(np.log(curve[:, 1]))[0] == pytest.approx(1.4 * np.diff(curve[:, 0])[0])
     names = [f"device 1, {what}" for what in ("handle (thick)", "encoder (thin)", "force")]
@@ -275,12 +275,12 @@ def test_lines_are_told_apart_without_colours():
 )
 def test_a_picture_has_the_format_of_its_suffix(suffix, begin, tmp_path):
     f = np.sin(np.arange(2000) / 20)[:, None]
-    path = plots.plot_run(trace(f), tmp_path / f"a.{suffix}", "t", 8.0)
+    path = plots.save(plots.draw_run(trace(f), "t", 8.0), tmp_path / f"a.{suffix}")
     assert path.read_bytes().startswith(begin)
 
 
 @pytest.mark.parametrize("name", ["a", "a.jpg", "a.pn"])
 def test_other_suffixes_of_pictures_are_refused(name, tmp_path):
     with pytest.raises(InputError, match=r"the suffix is .*allowed are \.png, \.pdf, \.svg"):
-        plots.plot_run(trace(np.zeros((2000, 1))), tmp_path / name, "t", 8.0)
+        plots.save(plots.draw_run(trace(np.zeros((2000, 1))), "t", 8.0), tmp_path / name)
     assert not list(tmp_path.iterdir())
