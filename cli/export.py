@@ -71,7 +71,7 @@ def main(argv: list[str]) -> int:
         verdict = Verdict(False, str(error))
     claim = own.claim if own and verdict.proved else None
     block = _block(args, stored, verdict, claim)
-    path = out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}.c")
+    path = out_file(args.out, f"out/export/{options.name_of(args.coupling)}-{block.name}.c")
     test = trial(block, args.seed)
     write(path, c_source(block, test, path.name))
 

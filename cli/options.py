@@ -480,14 +480,23 @@ def out_folder(args: argparse.Namespace, command: str) -> Path:
 def place(args: argparse.Namespace) -> str:
     """Return the case or scenario, and the coupling and condition where options name them, for names of files.
 
-    A file stands there without its folder and suffix, as `run-I-stiff` for `--coupling couplings/stiff.json`.
+    A file stands there without its suffix, as `run-I-stiff` for `--coupling stiff.json`. One of another folder has a
+    digest of that folder behind it: files of one name in two folders do not share their results.
     """
     if args.scenario == DEFAULT:
         loop = args.case
     else:
-        loop = Path(args.scenario).stem + ("" if args.case == "I" else f"-{args.case}")
+        loop = name_of(args.scenario) + ("" if args.case == "I" else f"-{args.case}")
     named_by_options = (getattr(args, option, None) for option in ("coupling", "condition"))
     return "-".join([loop, *(_in_file_names(what) for what in named_by_options if what)])
+
+
+def name_of(file: str) -> str:
+    """Return the name of a file without suffix, and a digest of its folder unless that is the working directory."""
+    path = Path(file)
+    if path.parent.resolve() == Path.cwd():
+        return path.stem
+    return f"{path.stem}-{sha256(str(path.parent.resolve()).encode()).hexdigest()[:6]}"
 
 
 _LONGEST = 80  # characters of a coupling or a condition in the name of a file, which may have 255
@@ -497,7 +506,7 @@ def _in_file_names(what: str | tuple[str, ...] | Condition) -> str:
     """Return the names of couplings or of a condition as a part of a file name; the end of a long one is its digest."""
     names = what if isinstance(what, tuple) else (what if isinstance(what, str) else what.name,)
     words = [part for name in names for part in name.split(":")]
-    parts = (Path(word).name.removesuffix(".json").removesuffix(".py") for word in words)
+    parts = (name_of(word) if word.endswith((".json", ".py")) else word for word in words)
     text = re.sub(r"[^\w.-]+", "-", "-".join(parts)).strip("-.")
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}-{sha256(text.encode()).hexdigest()[:8]}"
 

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from haptic_loop.cli.options import place
+from haptic_loop.cli.options import name_of, place
 from haptic_loop.cli.run import _parser, main
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.certificate import prove
@@ -19,7 +19,7 @@ from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.files import one_command, read, remove
 from haptic_loop.sim import couplings
 from haptic_loop.sim import run as loop
-from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.scenario import SCENARIOS, InputError, load
 from haptic_loop.sim.trace import Trace
 from tests.asked import decisive, needs, safe_with
 
@@ -271,15 +271,26 @@ def test_an_error_that_is_asked_for_chooses_the_engine_and_a_cross_check_stands_
 def test_two_couplings_do_not_share_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     stiffness = {"soft": 100.0, "stiff": 700.0}
-    (tmp_path / "couplings").mkdir()
     for name, K in stiffness.items():
+        Path(name).mkdir()
         imported = "from haptic_loop.controller.coupling import SpringDamper"
         text = f"{imported}\ndef {name}(loop): return SpringDamper([{K}] * 2, [1.0] * 2)\n"
-        Path(f"couplings/{name}.py").write_text(text)
-        assert main(["--coupling", f"couplings/{name}.py:{name}", "--duration", "0.01", "--no-plot"]) == 0
-    for name, K in stiffness.items():
-        report = json.loads(Path(f"out/run-I-{name}-{name}/report.json").read_text())
-        assert report["assessment"]["coupling"]["K"] == [K, K]
+        Path(f"{name}/mine.py").write_text(text)
+        Path(f"{name}/loop.toml").write_text((SCENARIOS / "omega-pair.toml").read_text())
+        sys.modules.pop("mine", None)  # as in a process of its own
+        coupling = ["--coupling", f"{name}/mine.py:{name}", "--scenario", f"{name}/loop.toml"]
+        assert main([*coupling, "--duration", "0.01", "--no-plot"]) == 0
+    sys.modules.pop("mine", None)
+    found = [json.loads(file.read_text())["assessment"]["coupling"]["K"] for file in Path("out").glob("*/report.json")]
+    assert sorted(found) == [[K, K] for K in stiffness.values()]
+
+
+def test_a_file_is_named_with_its_folder_unless_it_lies_here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = [name_of(file) for file in ("stiff.json", "a/stiff.json", "b/stiff.json", "c/../a/stiff.json")]
+    assert names[0] == name_of("./stiff.json") == name_of(str(tmp_path / "stiff.json")) == "stiff"
+    assert names[1] == names[3]
+    assert len({*names}) == 3
 
 
 @pytest.mark.parametrize(
@@ -288,8 +299,8 @@ def test_two_couplings_do_not_share_a_folder(tmp_path, monkeypatch):
         ([], "I"),
         (["--case", "none"], "none"),
         (["--coupling", "none"], "I-none"),
-        (["--coupling", "a/b.json"], "I-b"),
-        (["--case", "II", "--coupling", "../x y.py:Soft_1"], "II-x-y-Soft_1"),
+        (["--coupling", "b.json"], "I-b"),
+        (["--case", "II", "--coupling", "x y.py:Soft_1"], "II-x-y-Soft_1"),
         (["--condition", "any-environment"], "I-any-environment"),
         (["--scenario", "three-rigid", "--coupling", "optimal"], "three-rigid-optimal"),
     ],
