@@ -24,6 +24,7 @@ from haptic_loop.controller.law import Law
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.assessment import Assessment
+from haptic_loop.design.certificate import required_damping
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.result import Chosen, Design, DesignFailed
 from haptic_loop.hw import monitor
@@ -401,9 +402,10 @@ def certified_couplings(
 ) -> tuple[CertifiedCoupling, ...]:
     """The coupling for the measured delay and up to `spare` in reserve, each certified for one tick more.
 
-    A reserve is on no channel stiffer than the coupling before it: it is of the same kind or from the same file, or
-    else the spring-damper by Theorem 4, which guarantees the most. Where neither is certified without being stiffer,
-    there is no further reserve. Raises SafetyStop where the first coupling is not certified.
+    A reserve is softer than the coupling before it on every channel whose delay is longer, stiffer on none, and needs
+    less damping than that coupling would with these delays. It is of the same kind or from the same file, or else the
+    spring-damper by Theorem 4, which guarantees the most. Where neither is certified, there is no further one.
+    Raises SafetyStop where the first coupling is not certified.
     """
     found = [certified_coupling(scenario, case, name, condition, link, limiter=limiter)]
     wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), _FALLBACK]
@@ -414,7 +416,7 @@ def certified_couplings(
         except (SafetyStop, InputError):
             wanted.pop(0)
             continue
-        if _no_stiffer(reserve, found[-1]):
+        if _softer(reserve, found[-1]):
             found.append(reserve)
         else:
             wanted.pop(0)
@@ -424,13 +426,21 @@ def certified_couplings(
 _EQUAL = 1e-9  # relative difference of static stiffnesses that is rounding
 
 
-def _no_stiffer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
-    """Whether the coupling's own stiffness, or else the static stiffness that is felt, is higher on no channel."""
+def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
+    """Whether it is softer where its delay is longer, stiffer nowhere, and asks less of the devices with its delays.
+
+    A stiffness is the coupling's own K, or else the static one that is felt.
+    """
     own, other = (made.assessment.gains for made in (reserve, than))
-    if "K" in own and "K" in other:
-        return bool((np.array(own["K"]) <= np.array(other["K"])).all())
-    felt, before = (np.diag(made.scenario.loop(made.case).F(made.chosen.coupling).dc()) for made in (reserve, than))
-    return bool((felt <= before * (1 + _EQUAL)).all())
+    K, before = (np.array(gains.get("K", np.nan)) for gains in (own, other))
+    if np.isnan(K).any() or np.isnan(before).any():
+        K, before = (np.diag(made.scenario.loop(made.case).F(made.chosen.coupling).dc()) for made in (reserve, than))
+    later = np.greater(reserve.scenario.theta, than.scenario.theta)
+    if (before * (1 + _EQUAL) < K).any() or (later & (before * (1 - _EQUAL) <= K)).any():
+        return False
+    loop = reserve.scenario.loop(reserve.case)
+    needs = [required_damping(loop, made.chosen.coupling, than.chosen.asked).ratio for made in (reserve, than)]
+    return needs[0] < needs[1]
 
 
 def _shortfall(made: CertifiedCoupling) -> str:

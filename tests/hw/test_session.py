@@ -1,6 +1,7 @@
 """Whole sessions in virtual time: every fault, the exact engine's run, the delay into the design, limits and budget."""
 
 import re
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from haptic_loop.cli import bridge
 from haptic_loop.controller.law import Law
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.coupling_file import save as save_coupling
+from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.hw.control import _HostController, certified_coupling, certified_couplings
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.haptic_device import SerialDevice
@@ -276,12 +278,26 @@ def optimal_rungs(scenario):
     return certified_couplings(scenario, "I", "optimal", None, 1, spare=1)
 
 
+def assert_in_reserve(rungs):
+    """Each is softer where its delay is longer, stiffer nowhere, and needs less than the one before would there."""
+    for before, reserve in pairwise(rungs):
+        loop, slower = (made.scenario.loop("I") for made in (before, reserve))
+        later = np.greater(slower.theta, loop.theta)
+        assert later.any()
+        felt = [np.diag(made.scenario.loop("I").F(made.chosen.coupling).dc()) for made in (before, reserve)]
+        assert (felt[1][later] < felt[0][later]).all()
+        assert (felt[1] <= felt[0] * (1 + 1e-9)).all()
+        needs = [THIS_ENVIRONMENT.judge(slower, made.chosen.coupling).ratio for made in (before, reserve)]
+        assert needs[1] < min(needs[0], 1)
+
+
 def test_an_optimal_coupling_has_another_for_one_tick_more_in_reserve(optimal_rungs, capsys):
     fast, soft = optimal_rungs
     assert (fast.chosen.kind, soft.chosen.kind) == ("optimal", "optimal")
     assert (fast.link, soft.link) == (1, 2)
     assert fast.assessment.requirements["this-environment"].certified
     assert soft.assessment.requirements["this-environment"].certified
+    assert_in_reserve(optimal_rungs)
     assert soft.scenario.theta == (2, 2)
     bridge._print_certificate(Ages((130,) * 100), 1, optimal_rungs, (2.0, 2.0), Console(width=160))
     table = capsys.readouterr().out
@@ -297,6 +313,7 @@ def test_a_coupling_from_a_file_has_one_too(scenario, optimal_rungs, tmp_path):
     assert [r.chosen.kind for r in rungs] == ["stiff.json", "spring-damper", "spring-damper"]
     assert [r.link for r in rungs] == [1, 2, 3]
     assert all(r.certified for r in rungs)
+    assert_in_reserve(rungs)
     with pytest.raises(SafetyStop, match=r"the coupling stiff\.json is not certified for theta = \[2, 2\]"):
         certified_couplings(scenario, "I", str(path), None, 2)  # the one asked for is armed first, or none
 
