@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 
 import msgspec
 
@@ -18,7 +17,7 @@ from haptic_loop.design.designs import name_and_own
 from haptic_loop.design.result import MAKING, Chosen, Requirement
 from haptic_loop.sim import zwidth
 from haptic_loop.sim.couplings import NAMES
-from haptic_loop.sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
+from haptic_loop.sim.limit_cycles import DECIDED, UNDECIDED, HeldDevices, Plan
 from haptic_loop.sim.report import friction_left_out
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_no_world
 from haptic_loop.sim.trace import SUSTAINED
@@ -51,7 +50,6 @@ def main(argv: list[str]) -> int:
         needs = assessment.requirements
         notes = chosen.remarks(needs) if chosen.fails(needs) else chosen.notes
         fixed = FixedCoupling.of(chosen, assessment, scenario.loop(args.case).network, notes)
-        sweep = replace(sweep, lag=assessment.force_limits.rho)
     marks = tuple(args.mark)
     args.grid = args.grid or (60 if of_coupling and not sweep.walls else 24)
     grid = zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, marks)
@@ -70,7 +68,7 @@ def main(argv: list[str]) -> int:
 
         files.append(plot_zwidth(drawn, report, out / "zwidth.png"))
     title = f"{_span(grid.K)} N/m, B {_span(grid.B)} N s/m, {report.cells} couplings"
-    unseen = friction_left_out(plan.effects.on(sweep.devices)) if report.simulation.points else ()
+    unseen = friction_left_out(sweep.devices) if report.simulation.points else ()
     table = render.facts(f"K {title}", _rows(report), left=True)
     render.publish(args, report, [table], [*_marked(report), *_remarks(report), *unseen], out, files)
     return options.exit_code(report.holds, drawn.interrupted)
@@ -97,19 +95,18 @@ def _parser() -> options.Parser:
     of_map.add_argument("--humans", type=options.whole(1, 100_000), default=200, metavar="N", help=humans)
     _add_points(parser)
     parser.add_output(picture=True)
-    simulated = ("trials", "duration", "start", "press", "threshold", "quantisation", "saturation", "friction")
+    parser.set_defaults(limiter=None)  # the simulated motors never clip
+    simulated = ("trials", "duration", "start", "press", "threshold")
     parser.only("about simulated points: --points 0 has none", lambda args: args.points, *simulated)
-    parser.only("about simulated points with --rigid: --points 0 has none", lambda a: a.points or not a.rigid, "wall")
-    parser.only("with --saturation: motors without limits clip nothing", lambda args: args.saturation, "limiter")
     designed = "with --coupling, or of your own: nothing else is designed"
     parser.only(designed, lambda args: args.coupling or name_and_own(args.condition)[1], "condition")
     gains = "for a map of spring-dampers: with --coupling the axes are the environment's"
-    parser.only(gains, lambda args: args.coupling is None, "rigid", "wall", "velocity_filter")
+    parser.only(gains, lambda args: args.coupling is None, "rigid")
     return parser
 
 
 def _add_points(parser: options.Parser) -> None:
-    points = parser.add_argument_group("the points simulated in MuJoCo, and what they have beside the linear loop")
+    points = parser.add_argument_group("the points simulated in MuJoCo")
 
     def add(name: str, kind: Callable[[str], float], metavar: str, what: str, default: float | None = None) -> None:
         points.add_argument(f"--{name}", type=kind, metavar=metavar, default=default, help=what)
@@ -122,13 +119,6 @@ def _add_points(parser: options.Parser) -> None:
     add("press", options.number(0, 1e3, "N"), "NEWTONS", pressing)
     swing = "amplitude of an oscillation (default 2 steps or 1e-5)"
     add("threshold", options.number(1e-9, 1, "m"), "METRES", swing)
-    add("quantisation", options.number(0, 1e-2, "m"), "METRES", "encoder step of every device")
-    points.add_argument("--saturation", action="store_true", help="motors have their force limits")
-    parser.add_limiter("with --saturation clip forces at these limits", to=points)
-    add("friction", options.number(0, 1e3, "N"), "NEWTONS", "Coulomb friction of every device")
-    points.add_argument("--wall", action="store_true", help="contacts push and never pull")
-    cutoff = "first-order cut-off of the damped velocity; in all maps"
-    add("velocity-filter", options.number(1e-3, 1e6, "Hz"), "HERTZ", cutoff)
 
 
 def _mark(text: str) -> tuple[float, float]:
@@ -147,21 +137,16 @@ def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) 
     with options.refused():
         if chosen:
             return zwidth.EnvironmentSweep(devices, scenario.population, loop, chosen.coupling, own=chosen.own)
-        if args.wall and not args.rigid:
-            loop = loop.at(zwidth.one_sided(scenario.environment))
-        wall, clip = args.rigid and args.wall, args.limiter is False
-        own = name_and_own(args.condition)[1]
-        return zwidth.CouplingSweep(devices, scenario.population, loop, args.velocity_filter, wall, clip, own=own)
+        return zwidth.CouplingSweep(devices, scenario.population, loop, own=name_and_own(args.condition)[1])
 
 
 def _plan(args: argparse.Namespace, sweep: zwidth.Sweep) -> Plan:
-    effects = Effects(args.quantisation, args.friction, args.saturation)
-    coarsest = max(device.encoder_step for device in effects.on(sweep.devices))
+    coarsest = max(device.encoder_step for device in sweep.devices)
     threshold = max(2 * coarsest, _FINEST) if args.threshold is None else args.threshold
     shortest = max(1.5, 1024 * sweep.loop.T)
     if not shortest <= args.duration <= 1e4:
         raise InputError(f"--duration is {args.duration:g}, allowed are {shortest:g} to 10000 s")
-    return Plan(effects, args.points, args.trials, args.start, args.press, args.duration, threshold)
+    return Plan(args.points, args.trials, args.start, args.press, args.duration, threshold)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -171,7 +156,7 @@ def _plan(args: argparse.Namespace, sweep: zwidth.Sweep) -> Plan:
 def _rows(report: MapReport) -> render.Rows:
     crowd, simulation = report.population, report.simulation
     if report.fixed:
-        yield from _designed_rows(report.fixed, simulation.effects.force_limit_n is not None)
+        yield from _designed_rows(report.fixed)
     for name in report.conditions:
         error = (report.error or {}).get(name)
         near = f"; edge within {100 * error.edge_relative_in_K:.2g} % of the condition's own sweep" if error else ""
@@ -189,7 +174,7 @@ def _share(count: int, report: MapReport) -> str:
     return f"{100 * count / report.cells:.1f} % of the map"
 
 
-def _designed_rows(fixed: FixedCoupling, limited: bool) -> render.Rows:
+def _designed_rows(fixed: FixedCoupling) -> render.Rows:
     """The fixed coupling in the environment that it was designed for."""
     asked, guarantee = [*fixed.assessment.requirements.items()], fixed.assessment.guarantee
     needs = "; ".join(
@@ -201,15 +186,13 @@ def _designed_rows(fixed: FixedCoupling, limited: bool) -> render.Rows:
         ", ".join(f"{' - '.join(s.between)} {s.K:g} N/m, {s.B:g} N s/m" for s in fixed.contact_springs),
     )
     yield "there", f"guarantee: {guarantee.words if guarantee else 'none'}; {needs or 'no damping is enough'}"
-    yield "force limits there", fixed.assessment.force_limits.words if limited else None
 
 
 def _effects(effects: Shown) -> str:
     on = {
-        "quantisation": any(effects.encoder_step_m),
+        "encoder steps": any(effects.encoder_step_m),
         "friction": any(effects.friction_n),
-        "saturation": effects.force_limit_n is not None,
-        "one-sided contact": effects.one_sided,
+        "walls": effects.walls,
     }
     names = [name for name, present in on.items() if present]
     return f" with {', '.join(names)}" if names else ", linear loop"
@@ -250,11 +233,9 @@ def _remarks(report: MapReport) -> Iterator[str]:
             yield f"[red]CONTRADICTION[/]: {ratio.contradicted_cells} certified cells are unstable."
     if simulation.contradicts:
         yield f"[red]DISAGREEMENT[/]: MuJoCo and the linear loop at {simulation.differ_from_linear} points."
-    if report.velocity_filter_hz:
-        yield "The velocity filter is in all maps: it is linear, and part of the coupling."
-    if report.one_sided:
+    if report.walls:
         yield (
-            f"One-sided contact: this-environment covers {MAKING}; so does any-environment where psi = 0. The random "
+            f"Walls: this-environment covers {MAKING}; so does any-environment where psi = 0. The random "
             "humans meet each frozen contact state, the simulated points contact made and broken."
         )
     if simulation.points:

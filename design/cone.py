@@ -1,8 +1,7 @@
 """Linear matrix inequalities: minimise c'x where every block constant + sum_a x_a slope_a is positive semidefinite.
 
-A solver's status is a claim. A result is used only if it is finite, the blocks are semidefinite when they are evaluated
-again, and the caller's own `accept` agrees; otherwise the next settings of the ladder are tried. Settings change what
-the solver does to the data, so one that breaks down seldom takes the others with it.
+A solver's status is a claim. A result is used only if it is finite, if its blocks are semidefinite when they are
+evaluated again, and if the caller's `accept` agrees. Otherwise the next of several solver settings is tried.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ import numpy as np
 from haptic_loop.controller.lti import Array, Complex
 from haptic_loop.design.result import DesignFailed, Infeasible
 
-#: Largest negative eigenvalue that is taken for rounding; problems are posed in units where 1 is large.
+#: Largest negative eigenvalue that counts as rounding. Problems are scaled so that 1 is large.
 _TOLERANCE = 1e-4
-#: Entries of a triangle, and how many times the unknowns of its block, from which on Clarabel is the slower one.
+#: Clarabel is slower than `_interior` where a triangle has more entries than _LARGE and than _MANY times its unknowns.
 _LARGE, _MANY = 300, 4
 
 
 @dataclass(frozen=True)
 class _Settings:
-    """Options of Clarabel that differ from its own."""
+    """Options of Clarabel that differ from its defaults."""
 
     name: str
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -40,12 +39,12 @@ LADDER = (
     _Settings("as given", {"equilibrate_enable": False, "chordal_decomposition_enable": False}),
     _Settings("loose", {**_LOOSE, "static_regularization_constant": 1e-7}),
 )
-INTERIOR = _Settings("interior")  # our own method, for large blocks in few unknowns
+INTERIOR = _Settings("interior")  # `_interior`, for large blocks with few unknowns
 
 
 @dataclass(frozen=True)
 class _Attempt:
-    """What one rung of the ladder gave."""
+    """The outcome of one solver setting."""
 
     settings: str
     status: str
@@ -60,11 +59,11 @@ class Inequality:
 
     constant: Array | Complex  # (k, n, n)
     slopes: Array | Complex  # (q, k, n, n)
-    unknowns: Sequence[int]  # (q,) those of the problem that take part
+    unknowns: Sequence[int]  # (q,) indices of the problem's unknowns in this block
 
     @classmethod
     def of(cls, function: Callable[[Array], Array], unknowns: Sequence[int]) -> Inequality:
-        """function(x[unknowns]) >= 0, affine to symmetric matrices (k, n, n) or one, from its values at 0 and units."""
+        """Build function(x[unknowns]) >= 0 from values of the function, which is affine to (n, n) or (k, n, n)."""
         constant, *values = (function(x) for x in np.eye(len(unknowns) + 1, len(unknowns), k=-1))
         slopes = np.stack(values) - constant
         one = constant.ndim == 2
@@ -115,9 +114,11 @@ class ConeProgram:
     def solve(
         self, what: str, accept: Callable[[Array], bool] | None = None, ladder: Sequence[_Settings] | None = None
     ) -> Array:
-        """The optimal x (p,), verified. `what` names the problem in the message of an error.
+        """Return the optimal x (p,), verified. `what` names the problem in error messages.
 
-        Raises Infeasible when two settings agree that there is no solution and none found one, DesignFailed otherwise.
+        Raises:
+            Infeasible: two settings report that there is no solution, and none finds one.
+            DesignFailed: no setting gives a result that can be verified.
         """
         attempts: list[_Attempt] = []
         if ladder is None:
@@ -136,7 +137,7 @@ class ConeProgram:
         raise DesignFailed(self, attempts, f"{what} could not be solved ({statuses}); {advice}")
 
     def violation(self, x: Array) -> float:
-        """How negative the least eigenvalue of a block is."""
+        """Return minus the least eigenvalue of all blocks; a positive number is a violation."""
         least = (np.linalg.eigvalsh(block.at(x)).min(initial=np.inf) for block in self.blocks)
         return float(-min(least, default=np.inf))
 
@@ -154,8 +155,8 @@ class ConeProgram:
         return x, _Attempt(settings.name, status, value, time.perf_counter() - started, reason)
 
     def _doubt(self, x: Array, status: str, accept: Callable[[Array], bool] | None) -> str | None:
-        """Why x may not be used, or None."""
-        if status not in ("Solved", "AlmostSolved"):  # in Clarabel's words
+        """Return the reason why x may not be used, or None."""
+        if status not in ("Solved", "AlmostSolved"):
             return f"the solver reports {status}"
         if not np.isfinite(x).all():
             return "an unknown has no finite value"
@@ -165,7 +166,7 @@ class ConeProgram:
 
 
 def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, str]:
-    """(x, the status that Clarabel reports): minimise cost'x with constant - s = -slopes x and every s in its cone."""
+    """Minimise cost'x with constant - s = -slopes x and s in its cone; return x and Clarabel's status."""
     import clarabel
     import scipy
 
@@ -196,21 +197,21 @@ def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, 
 #
 # The S = constant + slopes x >= 0 have multipliers Z >= 0 with <slope_a, Z> = cost_a, and S Z = 0 at the optimum. S Z =
 # mu I is linearised to dZ = mu/S - Z - Z dS/S, made Hermitian (Helmberg, Kojima, Monteiro), and <slope_a, Z + dZ> =
-# cost_a leaves as many equations as there are unknowns. A first direction with mu = 0 says how small mu may become, and
-# what the product dZ dS leaves (Mehrotra). Neither S nor Z need satisfy its equation at the start.
+# cost_a leaves as many equations as there are unknowns. A predictor with mu = 0 gives the next mu and the second-order
+# term dZ dS (Mehrotra). The start may be infeasible.
 
-_GAP = 1e-8  # relative gap and violations at which the iteration ends
-_ENOUGH = 1e-6  # .. and at which its best point counts where rounding ends it before
+_GAP = 1e-8  # relative gap and violation at which the iteration ends
+_ENOUGH = 1e-6  # the best point counts as solved below this error if rounding stops the iteration
 _MOST_STEPS = 60
-_KEPT = 0.98  # of the way to the boundary
-_SHORT, _CENTRING = 0.2, 0.8  # a step after which the next aims at this share of mu
+_KEPT = 0.98  # share of the way to the boundary that a step may go
+_SHORT, _CENTRING = 0.2, 0.8  # a predictor step shorter than _SHORT is replaced by one towards _CENTRING mu
 
 
 _Parts = list[Any]  # a stack of Hermitian matrices for each block
 
 
 def _interior(problem: ConeProgram) -> tuple[Array, str]:
-    """(x, status in Clarabel's words)."""
+    """Solve the problem by a primal-dual method; return x and a status named as by Clarabel."""
     blocks, cost, x = problem.blocks, problem.cost, np.zeros(len(problem.cost))
     size = max(np.abs(part).max(initial=1.0) for block in blocks for part in (block.constant, block.slopes, cost))
     S: _Parts = [10 * size * (np.zeros_like(block.constant) + np.eye(block.constant.shape[-1])) for block in blocks]
@@ -242,9 +243,10 @@ def _interior(problem: ConeProgram) -> tuple[Array, str]:
 
 
 class _Newton:
-    """The linearised equations at (S, Z), which miss the blocks' values and the costs by `missing` and `wrong`.
+    """The linearised equations at (S, Z), with the residuals `missing` of the blocks and `wrong` of the costs.
 
-    Raises LinAlgError where S, Z or the equations are singular to rounding.
+    Raises:
+        LinAlgError: S, Z or the equations are singular to rounding.
     """
 
     def __init__(self, problem: ConeProgram, S: _Parts, Z: _Parts, missing: _Parts, wrong: Array) -> None:
@@ -263,7 +265,7 @@ class _Newton:
         self._factor = scipy.linalg.cho_factor(unit + 1e-14 * np.eye(wrong.size))
 
     def direction(self, mu: float, left: _Parts) -> tuple[Array, _Parts, _Parts, float, float]:
-        """(dx, dS, dZ, the longest steps in S and Z, up to 1) towards S Z = mu I, where dZ dS will be `left`."""
+        """Return dx, dS, dZ towards S Z = mu I with dZ dS = `left`, and the longest steps in S and Z, up to 1."""
         import scipy
 
         right = _inner(self._problem, self._change(self._missing, mu, left)) - self._wrong
@@ -274,13 +276,13 @@ class _Newton:
         return dx, dS, dZ, _longest(self._roots[0], dS), _longest(self._roots[1], dZ)
 
     def _change(self, dS: _Parts, mu: float, left: _Parts) -> _Parts:
-        """dZ, from dS."""
+        """Return dZ for a given dS."""
         parts = zip(self._Z, dS, left, self._inverse, strict=True)
         return [_hermitian(mu * inverse - z - (z @ ds + more) @ inverse) for z, ds, more, inverse in parts]
 
 
 def _inner(problem: ConeProgram, Z: _Parts) -> Array:
-    """<slope_a, Z> of every unknown."""
+    """Return <slope_a, Z> for every unknown a."""
     total = np.zeros(len(problem.cost))
     for block, z in zip(problem.blocks, Z, strict=True):
         total[list(block.unknowns)] += np.real(block.slopes.reshape(len(block.slopes), -1).conj() @ z.ravel())
@@ -288,7 +290,7 @@ def _inner(problem: ConeProgram, Z: _Parts) -> Array:
 
 
 def _longest(roots: _Parts, steps: _Parts) -> float:
-    """The share of the steps, up to 1, that leaves every matrix positive; `roots` are their inverse roots."""
+    """Return the longest step, up to 1, that keeps every matrix positive; `roots` are inverse Cholesky factors."""
     pairs = zip(roots, steps, strict=True)
     least = min(np.linalg.eigvalsh(root @ step @ _adjoint(root)).min() for root, step in pairs)
     return min(1.0, _KEPT / max(-least, 1e-300))
@@ -303,5 +305,5 @@ def _hermitian(X: Any) -> Any:
 
 
 def _product(X: Any, Y: Any) -> float:
-    """<X, Y> of Hermitian matrices."""
+    """Return the inner product of Hermitian matrices."""
     return float(np.real(np.vdot(X, Y)))

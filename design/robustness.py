@@ -1,4 +1,4 @@
-"""What an optimal or any other coupling is worth where the environment is not quite the one it was designed for."""
+"""Robustness: the damping that a coupling needs in environments near the one that it was designed for."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import InputError
 from haptic_loop.design.result import suffices
 
-#: Of more environments than _FEW every _THIN-th frequency is looked at; only those that ask for the most there, or for
-#: next to it, are swept whole.
+#: More than _FEW environments are first compared at every _THIN-th frequency. Only those within _NEAR of the worst one
+#: are then swept at all frequencies.
 _FEW, _THIN, _NEAR = 12, 12, 0.03
 
 
 @dataclass(frozen=True)
 class Robustness:
-    """What a coupling needs where the environment is not quite the one that it was designed for."""
+    """The worst requirement of a coupling in environments whose parameters differ by `percent`."""
 
     percent: float
-    required_over_available: float  # of the damping, at the worst
-    where: str  # which parameter, and which way
-    certified: bool  # there
+    required_over_available: float  # damping, in the worst environment
+    where: str  # the parameter that differs there, with its sign
+    certified: bool  # whether the condition holds there
 
 
 @dataclass(frozen=True)
 class Spread:
-    """A design that keeps the condition over `vertices`, too: what it costs at most, for it is made in a short time."""
+    """A design that holds at all `vertices`, too. It is made with a small budget, so its price is an upper bound."""
 
-    mismatch_db: float  # of this design in the nominal environment
-    price_db: float  # beside the nominal design
-    g: float
-    worst: float  # times the damping that there is, over the vertices
+    mismatch_db: float  # in the nominal environment
+    price_db: float  # mismatch less that of the nominal design
+    g: float  # share of the stiffness that is rendered
+    worst: float  # largest required over available damping at the vertices
     states: int  # of the loop
-    environments: int  # with the nominal one
-    proved: int  # of these, in exact arithmetic; the others by the refined sweep, when the time for proofs was over
-    reason: str | None = None  # or why the next one is not proved
+    environments: int  # number of vertices, the nominal environment included
+    proved: int  # of these in exact arithmetic; the others are swept once the budget for proofs is used up
+    reason: str | None = None  # why the next environment is not proved
 
 
 @dataclass(frozen=True)
 class Nearby:
-    """What a coupling for this environment needs in one that is 10 % off, and what a design for that would cost."""
+    """The requirement of a coupling in environments that differ by 10 %, and the price of a design for these."""
 
     robustness: Robustness | None = None
     designed_for_it: Spread | None = None
@@ -96,9 +96,9 @@ def _vertices(network: Network, percent: float) -> dict[str, Network]:
 def robustness(
     loop: Loop, coupling: Coupling, percent: float = 10.0, condition: Condition = THIS_ENVIRONMENT
 ) -> Robustness:
-    """The worst need of a coupling over `vertices`, by the refined sweep of the condition.
+    """Return the worst requirement of a coupling over `vertices`, by the refined sweep of the condition.
 
-    Of many a thinned sweep comes first, and only those that come near the worst are refined.
+    Where there are many vertices, a coarse sweep first finds those that come near the worst.
     """
     networks = {"nominal": loop.environment, **vertices(loop.network, percent)}
     loops = {name: at(loop, one) for name, one in networks.items()}
@@ -117,14 +117,14 @@ def robustness(
 
 
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
-    """The worst need within ten percent; None with walls, and for what is not all springs and masses."""
+    """Return the worst requirement within ten percent; None for walls and for environments given by a block."""
     if loop.environment.walls or not isinstance(loop.environment, Network) or loop.environment.block:
         return None
     return robustness(loop, coupling, condition=condition)
 
 
 def ranges_around(network: Network, percent: float) -> Ranges:
-    """Every stiffness and every mass this much more or less, each independent of the others."""
+    """Return ranges in which every stiffness and every mass varies by `percent`, independently of the others."""
 
     def near(value: float) -> tuple[float, float]:
         return tuple(float(f"{value * (1 + sign * percent / 100):.12g}") for sign in (-1, 1))  # type: ignore[return-value]

@@ -1,9 +1,9 @@
-"""The environment within ranges in which a coupling needs the most damping: a search, always the same, and no proof.
+"""Search the ranges of an environment for the member in which a coupling needs the most damping.
 
-Between the vertices the need is no convex function of stiffness and mass, and what asks the most often lies on an
-edge or a face, where points drawn evenly from the ranges never fall: the resonance moves from one vertex to the next.
-So every way in which the contacts may be there or absent is searched along all its edges, on its faces and inside,
-and from the worst points that were found a compass search goes on within the ranges until its steps are small.
+The search is deterministic and proves nothing. Between the vertices the required damping is not a convex function of
+stiffness and mass, because the resonance moves from one vertex to the next. The worst member often lies on an edge or
+a face, which points drawn evenly from the ranges never hit. So the search tries, for every set of contacts that may be
+present, all edges, the faces and the inside. A compass search then continues from the worst points.
 """
 
 from __future__ import annotations
@@ -23,32 +23,20 @@ from haptic_loop.design import budgets
 from haptic_loop.design.conditions import ratio_in
 
 _Ratio = Callable[[Member], float]  # required over available damping
+Progress = Callable[[int, int], None]  # points tried, points expected
 
-
-Progress = Callable[[int, int], None]  # points tried, of about how many
-
-
-_ON_EDGES, _ALONG = 240, (3, 9)  # points on the edges of a region, and on each of them: least, most
-
-
-_DRAWN, _SEED = 48, 0xFACE  # points on faces and inside of each region
-
-
-_MANY = 7  # parameters from which on vertices and edges are drawn, too
-
-
-_STARTS, _APART, _SAME = 4, 0.2, 0.05  # of the compass search in a region; least distance of starts, and of tops
-
-
-_FIRST, _LAST = 1 / 16, 1 / 128  # its steps, in widths of the ranges
-
+_ON_EDGES, _ALONG = 240, (3, 9)  # points on all edges of a region; least and most on one edge
+_DRAWN, _SEED = 48, 0xFACE  # random points on faces and inside of each region
+_MANY = 7  # with more parameters, vertices and edges are drawn at random, too
+_STARTS, _APART, _SAME = 4, 0.2, 0.05  # starts of the compass search; least distance between starts, between maxima
+_FIRST, _LAST = 1 / 16, 1 / 128  # first and last step of the compass search, in widths of the ranges
 
 SEARCH = "along all edges, or many of them, on faces and inside, then uphill from the worst points"
 
 
 @dataclass(frozen=True)
-class _Found:
-    """An environment of the ranges, and the share of the damping that is needed there."""
+class _Worst:
+    """A member of the ranges, and the share of the available damping that the coupling needs there."""
 
     member: Member
     ratio: float
@@ -56,11 +44,11 @@ class _Found:
 
 @dataclass(frozen=True)
 class Searched:
-    """The worst environments, each the top of its neighbourhood, the worst of all first; and how many were tried."""
+    """The local maxima that a search found, the worst first."""
 
-    worst: tuple[_Found, ...]
-    tried: int
-    ended: bool = False  # by its budget, before it was done
+    worst: tuple[_Worst, ...]
+    tried: int  # number of members
+    ended: bool = False  # True: the budget of work ended the search early
 
 
 def search(
@@ -70,16 +58,16 @@ def search(
     work: float = budgets.RANGES,
     over: Callable[[], bool] = lambda: False,
 ) -> Searched:
-    """Find where the coupling behind `ratio` needs the most in the ranges that consist of these regions.
+    """Find the members of these regions at which `ratio` is largest.
 
-    When this much counted work is done, or `over` says that the time that a user allowed is over, it returns the worst
-    of the points that it has tried.
+    The search ends early when it has done `work` units of counted work, or when `over` returns True because the time
+    that a user allowed is over. It then returns the worst of the members that it has tried.
     """
     ended, until = False, spent_after(work)
     points = [list(_points(region)) for region in regions]
     refinements = [min(_STARTS, len(some)) * 8 * region.low.size for region, some in zip(regions, points, strict=True)]
     tried, total = 0, sum(map(len, points)) + sum(refinements)
-    tops: list[_Found] = []
+    maxima: list[_Worst] = []
 
     for region, some in zip(regions, points, strict=True):
         known: dict[bytes, float] = {}
@@ -97,18 +85,18 @@ def search(
         starts = _apart(some, [need(point) for point in some], _APART)[:_STARTS]
         climbed = [_climbed(need, *start) for start in starts]
         distinct = _apart([point for point, _ in climbed], [value for _, value in climbed], _SAME)
-        tops += [_Found(_member(region, point), value) for point, value in distinct if value > -np.inf]
+        maxima += [_Worst(_member(region, point), value) for point, value in distinct if value > -np.inf]
     progress(total, total)
-    return Searched(tuple(sorted(tops, key=lambda found: -found.ratio)), tried, ended)
+    return Searched(tuple(sorted(maxima, key=lambda one: -one.ratio)), tried, ended)
 
 
 def _member(region: Region, point: Array) -> Member:
-    """The environment at a point of the unit cube that stands for the region."""
+    """Map a point of the unit cube to the member of the region."""
     return region.at("point", region.low + point * (region.high - region.low))
 
 
 def _points(region: Region) -> Iterator[Array]:
-    """Of the unit cube: its vertices, points along every edge, and points on faces and inside."""
+    """Yield points of the unit cube: its vertices, points along every edge, and points on faces and inside."""
     n = region.low.size
     rng = np.random.default_rng(_SEED)
     if n > _MANY:
@@ -129,13 +117,13 @@ def _points(region: Region) -> Iterator[Array]:
                 yield np.insert(np.array(others), i, x)
     if n == 1:
         return
-    for _ in range(_DRAWN):  # every number in between, or at one of its ends, as often as not
+    for _ in range(_DRAWN):  # each coordinate is an end of its range with probability 1/2
         between, end, coin = rng.random(n), rng.integers(0, 2, n), rng.random(n) < 0.5
         yield np.where(coin, between, end)
 
 
 def _apart(points: Sequence[Array], values: Sequence[float], distance: float) -> list[tuple[Array, float]]:
-    """The points by falling value, without those that are close to a worse one."""
+    """Return points with their values, largest first, without points that are close to a point of larger value."""
     chosen: list[tuple[Array, float]] = []
     for i in np.argsort(-np.array(values), kind="stable"):
         if all(np.abs(points[i] - other).max(initial=0.0) >= distance for other, _ in chosen):
@@ -144,8 +132,8 @@ def _apart(points: Sequence[Array], values: Sequence[float], distance: float) ->
 
 
 def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tuple[Array, float]:
-    """Uphill along the axes of the unit cube, with steps that are halved where none leads up; the ends are exact."""
-    step = 1.0 if point.size > _MANY else _FIRST  # from end to end first, where not all ends were tried
+    """Climb along the axes of the unit cube, and halve the step where no neighbour is larger."""
+    step = 1.0 if point.size > _MANY else _FIRST  # with many parameters not all vertices were tried before
     while point.size and step >= _LAST and np.isfinite(value):
         moves = [np.clip(point + sign * step * axis, 0, 1) for axis in np.eye(point.size) for sign in (1, -1)]
         values = [need(move) if (move != point).any() else -np.inf for move in moves]
@@ -163,7 +151,7 @@ def search_ranges(
     progress: Progress = lambda done, total: None,
     over: Callable[[], bool] = lambda: False,
 ) -> Searched:
-    """Find the worst environments of the loop's ranges."""
+    """Find the members of the loop's ranges in which the coupling needs the most damping."""
     assert loop.ranges
     parts = regions(loop.network, loop.ranges)
     return search(parts, lambda member: ratio_in(loop.at(member.network), coupling), progress, over=over)

@@ -130,12 +130,12 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Cells in MuJoCo, with the effects that no theory covers switched on. The human that is nearest to oscillating, by the
-# exact linear loop, holds the devices. The loop starts on that mode, so far out that Coulomb friction does not hold it;
-# the hand presses with a constant force, eased in; and what still oscillates at the end decides (sim.stability).
+# Cells in MuJoCo, with the encoder steps, the friction and the walls of the scenario. The human that is nearest to
+# oscillating, by the exact linear loop, holds the devices. The loop starts on that mode, so far out that Coulomb
+# friction does not hold it; the hand presses with a constant force, eased in; the end of the trace decides.
 
 
-UNLIMITED = 1e6  # [N] force limit of a motor that does not saturate: the largest that a device may have
+_UNLIMITED = 1e6  # [N] the largest force limit that a device may have
 _BATCH = 20  # simulations in one MuJoCo batch
 _EASE = 0.5  # [s] in which the press grows
 _BLOCK = 64  # ticks between two looks at the keyboard
@@ -143,32 +143,15 @@ DECIDED = 0.2  # [1/s] linear growth nearer to zero than this does not show with
 UNDECIDED = "too slow to say"  # verdict where the trace goes on oscillating as the linear loop would, decaying or not
 
 
-@dataclass(frozen=True)
-class Effects:
-    """What the simulated cells have beside the linear loop. None leaves what the devices of the scenario have."""
-
-    quantisation: float | None = None  # [m] encoder step
-    friction: float | None = None  # [N] Coulomb friction at each motor
-    saturation: bool = False  # whether motors have their force limits
-
-    def on(self, devices: Sequence[Device]) -> tuple[Device, ...]:
-        changes: dict[str, float] = {} if self.saturation else {"force_limit": UNLIMITED}
-        if self.quantisation is not None:
-            changes["encoder_step"] = self.quantisation
-        if self.friction is not None:
-            changes["friction"] = self.friction
-        return tuple(msgspec.structs.replace(device, **changes) for device in devices)
-
-    def nonlinear(self, devices: Sequence[Device]) -> bool:
-        """Whether the devices make the simulated loop another one than the linear one."""
-        return self.saturation or any(device.encoder_step or device.friction for device in self.on(devices))
+def unlimited(devices: Sequence[Device]) -> tuple[Device, ...]:
+    """The devices with motors that never clip: a map shows the loop below its force limits."""
+    return tuple(msgspec.structs.replace(device, force_limit=_UNLIMITED) for device in devices)
 
 
 @dataclass(frozen=True)
 class Plan:
     """How cells are simulated."""
 
-    effects: Effects
     points: int  # rows and columns of the grid that are simulated; 0 for none
     trials: int  # humans at each cell
     start: float  # [m] displacement of the motor or handle that moves most, at the start
@@ -293,7 +276,7 @@ def _simulate(
 ) -> Oscillation:
     """All trials at once; their humans must have the same number of links. `press` (m,) [N]."""
     T = trials[0].process.F.T
-    held_by = variants(plan.effects.on(held.devices), Crowd(np.stack([trial.links for trial in trials])))
+    held_by = variants(unlimited(held.devices), Crowd(np.stack([trial.links for trial in trials])))
     scene, ticks = held_by.scene, round(plan.duration / T)
     substeps = pace(held_by.plants().A).substeps(T)
     timing = Timing(np.array([T]), np.array([held.late])) if held.late else None

@@ -133,8 +133,8 @@ def _title(report: MapReport) -> str:
     what = report.scenario or "rigid wall"
     if report.fixed:
         what += f", {report.fixed.kind} coupling"
-    if report.one_sided:
-        what += ", one-sided"
+    if report.walls:
+        what += ", with walls"
     parts = [
         f"theta {_list(report.theta)}",
         f"T {1e3 * report.T:g} ms",
@@ -142,15 +142,11 @@ def _title(report: MapReport) -> str:
     ]
     if any(report.psi):
         parts.append(f"psi {_list(report.psi)}")
-    if report.velocity_filter_hz:
-        parts.append(f"velocity filter {report.velocity_filter_hz:g} Hz")
     effects = report.simulation.effects
     if any(effects.encoder_step_m):
         parts.append(f"encoder step {1e6 * max(effects.encoder_step_m):g} um")
     if any(effects.friction_n):
         parts.append(f"friction {max(effects.friction_n):g} N")
-    if effects.force_limit_n:
-        parts.append(f"limit {_list(effects.force_limit_n)} N")
     head = f"{what}: {', '.join(parts[:3])}"
     return head if len(parts) == 3 else f"{head}\n{', '.join(parts[3:])}"
 

@@ -1,6 +1,6 @@
-"""Stable or not: from the eigenvalues of the exact linear loop, from MuJoCo's own map, and from simulated traces.
+"""Decide stability: by eigenvalues of the exact linear loop, by MuJoCo's map over a period, and by simulated traces.
 
-Everything is for one loop or for a stack of loops, one for each set of humans: then arrays have a leading axis.
+Functions take one loop or a stack of loops, one for each set of humans. Arrays of a stack have a leading axis.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from haptic_loop.sim.engines import Engine, MujocoBatchEngine, profiler_off, qui
 from haptic_loop.sim.run import Simulation, beginnings, make_engine, run_blocks
 from haptic_loop.sim.trace import Trace
 
-#: growth rates up to this [1/s] count as stable: eigenvalues at 1 (a free loop that drifts) come out at 1e-12
+#: Growth rates up to this [1/s] count as stable. Rounding moves an eigenvalue at 1 (a drifting loop) by 1e-12.
 MARGINAL = 1e-9
-_CLEAR = 1e-3  # [1/s]: slower than this, a loop is too close to the margin for engines to disagree about
-_JUDGED = 4.0  # [s] of a loop whose ticks vary
-_DOUBTFUL, _LONGER = 1.0, 5  # [1/s]: slower growth is judged again, over so many times as long
-_NO_MODE = 1e-300  # of modulus, where none is fast enough
-_SHORTEST_TRACE = 200  # ticks below which a growth rate is not read from a trace
-_DECAY_TIMES = 4.0  # or times of growth, in a trace whose rate has a sign: other modes leave a few parts of e in it
+_CLEAR = 1e-3  # [1/s] engines may differ in sign below this growth rate, because of their own errors
+_JUDGED = 4.0  # [s] simulated of a loop whose ticks vary
+_DOUBTFUL, _LONGER = 1.0, 5  # growth below _DOUBTFUL [1/s] is measured again over _LONGER times the duration
+_NO_MODE = 1e-300  # modulus that stands for "no mode is fast enough"
+_SHORTEST_TRACE = 200  # ticks that a growth rate needs
+_DECAY_TIMES = 4.0  # time constants that a trace must last for the sign of its rate to count
 
 
 def unstable(growth: ArrayLike) -> NDArray[np.bool_]:
-    """Whether each growth rate [1/s] counts as unstable; nan does."""
+    """Return whether each growth rate [1/s] counts as unstable; nan counts as unstable."""
     return ~(np.asarray(growth) <= MARGINAL)
 
 
 def verdict(growth: float) -> str:
-    """ "stable" or "unstable" for a growth rate [1/s]."""
+    """Return "stable" or "unstable" for a growth rate [1/s]."""
     return "unstable" if unstable(growth) else "stable"
 
 
 def disagree(exact: ArrayLike, other: ArrayLike) -> NDArray[np.bool_]:
-    """Where two growth rates [1/s] have opposite signs though the exact one is clearly not zero."""
+    """Return where two growth rates [1/s] have opposite signs although the exact one is clearly not zero."""
     return (unstable(exact) != unstable(other)) & (np.abs(exact) > _CLEAR) & np.isfinite(other)
 
 
@@ -62,7 +62,7 @@ class ClosedLoop:
     T: float  # [s]
 
     def growths(self, *min_frequency_hz: float) -> list[Array]:
-        """[1/s] of the dominant mode among those from each of these frequencies on."""
+        """Return the growth [1/s] of the dominant mode at or above each of these frequencies [Hz]."""
         values = np.linalg.eigvals(self.A)
         size, hz = np.abs(values), np.abs(np.angle(values)) / (2 * np.pi * self.T)
         return [np.log(np.where(hz >= least, size, _NO_MODE).max(axis=-1)) / self.T for least in min_frequency_hz]
@@ -70,14 +70,14 @@ class ClosedLoop:
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """The eigenvalue of largest modulus of a closed loop, or of each of a stack: its growth decides."""
+    """The eigenvalue of largest modulus of a closed loop, or of each loop of a stack."""
 
     eigenvalue: NDArray[np.complex128]  # (...,)
     T: float  # [s]
 
     @classmethod
     def worst(cls, modes: Sequence[Mode]) -> Mode:
-        """Of several modes of each loop, the one of the largest modulus."""
+        """Return, for each loop, the mode of largest modulus among several."""
         values = np.stack([mode.eigenvalue for mode in modes])
         largest = np.argmax(np.abs(values), axis=0)[None]
         return cls(np.take_along_axis(values, largest, axis=0)[0], modes[0].T)
@@ -88,7 +88,7 @@ class Mode:
 
     @property
     def growth(self) -> Array:
-        """log|lambda| / T [1/s]"""
+        """The growth rate log|lambda| / T [1/s]."""
         with np.errstate(divide="ignore"):
             return np.log(self.spectral_radius) / self.T
 
@@ -98,12 +98,12 @@ class Mode:
 
     @property
     def verdict(self) -> str:
-        """Of one loop."""
+        """The verdict on a single loop."""
         return verdict(float(self.growth))
 
 
 def close(plant: HeldPlant, F: Lti) -> ClosedLoop:
-    """The plant's held input f and the force map F joined: f = C z + D x, z+ = A z + B x, x = C s."""
+    """Join the held plant with the force map F: f = C z + D x, z+ = A z + B x, x = C s."""
     *many, states, inputs = plant.B.shape
     outside, n = inputs - F.outputs, states + F.order
     force = plant.B[..., outside:]
@@ -115,21 +115,21 @@ def close(plant: HeldPlant, F: Lti) -> ClosedLoop:
 
 
 def dominant_mode(loop: ClosedLoop) -> Mode:
-    """The mode of the largest modulus, of one loop or of each of a stack."""
+    """Return the mode of largest modulus of one loop, or of each loop of a stack."""
     values = np.linalg.eigvals(loop.A)
     largest = np.argmax(np.abs(values), axis=-1)[..., None]
     return Mode(np.take_along_axis(values, largest, axis=-1)[..., 0].astype(complex), loop.T)
 
 
 def _left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
-    """The dominant mode's, (..., n), of unit length: left* A = lambda left*. No other mode contributes to left* xi."""
+    """Return the dominant mode's unit left eigenvector (..., n). No other mode contributes to left* xi."""
     values, vectors = np.linalg.eig(np.swapaxes(loop.A, -1, -2))
     largest = np.argmax(np.abs(values), axis=-1)[..., None, None]
     return np.take_along_axis(vectors, largest, axis=-1)[..., 0].conj()
 
 
 def exact_loops(variants: Variants, F: Lti, T: float | None = None, late: Sequence[float] | None = None) -> ClosedLoop:
-    """The exact closed loop with every set of humans, stacked, in periods T [s] (F's); forces latch `late` (m,) [s]."""
+    """Return the exact closed loops, one for each set of humans; forces latch `late` (m,) [s] after ticks."""
     return close(hold(variants.plants(), F.T if T is None else T, late), F)
 
 
@@ -141,15 +141,15 @@ def mujoco_loops(
     nthread: int = 0,
     late: Sequence[float] | None = None,
 ) -> ClosedLoop:
-    """The closed loops that MuJoCo itself simulates: its map over one period, joined with the process block.
+    """Return the closed loops that MuJoCo simulates: its map over one period, joined with the process.
 
-    The plant is linear, so its map is known from one period from each basis state and with each force alone:
-    2n + m simulations for every set of humans, stepped in one batch; with `late` (m,) [s], as in `hold`, m more.
+    The plant is linear. So one period from each basis state and with each force alone gives its map: 2n + m simulations
+    for every set of humans in one batch, and m more with `late` (m,) [s].
     """
     m, nsim, T = process.channels, len(variants), process.F.T
     n = variants.states + (m if late else 0)
     timing = Timing(np.array([T]), np.array([late])) if late else None
-    # within the actuators' limits, so that these do not clip
+    # unit forces stay within the actuators' limits
     unit = np.concatenate([np.ones(n), np.minimum(1.0, process.force_limit / 2)])
     unit[n - m : n] = unit[n:] if late else 1.0
     buffer = StepBuffer(process, 1, n, variants.scene.outside, nsim * (n + m))
@@ -169,36 +169,34 @@ def mujoco_loops(
 
 
 def _frozen_modes(simulation: Simulation) -> dict[State, Mode]:
-    """The dominant mode of the exact loop for every set of walls that touch; one entry where there is no wall."""
+    """Return the dominant mode for every set of touching walls; one entry where there is no wall."""
     return {walls: dominant_mode(close(simulation.plant, F)) for walls, F in simulation.process.law.frozen().items()}
 
 
 def worst_mode(simulation: Simulation) -> Mode:
-    """The dominant mode of the exact loop; where there are walls, of the worst frozen contact state."""
+    """Return the dominant mode of the exact loop, or of its worst frozen contact state where there are walls."""
     return max(_frozen_modes(simulation).values(), key=lambda mode: float(mode.spectral_radius))
 
 
 def exact_growth(simulation: Simulation) -> float:
-    """The growth rate [1/s] of the exact loop; where there are walls, in the worst frozen contact state."""
+    """Return the growth rate [1/s] of the exact loop, or of its worst frozen contact state."""
     return float(worst_mode(simulation).growth)
 
 
 _NOT_EXCITED = "not excited: nothing in this run moves the dominant mode; the verdict is that of the eigenvalues"
-_VECTOR_ROUNDING = 1e-12  # of the largest entry: what an eigenvector's entries may be off
-_UNLIKE = 0.05  # rms of what y does beside the mode, relative to it: above, it is no such mode but noise
-
-
-_AT_ONCE = 1 << 16  # ticks of a trace, whose states may be more than memory holds
+_VECTOR_ROUNDING = 1e-12  # error of an eigenvector's entries, relative to the largest
+_UNLIKE = 0.05  # largest relative rms residual of a trace that follows the mode; above it, the trace is noise
+_AT_ONCE = 1 << 16  # ticks that are projected at a time, because the states of a long trace may exceed the memory
 
 
 def _measured_growth(
     loop: ClosedLoop, trace: Trace, force_limit: Array, ahead: int = 0
 ) -> tuple[float | None, str | None]:
-    """The growth rate [1/s] of the loop's dominant mode in a trace, or None with the reason.
+    """Return the growth rate [1/s] of the loop's dominant mode in a trace, or None and the reason.
 
-    The trace is projected on the left eigenvector, y = left* xi, which no other mode of the exact loop touches.
-    With the known outside force subtracted, y[k+1] - left* B w[k] = lambda y[k]; lambda is the least-squares
-    fit over the ticks before the first clipped one, less `ahead`, by which a limiter acts before its force arrives.
+    The projection y = left* xi contains the dominant mode alone. With the known outside force subtracted,
+    y[k+1] - left* B w[k] = lambda y[k], and lambda is the least-squares fit over the ticks before the first clipped
+    one, less `ahead` ticks, by which a limiter acts before its force arrives.
     """
     clipped = trace.clipped(force_limit)
     usable = max(int(np.argmax(clipped)) - ahead, 0) if clipped.any() else clipped.size - 1 - ahead
@@ -207,7 +205,7 @@ def _measured_growth(
         return None, f"only {max(usable, 0)} {which}; a growth rate needs {_SHORTEST_TRACE}"
     left = _left_eigenvector(loop).conj()
     pushed = trace.w[:usable] @ (loop.B.T @ left)
-    # what rounding is relative to: large parts that cancel in y, and the eigenvector's own zeros
+    # rounding is relative to the parts that cancel in y, and to the errors of the eigenvector
     sizes = np.abs(left) + _VECTOR_ROUNDING / _NOISE_FLOOR * np.abs(left).max()
     y, squares = np.empty(usable + 1, dtype=np.complex128), 0.0
     for begin in range(0, usable + 1, _AT_ONCE):
@@ -234,21 +232,21 @@ class ExactVerdict:
 
 @dataclass(frozen=True, kw_only=True)
 class Eigenvalues(ExactVerdict):
-    """What the eigenvalues of the exact loop say."""
+    """The verdict of the exact loop with its spectral radius."""
 
     spectral_radius: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Frozen(ExactVerdict):
-    """The loop that has these walls, and no others."""
+    """The linear loop in which exactly these walls touch."""
 
     touching: list[int]  # counted from 1
 
 
 @dataclass(frozen=True)
 class _Contact:
-    """How often the walls were touched in a run, and the linear loops that they switch between."""
+    """How often walls were touched in a run, and the linear loops between which they switch."""
 
     made: int
     ticks: int
@@ -258,7 +256,7 @@ class _Contact:
 
 @dataclass(frozen=True, kw_only=True)
 class Stability(Eigenvalues):
-    """Measured on the trace, and from the eigenvalues of the exact loop; of walls, in the worst contact state."""
+    """The verdicts of the trace and of the exact loop's eigenvalues (with walls, of the worst contact state)."""
 
     verdict: str | None
     clipped_ticks: int
@@ -269,7 +267,7 @@ class Stability(Eigenvalues):
 
 
 def eigenvalues(mode: Mode) -> Eigenvalues:
-    """As a report has them."""
+    """Return the figures of a mode as a report has them."""
     return Eigenvalues(**_exact(mode), spectral_radius=float(mode.spectral_radius))
 
 
@@ -279,14 +277,14 @@ def _exact(mode: Mode) -> dict[str, Any]:
 
 
 def stability_of(simulation: Simulation, trace: Trace) -> Stability:
-    """The verdict on a run."""
+    """Return the verdict on a run."""
     contact = _contact(simulation, trace) if simulation.process.walls else None
     if contact and contact.ticks:
-        growth, reason = None, f"contact was made {contact.made} times, and a growth rate is of one linear loop"
+        growth, reason = None, f"contact was made {contact.made} times; a growth rate needs a single linear loop"
     elif simulation.friction:
-        growth, reason = None, "with Coulomb friction there is no growth rate; the eigenvalues are those without it"
+        growth, reason = None, "with Coulomb friction there is no growth rate; the eigenvalues leave friction out"
     elif trace.net:
-        growth, reason = None, "a net stands between forces and devices; the eigenvalues are those of the loop without"
+        growth, reason = None, "a passivity layer scales the forces; the eigenvalues are those of the loop without it"
     elif simulation.timing and not simulation.timing.steady:
         growth, reason = _timed_growth(simulation)
     else:
@@ -334,39 +332,39 @@ def _contact(simulation: Simulation, trace: Trace) -> _Contact:
     )
 
 
-# ---- the impulse test: what short traces say of many humans at once
+# ---- the impulse test: short traces of many humans at once
 #
-# From rest at x = 0, without voluntary motion, every handle is pushed once and then left alone. The measures are
-# summed up while the simulation runs, so that no trace is kept.
+# Every handle is pushed once, from rest at x = 0, and then left alone. Sums are accumulated while the simulation runs,
+# so that no trace is kept.
 
 _IMPULSE = 10e-3  # [s]
-_TO_THE_WALL = 20.0  # [N] so that a hand of 0.3 kg swings over a few centimetres
-_NOISE_FLOOR = 1e-8  # a mode weaker than this beside the whole state is noise of the engine
+_TO_THE_WALL = 20.0  # [N] a hand of 0.3 kg then swings over a few centimetres
+_NOISE_FLOOR = 1e-8  # a mode below this share of the state is noise of the engine
 
 
 @dataclass(frozen=True, eq=False)
 class ImpulseTest:
-    """One entry per simulation."""
+    """The results of an impulse test, with one entry per simulation."""
 
     growth: Array  # (nsim,) [1/s] of the exact loop's dominant mode, up to the first clipped tick; nan below the noise
-    error: Array  # (nsim,) [1/s] by which that may be off: a rate within it says nothing of the sign
+    error: Array  # (nsim,) [1/s] bound on the error of `growth`; a smaller rate has no certain sign
     clipped: NDArray[np.int64]  # (nsim,) ticks with a force at its limit
-    least_energy: Array  # (nsim,) [J] least W(N), with a limiter at any tick, else up to the first clipped one
-    audited: Array  # (nsim,) [J] sum of the magnitudes of what W adds up: the scale of its rounding
-    settling: Array  # (nsim,) rms of the handles' speeds in the last quarter over that in the second
-    contacts: NDArray[np.int64]  # (nsim,) how often a wall was touched
-    simulated: float  # [s] of all simulations together
+    least_energy: Array  # (nsim,) [J] least energy W; without a limiter up to the first clipped tick
+    audited: Array  # (nsim,) [J] sum of the magnitudes of the terms of W: the scale of its rounding
+    settling: Array  # (nsim,) rms speed of the handles in the last quarter over that in the second quarter
+    contacts: NDArray[np.int64]  # (nsim,) number of contacts with walls
+    simulated: float  # [s] simulated time of all simulations together
 
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """What each tick gives and takes where forces act at ticks: damping pays for every step."""
+    """The energy of each tick where forces act at ticks: the work of the forces and the least dissipation."""
 
     damping: Array  # (m, 1) [N/m] delta/T
 
     @staticmethod
     def of(variants: Variants, loop: Loop, late: Sequence[float] | None) -> Balance:
-        """Of devices in the hands of `variants`; forces latch `late` (m,) [s], within the latency, or at ticks."""
+        """Return the balance of devices held by `variants`; forces latch `late` (m,) [s] after ticks, or at ticks."""
         delta = np.array(loop.delta)[:, None]
         if late is None:
             return Balance(delta / loop.T)
@@ -376,17 +374,17 @@ class Balance:
         return _LateBalance(after, before, at_the_latch(variants.plants(), late))
 
     def terms(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
-        """Work of the forces and the least that devices dissipate, of each tick and channel, (count, m, nsim)."""
+        """Return the work of the forces and the least dissipation, for each tick and channel, (count, m, nsim)."""
         moved = np.diff(buffer.x[: count + 1], axis=0)
         return buffer.f[:count] * moved, self.damping * moved**2
 
 
 @dataclass(frozen=True, eq=False)
 class _LateBalance(Balance):
-    """The same of forces that latch within a tick: what pays for the steps before and, `damping`, after that."""
+    """The energy of each tick where forces latch within the tick, so that each period has two parts."""
 
-    before: Array  # (m, 1) [N/m] delta/t2; after it delta/(T - t1), T the longest period
-    seen: Array  # (nsim, m, entries) of models.hold.at_the_latch: where devices are then
+    before: Array  # (m, 1) [N/m] delta/t2, for the part before the latch; `damping` is delta/(T_max - t1)
+    seen: Array  # (nsim, m, entries) of models.hold.at_the_latch: positions at the latch
 
     def terms(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
         x, s, f = buffer.x[: count + 1], buffer.s[:count], buffer.f[:count]
@@ -397,7 +395,7 @@ class _LateBalance(Balance):
 
 
 def impulse_forces(scene: Scene, T: float, first: int, ticks: int, size: float = 1.0) -> Array:
-    """Forces [N] of the impulse, (ticks, outside): `size` on handle 1, -1/2 of it on handle 2, 1/3 on handle 3, ..."""
+    """Return the impulse [N], (ticks, outside): `size` on handle 1, -1/2 of it on handle 2, 1/3 on handle 3, ..."""
     w = np.zeros((ticks, scene.outside))
     until = max(1, round(_IMPULSE / T)) - first
     for i, column in enumerate(scene.tapped):
@@ -414,7 +412,7 @@ def impulse_test(
     ticks: int,
     tick_done: Callable[[int], None] = lambda ticks: None,
 ) -> ImpulseTest:
-    """Simulate `ticks` periods with every set of humans and measure them. `loops` are the exact ones.
+    """Simulate `ticks` periods with every set of humans and measure them. `loops` are the exact closed loops.
 
     Where there are walls the impulse is large enough to reach them, and no growth is read from the trace.
     """
@@ -433,12 +431,11 @@ def impulse_test(
 def impulse_growth(
     process: Process, engine: Engine, scene: Scene, states: int, ticks: int, nsim: int = 1
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """(growth, clipped) after an impulse on every handle, (nsim,) each, of loops that may vary in time.
+    """Return growth and clipping, (nsim,) each, after an impulse on every handle, also where the timing varies.
 
-    `states` is the order of the plant.
-
-    The growth [1/s] is that of the handles' speeds from the second quarter to the last: inf where numbers overflow,
-    -inf at exact rest. Of an unlimited process it does not depend on the size of the impulse.
+    `states` is the order of the plant. The growth [1/s] compares the handles' speeds in the last quarter with those in
+    the second: inf where numbers overflow, -inf at exact rest. Without force limits it does not depend on the size of
+    the impulse.
     """
     T, quarter, limit = process.F.T, ticks // 4, process.force_limit[:, None]
     speeds, clipped = _Speeds(scene, nsim, (quarter, 2 * quarter), (ticks - quarter, ticks)), np.zeros(nsim, dtype=bool)
@@ -454,7 +451,7 @@ def impulse_growth(
 
 
 def linear_growth(simulation: Simulation, ticks: int) -> tuple[float, float]:
-    """(rate [1/s], window [s]) of the exact linear loop after an impulse, with its timing and its delays."""
+    """Return the growth rate [1/s] of the exact linear loop after an impulse, and the time [s] that it covers."""
     free = replace(simulation.smooth, process=simulation.process.unlimited)
     T, states = simulation.scenario.T, simulation.plant.A.shape[0]
     rate, _ = impulse_growth(free.process, make_engine(free, "exact"), free.scene, states, ticks)
@@ -463,9 +460,9 @@ def linear_growth(simulation: Simulation, ticks: int) -> tuple[float, float]:
 
 
 def _timed_growth(simulation: Simulation) -> tuple[float, str]:
-    """The growth [1/s] under a timing that varies, and how it was found; a slow one may be modes that beat."""
+    """Return the growth [1/s] under a timing that varies, and how it was measured."""
     growth, window = linear_growth(simulation, round(_JUDGED / simulation.scenario.T))
-    if 0 < growth < _DOUBTFUL:
+    if 0 < growth < _DOUBTFUL:  # two decaying modes that beat look like growth in a short window
         growth, window = linear_growth(simulation, round(_LONGER * _JUDGED / simulation.scenario.T))
     how = f"growth of the linear loop after an impulse, over {window:.3g} s of periods and latencies as in the run"
     return growth, f"{how}; the eigenvalues are those of even periods and the middle of the latency"
@@ -486,7 +483,7 @@ class _Speeds:
 
 
 class _Audit:
-    """What the impulse test measures, summed over the ticks seen so far."""
+    """The sums of an impulse test over the ticks so far."""
 
     def __init__(self, process: Process, scene: Scene, loops: ClosedLoop, balance: Balance, ticks: int) -> None:
         nsim, self._balance = loops.A.shape[0], balance
@@ -523,7 +520,7 @@ class _Audit:
         self._size += (np.abs(work) + spent).sum(axis=0)
 
         self._speeds.see(buffer, first, count)
-        if law.walls:  # no one linear loop whose mode could be followed
+        if law.walls:  # the loop switches between linear loops, so it has no single mode
             return
         xi = np.concatenate([s, z], axis=1)
         y = np.einsum("ns,ksn->kn", self._left.conj(), xi)

@@ -106,16 +106,16 @@ class Trace(ReadOnly):
         return f"Trace({n} samples of {m} channels{f', {self.t[-1]:.4g} s' if n else ''}{sizes}{verdict})"
 
     def clipped(self, force_limit: Array) -> NDArray[np.bool_]:
-        """(N,) whether any force was at its limit, (m,) [N], at a tick."""
+        """Return (N,) whether any force was at its limit, (m,) [N], at each tick."""
         return np.any(np.abs(self.f) >= force_limit, axis=1)
 
     def ticks_before_clipping(self, force_limit: Array) -> int:
-        """Ticks before the first clipped one; all of them where there is none."""
+        """Return the number of ticks before the first clipped one, or of all ticks."""
         clipped = self.clipped(force_limit)
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
     def dominant_frequency_hz(self) -> float | None:
-        """The strongest line above 10 Hz in the last quarter of the forces, what one hears and feels; None if short."""
+        """Return the strongest line above 10 Hz in the last quarter of the forces; None for a short trace."""
         tail = self.f[-(self.f.shape[0] // 4) :]
         if tail.shape[0] < 64:
             return None
@@ -168,7 +168,7 @@ class Trace(ReadOnly):
         return ": ".join(word for word in words if word) or "run"
 
     def save_npz(self, path: Path) -> Path:
-        """What was measured and the metadata (as JSON text), compressed, without pickle."""
+        """Write the measured arrays and the metadata (as JSON text), compressed, without pickle."""
 
         def content(file: BinaryIO) -> None:
             arrays = {name: getattr(self, name) for name in _MEASURED}
@@ -178,12 +178,12 @@ class Trace(ReadOnly):
 
     @classmethod
     def load_npz(cls, path: Path) -> Self:
-        """A trace written by `save_npz`. Raises InputError where the file is not one."""
+        """Read a trace that `save_npz` wrote. Raises InputError for any other file."""
         return cls.of_arrays(path, read_arrays(path, "a trace of this program"))
 
     @classmethod
     def of_arrays(cls, path: Path, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """A trace from the arrays of its file. Raises InputError where they are not those of a trace."""
+        """Build a trace from the arrays of its file. Raises InputError where they are not those of a trace."""
         try:
             measured: dict[str, Any] = {name: _real(name, arrays[name]) for name in _MEASURED}
             return cls(**measured, meta=json.loads(str(arrays["meta"])))
@@ -191,7 +191,7 @@ class Trace(ReadOnly):
             raise InputError(f"{path}: not a trace of this program ({error})") from None
 
     def save_csv(self, path: Path) -> Path:
-        """Time, displacements and forces, one line per sample, SI units in the header."""
+        """Write time, displacements and forces, one line per sample, with SI units in the header."""
         channels = range(1, self.x.shape[1] + 1)
         names = ["t [s]", *(f"x{i} [m]" for i in channels), *(f"f{i} [N]" for i in channels)]
         table = np.column_stack([self.t, self.x, self.f])
@@ -204,15 +204,15 @@ class Trace(ReadOnly):
 
 # ---- octaves, and whether something goes on oscillating
 
-_PERIODS = 4  # in a window, of the slowest oscillation that is seen: of fewer the window function mixes octaves
-_TREND = 7  # degree of the polynomial that is the slow part: of 15 mm at 0.6 Hz it leaves less than a micrometre
+_PERIODS = 4  # periods of the slowest octave in a window; with fewer the window function mixes octaves
+_TREND = 7  # degree of the polynomial that is subtracted; of 15 mm at 0.6 Hz it leaves less than a micrometre
 SUSTAINED = 0.95
 RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
 
 
 @dataclass(frozen=True, eq=False)
 class Oscillation:
-    """One entry per simulation."""
+    """Whether positions go on oscillating, with one entry per simulation."""
 
     sustained: NDArray[np.bool_]  # (nsim,) the verdict
     amplitude: Array  # (nsim,) [m] of the strongest octave that is sustained, else of the strongest one; inf: diverged
@@ -220,12 +220,12 @@ class Oscillation:
 
 
 def slowest_seen(duration: float) -> float:
-    """[Hz] the lowest frequency that `oscillation` sees in a trace of that many seconds."""
+    """Return the lowest frequency [Hz] that `oscillation` sees in a trace of `duration` seconds."""
     return 4 * _PERIODS / duration
 
 
 def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
-    """Of positions x (ticks, m, nsim) [m] in the second half of traces, sampled every T seconds."""
+    """Judge positions x (ticks, m, nsim) [m], the second half of traces sampled every T seconds."""
     half = x.shape[0] // 2
     diverged = ~(np.abs(x) < RUNAWAY).all(axis=(0, 1))
     calm = np.where(diverged, 0.0, x)
@@ -244,8 +244,10 @@ def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
 
 
 def _octaves(x: Array, T: float) -> tuple[Array, Array, Array]:
-    """Of x (ticks, m, nsim) without its slow part: amplitude of each octave (that of a sinusoid of its power) and
-    frequency [Hz] of its strongest line, both (octaves, m, nsim), and its part of all lines, (octaves,).
+    """Split x (ticks, m, nsim), less its slow part, into octaves.
+
+    Returns the amplitude of a sinusoid of the octave's power and the frequency [Hz] of its strongest line, both
+    (octaves, m, nsim), and the octave's share of all lines, (octaves,).
     """
     ticks = x.shape[0]
     window = np.hanning(ticks)
@@ -270,16 +272,16 @@ def _octaves(x: Array, T: float) -> tuple[Array, Array, Array]:
 
 # ---- how fast an oscillation grows
 
-_WINDOW = 1.0  # [s] at most
+_WINDOW = 1.0  # [s] longest window
 _LEAST_SAMPLES = 10  # in a window
-_WINDOWS = 7  # in the second half of such a part, each half over the next, at least
-_NEEDED = 4  # of them, one after the other, that an oscillation is seen in
-_SHORTEST = 200  # ticks
-_FLOOR = 3.0  # times what the encoders' rounding puts into an octave: less is not an oscillation
-_CLEAR = 4.0  # standard errors, of a line through as few as four points
-_FARTHEST = 1e100  # [m] more has no square
-_EVEN = 1e-3  # of a period that t may stray from its first step: rounding of long times does less
-_FINEST = 1e-9  # [m] step taken for an ideal encoder: floating-point noise is no oscillation
+_WINDOWS = 7  # least number of windows, each of which overlaps the next by half
+_NEEDED = 4  # consecutive windows in which an oscillation must be seen
+_SHORTEST = 200  # ticks that a growth rate needs
+_FLOOR = 3.0  # an oscillation exceeds this multiple of the encoders' rounding in its octave
+_CLEAR = 4.0  # standard errors by which a slope differs from zero; a line may have four points only
+_FARTHEST = 1e100  # [m] larger numbers have no square
+_EVEN = 1e-3  # periods may differ by this share; rounding of long times is smaller
+_FINEST = 1e-9  # [m] step assumed for an ideal encoder, above floating-point noise
 
 
 @dataclass(frozen=True)
@@ -297,7 +299,7 @@ class Growth:
     reason: str | None = None
 
     def words(self, T: float) -> str:
-        """In one line, for ticks of T [s]."""
+        """Describe the growth in one line, for ticks of T [s]."""
         where = f"ticks {self.first} to {self.stop} ({(self.stop - self.first) * T:.2f} s)"
         above = "" if self.slowest_hz is None else f" (from {self.slowest_hz:.3g} Hz up)"
         if self.reason or self.amplitude_m is None:
@@ -307,11 +309,11 @@ class Growth:
 
 
 def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
-    """Of displacements x (N, m) [m] sampled every T [s] by encoders of steps (m,) [m]; tick 0 of x is called `first`.
+    """Measure how fast displacements x (N, m) [m] grow, sampled every T [s] by encoders of steps (m,) [m].
 
-    Looks at the second half of x; where nothing is seen there for long enough, as of a mode that grows fast, at the
-    last quarter, and so on. Where octaves grow, the strongest of these is reported, else the strongest of all: a mode
-    that decays does not hide one that grows.
+    The second half of x is examined first. If nothing is seen there for long enough, because a mode grows fast, the
+    last quarter is, and so on. The strongest growing octave is reported, or the strongest one if none grows. `first`
+    is the number of the first tick.
     """
     n, stop = len(x), first + len(x)
     if n < _SHORTEST:
@@ -336,10 +338,10 @@ def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
 
 
 class _Lines(NamedTuple):
-    """What oscillates in a part of a trace."""
+    """The oscillations in a part of a trace."""
 
     found: list[tuple[float, float, float, float]]  # rate and its error [1/s], frequency [Hz], amplitude [m], by octave
-    brief: bool  # something does, in too few windows
+    brief: bool  # an oscillation is seen in too few windows
     floor: float  # [m]
     slowest: float  # [Hz]
 
@@ -362,13 +364,13 @@ def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
 
 
 def _longest(on: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """The places of the longest run of True; the last of several."""
+    """Return the indices of the longest run of True, the last one of several."""
     runs = np.split(np.arange(len(on)), np.flatnonzero(np.diff(on)) + 1)
     return max((run for run in reversed(runs) if on[run[0]]), key=len, default=np.zeros(0, np.intp))
 
 
 def _slope(values: Array, spacing: float) -> tuple[float, float]:
-    """Of the line through values `spacing` seconds apart, with its standard error [1/s]."""
+    """Fit a line through values `spacing` seconds apart; return slope and standard error [1/s]."""
     n = len(values)
     t = spacing * (np.arange(n) - (n - 1) / 2)
     slope = float(t @ values / (t @ t))
@@ -377,9 +379,9 @@ def _slope(values: Array, spacing: float) -> tuple[float, float]:
 
 
 def growths(trace: Trace) -> list[Growth]:
-    """One entry per part of a trace in which the loop was one linear loop: `run.steady_ticks` of its metadata.
+    """Measure the growth in each part of a trace in which the loop was linear (`run.steady_ticks` of its metadata).
 
-    Where a trace does not name any, all of it is one. Raises InputError where what it names is none of it.
+    A trace that names no parts is one part. Raises InputError where the named parts are not ticks of the trace.
     """
     n, m = trace.x.shape
     run = trace.meta.get("run") if isinstance(trace.meta, dict) else None

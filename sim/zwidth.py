@@ -4,7 +4,7 @@ What K and B are is decided by the sweep. With `CouplingSweep` they are the gain
 on every channel, in one environment or against a rigid wall. With `EnvironmentSweep` the coupling is fixed, and they
 are those of every spring at a contact of the environment. A map asks of each cell both conditions (design.conditions,
 for a whole row of cells at once), the eigenvalues of the exact loop with every human of a population, and, at a sparse
-part of the cells, MuJoCo with the effects that no theory covers.
+part of the cells, MuJoCo with the encoder steps, the friction and the walls of the scenario.
 """
 
 from __future__ import annotations
@@ -29,11 +29,10 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller import environment
 from haptic_loop.controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
-from haptic_loop.controller.law import Law, Limiter
+from haptic_loop.controller.law import Law
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import Process
-from haptic_loop.design.assessment import covered_limits
 from haptic_loop.design.audit import check_loop, edge
 from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
@@ -52,8 +51,6 @@ from haptic_loop.sim.stability import MARGINAL
 
 
 MODEL_KEPT = "model kept"
-#: a one-sided wall behind the coupling is this stiff [N/m], which makes K too soft by K / 1e10
-_HARD_WALL = environment.Network(("tip",), walls=(environment.Wall(("tip", environment.GROUND), stiffness=1e10),))
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,14 +73,9 @@ class _Sweep(ABC):
         return {each.name: each for each in (*map(named, (*CONDITIONS, *known)), *([self.own] if self.own else []))}
 
     @property
-    @abstractmethod
-    def simulated(self) -> Loop:
-        """The loop of the simulated points."""
-
-    @property
     def walls(self) -> bool:
-        """Whether contact is made and broken."""
-        return bool(self.simulated.environment.walls)
+        """Whether the environment has walls, which make and break contact."""
+        return bool(self.loop.environment.walls)
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -98,8 +90,9 @@ class _Sweep(ABC):
     def _one_by_one(self, condition: str, K: Array, B: Array) -> Array:
         return np.array([self.requirement(condition, k, b).ratio for k, b in zip(K.tolist(), B.tolist(), strict=True)])
 
-    def _limits(self, devices: Sequence[Device]) -> tuple[Array, Array]:
-        """Force limits [N] and encoder steps [m], (m,) each."""
+    def _actuators(self) -> tuple[Array, Array]:
+        """Force limits [N] beyond reach, and encoder steps [m], (m,) each."""
+        devices = limit_cycles.unlimited(self.devices)
         return np.array([d.force_limit for d in devices]), np.array([d.encoder_step for d in devices])
 
 
@@ -107,17 +100,8 @@ class _Sweep(ABC):
 class CouplingSweep(_Sweep):
     """K and B are those of the coupling, on every channel. Raises ValueError naming the field that is wrong."""
 
-    cutoff: float | None = None  # [Hz] of a filter on the velocity that the coupling damps
-    one_sided: bool = False  # whether a rigid wall only pushes; the walls of a network do in any case
-    clip: bool = False  # whether motors clip forces, in place of the limiter that a guarantee covers
-
     def __post_init__(self) -> None:
         check_loop(self.loop)
-
-    @property
-    def simulated(self) -> Loop:
-        """With the contact that is made and broken in MuJoCo, if there is one."""
-        return self.loop.at(_HARD_WALL) if self.one_sided else self.loop
 
     @property
     def usual_scale(self) -> str:
@@ -137,7 +121,7 @@ class CouplingSweep(_Sweep):
     @cached_property
     def _multipliers(self) -> dict[str, tuple[Array | None, str | None]]:
         """What a condition needs beside every coupling, (m,); or why it says nothing of this loop."""
-        return {name: each.least_multiplier(self.simulated) for name, each in self.asked.items()}
+        return {name: each.least_multiplier(self.loop) for name, each in self.asked.items()}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """F of every coupling, a stack for each frozen contact state of the environment, all walls touching first.
@@ -147,24 +131,11 @@ class CouplingSweep(_Sweep):
         """
         return tuple(state.F(self._couplings(K, B)) for state in self.loop.frozen()[::-1])
 
-    def processes(self, K: Array, B: Array, devices: Sequence[Device]) -> list[Process]:
-        """What the computer does every T with each coupling; limits and encoder steps are those of `devices`.
-
-        Where motors have limits, forces leave through the limiter that a guarantee covers; the rest are clipped.
-        """
-        limits, steps = self._limits(devices)
-        loop, V = self.simulated, self._couplings(K, B).compliance(self.loop.T)
-        limited = not self.clip and (limits < limit_cycles.UNLIMITED).any()
-        limiters = [self._limiter(k, b, limits) if limited else () for k, b in zip(K.tolist(), B.tolist(), strict=True)]
-        return [Process(loop.law(Compliance(V[i]), *limiters[i]), limits, steps) for i in range(K.size)]
-
-    def _limiter(self, K: float, B: float, force_limit: Array) -> tuple[Array, Array]:
-        """Limit and rho of the limiter of one coupling; one that is not covered never slips, and its motors clip."""
-        coupling = self._coupling(K, B)
-        rho = covered_limits(self.loop, coupling, {name: self.requirement(name, K, B) for name in self.asked}).rho
-        if rho is None or (self.one_sided and any(rho)):  # which is a proof of the wall that holds
-            return np.full(self.loop.channels, np.inf), np.zeros(self.loop.channels)
-        return force_limit, np.array(rho)
+    def processes(self, K: Array, B: Array) -> list[Process]:
+        """What the computer does every T with each coupling, with motors that never clip."""
+        limits, steps = self._actuators()
+        V = self._couplings(K, B).compliance(self.loop.T)
+        return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough. Walls make and break contact."""
@@ -176,7 +147,7 @@ class CouplingSweep(_Sweep):
             each = [None] * self.loop.channels if given is None else [(p,) for p in given.tolist()]
             loops = [*set(zip(map(self.loop.channel, range(self.loop.channels)), each, strict=True))]
             couplings = self._couplings(K, B, 1)
-        elif self.walls and asked.guarantee(self.simulated) != ANY:  # every coupling has multipliers of its own
+        elif self.walls and asked.guarantee(self.loop) != ANY:  # every coupling has multipliers of its own
             return self._one_by_one(condition, K, B)
         found = [asked.ratios(loop, couplings, multiplier) for loop, multiplier in loops]
         known = [ratios for ratios in found if ratios is not None]
@@ -187,15 +158,15 @@ class CouplingSweep(_Sweep):
         asked, (given, reason), coupling = self.asked[condition], self._multipliers[condition], self._coupling(K, B)
         if reason:
             return refusal(condition, self.loop.delta, reason)
-        return asked.judge(self.simulated, coupling, given)
+        return asked.judge(self.loop, coupling, given)
 
     def _coupling(self, K: float, B: float) -> SpringDamper:
-        return SpringDamper([K] * self.loop.channels, [B] * self.loop.channels, self.cutoff)
+        return SpringDamper([K] * self.loop.channels, [B] * self.loop.channels)
 
     def _couplings(self, K: Array, B: Array, channels: int | None = None) -> SpringDamper:
         m = channels or self.loop.channels
         each = np.ones(m)
-        return SpringDamper(np.multiply.outer(K, each), np.multiply.outer(B, each), self.cutoff)
+        return SpringDamper(np.multiply.outer(K, each), np.multiply.outer(B, each))
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,9 +184,7 @@ class EnvironmentSweep(_Sweep):
     """
 
     coupling: Coupling
-    lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of its limiter, in every environment; None: motors clip
 
-    cutoff = None  # a velocity filter belongs to the other sweep
     usual_scale = "log"
 
     def __post_init__(self) -> None:
@@ -227,11 +196,6 @@ class EnvironmentSweep(_Sweep):
             )
         if not contact_springs(self.loop.network):
             raise ValueError("environment: no spring or damper ends at a contact, so there is no K and B to vary")
-
-    @property
-    def simulated(self) -> Loop:
-        """Contact made and broken belongs to the other sweep."""
-        return self.loop
 
     @property
     def stiffness_scale(self) -> float:
@@ -253,17 +217,10 @@ class EnvironmentSweep(_Sweep):
         """F in every environment, the coupling's model following it; one stack, since there is no contact to freeze."""
         return (self._at(K, B).F(self.coupling),)
 
-    def processes(self, K: Array, B: Array, devices: Sequence[Device]) -> list[Process]:
-        """What the computer does every T in each environment; limits and encoder steps are those of `devices`."""
-        (limits, steps), theta = self._limits(devices), self.loop.theta
-        sent, limited = self._at(K, B).sent(self.coupling), (limits < limit_cycles.UNLIMITED).any()
-        laws = [
-            Law(sent[i], theta)
-            if self.lag is None or not limited
-            else Limiter(sent[i], theta, limit=limits, rho=self.lag)
-            for i in range(K.size)
-        ]
-        return [Process(law, limits, steps) for law in laws]
+    def processes(self, K: Array, B: Array) -> list[Process]:
+        """What the computer does every T in each environment, with motors that never clip."""
+        (limits, steps), sent = self._actuators(), self._at(K, B).sent(self.coupling)
+        return [Process(Law(sent[i], self.loop.theta), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough."""
@@ -323,19 +280,6 @@ Sweep = CouplingSweep | EnvironmentSweep
 def contact_springs(network: environment.Network) -> tuple[environment.Spring, ...]:
     """The springs that end at a contact."""
     return tuple(s for s in network.springs if set(s.between) & set(network.contacts))
-
-
-def one_sided(network: environment.Network) -> environment.Network:
-    """The network whose contacts only push: every spring at a contact becomes a wall, in the direction it is given in.
-
-    Raises ValueError where the contacts have no springs.
-    """
-    at_contact = [s for s in contact_springs(network) if s.stiffness > 0]
-    if not at_contact:
-        raise ValueError("no spring ends at a contact, so there is nothing to make one-sided")
-    kept = tuple(spring for spring in network.springs if spring not in at_contact)
-    walls = tuple(environment.Wall(s.between, s.stiffness, s.damping) for s in at_contact)
-    return environment.Network(network.contacts, kept, network.masses, (*network.walls, *walls))
 
 
 def _press_directions(loop: Loop) -> Array:
@@ -465,8 +409,7 @@ def draw_map(
         return _population(held, [F[part.start] for F in maps], leading)
 
     def loops(some: limit_cycles.Cells) -> tuple[Lti, list[Process]]:
-        devices = plan.effects.on(sweep.devices)
-        return sweep.force_maps(K[some], B[some])[0], sweep.processes(K[some], B[some], devices)
+        return sweep.force_maps(K[some], B[some])[0], sweep.processes(K[some], B[some])
 
     begin = time.perf_counter()
     _ = sweep.refusals  # once, before threads ask for it
@@ -487,7 +430,7 @@ def draw_map(
     if not stopped and plan.points:
         begin = time.perf_counter()
         cells = grid.subset(plan.points)
-        press = plan.press * _press_directions(sweep.simulated)
+        press = plan.press * _press_directions(sweep.loop)
         points, stopped = limit_cycles.simulate_cells(
             cells, loops, held, plan, press, lambda k, of: progress("MuJoCo", k, of)
         )

@@ -54,8 +54,7 @@ class Shown:
 
     encoder_step_m: list[float]
     friction_n: list[float]
-    force_limit_n: list[float] | None
-    one_sided: bool
+    walls: bool
 
 
 @dataclass(frozen=True)
@@ -146,16 +145,11 @@ class _Simulated:
         """The points that were reached, and what they have beside the linear loop."""
         points, (K, B) = drawn.points, (axis[drawn.points.cell] for axis in drawn.grid.flat)
         figures = (K, B, points.verdicts, points.amplitude, points.frequency_hz, points.growth, points.differ)
-        devices = plan.effects.on(sweep.devices)
-        effects = Shown(
-            [device.encoder_step for device in devices],
-            [device.friction for device in devices],
-            [d.force_limit for d in devices] if plan.effects.saturation else None,
-            sweep.walls,
-        )
+        steps = [device.encoder_step for device in sweep.devices]
+        friction = [device.friction for device in sweep.devices]
         return cls(
-            effects,
-            plan.effects.nonlinear(sweep.devices) or sweep.walls,
+            Shown(steps, friction, sweep.walls),
+            sweep.walls or any(steps) or any(friction),
             plan.trials,
             plan.duration,
             plan.start,
@@ -185,8 +179,7 @@ class MapReport:
     theta: tuple[int, ...]
     psi: tuple[int, ...]
     delta: tuple[float, ...]
-    velocity_filter_hz: float | None
-    one_sided: bool
+    walls: bool
     conditions: list[str]
     grid: _Grid
     population: _Population
@@ -228,7 +221,6 @@ class MapReport:
             loop.theta,
             loop.psi,
             loop.delta,
-            sweep.cutoff,
             sweep.walls,
             list(drawn.ratio),
             _Grid(drawn.grid.K, drawn.grid.B, drawn.grid.scale),

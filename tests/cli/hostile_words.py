@@ -15,7 +15,7 @@ NO_NUMBERS = ("x", "", "nan", "1,,2", "\x1b[31m1", "9" * 5000, "-1e999")
 NUMERIC = {
     "run": "theta psi lam delta T T-max latency loss varying-delay energy-budget substeps duration vertex seed",
     "validate": "humans shards generations duration seed theta",
-    "zwidth": "grid K-range B-range mark humans points trials duration start press threshold quantisation friction",
+    "zwidth": "grid K-range B-range mark humans points trials duration start press threshold",
     "view": "fps duration",
     "accuracy": "duration",
     "design": "ranges samples band high-gain seconds order varying-delay delta",
@@ -277,7 +277,7 @@ REFUSED = {
         --seconds 0 | --seconds 1e9 | --coulomb -1 | --coulomb 100 | --fault axis9:jump | --pace 0 | --T 0.05
         --port nix | --measure 0 | --quantile 2""",
     "zwidth": """--coupling nix | --K-range 5,1 | --B-range -1,5 | --grid 1 | --rigid --theta 1,2
-        --mark 1 | --mark 1,2,3 | --points -1 | --velocity-filter 0""",
+        --mark 1 | --mark 1,2,3 | --points -1""",
 }
 HUMANS = """from haptic_loop.models.human import Human, Link
 humans = [Human((Link(0.3, 3.0, 200.0),))] * 2

@@ -1,4 +1,4 @@
-"""The condition that docs/architecture.md shows, in every command: designed for, proved, judged, drawn, driven."""
+"""The condition that docs/extending.md shows, in every command: designed for, proved, judged, drawn, driven."""
 
 import json
 import re
@@ -13,7 +13,7 @@ from haptic_loop.design.files import InputError
 from haptic_loop.hw.control import SafetyStop, certified_coupling
 from tests.asked import decisive
 
-PAGE = (Path(__file__).parents[2] / "docs/architecture.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs/extending.md").read_text()
 NAME, OWN = "joined-devices", "joined_devices.py:JoinedDevices"
 JSON = ["--json", "report.json"]
 

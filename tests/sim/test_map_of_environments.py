@@ -1,9 +1,7 @@
 """The K-B map of a fixed coupling: figures against closed forms and dense sweeps, and what the command says of them."""
 
 import json
-from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 from worlds import VERTICES_ONLY
@@ -12,7 +10,6 @@ from haptic_loop.cli import zwidth
 from haptic_loop.cli.options import DONE
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring
-from haptic_loop.controller.tick import Process, StepBuffer
 from haptic_loop.design.frequency import on_circle
 from haptic_loop.design.optimal import design
 from haptic_loop.design.program import Options
@@ -75,25 +72,6 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
         found = sweep.ratios("this-environment", np.array([K]), np.array([B]))[0]
         assert found == pytest.approx(densely(sweep, filtered, K, B), rel=1e-5)
         assert sweep.requirement("this-environment", K, B).ratio == pytest.approx(found, rel=1e-6)
-
-
-def test_forces_leave_through_the_limiter_of_the_coupling_in_every_environment():
-    """Contact springs of 900 and 1800 N/m: the forces are those of that network behind a limiter made for it alone."""
-    coupling, limit, lag = SpringDamper((5832.0, 2545.0), (0.187, 1.386)), np.array([0.3, 0.3]), (11.4, 11.4)
-    devices = tuple(msgspec.structs.replace(device, force_limit=0.3) for device in PAIR.device)
-    sweep, K = replace(around(PAIR, coupling), lag=lag), (900.0, 1800.0)
-    for stiffness, process in zip(K, sweep.processes(np.array(K), np.ones(2), devices), strict=True):
-        springs = tuple(msgspec.structs.replace(s, stiffness=stiffness, damping=1.0) for s in PAIR.environment.springs)
-        network = Network(PAIR.environment.contacts, springs, PAIR.environment.masses)
-        alone = PAIR.loop("I").at(network).law(coupling, limit, lag)
-        found, expected = (StepBuffer(p, 60, 2) for p in (process, Process(alone, limit, np.zeros(2))))
-        for buffer in (found, expected):
-            buffer.x[:60] = 2e-3 * np.sin(0.1 * np.arange(60))[:, None, None] * np.array([[1.0], [-1.0]])
-            for k in range(60):
-                buffer.tick(k)
-        np.testing.assert_allclose(found.f[:60], expected.f[:60], atol=1e-9)
-        assert (np.abs(found.f[:60]) == 0.3).mean() > 0.2
-    assert replace(sweep, lag=None).processes(np.array(K), np.ones(2), devices)[0].law.bounds == []
 
 
 def test_the_model_of_a_pair_may_stay_behind():

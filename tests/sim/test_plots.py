@@ -220,11 +220,11 @@ def told(**changes):
     def point(B, K, verdict, differs=False):
         return SimpleNamespace(B=B, K=K, verdict=verdict, differs_from_linear=differs)
 
-    effects = SimpleNamespace(encoder_step_m=[1e-5, 0.0], friction_n=[0.0, 0.0], force_limit_n=None)
+    effects = SimpleNamespace(encoder_step_m=[1e-5, 0.0], friction_n=[0.0, 0.0])
     points = [point(0, 10, "rests"), point(2, 20, "oscillates", True), point(1, 20, map_plot.UNDECIDED)]
     simulation = SimpleNamespace(points=points, effects=effects, nonlinear=True)
-    head = {"fixed": None, "scenario": None, "coupling": None, "one_sided": False}
-    loop = {"theta": [1, 1], "psi": [0, 1], "T": 1e-3, "delta": [1.37, 2.0], "velocity_filter_hz": None}
+    head = {"fixed": None, "scenario": None, "coupling": None, "walls": False}
+    loop = {"theta": [1, 1], "psi": [0, 1], "T": 1e-3, "delta": [1.37, 2.0]}
     rest = {
         "population": SimpleNamespace(humans=7),
         "simulation": simulation,
