@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 
 from haptic_loop.cli import options, render, session_cli
+from haptic_loop.cli.world import world_start
 from haptic_loop.design.certificate import named
 from haptic_loop.design.files import plain, write_json
 from haptic_loop.design.guarantees import CAVEATS
@@ -27,7 +28,8 @@ from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import session_for
 from haptic_loop.hw.session_report import SessionReport, outcome, save
 from haptic_loop.sim.couplings import NAMES
-from haptic_loop.sim.scenario import InputError, Scenario, require_no_world
+from haptic_loop.sim.scenario import InputError, Scenario, is_world
+from haptic_loop.sim.world import START_J, Claim
 
 _LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
 
@@ -36,7 +38,6 @@ def main(argv: list[str]) -> int:
     """One session. 0: it ended as planned, 1: refused, stopped, lost or e-stop, 130: interrupted, after a ramp."""
     args = _parser().parse_args(argv)
     scenario, settings = session_cli.steady_scenario(args, "hw.bridge"), session_cli.check_link(args)
-    require_no_world(scenario, "hw.bridge")
     seconds = scenario.duration if args.duration is None else args.duration
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
@@ -45,6 +46,9 @@ def main(argv: list[str]) -> int:
         asked, late = named(args.condition), ((0.0, scenario.T / 2),) * scenario.channels
         if reason := asked.beyond(msgspec.structs.replace(scenario.loop(args.case), latency=late)):
             raise InputError(f"--latch arrival with --condition {asked.name}: {reason}")
+    start = world_start(args) if is_world(scenario) else START_J
+    if is_world(scenario):
+        args.energy_budget = None  # the account is that of the contacts
     if args.energy_budget and at_once:
         raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
     if args.energy_budget and not args.energy_budget[0]:
@@ -60,7 +64,7 @@ def main(argv: list[str]) -> int:
     def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
         met, link = timed(scenario, ages, args.quantile, 1e6 * args.guard, at_once)
         asked = args.case, args.coupling, args.condition
-        programs = certified_couplings(met, *asked, link, limiter=args.limiter)
+        programs = certified_couplings(met, *asked, link, limiter=args.limiter, start=start)
         _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         return programs
 
@@ -177,6 +181,12 @@ def _print_session(report: SessionReport, console: render.Screen, details: bool)
     for i, part in enumerate(report.energy_budget or [], start=1):
         console.print(f"energy budget, arming {i}: limited {part.limited_ticks} of {part.ticks} ticks")
         console.print(f"  {part.guarantee}")
+    for i, part in enumerate(report.world or [], start=1):
+        claim = Claim.of(report.assessment).words if report.assessment else "No guarantee."
+        console.print(f"world, arming {i}: {claim} The shell acted on {part.ticks_acted} of {part.ticks} ticks.")
+        if part.step_us:
+            took = f"{part.step_us['p50']:.0f} us at the median, {part.step_us['p99']:.0f} at 99 %"
+            console.print(f"  a step of the scene took {took} of the processor, of {1e6 * report.run.T_s:.0f} us")
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link.counters.items() if n)
     console.print(f"counted: {counted or 'nothing'}")
     if details:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import inf, isfinite, isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from haptic_loop.cli import options, render
 from haptic_loop.design.files import off_table, write_json
-from haptic_loop.sim.scenario import InputError, require_even_ticks, require_no_world
+from haptic_loop.sim.scenario import InputError, is_world, require_even_ticks
 from haptic_loop.sim.view.session import (
     COUPLINGS,
     GIVEN,
@@ -47,12 +48,14 @@ def main(argv: list[str]) -> int:
     from haptic_loop.sim.view.stage import check_film
 
     scenario = options.scenario_from(args)
-    require_no_world(scenario, "sim.view")
     require_even_ticks(scenario, "sim.view")
     if args.video:
         check_film(Path(args.video))
         if args.video.endswith(".gif") and 100 % args.fps:  # GIF counts in hundredths of a second
             raise InputError(f"--fps is {args.fps}, allowed for a .gif are the numbers that divide 100")
+    if is_world(scenario):
+        args.coupling, args.duration = args.coupling or "moving-average", args.duration or scenario.duration
+        args.script = args.script or "0:restart"
     label, script = _beginning(args, scenario.channels)
     # --case none begins without a coupling; those that keys bring are for case I
     given = args.coupling if label == GIVEN else None
@@ -89,14 +92,16 @@ class _Event:
     @classmethod
     def of(cls, t: float, what: str, prepared: PreparedLoop) -> _Event:
         scenario, mode = prepared.scenario, prepared.mode
-        loop = prepared.label, scenario.theta, scenario.psi, float(mode.growth), float(mode.frequency_hz)
+        growth, frequency = (float(mode.growth), float(mode.frequency_hz)) if mode else (nan, nan)
+        loop = prepared.label, scenario.theta, scenario.psi, growth, frequency
         return cls(t, what, *loop, prepared.assessment)
 
     def line(self) -> str:
         guarantee = self.assessment.guarantee
         held = [name for name, need in self.assessment.requirements.items() if need.certified] if guarantee else []
         growth = f"{self.exact_growth_rate_per_s:+.3g} 1/s at {self.exact_frequency_hz:.1f} Hz"
-        grows = growth if isfinite(self.exact_growth_rate_per_s) else "no growth"
+        unknown = "a world" if isnan(self.exact_growth_rate_per_s) else "no growth"
+        grows = growth if isfinite(self.exact_growth_rate_per_s) else unknown
         proved = f"certified ({', '.join(held)})" if held else "NOT certified"
         loop = f"{self.coupling}, theta {list(self.theta)}, psi {list(self.psi)}: {grows}, {proved}"
         return f"{self.t_s:6.2f} s  {self.event:<10} {loop}"
@@ -209,12 +214,11 @@ def _names() -> list[str]:
 
 def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
     """Film the session by its own clock, so that the film is the same every time; after Ctrl-C it is shorter."""
-    from haptic_loop.sim.view.stage import FlatPictures, save_film
+    from haptic_loop.sim.view.stage import pictures_for, save_film
 
     seconds = args.duration or (session.script_ends + _AFTER)
     count, interrupted = round(seconds * args.fps) + 1, False
-    simulation = session.prepared.simulation
-    artist = FlatPictures(simulation.scene, simulation.process.force_limit)
+    artist = pictures_for(session)
 
     def pictures(move: render.Move) -> Iterator[Picture]:
         nonlocal interrupted
@@ -227,18 +231,17 @@ def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
             yield picture
             move(i + 1, count)
 
-    with render.progress("filming") as move:
+    with closing(artist), render.progress("filming") as move:
         made = save_film(Path(args.video), pictures(move), args.fps)
     return _Ended(interrupted, _Film(args.video, made, args.fps))
 
 
 def _window(session: LiveLoop, duration: float | None) -> _Ended:
-    from haptic_loop.sim.view.stage import NoWindow, ShownScene, show
+    from haptic_loop.sim.view.stage import NoWindow, show, stage_for
 
-    stage = ShownScene(session.prepared.simulation.scene, session.prepared.simulation.process.force_limit)
     interrupted = False
     try:
-        show(session, stage, duration)
+        show(session, stage_for(session), duration)
     except NoWindow as error:
         raise InputError(f"{error}; --video FILE.gif needs no window") from None
     except KeyboardInterrupt:

@@ -96,7 +96,7 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
         return choose(scenario, args.case, args.coupling, args.condition)
 
 
-def _start(args: argparse.Namespace) -> float:
+def world_start(args: argparse.Namespace) -> float:
     """W0 [J] of --energy-budget. Raises InputError for a cap, which the account of a world does not have."""
     if not args.energy_budget:
         return START_J
@@ -129,7 +129,7 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
         if getattr(args, name, None):
             shown = name.replace("_", "-")
             raise InputError(f"--{shown}: with environment.world there is no linear loop to compare with; leave it out")
-    start, chosen = _start(args), _chosen(args, scenario)
+    start, chosen = world_start(args), _chosen(args, scenario)
     report = _reported(args, scenario, chosen, start)
     settings = EngineSettings(args.engine, args.integrator, args.substeps)
     began = time.perf_counter()

@@ -37,6 +37,7 @@ channels and simulations.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -309,19 +310,30 @@ class Shell(_Net):
         self._released = self._released + rise
         self._earn(rise)
 
-    def limit(self, wanted: ArrayLike) -> tuple[Array, Array]:
-        """f = s f_wanted [N] and the port's displacement u [m] with it, (m, nsim) each; ends the tick."""
+    def limit(self, wanted: ArrayLike, rounded: Callable[[Array], Array] = lambda f: f) -> tuple[Array, Array]:
+        """f = s f_wanted [N] and the port's displacement u [m] with it, (m, nsim) each; ends the tick.
+
+        `rounded` gives the force that a device can be sent in place of s f_wanted; where that one would cost more
+        energy than there is, f is 0.
+        """
         wanted, spoilt = _finite(wanted)
         linear = (wanted * (self._free - self._before)).sum(axis=0)
         square = np.maximum((wanted * (self._V.D @ wanted)).sum(axis=0), 0.0)
         scale = self._scale(linear, square)
-        force = scale * wanted
+        force = rounded(scale * wanted)
+        earned = (force * (self._free - self._V.D @ force - self._before)).sum(axis=0)
+        if (dear := (self.energy + earned < 0) & (force != scale * wanted).any(axis=0)).any():
+            force, scale = np.where(dear, 0.0, force), np.where(dear, 0.0, scale)
+        self._count(scale, spoilt)
+        return force, self.book(force)
+
+    def book(self, force: Array) -> Array:
+        """Count a force (m, nsim) [N] that acts in this tick, whatever it costs; the port's u [m] with it."""
         u = self._free - self._V.D @ force
         self._earn((force * (u - self._before)).sum(axis=0))
         self._state = self._V.A @ self._state + self._V.B @ force
         self._before = u
-        self._count(scale, spoilt)
-        return force, u.copy()
+        return u.copy()
 
     def _scale(self, linear: Array, square: Array) -> Array:
         """(nsim,) the largest s in [0, 1] with W + linear s - square s^2 >= 0."""

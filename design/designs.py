@@ -71,10 +71,10 @@ def kind_of(name: str) -> Kind:
 def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """The default condition of a design: a spring-damper is designed for this environment, which feels best.
 
-    For any environment where this-environment covers less than the loop: limited forces before walls, ranges, delays
-    that vary. Other kinds for their own condition.
+    For any environment where this-environment covers less than the loop: limited forces before walls, worlds, ranges,
+    delays that vary. Other kinds for their own condition.
     """
-    less = loop.environment.walls or loop.ranges or loop.varying_delay
+    less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
     conditions = kind_of(kind).conditions
     if loop.known_devices and KNOWN_DEVICE in conditions and not (less or loop.latency):
         return KNOWN_DEVICE.name  # it is never worse than this-environment, which it falls back on

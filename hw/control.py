@@ -9,6 +9,7 @@ and the scenario's latency is what was measured.
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from haptic_loop.controller.budget import BudgetFigures, EnergyBudget, Packets
+from haptic_loop.controller.budget import BudgetFigures, EnergyBudget, Packets, Shell
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.loop import Loop
@@ -31,7 +32,8 @@ from haptic_loop.hw import monitor
 from haptic_loop.hw.limits import Gain, Heat, SafetyLimits, Units
 from haptic_loop.hw.protocol import MAX_THETA, Config, SafetyStop, State
 from haptic_loop.sim.couplings import assessed, choose, given
-from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.scenario import InputError, Scenario, is_world
+from haptic_loop.sim.world import START_J, scene_of
 
 _SPEED_SECONDS = 0.01  # over which a speed is taken: one count of the coarsest encoder is 0.03 m/s
 _FALLBACK = ("spring-damper", "any-environment")  # what softer couplings are where the one asked for cannot be had
@@ -143,6 +145,57 @@ class SentBudget:
         return self._budget.figures(f"no passive hand is given {given} {dissipated}")
 
 
+class WorldController:
+    """A MuJoCo scene behind a coupling, and the energy shell that counts the forces as they are sent.
+
+    Every tick is `step`, then `limit` for what the session makes of the forces: gain, caps and whole steps are for the
+    shell a part of the environment. Of a tick without an answer it counts the force that the device holds.
+    """
+
+    def __init__(
+        self, scenario: Scenario, coupling: Coupling, start: float, cap: Sequence[float], waits: Sequence[int]
+    ) -> None:
+        """`start` is W0 [J], `waits` (m,) the ticks by which the host delays what it sends. Raises InputError."""
+        V = coupling.compliance(scenario.T)
+        scene = scene_of(scenario, coupling)  # raises InputError for a coupling without V
+        assert V is not None
+        self.T, self.port, self.shell = scenario.T, scene.port(cap), Shell(V, start=start)
+        self.least = 0.0  # [J] of the sum of f'(u - u_-) so far
+        self.seconds: list[float] = []  # of the processor, for each step of the scene
+        self._start, self._sent = start, np.zeros((len(waits), 1))
+        self._open = False  # whether a tick was begun whose force is not counted yet
+        self._lines = [deque([0] * n) for n in waits]
+
+    def step(self, x: Sequence[float]) -> list[float]:
+        """Forces (m,) [N] of the scene for the displacements x (m,) [m]."""
+        if self._open:
+            self.shell.book(self._sent)
+        free = self.shell.free(np.array(x)[:, None])
+        began = time.thread_time()
+        wanted = self.port.step(free[:, 0])
+        self.seconds.append(time.thread_time() - began)
+        self.shell.credit([self.port.released])
+        self._open = True
+        return wanted.tolist()
+
+    def limit(self, steps: Sequence[int], unit: Sequence[float]) -> tuple[int, ...]:
+        """What the shell lets through of `steps`, which are -`unit` (m,) [N] each: whole steps again."""
+        each = -np.array(unit)[:, None]
+        wanted = np.array(steps)[:, None] * each
+        self._sent, _ = self.shell.limit(wanted, lambda f: np.where(f == wanted, f, np.trunc(f / each) * each))
+        self._open = False
+        self.least = min(self.least, float(self.shell.energy[0]) - self._start - self.port.released)
+        return tuple(int(n) for n in np.round(self._sent / each)[:, 0])
+
+    def later(self, steps: Sequence[int], ticks: int) -> tuple[int, ...]:
+        """What is to be sent now where `steps` are new, `ticks` after those before."""
+        sent = []
+        for line, step in zip(self._lines, steps, strict=True):
+            line.extend([line[-1] if line else step] * (ticks - 1) + [step])
+            sent.append([line.popleft() for _ in range(ticks)][-1])
+        return tuple(sent)
+
+
 class TraceRow(NamedTuple):
     """One tick of a trace. Where `state` is None no STATE came: x is filled in and nothing was sent."""
 
@@ -196,6 +249,7 @@ class Drive:
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] over which a speed is taken
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] tick by tick
         self._before: tuple[float, ...] | None = None  # [m] of the STATE before that, where none is missing
+        self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
         self._commands, self._clock = monitor.CommandMonitor(config), monitor.ClockMonitor(limits.watchdog_us, T)
 
@@ -238,6 +292,11 @@ class Drive:
             if whole != steps:
                 force, steps = self.units.forces(whole), whole
                 self._counters.limited += 1
+        if self.world:
+            whole = self.world.limit(steps, self.units.force_step)
+            if whole != steps:
+                force, steps = self.units.forces(whole), whole
+            steps = self.world.later(steps, ticks)
         self._before, self.x, self.force = self.x if ticks == 1 else None, x, force
         self._counters.clipped += shaped.clipped
         self._counters.slowed += shaped.slowed
@@ -337,7 +396,10 @@ class CertifiedCoupling:
         return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
 
     def controller(self, cap: Sequence[float]) -> Controller:
-        lag = self.assessment.force_limits.rho
+        lag, start = self.assessment.force_limits.rho, self.assessment.force_limits.energy_budget
+        if is_world(self.scenario):
+            waits = [n - self.link for n in self.scenario.theta]
+            return WorldController(self.scenario, self.chosen.coupling, start or 0.0, cap, waits)
         return host_controller(self.scenario.loop(self.case), self.chosen.coupling, self.link, cap, lag)
 
     def capped(self, cap: Sequence[float]) -> Assessment:
@@ -366,10 +428,12 @@ def certified_coupling(
     link: int,
     own: Coupling | Design | None = None,
     limiter: bool | None = None,
+    start: float = START_J,
 ) -> CertifiedCoupling:
     """The coupling `name`, or one's `own`, for a link of `link` ticks (0: the host is the clock).
 
-    Forces leave through the limiter that these cover, unless `limiter` is False.
+    Forces leave through the limiter that these cover, unless `limiter` is False. In a MuJoCo world they leave through
+    the energy shell, with W0 = `start` [J].
 
     Raises SafetyStop where no coupling is certified for it, InputError where the request contradicts itself.
     """
@@ -382,7 +446,10 @@ def certified_coupling(
     except DesignFailed as error:
         raise SafetyStop(f"no coupling for a link of {link} tick{'s' if link > 1 else ''}: {error}") from None
     alone = slower.replace(ranges=None) if slower.ranges else slower  # only the nominal environment is rendered
-    assessment = assessed(alone, case, chosen, limiter=limiter)
+    if is_world(alone):
+        assessment = assessed(alone, case, chosen, energy_budget=start, limiter=False)
+    else:
+        assessment = assessed(alone, case, chosen, limiter=limiter)
     waits = min(MAX_THETA, *slower.theta) if link else 0  # what is longer, the host waits for
     made = CertifiedCoupling(waits, slower, case, chosen, assessment)
     if not made.certified:
@@ -399,6 +466,7 @@ def certified_couplings(
     link: int,
     spare: int = 2,
     limiter: bool | None = None,
+    start: float = START_J,
 ) -> tuple[CertifiedCoupling, ...]:
     """The coupling for the measured delay and up to `spare` in reserve, each certified for one tick more.
 
@@ -407,12 +475,12 @@ def certified_couplings(
     spring-damper by Theorem 4, which guarantees the most. Where neither is certified, there is no further one.
     Raises SafetyStop where the first coupling is not certified.
     """
-    found = [certified_coupling(scenario, case, name, condition, link, limiter=limiter)]
+    found = [certified_coupling(scenario, case, name, condition, link, limiter=limiter, start=start)]
     wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), _FALLBACK]
     while len(found) <= spare and wanted:
         kind, by = wanted[0]
         try:
-            reserve = certified_coupling(scenario, case, kind, by, found[-1].link + 1, limiter=limiter)
+            reserve = certified_coupling(scenario, case, kind, by, found[-1].link + 1, limiter=limiter, start=start)
         except (SafetyStop, InputError):
             wanted.pop(0)
             continue
@@ -434,13 +502,20 @@ def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
     own, other = (made.assessment.gains for made in (reserve, than))
     K, before = (np.array(gains.get("K", np.nan)) for gains in (own, other))
     if np.isnan(K).any() or np.isnan(before).any():
-        K, before = (np.diag(made.scenario.loop(made.case).F(made.chosen.coupling).dc()) for made in (reserve, than))
+        K, before = (np.diag(_felt_at_rest(made)) for made in (reserve, than))
     later = np.greater(reserve.scenario.theta, than.scenario.theta)
     if (before * (1 + _EQUAL) < K).any() or (later & (before * (1 - _EQUAL) <= K)).any():
         return False
     loop = reserve.scenario.loop(reserve.case)
     needs = [required_damping(loop, made.chosen.coupling, than.chosen.asked).ratio for made in (reserve, than)]
     return needs[0] < needs[1]
+
+
+def _felt_at_rest(made: CertifiedCoupling) -> Array:
+    """Static stiffness (m, m) [N/m] that the devices feel; of a world, where nothing in it gives way."""
+    loop = made.scenario.loop(made.case)
+    V = made.chosen.coupling.compliance(loop.T) if is_world(made.scenario) else None
+    return loop.F(made.chosen.coupling).dc() if V is None else np.linalg.inv(V.dc())
 
 
 def _shortfall(made: CertifiedCoupling) -> str:

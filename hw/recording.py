@@ -184,6 +184,8 @@ def _again(
     recipe: Recipe, ticks: NDArray[np.intp], result: Trace, link: dict[str, Array], into: tuple[Array, Array]
 ) -> None:
     """The `ticks` of one arming: forces asked for and steps sent, written to `into`."""
+    if recipe.scenario.environment.world:
+        raise ValueError("its forces came from a MuJoCo world, which is not in the trace")
     m, coupling, (asked, sent) = len(recipe.cap), recipe.coupling.build(recipe.scenario.T), into
     controller = host_controller(recipe.scenario.loop("I"), coupling, recipe.link_delay, recipe.limits.cap, recipe.lag)
     units, force = Units((1.0,) * m, recipe.force_step, (1,) * m), (0.0,) * m

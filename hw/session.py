@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from haptic_loop.hw import protocol as wire
-from haptic_loop.hw.control import Armable, Arming, BudgetPlan, Drive, SentBudget, TraceRow
+from haptic_loop.hw.control import Armable, Arming, BudgetPlan, Drive, SentBudget, TraceRow, WorldController
 from haptic_loop.hw.haptic_device import HapticDevice, PortLost
 from haptic_loop.hw.limits import (
     DRIVING,
@@ -70,6 +70,7 @@ class Session:
         self.program: Armable | None = None
         self.drive: Drive | None = None  # the coupling at work, from one arming to the next end
         self.armings: list[Arming] = []
+        self.worlds: list[WorldController] = []  # arming by arming
         self.record: Callable[[TraceRow], None] = lambda row: None
         self.listen: Callable[[_Event], None] = lambda event: None
         self.missed_while_driving = 0  # ticks
@@ -145,6 +146,8 @@ class Session:
             assert self._noise
             told = self.units, self.limits, self.settings, self.counters, self.record
             self.drive = Drive(arming, *told, self._noise.still, _expected(self.scenario))
+            if self.drive.world:
+                self.worlds.append(self.drive.world)
             self._enter(Stage.ARMING, "asked to")
         return ()
 

@@ -21,7 +21,8 @@ from haptic_loop.hw.protocol import NO_MARGIN
 from haptic_loop.hw.recording import Recipe, Recorder
 from haptic_loop.hw.session import Session
 from haptic_loop.sim.scenario import InputError
-from haptic_loop.sim.trace import Growth, growths
+from haptic_loop.sim.trace import Growth, Trace, growths
+from haptic_loop.sim.world import WorldRecord
 
 _PERCENTILES = (50, 90, 99, 100)
 
@@ -128,6 +129,34 @@ class _Ran:
 
 
 @dataclass(frozen=True)
+class WorldSession(WorldRecord):
+    """What happened at the contacts of a world in one arming, and what the scene cost."""
+
+    step_us: dict[str, float] | None  # of the processor that a step of the scene took
+
+    @classmethod
+    def all_of(cls, session: Session, trace: Trace, arming: np.ndarray) -> list[WorldSession]:
+        """One for each arming; `trace` is that of the session, `arming` (N,) counts them from 0."""
+        found, delta, T = [], np.array(session.scenario.delta), session.scenario.T_max or session.scenario.T
+        for i, world in enumerate(session.worlds):
+            x, f = trace.x[arming == i], trace.f[arming == i]
+            dx = np.diff(x, axis=0)
+            given = -(f[:-1] * dx + delta / T * dx**2).sum(axis=1)
+            found.append(
+                cls(
+                    ticks=world.shell.ticks,
+                    ticks_acted=int(world.shell.limited[0]),
+                    given_J=float(np.cumsum(given).max(initial=0.0)),
+                    port_least_J=world.least,
+                    released_J=world.port.released,
+                    created_J=world.port.created,
+                    step_us=_percentiles(1e6 * np.array(world.seconds)),
+                )
+            )
+        return found
+
+
+@dataclass(frozen=True)
 class SessionReport:
     """What a session came to, without a verdict: the coupling with its certificates, the log, the link."""
 
@@ -142,6 +171,7 @@ class SessionReport:
     run: _Ran = off_table()
     growth: list[Growth] = off_table()
     energy_budget: list[BudgetFigures] | None = off_table()  # arming by arming
+    world: list[WorldSession] | None = off_table()  # the same
 
 
 def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:
@@ -154,7 +184,8 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     step = list(session.units.encoder_step) if ticks else None
     ran = _Ran(ticks, ticks * T, T, session.scenario.digest, pace, step, steady)
     trace = recorder.trace(session.units, T, {"run": asdict(ran)}) if coupled and ticks else None
-    grown = growths(trace) if trace else []
+    worlds = WorldSession.all_of(session, trace, recorder.link()["arming"]) if trace and session.worlds else None
+    grown = growths(trace) if trace and not worlds else []  # the motion of a scene is no oscillation of the loop
     stage, cause = str(session.stage), session.cause
     if session.stage == Stage.FINISHED and (doubt := _doubt(session, grown, ticks)):
         stage, cause = str(Stage.STOPPED), f"{cause}, but {doubt}"
@@ -171,6 +202,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
         ran,
         grown,
         [arming.budget.figures() for arming in session.armings if arming.budget] or None,
+        worlds,
     )
 
 

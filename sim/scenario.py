@@ -349,7 +349,7 @@ def is_world(scenario: Scenario) -> bool:
 def require_no_world(scenario: Scenario, what: str) -> None:
     """Raises InputError for commands that cannot use a world."""
     if is_world(scenario):
-        able = "sim.run, sim.validate, design and design.audit take worlds"
+        able = "sim.run, sim.view, sim.validate, design, design.audit and hw.bridge take worlds"
         raise InputError(
             f"environment.world: {what} takes networks only; {able}, linearise(world, pose) gives a network"
         )

@@ -8,8 +8,9 @@ whatever the scene does, it lets no more energy out of the port than W0 and what
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -154,7 +155,7 @@ class Touched:
     start: float = START_J  # W0 [J]
     gravity: bool = True  # False switches the scene's gravity off
 
-    def net(self, simulation: Simulation, process: Process, nsim: int) -> Net:
+    def net(self, simulation: Simulation, process: Process, nsim: int) -> InWorld:
         """A fresh one. Raises InputError."""
         V = simulation.coupling.compliance(simulation.loop.T)
         if V is None or not V.D.any():
@@ -168,6 +169,37 @@ class Touched:
             raise InputError(f"energy budget: {error}") from None
         damping = np.array(simulation.loop.delta)[:, None] / (simulation.loop.T_max or simulation.loop.T)
         return InWorld(shell, [scene.port(process.force_limit) for _ in range(nsim)], damping)
+
+
+def live(simulation: Simulation, start: float = START_J) -> Simulation:
+    """The same loop with its world in it, for any number of ticks: the scene's net delays the forces itself."""
+    touched, process = Touched(start), simulation.process
+
+    def late(nsim: int) -> Net:
+        return Late(touched.net(simulation, process, nsim), simulation.scenario.theta)
+
+    late(1)  # raises for a coupling that no world can use
+    return replace(simulation, process=replace(process, net=late))
+
+
+class Late:
+    """A world whose forces reach the devices after constant delays."""
+
+    def __init__(self, world: InWorld, theta: Sequence[int]) -> None:
+        self.world = world
+        self._lines = [deque([0.0] * n) for n in theta]
+
+    def send(self, x: Array, force: Array, /) -> None:
+        self.world.send(x, force)
+        for line, f in zip(self._lines, force, strict=True):
+            line.append(float(f[0]))
+            f[0] = line.popleft()
+
+    def apply(self, k: int, force: Array, /) -> None:
+        self.world.apply(k, force)
+
+    def figures(self) -> WorldFigures:
+        return self.world.figures()
 
 
 class InWorld:

@@ -34,8 +34,9 @@ from haptic_loop.models.scene import Plant, Scene
 from haptic_loop.sim.couplings import NAMES, assessed, choose
 from haptic_loop.sim.engines import ExactEngine
 from haptic_loop.sim.run import Simulation, assemble, outside_forces, run_block
-from haptic_loop.sim.scenario import LONGEST_DELAY, InputError, Scenario
+from haptic_loop.sim.scenario import LONGEST_DELAY, InputError, Scenario, is_world
 from haptic_loop.sim.stability import Mode, worst_mode
+from haptic_loop.sim.world import START_J, InWorld, Late, WorldFigures, live
 
 # ----------------------------------------------------------------------------------------------------
 # What may happen to a running loop, by a key or by a script.
@@ -176,7 +177,7 @@ class PreparedLoop:
     label: str  # as the user calls the coupling
     chosen: Chosen
     simulation: Simulation
-    mode: Mode  # of the exact linear loop; before walls, of the worst contact state
+    mode: Mode | None  # of the exact linear loop; before walls, of the worst contact state; a world has none
     assessment: Assessment
 
     @property
@@ -217,6 +218,10 @@ def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
 
 def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> PreparedLoop:
     alone = scenario.replace(ranges=None) if scenario.ranges else scenario  # only the nominal environment runs
+    if is_world(scenario):
+        simulation = live(assemble(scenario, chosen.coupling))
+        assessment = assessed(alone, menu.case, chosen, energy_budget=START_J, limiter=False)
+        return PreparedLoop(menu, label, chosen, simulation, None, assessment)
     assessment = assessed(alone, menu.case, chosen, limiter=menu.limiter)
     simulation = assemble(scenario, chosen.coupling, assessment.force_limits.rho)
     return PreparedLoop(menu, label, chosen, simulation, worst_mode(simulation), assessment)
@@ -304,6 +309,8 @@ class Frame:
     overruns: int
     lost: float  # [s]
     factor: float  # simulated over real time
+    pose: Array | None = None  # (nq,) positions of a world's scene
+    world: WorldFigures | None = None
 
 
 class LiveLoop:
@@ -360,7 +367,10 @@ class LiveLoop:
         recent = self._history[-1:] if made is None else made
         shown = self._history[-max(1, min(self._tick, len(self._history))) :]
         n, limit = self.prepared.simulation.scene.model.nq, self.prepared.simulation.process.force_limit
+        world = self.world
         return Frame(
+            pose=world and world.ports[0].data.qpos.copy(),
+            world=world and world.figures(),
             t=self.t,
             q=self.state[:n],
             mean=recent.mean(axis=0),
@@ -446,7 +456,8 @@ class LiveLoop:
         self._note = words(event)
 
     def _switch(self, event: _Event, prepared: PreparedLoop) -> None:
-        self._enter(prepared, self.state)
+        # a scene begins in its first pose, and so do the devices then
+        self._enter(prepared, np.zeros_like(self.state) if is_world(prepared.scenario) else self.state)
         self._note = words(event)
         self.log.append((self.t, words(event), prepared))
 
@@ -459,6 +470,12 @@ class LiveLoop:
         buffer.z[0, :, 0] = process.ticked.at_rest(s[: process.channels])
         self.prepared, self._buffer = prepared, buffer
         self._start_engine()
+
+    @property
+    def world(self) -> InWorld | None:
+        """The MuJoCo scene in the loop, where there is one."""
+        net = self._buffer.net
+        return net.world if isinstance(net, Late) else None
 
     def _hold(self, grip: Grip | None) -> None:
         """Take, move or let go of a handle."""

@@ -8,6 +8,7 @@ where that is installed.
 
 from __future__ import annotations
 
+import copy
 import shutil
 import subprocess
 import sys
@@ -16,8 +17,10 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import mujoco
 import numpy as np
@@ -29,9 +32,12 @@ from haptic_loop.design.files import InputError, check_file, write
 from haptic_loop.design.result import Requirement
 from haptic_loop.models.scene import APART, DRAWN, STEP, Scene
 from haptic_loop.sim.view.session import HISTORY, KEYS, Frame, Grip, LiveLoop, PreparedLoop, keys_help
+from haptic_loop.sim.world import WorldFigures
 
 if TYPE_CHECKING:
     from mujoco import viewer
+
+    from haptic_loop.models.world import World
 
 Picture = NDArray[np.uint8]  # (height, width, 3)
 _Colour = tuple[float, float, float]
@@ -107,13 +113,13 @@ def _overlay(frame: Frame, live: bool) -> _Lines:
     """Labels and values; `live` adds the clock, which a video has none of."""
     prepared, scenario = frame.prepared, frame.prepared.scenario
     delays = f"theta {_list(scenario.theta)}, psi {_list(scenario.psi)} samples of {1e3 * scenario.T:g} ms"
-    mode = prepared.mode
+    mode, needs = prepared.mode, prepared.assessment.requirements
     lines = [
         ("coupling", prepared.label),
         ("delays", delays),
-        ("growth", f"{mode.growth:+.3g} 1/s at {mode.frequency_hz:.1f} Hz: {mode.verdict}"),
-        *((name.replace("-", " "), _needs(need)) for name, need in prepared.assessment.requirements.items()),
-        ("force limits", _limited(prepared)),
+        *([("growth", f"{mode.growth:+.3g} 1/s at {mode.frequency_hz:.1f} Hz: {mode.verdict}")] if mode else []),
+        *((name.replace("-", " "), _needs(need)) for name, need in needs.items() if mode or not need.reason),
+        *([_account(frame.world, prepared)] if frame.world else [("force limits", _limited(prepared))]),
         ("largest force", f"{np.abs(frame.history).max():.2f} N in {HISTORY:g} s, {frame.clipped} ticks at the limit"),
     ]
     if np.any(frame.push):
@@ -134,6 +140,13 @@ def _limited(prepared: PreparedLoop) -> str:
     if assessment.guarantee is None:
         return "no guarantee"
     return "clipped: not covered" if assessment.force_limits.rho is None else "limited: the guarantee holds there too"
+
+
+def _account(figures: WorldFigures, prepared: PreparedLoop) -> tuple[str, str]:
+    """What the energy shell of a world has done."""
+    W0, given, released = (1e3 * joules for joules in (figures.start_J, figures.given_J, figures.released_J))
+    most = f"gave {given:.2f} mJ of {W0:g} + {released:.1f}" if prepared.assessment.guarantee else "no guarantee"
+    return "energy shell", f"acted on {figures.limited_ticks} of {figures.ticks} ticks, {most}"
 
 
 def _needs(requirement: Requirement) -> str:
@@ -169,9 +182,9 @@ class ShownScene:
         self.data = mujoco.MjData(self.model)
         self.channel = _channels(scene)  # joint -> channel; bodies and joints have the same order
 
-    def show(self, q: Array) -> None:
-        """Put the joints at q [m]."""
-        self.data.qpos[:] = q
+    def show(self, frame: Frame) -> None:
+        """Put the joints where they are in a frame."""
+        self.data.qpos[:] = frame.q
         self.data.qvel[:] = 0.0
         mujoco.mj_forward(self.model, self.data)
 
@@ -202,7 +215,7 @@ class ShownScene:
 
     def figures(self, frame: Frame, picture: mujoco.MjrRect) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
         """The forces of the last seconds, side by side at the bottom of a picture."""
-        m = self.scene.channels
+        m = frame.history.shape[1]
         width, height = picture.width // m, round(_PLOT * picture.height)
         low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
         top, drawn = _scale(frame.history), []
@@ -211,11 +224,79 @@ class ShownScene:
             drawn.append((place, _figure(i, low[:, i], high[:, i], top)))
         return drawn
 
-    def aim(self, camera: mujoco.MjvCamera, aside: tuple[float, float, float], back: float) -> None:
-        """Look from above at a point `aside` of the devices' middle and from `back` of it, in extents of the scene."""
-        camera.lookat[:] = self.model.stat.center + self.model.stat.extent * np.array(aside)
-        camera.distance = back * self.model.stat.extent
+    def aim(self, camera: mujoco.MjvCamera) -> None:
+        """Look from above at the devices, between the words and the plots."""
+        camera.lookat[:] = self.model.stat.center + self.model.stat.extent * np.array((0.0, 0.0, 0.2))
+        camera.distance = 3.0 * self.model.stat.extent
         camera.azimuth, camera.elevation = 90.0, -35.0
+
+
+class ShownWorld(ShownScene):
+    """A MuJoCo scene that is touched, and each device as a stylus whose tip is where the device is."""
+
+    def __init__(self, world: World, force_limit: Array, size: tuple[int, int] = _SIZE) -> None:
+        self.force_limit = force_limit
+        self.model = copy.deepcopy(world.model)  # the loop changes its own while a window draws
+        self.model.vis.global_.offwidth, self.model.vis.global_.offheight = size
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_forward(self.model, self.data)
+        self._bodies = [self.model.body(contact.body).id for contact in world.contacts]
+        self._rest = [self.data.xpos[body].copy() for body in self._bodies]
+        self._along = [np.array(contact.along) for contact in world.contacts]  # (axes, 3) each
+        self._x = [np.zeros(len(along)) for along in self._along]
+        self.model.vis.headlight.ambient[:], self.model.vis.headlight.diffuse[:] = 0.45, 0.5
+        away = [rest - self.model.stat.center + (0.0, 0.0, 0.2 * self.model.stat.extent) for rest in self._rest]
+        length = 0.45 * self.model.stat.extent
+        self._stylus = [length * one / max(float(np.linalg.norm(one)), 1e-9) for one in away]  # from tip to handle [m]
+
+    def show(self, frame: Frame) -> None:
+        """Put the bodies where they are in a frame."""
+        assert frame.pose is not None
+        self.data.qpos[:] = frame.pose
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        self._x = self._by_device(frame.q)
+
+    def _by_device(self, values: Array) -> list[Array]:
+        return np.split(values[: sum(map(len, self._along))], np.cumsum([len(a) for a in self._along])[:-1])
+
+    def grip(self, perturb: mujoco.MjvPerturb) -> Grip | None:
+        """What the mouse holds: a contact, with its first direction."""
+        held = int(perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
+        if perturb.select not in self._bodies or not held:
+            return None
+        i = self._bodies.index(perturb.select)
+        drawn = np.array(perturb.refselpos) - self._rest[i]
+        return Grip(sum(map(len, self._along[:i])), float(self._along[i][0] @ drawn))
+
+    def draw(self, drawn: mujoco.MjvScene, frame: Frame) -> None:
+        """A stylus for each device, and arrows at its handle for the force on it and what pushes it."""
+        size = 0.045 * self.model.stat.extent
+        forces, pushes = self._by_device(frame.mean), self._by_device(frame.push)
+        for i, (along, x) in enumerate(zip(self._along, self._x, strict=True)):
+            own, tip = _colour(i), self._rest[i] + x @ along
+            at, reach = tip + self._stylus[i], 25 * size / float(np.min(self.force_limit))
+            _connect(drawn, _BAR, size / 5, tip, at, (*_GREY, 1.0))
+            _sphere(drawn, at, size, (*own, 1.0))
+            _connect(drawn, _ARROW, size / 3, at, at - reach * forces[i] @ along, (*own, 1.0))
+            _connect(drawn, _ARROW, size / 4, at, at + reach * pushes[i] @ along, (0.1, 0.1, 0.1, 1.0))
+
+    def aim(self, camera: mujoco.MjvCamera) -> None:
+        """Look from the camera of the scene, or from the front and somewhat above."""
+        mujoco.mjv_defaultFreeCamera(self.model, camera)
+        if self.model.ncam:
+            camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
+        else:
+            camera.azimuth, camera.elevation, camera.distance = 110.0, -20.0, 2.8 * self.model.stat.extent
+
+
+def stage_for(session: LiveLoop) -> ShownScene:
+    """What shows this loop."""
+    simulation = session.prepared.simulation
+    if session.world:
+        return ShownWorld(session.world.ports[0].world, simulation.process.force_limit)
+    return ShownScene(simulation.scene, simulation.process.force_limit)
 
 
 def _dressed(scene: Scene, size: tuple[int, int] = _SIZE) -> mujoco.MjModel:
@@ -274,6 +355,13 @@ def _arrow(drawn: mujoco.MjvScene, at: Array, length: float, rgba: tuple[float, 
         _connect(drawn, _ARROW, 0.005, at, at + np.array([length, 0, 0]), rgba)
 
 
+def _sphere(drawn: mujoco.MjvScene, at: Array, radius: float, rgba: tuple[float, ...]) -> None:
+    if drawn.ngeom < drawn.maxgeom:
+        geom, colour = drawn.geoms[drawn.ngeom], np.array(rgba, dtype=np.float32)
+        mujoco.mjv_initGeom(geom, _SPHERE, np.full(3, radius), np.asarray(at, float), np.eye(3).ravel(), colour)
+        drawn.ngeom += 1
+
+
 def _connect(
     drawn: mujoco.MjvScene, shape: mujoco.mjtGeom, width: float, a: Array, b: Array, rgba: tuple[float, ...]
 ) -> None:
@@ -330,7 +418,7 @@ def show(session: LiveLoop, stage: ShownScene, until: float | None = None) -> No
     try:
         with window:
             with window.lock():
-                stage.aim(window.cam, (0.0, 0.0, 0.2), 3.0)  # between the words and the plots
+                stage.aim(window.cam)
             _loop(session, stage, window, time.perf_counter, time.sleep, until)
     finally:  # the viewer must have left OpenGL before Python ends
         for thread in set(threading.enumerate()) - threads:
@@ -359,7 +447,7 @@ def _loop(
 def _shown(stage: ShownScene, window: viewer.Handle, frame: Frame) -> Grip | None:
     """Show a frame, and return what the mouse holds afterwards."""
     with window.lock():
-        stage.show(frame.q)
+        stage.show(frame)
         grip = stage.grip(window.perturb)
         if window.user_scn is not None:
             window.user_scn.ngeom = 0
@@ -411,9 +499,15 @@ class FlatPictures:
             pen.text((8, top), label, _BLACK, self._font)
             pen.text((130, top), value, _BLACK, self._font)
             top += 15
-        self._bodies(pen, frame, max(top, round(_WORDS * height)), below)
+        self._scene(image, frame, top, below)
         self._forces(pen, frame, below + 18, height - 18)
         return np.asarray(image)
+
+    def close(self) -> None:
+        """Free what drew the pictures."""
+
+    def _scene(self, image: Image.Image, frame: Frame, top: int, bottom: int) -> None:
+        self._bodies(ImageDraw.Draw(image), frame, max(top, round(_WORDS * image.height)), bottom)
 
     def _bodies(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
         steps = max(self._places) + 2
@@ -458,6 +552,61 @@ class FlatPictures:
             for j in np.flatnonzero(np.isfinite(low[:, i])):
                 ends = middle - np.array([low[j, i], high[j, i]]) / most * (bottom - top) / 2
                 pen.line((x[j], ends[0], x[j], ends[1] - 1), _rgb(_colour(i)), 2)
+
+
+class WorldPictures(FlatPictures):
+    """Frames of a MuJoCo scene with the devices in it, rendered without a display, and the forces."""
+
+    def __init__(self, stage: ShownWorld, scene: Scene, force_limit: Array, size: tuple[int, int] = _SIZE) -> None:
+        """Raises InputError where there is no OpenGL."""
+        super().__init__(scene, force_limit)
+        self.stage, self._gl = stage, _offscreen(*size)
+        self._gl.make_current()
+        self._drawn = mujoco.MjvScene(stage.model, maxgeom=10_000)
+        self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
+        stage.aim(self._camera)
+        self._context = mujoco.MjrContext(stage.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+
+    def rendered(self, frame: Frame, width: int, height: int) -> Picture:
+        """(height, width, 3): scene and devices alone."""
+        stage, size = self.stage, mujoco.MjrRect(0, 0, width, height)
+        stage.show(frame)
+        whole = int(mujoco.mjtCatBit.mjCAT_ALL)
+        pixels, depth = np.empty((height, width, 3), dtype=np.uint8), np.empty((height, width), dtype=np.float32)
+        mujoco.mjv_updateScene(stage.model, stage.data, self._option, None, self._camera, whole, self._drawn)
+        stage.draw(self._drawn, frame)
+        self._gl.make_current()
+        mujoco.mjr_render(size, self._drawn, self._context)
+        mujoco.mjr_readPixels(pixels, depth, size, self._context)
+        pixels[(depth == depth.max()) & (depth.max() > 0.999)] = 255  # nothing is there
+        return pixels[::-1]
+
+    def close(self) -> None:
+        """Free the renderer, whose numbers for textures the next one would share."""
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()
+
+    def _scene(self, image: Image.Image, frame: Frame, top: int, bottom: int) -> None:
+        image.paste(Image.fromarray(self.rendered(frame, image.width, bottom - top - 8)), (0, top + 4))
+
+
+def pictures_for(session: LiveLoop) -> FlatPictures:
+    """What draws the pictures of this loop's film. Raises InputError where a world needs OpenGL and there is none."""
+    simulation, stage = session.prepared.simulation, stage_for(session)
+    make = partial(WorldPictures, stage) if isinstance(stage, ShownWorld) else FlatPictures
+    return make(simulation.scene, simulation.process.force_limit)
+
+
+def _offscreen(width: int, height: int) -> Any:
+    """An OpenGL context without a window, by EGL or OSMesa. Raises InputError."""
+    for kind in ("egl", "osmesa", "cgl"):
+        try:
+            return import_module(f"mujoco.{kind}").GLContext(width, height)
+        except Exception:
+            continue
+    raise InputError("--video: a scene is rendered by OpenGL, and neither EGL nor OSMesa is here (libegl1)")
 
 
 def _rgb(parts: _Colour) -> tuple[int, int, int]:

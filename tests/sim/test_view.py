@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import sys
 import threading
 from concurrent.futures import Executor, Future
@@ -14,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from haptic_loop import simulate
 from haptic_loop.cli import view as command
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.result import Chosen
@@ -29,6 +31,7 @@ from haptic_loop.sim.view.session import (
     _STIFFNESS,
     GIVEN,
     KEYS,
+    Couple,
     Grip,
     LiveLoop,
     Menu,
@@ -56,6 +59,8 @@ from haptic_loop.sim.view.stage import (
     _scale,
     _typed,
     keys_help,
+    pictures_for,
+    stage_for,
 )
 
 SCENARIO = load()
@@ -291,7 +296,7 @@ def test_the_mouse_draws_the_handle_and_lets_it_go():
 def test_the_viewer_s_selection_is_a_grip(none):
     stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     q = np.array([0.001, 0.002, 0.003, 0.004])
-    stage.show(q)
+    stage.show(replace(session(none).frame(0.0), q=q))
     perturb = mujoco.MjvPerturb()
     assert stage.grip(perturb) is None
     motor, handle = stage.model.body("device_2/motor").id, none.simulation.scene.handles[1]
@@ -586,3 +591,72 @@ def test_without_a_display_there_is_a_line(monkeypatch):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(InputError, match=r"no window can be opened: .*; --video FILE\.gif needs no window"):
         run("--coupling", "none")
+
+
+# MuJoCo worlds
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return first_loop(Menu("I"), load("world-ball"), "moving-average")
+
+
+def test_a_world_is_felt_live_as_in_a_run(ball):
+    """The session delays forces by itself; sim.run does it by packets."""
+    running = LiveLoop(ball, Inline(), (), math.inf)
+    trace = simulate(ball.scenario.replace(duration=0.5), ball.coupling, engine="exact")
+    frame = running.frame(0.5)
+    np.testing.assert_allclose(frame.history, trace.f, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(frame.q[:2], trace.x[-1], rtol=0, atol=1e-4)  # one tick later
+    assert frame.world.ticks == 500
+    assert frame.world.given_J == pytest.approx(trace.meta["world"]["given_J"], abs=1e-12)
+
+
+def test_a_change_begins_the_scene_anew(ball):
+    running = LiveLoop(ball, Inline(), parse_script("0.3:theta+1 0.4:none 0.45:spring-damper", 2)[:1], math.inf)
+    assert np.abs(running.frame(0.3).pose).max() > 1e-4
+    later = running.frame(0.301)
+    assert later.prepared.scenario.theta == (2, 3)
+    assert np.abs(later.pose).max() < 1e-4
+    assert np.abs(later.q).max() < 1e-4
+    running.keys.put(Couple("none"))
+    running.frame(0.31)
+    assert "needs a coupling" in running.frame(0.32).note
+
+
+def test_the_window_shows_scene_and_devices(ball):
+    running = LiveLoop(ball, Inline())
+    stage = stage_for(running)
+    window, time = FakeWindow(40, stage), [0.0]
+
+    def sleep(seconds):
+        time[0] += 1 / 60
+        if time[0] > 0.3:
+            window.perturb.select = stage.model.body("finger 2").id
+            window.perturb.active = int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
+            window.perturb.refselpos[:] = stage._rest[1] + (0.03, 0.0, 0.0)
+
+    _loop(running, stage, window, lambda: time[0], sleep)
+    words = window.said[-1][0][2]
+    assert "energy shell" in words
+    assert "growth" not in words
+    assert "push" in words
+    assert window.user_scn.ngeom >= 4  # two styluses of two shapes
+    np.testing.assert_array_equal(stage.data.qpos, running.frame(0).pose)
+    assert stage.grip(window.perturb) == Grip(1, pytest.approx(0.03))
+
+
+def test_a_film_of_a_world_shows_the_scene(ball, tmp_path, capsys):
+    running = LiveLoop(ball, Inline(), (), math.inf)
+    try:
+        artist = pictures_for(running)
+    except InputError:
+        pytest.skip("no OpenGL here")
+    with contextlib.closing(artist):
+        first, last = (artist.rendered(running.frame(t), 160, 120).astype(int) for t in (0.0, 1.0))
+    assert (first == 255).all(axis=2).mean() > 0.3  # nothing behind the scene
+    assert (first != last).any(axis=2).sum() > 100
+    run("--scenario", "world-peg", "--duration", "0.4", "--video", str(tmp_path / "a.gif"))
+    with Image.open(tmp_path / "a.gif") as image:
+        assert (image.size, image.n_frames) == ((640, 640), 5)
+    assert "a world, certified (any-environment)" in capsys.readouterr().out

@@ -253,7 +253,7 @@ def test_a_design_for_a_world_is_proved_exactly(tmp_path, capsys):
     assert stored.loop.environment.world.file == "door.xml"
 
 
-@pytest.mark.parametrize("words", ["view", "zwidth", "compare", "bridge --rehearse", "accuracy"])
+@pytest.mark.parametrize("words", ["zwidth", "compare", "accuracy"])
 def test_other_commands_refuse_a_world_in_one_line(words):
     name, *options = words.split()
     with pytest.raises(InputError, match="takes networks only") as caught:

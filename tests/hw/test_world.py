@@ -1,0 +1,129 @@
+"""MuJoCo worlds behind the protocol of a device: the account at the contacts, from what was sent."""
+
+import json
+
+import numpy as np
+import pytest
+
+from haptic_loop.cli import bridge
+from haptic_loop.controller.budget import Shell
+from haptic_loop.controller.coupling import SpringDamper
+from haptic_loop.controller.lti import Lti
+from haptic_loop.hw.control import WorldController
+from haptic_loop.hw.recording import load as read
+from haptic_loop.hw.rehearsal import rehearse
+from haptic_loop.sim.scenario import InputError, load
+
+DRIVEN = """<mujoco><option gravity="0 0 0"/><worldbody>
+<body name="left" pos="-0.03 0 0"><geom type="sphere" size="0.01"/></body>
+<body name="right" pos="0.03 0 0"><geom type="sphere" size="0.01"/></body>
+<body name="load"><joint name="j" type="slide" axis="1 0 0"/><geom type="box" size="0.019 0.05 0.05" mass="0.3"/></body>
+</worldbody><actuator><velocity joint="j" kv="-60"/></actuator></mujoco>"""
+
+
+def session(tmp_path, capsys, *words):
+    code = bridge.main(["--rehearse", "--no-plot", "--out", str(tmp_path / "out"), *words])
+    return code, json.loads((tmp_path / "out" / "report.json").read_text()), " ".join(capsys.readouterr().out.split())
+
+
+def driven(tmp_path):
+    """A scene whose motor gives energy for ever."""
+    (tmp_path / "driven.xml").write_text(DRIVEN)
+    (tmp_path / "loop.toml").write_text(
+        """name = "driven"
+T = 1e-3
+theta = [1, 1]
+device = [{ kind = "rigid", mass = 0.25, damping = 1.37, force_limit = 12.0 },
+          { kind = "rigid", mass = 0.25, damping = 1.37, force_limit = 12.0 }]
+[environment]
+world = "driven.xml"
+contacts = ["left", "right"]
+[[human]]
+links = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]
+voluntary = { amplitude = 0.03, frequency = 0.5, phase = 0.0, ease = 0.5 }
+[[human]]
+links = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]
+"""
+    )
+    return tmp_path / "loop.toml"
+
+
+def account(trace, link, coupling, T):
+    """The least sum of f'(u - u_-) [J] with f as it was sent and u = x - V f, without the program's shell."""
+    V: Lti = coupling.compliance(T)
+    f = -4e-4 * link["sent"]
+    state, before, total, least = np.zeros(V.order), np.zeros(2), 0.0, 0.0
+    for x, force in zip(trace.x, f, strict=True):
+        u = x - (V.C @ state + V.D @ force)
+        state = V.A @ state + V.B @ force
+        total, before = total + force @ (u - before), u
+        least = min(least, total)
+    return least
+
+
+def test_a_world_is_rehearsed_behind_its_shell(tmp_path, capsys):
+    code, report, shown = session(tmp_path, capsys, "--scenario", "world-ball", "--duration", "1")
+    (world,) = report["world"]
+    assert code == 0
+    assert "no passive hand is given more than W0 = 2 mJ" in shown
+    assert "us at the median" in shown
+    assert world["ticks_acted"] == 0
+    assert world["step_us"]["p50"] > 0
+    assert world["given_J"] <= 2e-3 + world["released_J"]
+
+
+@pytest.mark.parametrize("budget", [0.002, 0.02])
+def test_an_active_scene_is_held_back_on_hardware(tmp_path, capsys, budget):
+    """A motor with negative damping: forces are whole steps of 0.4 mN, and the account still holds."""
+    words = ("--scenario", str(driven(tmp_path)), "--duration", "1.5", "--energy-budget", str(budget))
+    _, report, _ = session(tmp_path, capsys, *words)
+    (world,) = report["world"]
+    trace, link = read(tmp_path / "out" / "trace.npz")
+    coupling = read_coupling_of(trace)
+    assert world["ticks_acted"] > 10
+    assert np.abs(link["sent"]).max() > 100
+    least = account(trace, link, coupling, 1e-3)
+    assert least == pytest.approx(world["port_least_J"], abs=1e-12)
+    assert -budget - 1e-12 <= least < -0.9 * budget
+    assert world["given_J"] <= budget + world["released_J"] + 1e-12
+
+
+def read_coupling_of(trace):
+    from haptic_loop.hw.recording import _recipes_of
+
+    (recipe,) = _recipes_of(trace)
+    return recipe.coupling.build(recipe.scenario.T)
+
+
+def test_the_host_delays_what_waits_longer_than_the_link():
+    world = WorldController(load("world-ball"), SpringDamper([800.0, 800.0], [0.4, 0.4]), 0.0, [2.0, 2.0], [0, 3])
+    sent = [world.later((k, 10 * k), 1) for k in range(1, 6)]
+    assert sent == [(1, 0), (2, 0), (3, 0), (4, 10), (5, 20)]
+    assert world.later((9, 90), 3) == (9, 50)  # two ticks had no answer: the force before is held
+
+
+def test_a_force_in_steps_never_overdraws_the_shell():
+    V, rng, step = SpringDamper([500.0, 700.0], [0.5, 0.4]).compliance(1e-3), np.random.default_rng(0), 0.05
+    shell, dearer = Shell(V, start=1e-4), 0
+    for _ in range(2000):
+        shell.free(1e-3 * rng.normal(size=(2, 1)))
+        wanted = step * np.round(rng.normal(size=(2, 1)) / step)
+        force, _ = shell.limit(wanted, lambda f, w=wanted: np.where(f == w, f, step * np.trunc(f / step)))
+        assert np.abs(force / step - np.round(force / step)).max() < 1e-9
+        assert shell.energy[0] >= -1e-18
+        dearer += bool((force == 0).all())
+    assert 0 < dearer < 2000
+
+
+def test_a_session_in_a_world_has_no_replay(tmp_path, capsys):
+    from haptic_loop.cli import replay
+
+    session(tmp_path, capsys, "--scenario", "world-peg", "--duration", "0.2")
+    with pytest.raises(InputError, match="MuJoCo world, which is not in the trace"):
+        replay.main([str(tmp_path / "out" / "trace.npz")])
+
+
+def test_a_rehearsal_from_python_takes_a_world():
+    rehearsed = rehearse(load("world-door"), seconds=0.3)
+    assert rehearsed.stage == "finished"
+    assert rehearsed.assessment.guarantee.energy_J == 2e-3
