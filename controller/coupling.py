@@ -16,11 +16,12 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haptic_loop.controller.arithmetic import Number, numbers
+from haptic_loop.controller.arithmetic import Number, inverse, numbers, positive_definite, times
 from haptic_loop.controller.lti import Array, Block, Complex, Lti, ReadOnly, Sampled, as_like, frozen, taps
 
 _LARGEST_COEFFICIENT = 1e12  # largest coefficient of a stored coupling, SI units
 _MOST_TERMS = 2000  # longest moving average; each term is a state
+_ROUNDING = 1e-12  # that a damping matrix may miss of being semidefinite, relatively
 _LARGEST_WEIGHT = 1e9  # largest weight of a force filter; larger ones would overflow in the sweep
 _Rows = tuple[tuple[float, ...], ...]
 
@@ -192,6 +193,52 @@ class SpringDamper(ReadOnly, Coupling):
 
     def _beta(self, T: Number) -> Any:
         return 0 if self.cutoff is None else 1 / (1 + 2 * np.pi * self.cutoff * T)
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixSpringDamper(ReadOnly, Coupling):
+    """V = [K + B (z-1)/(Tz)]^-1 with symmetric matrices, springs and dampers between the axes of devices (26).
+
+    Raises:
+        ValueError: K is not symmetric and positive definite, or B not symmetric and positive semidefinite.
+    """
+
+    K: Array  # (m, m) [N/m]
+    B: Array  # (m, m) [N s/m]
+
+    kind = "matrix-spring-damper"
+
+    if TYPE_CHECKING:
+
+        def __init__(self, K: ArrayLike, B: ArrayLike) -> None: ...
+
+    def __post_init__(self) -> None:
+        for name in "KB":
+            object.__setattr__(self, name, frozen(getattr(self, name), 2, name))
+            values = getattr(self, name)
+            _require_sensible(name, values)
+            if values.shape != (len(self.K),) * 2 or not values.size or (values != values.T).any():
+                raise ValueError(f"{name} is {values.tolist()}, expected a symmetric matrix with a row per channel")
+        if not positive_definite(numbers(self.K, Fraction(1))):
+            raise ValueError(f"K is {self.K.tolist()}, expected a positive definite matrix in N/m")
+        if np.linalg.eigvalsh(self.B)[0] < -_ROUNDING * np.abs(self.B).max():
+            raise ValueError(f"B is {self.B.tolist()}, expected a positive semidefinite matrix in N s/m")
+
+    def compliance(self, T: Number) -> Lti:
+        """Return V(z), with a state per axis that has a damper."""
+        step, at = numbers(self.B, T) / T, np.flatnonzero(self.B.any(axis=0))
+        gain = inverse(numbers(self.K, T) + step)
+        memory = times(gain, step[:, at])
+        return Lti(memory[at], gain[at], memory, gain, T)
+
+    def figures(self, T: float) -> dict[str, Any]:
+        return {"K": self.K.tolist(), "B": self.B.tolist()} | super().figures(T)
+
+    def scaled(self, stiffness: float = 1.0, damping: float = 1.0) -> MatrixSpringDamper:
+        return MatrixSpringDamper(stiffness * self.K, damping * self.B)
+
+    def form(self) -> _MatrixSpringDamperForm:
+        return _MatrixSpringDamperForm(_rows(self.K), _rows(self.B))
 
 
 def _spring_damper(k: Array, b: Array, beta: Any, T: Number) -> Lti:
@@ -546,6 +593,23 @@ class _SpringDamperForm(Strict, frozen=True, tag_field="kind", tag="spring-dampe
         return SpringDamper(self.K, self.B)
 
 
+class _MatrixSpringDamperForm(Strict, frozen=True, tag_field="kind", tag="matrix-spring-damper"):
+    """The form of springs and dampers between the axes of devices (26)."""
+
+    K: _Rows  # (m, m) [N/m]
+    B: _Rows  # (m, m) [N s/m]
+
+    def __post_init__(self) -> None:
+        self.build(1.0)
+
+    @property
+    def shape(self) -> tuple[str, int, int]:
+        return "K", len(self.K), len(self.K)
+
+    def build(self, T: float) -> MatrixSpringDamper:
+        return MatrixSpringDamper(*(_table(name, getattr(self, name), *(len(self.K),) * 2) for name in "KB"))
+
+
 class _MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-average"):
     """The form of a moving sum of the forces and a plain spring per channel."""
 
@@ -627,7 +691,15 @@ class _ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter"
         return ForceFilter(self.poles, self.pairs, self.R)
 
 
-Form = _NoForm | _SpringDamperForm | _MovingAverageForm | _ComplianceForm | _InternalModelForm | _ForceFilterForm
+Form = (
+    _NoForm
+    | _SpringDamperForm
+    | _MatrixSpringDamperForm
+    | _MovingAverageForm
+    | _ComplianceForm
+    | _InternalModelForm
+    | _ForceFilterForm
+)
 
 
 def require_channels(form: Form, m: int) -> None:
@@ -638,7 +710,7 @@ def require_channels(form: Form, m: int) -> None:
         raise ValueError(f"{shape[0]} {size}, the environment has {m} contacts")
 
 
-def _require_sensible(name: str, rows: _Rows) -> None:
+def _require_sensible(name: str, rows: _Rows | Array) -> None:
     """Raise ValueError if a coefficient is so large that a sweep would overflow."""
     for value in (value for row in rows for value in row):
         if not abs(value) <= _LARGEST_COEFFICIENT:

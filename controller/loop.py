@@ -11,6 +11,7 @@ It computes nothing in time: the tick is controller.tick.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import Annotated, Any
 
@@ -23,7 +24,7 @@ from haptic_loop.controller.coupling import Coupling, Strict
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import RIGID_WALL, Environment, Network, RigidWall, walled_environment
 from haptic_loop.controller.law import Law, Limiter
-from haptic_loop.controller.lti import Block, Complex, Lti, Sampled, as_like
+from haptic_loop.controller.lti import Array, Block, Complex, Lti, Sampled, as_like
 from haptic_loop.controller.ranges import Member, Ranges, members
 
 MOST_SAMPLES = 1000  # of delay on a channel; every one is a state
@@ -177,10 +178,25 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         ends = np.cumsum(self.axes or (1,) * self.channels).tolist()
         return tuple(slice(first, last) for first, last in zip([0, *ends[:-1]], ends, strict=True))
 
+    def per_device(self, values: ArrayLike) -> Array:
+        """The least of the values (m,) of each device's channels."""
+        return np.minimum.reduceat(np.asarray(values, dtype=float), [own.start for own in self.devices])
+
+    def per_channel(self, values: Sequence[Any]) -> tuple[Any, ...]:
+        """A value per device as one per channel."""
+        return tuple(v for v, n in zip(values, self.axes or (1,) * self.channels, strict=True) for _ in range(n))
+
+    @property
+    def least_damping(self) -> tuple[float, ...]:
+        """The least eigenvalue of each Delta_i [N s/m]: the damping that every direction of a device has."""
+        if self.levels is None:
+            return tuple(self.per_device(self.delta).tolist())
+        return tuple(float(np.linalg.eigvalsh(np.array(level))[0]) for level in self.levels)
+
     def Delta(self, exact: bool = False) -> Any:
         """Delta_D = blockdiag(Delta_1, ..) (3) [N s/m], (m, m), which the devices guarantee."""
         T = self.period(exact)
-        out = np.diag(numbers(self.delta, T))
+        out = numbers(np.diag(self.delta), T)
         for own, level in zip(self.devices, self.levels or (), strict=self.levels is not None):
             out[own, own] = numbers(level, T)
         return out

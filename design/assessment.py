@@ -276,11 +276,12 @@ def _by_its_own_block(
     if not requirement.certified:
         needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
         return ForceLimits(None, requirement.reason or needs, requirement, c)
+    rho = loop.per_channel(limiter.rho(loop))
     try:
         proved = prove(loop, coupling, limiter, swept=requirement)
     except NotProved as refused:
-        return ForceLimits(limiter.rho(loop), f"swept, not proved: {refused}", requirement, c)
-    return ForceLimits(limiter.rho(loop), _OWN_PROOF, replace(requirement, proof="rational"), c, proved)
+        return ForceLimits(rho, f"swept, not proved: {refused}", requirement, c)
+    return ForceLimits(rho, _OWN_PROOF, replace(requirement, proof="rational"), c, proved)
 
 
 # ----------------------------------------------------------------------------------------------------

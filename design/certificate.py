@@ -259,7 +259,7 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
     if certificate is None:
         return None
     if certificate.limiter:
-        return certificate.multipliers["rho"]
+        return loop.per_channel(certificate.multipliers["rho"])
     known = _NAMED.get(certificate.condition)
     return known.lag(loop) if known else None
 
@@ -284,8 +284,8 @@ def condition_of(certificate: Certificate, own: Condition | None = None) -> Cond
     if not base.extensible:
         raise ValueError(f"facts: {certificate.condition} needs no multiplier for limited forces, and one is on file")
     rho, c = (certificate.multipliers.get(name, ()) for name in ("rho", "c"))
-    if not rho or len(rho) != len(certificate.available) or len(c) % len(rho):
-        raise ValueError(f"multipliers: rho has {len(rho)} numbers and c {len(c)}, expected as many for each channel")
+    if not rho or len(rho) > len(certificate.available) or len(c) % len(rho):
+        raise ValueError(f"multipliers: rho has {len(rho)} numbers and c {len(c)}, expected as many for each device")
     return LimitedForces(lags=len(c) // len(rho), held=rho)
 
 

@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers
+from haptic_loop.controller.arithmetic import Number, SingularLoop, inverse, numbers
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay, moving_sum
 from haptic_loop.controller.loop import Loop
@@ -42,7 +42,7 @@ from haptic_loop.controller.ranges import Member
 from haptic_loop.design.arguments import shown
 from haptic_loop.design.facts import compose
 from haptic_loop.design.files import InputError
-from haptic_loop.design.frame import Demand, even_damping
+from haptic_loop.design.frame import Demand, even_damping, even_level
 from haptic_loop.design.frequency import (
     Response,
     frequencies,
@@ -69,8 +69,9 @@ def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
 
 
 def theta_hat(theta: Sequence[int], damping: Any, T: Number) -> Lti:
-    """Theta-hat (12), diag(T/(2 damping_i)) (1 + 1/z + ... + z^-theta_i): what delays take of damping (m,) [N s/m]."""
-    return np.diag(T / (2 * damping)) @ moving_sum(theta, T)
+    """Theta-hat (12), T/2 Delta^-1 (1 + 1/z + ... + z^-theta_i): what delays take of Delta (m, m) or its diagonal."""
+    weight = np.diag(T / (2 * damping)) if np.ndim(damping) == 1 else T / 2 * inverse(damping)
+    return weight @ moving_sum(theta, T)
 
 
 def v_hat(H: Block) -> tuple[Array, Block]:
@@ -84,6 +85,10 @@ def v_hat(H: Block) -> tuple[Array, Block]:
     return H1, -regular
 
 
+#: Why a condition says nothing of devices whose levels Delta_i are not diagonal.
+FULL_LEVELS = "levels: it is derived for devices whose Delta_i is diagonal"
+
+
 def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | None = None) -> Demand[Block]:
     """Theorem 4 for the damping s Delta_D, times s; with the multiplier phi (m,) [N s/m] that psi >= 1 needs.
 
@@ -92,6 +97,8 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     He[[T v_hat(H), 0], [2 H, Delta_V^-1]] >= 0, without rows of the second kind where phi is 0. Damping enters by
     Theta-hat and Delta_D^-1, in proportion to 1/s. Raises ValueError for a phi that is not a multiplier.
     """
+    if phi is not None and loop.levels:
+        raise ValueError(FULL_LEVELS)
     T, damping = V.T, even_damping(loop, V.T)
     shortage = numbers([0] * loop.channels if phi is None else phi, T)
     if len(shortage) != len(damping) or not ((shortage >= 0) & (shortage < damping)).all():
@@ -107,7 +114,8 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
         return H1, hstack(vstack(T * regular, (2 * H).rows(paid)), constant_like(H, corner))
 
     V1, gain = excess(V, shortage)
-    _, taken = excess(as_like(V, theta_hat(loop.theta, damping, T)), damping)
+    level = even_level(loop, T) if loop.levels else damping
+    _, taken = excess(as_like(V, theta_hat(loop.theta, level, T)), damping)
     return Demand(-taken, gain, {"V(1)": V1})
 
 

@@ -297,7 +297,7 @@ class ThisEnvironment(Multiplied):
         units = next(each.units for each in unknowns if each.name == "alpha")
         tried = []
         for share in _SHARES if 2 * m > _MOST_ROWS else (1.0,):
-            alpha = np.maximum(share * most, 1e-8 * np.array(units)).tolist()
+            alpha = np.maximum(share * -loop.per_device(-most), 1e-8 * np.array(units)).tolist()
             tried.append([v for part in others for v in (part or alpha)])
         return min(tried, key=lambda values: float(least_scale(self.block(G, loop, values), w).max()))
 
@@ -442,11 +442,11 @@ BETA = 0.01  # of a limiter's lag under this-environment unless another is asked
 
 @dataclass(frozen=True)
 class LimitedForces(ThisEnvironment):
-    """this-environment also while forces are limited, by a limiter of lag rho = beta delta/T."""
+    """this-environment also while forces are limited, by a limiter of lag rho_i = beta lambda_min(Delta_i)/T."""
 
     beta: float = BETA
-    lags: int = 1  # weights c_ij per channel
-    held: tuple[float, ...] | None = None  # (m,) rho [N/m] where it is given, as by a certificate
+    lags: int = 1  # weights c_ij per device
+    held: tuple[float, ...] | None = None  # rho [N/m] per device where it is given, as by a certificate
     name, covers = "limiter", ("psi", "T_max", "latency", "varying_delay", "walls")
 
     def __post_init__(self) -> None:
@@ -456,8 +456,8 @@ class LimitedForces(ThisEnvironment):
             raise ValueError(f"limiter: rho is {list(self.held)}, expected positive numbers in N/m")
 
     def rho(self, loop: Loop) -> tuple[float, ...]:
-        """(m,) [N/m], to six digits, which the damping in a sweep does not scale."""
-        return self.held or tuple(float(f"{self.beta * d / loop.T:.6g}") for d in loop.delta)
+        """Per device [N/m], to six digits, which the damping in a sweep does not scale."""
+        return self.held or tuple(float(f"{self.beta * d / loop.T:.6g}") for d in loop.least_damping)
 
     @property
     def base(self) -> str:
@@ -470,9 +470,10 @@ class LimitedForces(ThisEnvironment):
         return (*super().facts(loop), Limiter(self.rho(loop), self.lags))
 
     def rows(self, loop: Loop, multiplier: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
-        """c as a row per channel, of one entry per lag: the last numbers, after those of walls and switching delays."""
-        c = tuple(multiplier)[len(multiplier) - loop.channels * self.lags :] if multiplier else ()
-        return tuple(c[i * self.lags : (i + 1) * self.lags] for i in range(loop.channels))
+        """c as a row per device, of one entry per lag: the last numbers, after those of walls and switching delays."""
+        devices = len(loop.devices)
+        c = tuple(multiplier)[len(multiplier) - devices * self.lags :] if multiplier else ()
+        return tuple(c[i * self.lags : (i + 1) * self.lags] for i in range(devices))
 
     def not_designed(self, loop: Loop) -> str | None:
         """Return why no design spends the damping on this condition, which judges more loops, or None."""
@@ -497,6 +498,6 @@ LIMITER = LimitedForces()
 
 def beta_of(loop: Loop, certificate: Certificate) -> float:
     """beta of the limiter that a certificate covers, for another one like it; the usual one where it has none."""
-    rho = certificate.multipliers.get("rho", ())
-    beta = float(f"{rho[0] * loop.T / certificate.available[0]:.6g}") if rho else BETA
+    rho, share = certificate.multipliers.get("rho", ()), loop.least_damping[0] / loop.delta[0]
+    beta = float(f"{rho[0] * loop.T / (certificate.available[0] * share):.6g}") if rho else BETA
     return beta if 0 < beta <= 1 else BETA

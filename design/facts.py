@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -101,7 +102,7 @@ class EvenPeriods(HandsSide):
 
 
 class Latency(HandsSide):
-    """Forces that latch at kT + tau, with any tau in [t1, t2] at every tick and on every channel.
+    """Forces that latch at kT + tau, with any tau in [t1, t2] at every tick and on every device.
 
     The device moves by xa under f[k-1] and then by xb under f[k]. A channel with t2 = 0 has no xa. The shortest
     period must be longer than t2. Where t1 < t2 the multiplier Q weighs the squares of both parts together: any
@@ -118,9 +119,9 @@ class Latency(HandsSide):
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
         if not _varies(loop):
             return ()
-        q11, q22 = (tuple(each) for each in zip(*(_separate(loop, i) for i in range(loop.channels)), strict=True))
+        q11, q22 = (tuple(each) for each in zip(*(_separate(loop, d) for d in range(len(loop.devices))), strict=True))
         q12 = tuple(float(np.sqrt(a * b)) for a, b in zip(q11, q22, strict=True))
-        said = "an entry of Q [1/s] of each channel, 0 where the latency does not vary"
+        said = "an entry of Q [1/s] of each device, 0 where the latency does not vary"
         return (
             Unknowns("q11", q11, said, 0.0, 1e6),
             Unknowns("q12", q12, said, -1e6, 1e6, start=(0.0,) * len(q12)),
@@ -131,9 +132,10 @@ class Latency(HandsSide):
         first, last = (numbers([row[i] for row in loop.latency or ()], T) for i in (0, 1))
         late, damping = [i for i, t in enumerate(last) if t], numbers(loop.delta, T)
         form = np.diag(np.concatenate([damping[late] / last[late], damping / (longest(loop, T) - first)]))
+        device = loop.per_channel(range(len(loop.devices)))
         for a, i in enumerate(late):
             if first[i] < last[i] and "q11" in values:
-                q11, q12, q22 = (numbers(values[name][i], T) for name in ("q11", "q12", "q22"))
+                q11, q12, q22 = (numbers(values[name][device[i]], T) for name in ("q11", "q12", "q22"))
                 b = len(late) + i
                 form[a, a], form[a, b], form[b, a], form[b, b] = (damping[i] * q for q in (q11, q12, q12, q22))
         return form
@@ -141,34 +143,34 @@ class Latency(HandsSide):
     def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
         """s - D Q D with D = diag(tau, T_max - tau)^(1/2), at latencies of the range."""
         found = []
-        for i in _varies(loop):
-            tau = np.linspace(*(loop.latency or ())[i], _LATENCIES)
-            D, Q = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, _entries(values, i)
+        for d in _varies(loop):
+            tau = np.linspace(*_ranges(loop)[d], _LATENCIES)
+            D, Q = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, _entries(values, d)
             found.append(s * np.eye(2) - D[:, :, None] * Q * D[:, None, :])
         return found
 
     def allowed(self, loop: Loop, values: Values) -> Values:
         shrunk = {name: list(values[name]) for name in ("q11", "q12", "q22")}
-        for i in _varies(loop):
-            tau = np.linspace(*(loop.latency or ())[i], _CLOSER)
-            D, Q = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, _entries(values, i)
+        for d in _varies(loop):
+            tau = np.linspace(*_ranges(loop)[d], _CLOSER)
+            D, Q = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, _entries(values, d)
             most = np.linalg.eigvalsh(D[:, :, None] * Q * D[:, None, :]).max()
             for less in _LESS:  # than what rounding of entries and latencies in between cost
                 entries = [float(f"{(1 - less) / most * Q[a, b]:.{_DIGITS}g}") for a, b in ((0, 0), (0, 1), (1, 1))]
-                if _admits(loop, i, entries):
+                if _admits(loop, d, entries):
                     break
             else:
-                entries = [*_separate(loop, i)[:1], 0.0, *_separate(loop, i)[1:]]
+                entries = [*_separate(loop, d)[:1], 0.0, *_separate(loop, d)[1:]]
             for name, entry in zip(shrunk, entries, strict=True):
-                shrunk[name][i] = entry
+                shrunk[name][d] = entry
         return {**values, **shrunk}
 
     def excess(self, loop: Loop, values: Values) -> str | None:
-        for i in _varies(loop):
-            entries = [float(values[name][i]) for name in ("q11", "q12", "q22")]
-            if not _admits(loop, i, entries):
-                first, last = (loop.latency or ())[i]
-                between = f"the latency of channel {i + 1}, {first:g} to {last:g} s"
+        for d in _varies(loop):
+            entries = [float(values[name][d]) for name in ("q11", "q12", "q22")]
+            if not _admits(loop, d, entries):
+                first, last = _ranges(loop)[d]
+                between = f"the latency of device {d + 1}, {first:g} to {last:g} s"
                 return f"q11, q12, q22 are {entries} 1/s, more than {between}, allows"
         return None
 
@@ -179,15 +181,20 @@ _LESS = 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4
 
 
 def _varies(loop: Loop) -> list[int]:
-    """The channels whose latency lies in a range."""
-    return [i for i, (first, last) in enumerate(loop.latency or ()) if first < last]
+    """The devices whose latency lies in a range."""
+    return [d for d, (first, last) in enumerate(_ranges(loop)) if first < last]
 
 
-def _separate(loop: Loop, i: int) -> tuple[float, float]:
+def _ranges(loop: Loop) -> list[tuple[float, float]]:
+    """The latency [s] of every device, which its axes share."""
+    return [loop.latency[own.start] for own in loop.devices] if loop.latency else []
+
+
+def _separate(loop: Loop, d: int) -> tuple[float, float]:
     """Decimals of at most 1/t2 and 1/(T_max - t1) [1/s], which charge both parts of a period apart; 0, 0 without Q."""
-    if i not in _varies(loop):
+    if d not in _varies(loop):
         return 0.0, 0.0
-    (first, last), T = (loop.latency or ())[i], rational(loop.T_max or loop.T)
+    (first, last), T = _ranges(loop)[d], rational(loop.T_max or loop.T)
     found = []
     for longest_part in (rational(last), T - rational(first)):
         q = float(1 / longest_part)
@@ -195,18 +202,18 @@ def _separate(loop: Loop, i: int) -> tuple[float, float]:
     return found[0], found[1]
 
 
-def _entries(values: Values, i: int) -> Array:
-    """Q (2, 2) of a channel."""
-    q11, q12, q22 = (values[name][i] for name in ("q11", "q12", "q22"))
+def _entries(values: Values, d: int) -> Array:
+    """Q (2, 2) of a device."""
+    q11, q12, q22 = (values[name][d] for name in ("q11", "q12", "q22"))
     return np.array([[q11, q12], [q12, q22]])
 
 
-def _admits(loop: Loop, i: int, entries: Sequence[float]) -> bool:
-    """Whether Q <= diag(1/tau, 1/(T_max - tau)) for all tau of channel i, over the rationals.
+def _admits(loop: Loop, d: int, entries: Sequence[float]) -> bool:
+    """Whether Q <= diag(1/tau, 1/(T_max - tau)) for all tau of device d, over the rationals.
 
     That is q11 tau <= 1, q22 (T_max - tau) <= 1, and a quadratic in tau, the determinant, that is nowhere negative.
     """
-    (t1, t2), T = map(rational, (loop.latency or ())[i]), rational(loop.T_max or loop.T)
+    (t1, t2), T = map(rational, _ranges(loop)[d]), rational(loop.T_max or loop.T)
     q11, q12, q22 = map(rational, entries)
     ends = (t1, t2)
     if any(q11 * tau > 1 or q22 * (T - tau) > 1 for tau in ends):
@@ -299,7 +306,9 @@ class Walls(Fact):
 
 
 class Switching(Fact):
-    """Delays that switch within [lo, hi] at every tick and on every channel, weighed by alpha > 0 [N/m].
+    """Delays that switch within [lo, hi] at every tick and on every device, weighed by alpha_i > 0 [N/m] per device.
+
+    Axes of a device share its delay, so that its error may be weighed by alpha_i Delta_i over the mean of its diagonal.
 
     A force that is late by n in [lo, hi] differs from the nominal one by at most half the width times the sum of the
     steps in between; the multiplier weighs that error w against the displacement that the force multiplies.
@@ -309,26 +318,29 @@ class Switching(Fact):
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
         moves = np.array(loop.delays.hi) > np.array(loop.delays.lo)
-        units = tuple((even_damping(loop) / loop.T * moves).tolist())
+        units = tuple(loop.per_device(even_damping(loop) / loop.T * moves).tolist())
         said = "a positive number where the delay varies and 0 elsewhere"
         return (Unknowns("alpha", units, said, 1e-8, 1e6),)
 
     def enter(self, block: Collected[Any], loop: Loop, values: Values) -> None:
-        for i, (lo, hi) in enumerate(zip(loop.delays.lo, loop.delays.hi, strict=True)):
-            if lo == hi:
+        level = loop.Delta(isinstance(block.T, Fraction))
+        for own, alpha in zip(loop.devices, values["alpha"], strict=True):
+            axes, wide = range(own.start, own.stop), loop.delays.hi[own.start] - loop.delays.lo[own.start]
+            if not wide:
                 continue
-            alpha = numbers(values["alpha"][i], block.T)
-            moving = block.moving(i)
-            for g, p in moving:
-                for h, q in moving:
-                    for power, weight in _correlation(p, q):
-                        at_once = power == 0
-                        (block.term if at_once else block.before)(
-                            g, h, -alpha * weight / 2 if at_once else -alpha * weight
-                        )
-            w = block.input("w", i)
-            block.steps(w, i, (hi - lo,))
-            block.term(w, w, 2 * alpha)
+            weights = numbers(alpha, block.T) * (level[own, own] / (np.trace(level[own, own]) / len(axes)))
+            for i in axes:
+                block.steps(block.input("w", i), i, (wide,))
+            for (a, i), (b, j) in itertools.product(enumerate(axes), repeat=2):
+                if not (weight := weights[a, b]):
+                    continue
+                for (g, p), (h, q) in itertools.product(block.moving(i), block.moving(j)):
+                    for power, share in _correlation(p, q):
+                        if power == 0:
+                            block.term(g, h, -weight * share / 2)
+                        else:
+                            block.before(g, h, -weight * share)
+                block.term(block.places["w", i], block.places["w", j], 2 * weight)
 
 
 def _correlation(p: Weights, q: Weights) -> list[tuple[int, Any]]:
@@ -340,7 +352,10 @@ _SPARE = 0.02  # of rho: what the block keeps, however large the damping, so tha
 
 
 class Limiter(Fact):
-    """Forces that leave through the limiter of controller.law, of lag rho > 0 [N/m] per channel."""
+    """Forces that leave through the limiter of controller.law, of lag rho > 0 [N/m] per device.
+
+    One rho and one multiplier c per lag for all axes of a device: that covers a ball and a box of forces.
+    """
 
     name = "limiter"
 
@@ -348,15 +363,15 @@ class Limiter(Fact):
         self.rho, self.lags = tuple(rho), lags
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
-        units = (1.0,) * loop.channels * self.lags
-        return (Unknowns("c", units, "numbers >= 0, as many for each channel", 0.0, 10.0, start=(0.0,) * len(units)),)
+        units = (1.0,) * len(loop.devices) * self.lags
+        return (Unknowns("c", units, "numbers >= 0, as many for each device", 0.0, 10.0, start=(0.0,) * len(units)),)
 
     def enter(self, block: Collected[Any], loop: Loop, values: Values) -> None:
-        for i in range(loop.channels):
+        for i, d in enumerate(loop.per_channel(range(len(loop.devices)))):
             for part, _ in block.moving(i)[-2:]:  # the displacement that the slip is taken off, and the slip
-                block.keep(part, _SPARE * self.rho[i])
-            c = [numbers(v, block.T) for v in values["c"][i * self.lags : (i + 1) * self.lags]]
-            e, rho = block.slip(i), numbers(self.rho[i], block.T)
+                block.keep(part, _SPARE * self.rho[d])
+            c = [numbers(v, block.T) for v in values["c"][d * self.lags : (d + 1) * self.lags]]
+            e, rho = block.slip(i), numbers(self.rho[d], block.T)
             block.force(e, i, (-rho, rho))
             block.steps(e, i, less_advance(block.path[i], 1))
             for j, weight in enumerate(c, start=1):
@@ -365,6 +380,20 @@ class Limiter(Fact):
 
 # ----------------------------------------------------------------------------------------------------
 # The composition.
+
+
+def _levelled(form: Any, inputs: Sequence[Input], loop: Loop, T: Number) -> Any:
+    """The damping's form for matrix levels: q_ab delta_i of the inputs a, b of axis i becomes q_ab Delta_i."""
+    if loop.levels is None:
+        return form
+    level, at = loop.Delta(isinstance(T, Fraction)), {(each.name, each.channel): g for g, each in enumerate(inputs)}
+    out = form.copy()
+    for g, one in enumerate(inputs):
+        for h, other in enumerate(inputs):
+            i, j = one.channel, other.channel
+            if i != j and level[i, j]:
+                out[g, h] = form[g, at[other.name, i]] * level[i, j] / level[i, i]
+    return out
 
 
 def compose(
@@ -411,9 +440,13 @@ def compose(
 
 def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, scaled: bool) -> None:
     """Enter what the hands' side takes; where `scaled`, what its multipliers weigh does not grow with s."""
-    damping, rest = hands.damping(loop, block.T, values), list(hands.rest(loop, block.T, values))
+
+    def form(values: Values) -> Any:
+        return _levelled(hands.damping(loop, block.T, values), block.hands, loop, block.T)
+
+    damping, rest = form(values), list(hands.rest(loop, block.T, values))
     if scaled and (unknowns := hands.unknowns(loop)):
-        idle = hands.damping(loop, block.T, {**values, **{each.name: (0,) * len(each.units) for each in unknowns}})
+        idle = form({**values, **{each.name: (0,) * len(each.units) for each in unknowns}})
         rest[:1] = [damping - idle + (rest[0] if rest else 0)]
         damping = idle
     block.take(damping, rest)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from typing import Any, Generic
 
 import numpy as np
@@ -60,6 +61,13 @@ def even_damping(loop: Loop, T: Number | None = None) -> Any:
     T = loop.T if T is None else T
     damping = numbers(loop.delta, T)
     return damping if loop.T_max is None else damping * (T / numbers(loop.T_max, T))
+
+
+def even_level(loop: Loop, T: Number | None = None) -> Any:
+    """Delta_D T/T_max [N s/m], (m, m), as `even_damping` has its diagonal."""
+    T = loop.T if T is None else T
+    level = loop.Delta(exact=isinstance(T, Fraction))
+    return level if loop.T_max is None else level * (T / numbers(loop.T_max, T))
 
 
 Weights = Sequence[Any]  # w_0 + w_1/z + .. of a row, or w_0 + w_1 z + .. of a displacement

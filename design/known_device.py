@@ -31,7 +31,7 @@ from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import DeviceBounds, Loop
 from haptic_loop.controller.lti import Array, Complex, Lti, hstack, taps, vstack
 from haptic_loop.controller.ranges import Member
-from haptic_loop.design.conditions import Condition, Demand, even_damping, v_hat
+from haptic_loop.design.conditions import FULL_LEVELS, Condition, Demand, even_damping, v_hat
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.exact import require_size
 from haptic_loop.design.frequency import Response, frequencies, hermitian, largest_eigenvalue, on_circle, supremum
@@ -484,6 +484,8 @@ class KnownDevice(Condition):
     def beyond(self, loop: Loop) -> str | None:
         if not loop.known_devices:
             return _NONE
+        if loop.levels:
+            return FULL_LEVELS
         return _NO_SHORTEST if shortest_period(loop) is None else super().beyond(loop)
 
     def without(self, coupling: Coupling) -> str | None:

@@ -310,6 +310,8 @@ class _AnyEnvironment(Condition):
     def beyond(self, loop: Loop) -> str | None:
         if loop.environment.walls and any(loop.psi):
             return "with delay in the environment its multiplier is of a linear one: no walls"
+        if loop.levels and any(loop.psi):
+            return f"{conditions.FULL_LEVELS} where the environment is late (psi >= 1)"
         if loop.varying_delay:
             return "delays that switch are covered in one environment: ask this-environment, or for a constant delay"
         return LATE if loop.latency else None
@@ -342,7 +344,8 @@ class _AnyEnvironment(Condition):
         if reason or V is None:
             return refusal(self.name, loop.delta, reason or self._without(coupling))
         if not any(loop.psi):
-            if channels := coupling.channels(loop.T):
+            channels = None if loop.levels else coupling.channels(loop.T)
+            if channels:
                 return conditions.any_environment_per_channel(channels, loop)
             return conditions.any_environment(V, loop)
         if multiplier is None:
