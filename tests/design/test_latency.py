@@ -165,7 +165,7 @@ def test_forged_weights_are_refused():
     assert verify(msgspec.json.decode(msgspec.json.encode(stored), type=Stored)).proved
     more = {name: (1.01 * first, rest) for name, (first, rest) in stored.certificate.multipliers.items()}
     forged = sealed(change(stored.certificate, multipliers=more))
-    assert "more than the latency of channel 1" in verify(change(stored, certificate=forged)).reason
+    assert "more than the latency of device 1" in verify(change(stored, certificate=forged)).reason
 
 
 def test_a_channel_that_latches_at_the_tick_has_no_row_of_its_own():
