@@ -70,7 +70,7 @@ def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
 
 def theta_hat(theta: Sequence[int], damping: Any, T: Number) -> Lti:
     """Theta-hat (12), T/2 Delta^-1 (1 + 1/z + ... + z^-theta_i): what delays take of Delta (m, m) or its diagonal."""
-    weight = np.diag(T / (2 * damping)) if np.ndim(damping) == 1 else T / 2 * inverse(damping)
+    weight: Any = np.diag(T / (2 * damping)) if np.ndim(damping) == 1 else inverse(2 * damping / T)
     return weight @ moving_sum(theta, T)
 
 
