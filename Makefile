@@ -4,6 +4,7 @@
 # make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on, and the slow pages: half an hour
+# make firmware  the sketches, compiled and run on a simulated ATmega328P and Cortex-M7; the packages that it needs: .ci/run
 # make mutate  small mistakes in what verdicts rest on, and whether a test notices: about ten minutes
 # make kernels  six designs under load, on one core and twice at once, byte by byte; then the numerical tests under every
 #   kernel of OpenBLAS that this processor runs, and a table: an hour
@@ -16,7 +17,7 @@ PY := .venv/bin/python
 # than cores, since sessions in real time mostly wait; tests/conftest.py has the longest files first
 PARALLEL := -n $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1) --dist loadfile --no-loadscope-reorder
 
-.PHONY: run test check validate lint coverage bench mutate kernels oldest installed figures clean
+.PHONY: run test check validate firmware lint coverage bench mutate kernels oldest installed figures clean
 
 run: .venv/ready
 	$(PY) -m sim.run --case I
@@ -36,6 +37,9 @@ validate: .venv/ready
 	$(PY) tests/cli/hostile.py --signals
 	$(PY) docs/regenerate.py --check
 	$(MAKE) installed
+
+firmware: .venv/ready
+	$(PY) -m pytest -m firmware tests/hw/test_boards.py
 
 mutate: .venv/ready
 	$(PY) tests/mutate.py

@@ -22,7 +22,9 @@ from haptic_loop.design.export import (
     NothingToExport,
     c_source,
     coupling_block,
+    in_single_precision,
     process_block,
+    single_precision_error,
     trial,
     with_origin,
 )
@@ -56,6 +58,7 @@ class _Exported:
     multiplications: int = render.figure("one tick", "{} multiplications")
     force_limit: Array | None = off_table()
     forces: str | None = render.figure("forces")
+    single: str | None = render.figure("single precision", json="if given")
     test: dict[str, Any] = render.figure("test vector", "{[ticks]} ticks, in the file")
     claim: str | None = render.figure("claim", json="if given")  # of a condition of the user's own
 
@@ -88,6 +91,7 @@ def main(argv: list[str]) -> int:
         block.system.order**2 + 2 * block.system.order * block.system.inputs + block.system.inputs**2,
         block.limiter and block.limiter.limit,
         forces if args.process else None,
+        _error(block) if args.float else None,
         {"ticks": len(test.inputs), "seed": args.seed, "largest_output": np.abs(test.outputs).max()},
         claim,
     )
@@ -109,6 +113,8 @@ def _parser() -> options.Parser:
     parser.add_argument("--without-theta", action="store_true", help=link)
     limit = "with the limiter that the certificate covers, for forces of up to so much [N]; one is for all channels"
     parser.add_argument("--force-limit", type=options.several(float, 1e-3, 1e6, "N"), metavar="N,N,..", help=limit)
+    single = "compute in single precision, for processors without double; its error is printed"
+    parser.add_argument("--float", action="store_true", help=single)
     parser.add_condition("the condition of the file's certificate, where that is one of your own")
     parser.add_output("FILE", "the file (default out/export/<coupling>-<what>.c)")
     parser.only("with --process: a coupling alone has no delay", lambda args: args.process, "without_theta")
@@ -125,4 +131,12 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: st
         raise InputError(f"{args.coupling}: {error} (--process)") from None
     except ValueError as error:  # coefficients beyond floating point
         raise InputError(f"{args.coupling}: {error}") from None
-    return with_origin(block, Path(args.coupling).name, stored, verdict, claim)
+    block = with_origin(block, Path(args.coupling).name, stored, verdict, claim)
+    return in_single_precision(block) if args.float else block
+
+
+def _error(block: ExportedBlock) -> str:
+    """Return what single precision costs, as one line."""
+    error, largest = single_precision_error(block)
+    unit = "N" if block.output.letter == "f" else "m"
+    return f"differs from double precision by at most {error:.2g} {unit}; the largest value is {largest:.3g} {unit}"

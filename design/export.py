@@ -11,6 +11,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from string import Template
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,8 @@ from haptic_loop.design.result import listed, switching_guarantee
 #
 # A tick is y = C z + D u, z+ = A z + B u. Every entry of y and of z+ is one sum in double precision that starts at
 # 0.0 and adds, one rounded product after another, the states z_0, z_1, .. and then the inputs u_0, u_1, ..: an order
-# that every language can keep, so that an exported block repeats its test vector to the last bit.
+# that every language can keep, so that an exported block repeats its test vector to the last bit. In single precision
+# coefficients, inputs and every operation are rounded to 24 bits.
 #
 # Where forces are limited, a tick that asks for more solves the box problem of controller.complementarity by switching
 # the first wrong limit, which ends (docs/theory.md), with elimination in the order of the channels, which needs no
@@ -38,6 +40,8 @@ from haptic_loop.design.result import listed, switching_guarantee
 
 _TICKS = 64  # of a test vector: longer than the delays and the fast modes of a loop
 _MOST_TURNS = 100_000  # of a tick's box problem; a handful are needed
+_SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 170 units in the last place
+_COMPARED = 4096  # ticks over which single and double precision are compared
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,12 @@ class ExportedBlock:
     output: _Signal
     about: tuple[str, ...]  # what it is, one line each
     limiter: Limiter | None = None  # whose loop the system is while no force is limited
+    single: bool = False  # whether the file computes in single precision
+
+    @property
+    def dtype(self) -> type[np.floating]:
+        """Return the type of every number in the file."""
+        return np.float32 if self.single else np.float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,22 +145,53 @@ def trial(block: ExportedBlock, seed: int = 0) -> _Trial:
     if block.limiter:
         share = np.abs(sequential(block.system, inputs)) / block.limiter.limit
         inputs = inputs / np.quantile(share.max(axis=1), 2 / 3)
-    return _Trial(inputs, sequential(block.system, inputs, block.limiter))
+    inputs = inputs.astype(block.dtype)
+    return _Trial(inputs, sequential(block.system, inputs, block.limiter, block.dtype))
 
 
-def sequential(system: Lti, inputs: Array, limiter: Limiter | None = None) -> Array:
+def single_precision_error(block: ExportedBlock, seed: int = 0) -> tuple[float, float]:
+    """Compare single with double precision over 4096 ticks of normally distributed inputs.
+
+    Returns:
+        The largest difference and the largest output, in the unit of the output.
+    """
+    rng = np.random.default_rng(seed)
+    inputs = block.input.size * rng.standard_normal((_COMPARED, block.system.inputs))
+    double, single = (sequential(block.system, inputs, block.limiter, kind) for kind in (np.float64, np.float32))
+    return float(np.abs(double - single).max()), float(np.abs(double).max())
+
+
+def in_single_precision(block: ExportedBlock) -> ExportedBlock:
+    """Return the block in single precision, with a line on the error that this costs."""
+    error, largest = single_precision_error(block)
+    said = f"Single precision: {_COMPARED} ticks differ from double precision by at most {error:.2g} where the largest "
+    said += f"{block.output.what} is {largest:.3g}. No proof covers this rounding."
+    return replace(block, single=True, about=(*block.about, said))
+
+
+def _limits(limiter: Limiter, dtype: type[np.floating]) -> Array:
+    """Return the force limits (m,) [N], rounded towards zero."""
+    limits = limiter.limit.astype(dtype)
+    return np.where(limits > limiter.limit, np.nextafter(limits, dtype(0)), limits)
+
+
+def sequential(
+    system: Lti, inputs: Array, limiter: Limiter | None = None, dtype: type[np.floating] = np.float64
+) -> Array:
     """Outputs (ticks, p) for inputs (ticks, m), from rest, every sum in the order that the module states."""
-    rows = np.block([[system.C, system.D], [system.A, system.B]])
-    z, outputs = np.zeros(system.order), []
-    for u in inputs:
-        sums = np.zeros(len(rows))
+    rows = np.block([[system.C, system.D], [system.A, system.B]]).astype(dtype)
+    z, outputs = np.zeros(system.order, dtype), []
+    limits = _limits(limiter, dtype) if limiter else None
+    for u in inputs.astype(dtype):
+        sums = np.zeros(len(rows), dtype)
         for column, value in zip(rows.T, [*z, *u], strict=True):
             sums = sums + column * value
-        if limiter:
+        if limiter and limits is not None:
             free = sums[limiter.sent_rows]
-            if (np.abs(free) > limiter.limit).any():
-                e, f = _boxed(_box_matrix(limiter).tolist(), limiter.limit.tolist(), free.tolist())
-                for column, value in zip(limiter.kick.T, e, strict=True):
+            if (np.abs(free) > limits).any():
+                M = _box_matrix(limiter).astype(dtype)
+                e, f = _boxed([list(row) for row in M], list(limits), list(free))
+                for column, value in zip(limiter.kick.astype(dtype).T, e, strict=True):
                     sums = sums + column * value
                 sums[limiter.sent_rows] = f
         outputs.append(sums[: system.outputs])
@@ -169,13 +210,20 @@ def _turns(m: int) -> int:
     return min(3**m, _MOST_TURNS)
 
 
-def _boxed(M: list[list[float]], limit: list[float], q: list[float]) -> tuple[list[float], list[float]]:
-    """(e, f) of f = q - M e, as the C file computes it, operation by operation."""
-    m = len(q)
-    sign, e, f = [0.0] * m, [0.0] * m, [0.0] * m
+def _rounding(single: bool) -> float:
+    """Return the rounding error of a residual, relative to the terms of its difference."""
+    return float(np.float32(_SINGLE_ROUNDING)) if single else PIVOT_ROUNDING
+
+
+def _boxed(M: list[list[Any]], limit: list[Any], q: list[Any]) -> tuple[list[Any], list[Any]]:
+    """Return (e, f) of f = q - M e as the C file computes it, operation by operation, in the precision of q."""
+    m, real = len(q), type(q[0])
+    zero, one = real(0), real(1)
+    rounding = real(_rounding(real is np.float32))
+    sign, e, f = [zero] * m, [zero] * m, [zero] * m
     for _ in range(_turns(m)):
-        a = [[M[i][j] if sign[i] and sign[j] else float(i == j) for j in range(m)] for i in range(m)]
-        v = [q[i] - sign[i] * limit[i] if sign[i] else 0.0 for i in range(m)]
+        a = [[M[i][j] if sign[i] and sign[j] else real(i == j) for j in range(m)] for i in range(m)]
+        v = [q[i] - sign[i] * limit[i] if sign[i] else zero for i in range(m)]
         for k in range(m):
             for i in range(k + 1, m):
                 ratio = a[i][k] / a[k][k]
@@ -192,8 +240,8 @@ def _boxed(M: list[list[float]], limit: list[float], q: list[float]) -> tuple[li
             for j in range(m):
                 sum_ -= M[i][j] * v[j]
                 size += abs(M[i][j] * v[j])
-            tiny = size * PIVOT_ROUNDING
-            e[i] = v[i] if sign[i] * v[i] > 0.0 else 0.0
+            tiny = size * rounding
+            e[i] = v[i] if sign[i] * v[i] > 0.0 else zero
             f[i] = limit[i] if sum_ > limit[i] else -limit[i] if sum_ < -limit[i] else sum_
             if sign[i]:
                 f[i] = sign[i] * limit[i]
@@ -201,11 +249,11 @@ def _boxed(M: list[list[float]], limit: list[float], q: list[float]) -> tuple[li
                 continue
             wrong = True
             if not sign[i] and sum_ > limit[i] + tiny:
-                sign[i] = 1.0
+                sign[i] = one
             elif not sign[i] and sum_ < -limit[i] - tiny:
-                sign[i] = -1.0
+                sign[i] = -one
             elif sign[i] and sign[i] * v[i] * M[i][i] < -tiny:
-                sign[i] = 0.0
+                sign[i] = zero
             else:
                 wrong = False
         if not wrong:
@@ -230,7 +278,7 @@ _SOURCE_C = Template("""\
 $about
  *
  * One tick:  $y = C z + D $u,  z+ = A z + B $u.  Every entry is one sum that starts at 0.0 and adds the
- * states z[0], z[1], .. and then the inputs, product by product. Compiled with IEEE doubles (FLT_EVAL_METHOD 0),
+ * states z[0], z[1], .. and then the inputs, product by product. Compiled with IEEE ${real}s (FLT_EVAL_METHOD 0),
  * without contraction of a*b + c and without -ffast-math, it repeats Python's test vector to the last bit:
  *
  *     cc -std=c99 -O2 -ffp-contract=off -DHAPTIC_LOOP_TEST $file -o test && ./test
@@ -245,14 +293,14 @@ enum { ${NAME}_CHANNELS = $m, ${NAME}_STATES = $n };
 #define ${NAME}_PERIOD $T /* [s] */
 
 typedef struct {
-    double z[${NAME}_STATES];
+    ${real} z[${NAME}_STATES];
 } ${name}_state;
 
 /* To rest. */
 void ${name}_reset(${name}_state *state);
 
 /* One tick: $input in, $output out. */
-void ${name}_step(${name}_state *state, const double $u[${NAME}_CHANNELS], double $y[${NAME}_CHANNELS]);
+void ${name}_step(${name}_state *state, const ${real} $u[${NAME}_CHANNELS], ${real} $y[${NAME}_CHANNELS]);
 $more_declared
 #ifndef HAPTIC_LOOP_DECLARATIONS_ONLY
 
@@ -262,16 +310,16 @@ void ${name}_reset(${name}_state *state)
 {
     int i;
     for (i = 0; i < ${NAME}_STATES; i++)
-        state->z[i] = 0.0;
+        state->z[i] = 0.0${f};
 }
 
 $limit_defined
-void ${name}_step(${name}_state *state, const double $u[${NAME}_CHANNELS], double $y[${NAME}_CHANNELS])
+void ${name}_step(${name}_state *state, const ${real} $u[${NAME}_CHANNELS], ${real} $y[${NAME}_CHANNELS])
 {
-    double next[${NAME}_STATES], out[${NAME}_CHANNELS];
+    ${real} next[${NAME}_STATES], out[${NAME}_CHANNELS];
     int i, j;
     for (i = 0; i < ${NAME}_CHANNELS; i++) {
-        double sum = 0.0;
+        ${real} sum = 0.0${f};
         for (j = 0; j < ${NAME}_STATES; j++)
             sum += ${name}_C[i][j] * state->z[j];
         for (j = 0; j < ${NAME}_CHANNELS; j++)
@@ -279,7 +327,7 @@ void ${name}_step(${name}_state *state, const double $u[${NAME}_CHANNELS], doubl
         out[i] = sum;
     }
     for (i = 0; i < ${NAME}_STATES; i++) {
-        double sum = 0.0;
+        ${real} sum = 0.0${f};
         for (j = 0; j < ${NAME}_STATES; j++)
             sum += ${name}_A[i][j] * state->z[j];
         for (j = 0; j < ${NAME}_CHANNELS; j++)
@@ -301,7 +349,7 @@ $tests
 int main(void)
 {
     ${name}_state state;
-    double out[${NAME}_CHANNELS];
+    ${real} out[${NAME}_CHANNELS];
     int run, k, i, wrong = 0;
     for (run = 0; run < 2; run++) { /* twice: a reset brings back the start */
         ${name}_reset(&state);
@@ -326,15 +374,15 @@ int main(void)
 #: a coupling stands in a feedback loop that its user closes, so it can be asked before its input is known
 _FREE_DECLARED = """
 /* $y = free + D $u: the free part, before this tick's $u is known, and D, for solving u = x - $y, $u = E(u). */
-void ${name}_free(const ${name}_state *state, double $y[${NAME}_CHANNELS]);
-extern const double ${name}_D[${NAME}_CHANNELS][${NAME}_CHANNELS];
+void ${name}_free(const ${name}_state *state, ${real} $y[${NAME}_CHANNELS]);
+extern const ${real} ${name}_D[${NAME}_CHANNELS][${NAME}_CHANNELS];
 """
 _FREE_DEFINED = """
-void ${name}_free(const ${name}_state *state, double $y[${NAME}_CHANNELS])
+void ${name}_free(const ${name}_state *state, ${real} $y[${NAME}_CHANNELS])
 {
     int i, j;
     for (i = 0; i < ${NAME}_CHANNELS; i++) {
-        $y[i] = 0.0;
+        $y[i] = 0.0${f};
         for (j = 0; j < ${NAME}_STATES; j++)
             $y[i] += ${name}_C[i][j] * state->z[j];
     }
@@ -344,25 +392,25 @@ void ${name}_free(const ${name}_state *state, double $y[${NAME}_CHANNELS])
 
 #: the box problem, and what a tick does that asks for more than a limit
 _LIMIT_DEFINED = """
-static double ${name}_size(double a)
+static ${real} ${name}_size(${real} a)
 {
-    return a < 0.0 ? -a : a;
+    return a < 0.0${f} ? -a : a;
 }
 
 /* f = q - M e within the limits, e of the sign of the limit that is reached: the first wrong limit is switched. */
-static void ${name}_limit(const double q[${NAME}_CHANNELS], double e[${NAME}_CHANNELS], double f[${NAME}_CHANNELS])
+static void ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_CHANNELS], ${real} f[${NAME}_CHANNELS])
 {
-    double sign[${NAME}_CHANNELS] = {0.0}, a[${NAME}_CHANNELS][${NAME}_CHANNELS], v[${NAME}_CHANNELS];
+    ${real} sign[${NAME}_CHANNELS] = {0.0${f}}, a[${NAME}_CHANNELS][${NAME}_CHANNELS], v[${NAME}_CHANNELS];
     int turn, wrong, i, j, k;
     for (turn = 0; turn < $turns; turn++) {
         for (i = 0; i < ${NAME}_CHANNELS; i++) {
             for (j = 0; j < ${NAME}_CHANNELS; j++)
-                a[i][j] = sign[i] != 0.0 && sign[j] != 0.0 ? ${name}_M[i][j] : (i == j ? 1.0 : 0.0);
-            v[i] = sign[i] != 0.0 ? q[i] - sign[i] * ${name}_LIMIT[0][i] : 0.0;
+                a[i][j] = sign[i] != 0.0${f} && sign[j] != 0.0${f} ? ${name}_M[i][j] : (i == j ? 1.0${f} : 0.0${f});
+            v[i] = sign[i] != 0.0${f} ? q[i] - sign[i] * ${name}_LIMIT[0][i] : 0.0${f};
         }
         for (k = 0; k < ${NAME}_CHANNELS; k++)
             for (i = k + 1; i < ${NAME}_CHANNELS; i++) {
-                double ratio = a[i][k] / a[k][k];
+                ${real} ratio = a[i][k] / a[k][k];
                 for (j = k + 1; j < ${NAME}_CHANNELS; j++)
                     a[i][j] -= ratio * a[k][j];
                 v[i] -= ratio * v[k];
@@ -374,25 +422,25 @@ static void ${name}_limit(const double q[${NAME}_CHANNELS], double e[${NAME}_CHA
         }
         wrong = 0;
         for (i = 0; i < ${NAME}_CHANNELS; i++) {
-            double limit = ${name}_LIMIT[0][i], sum = q[i], size = ${name}_size(q[i]), tiny;
+            ${real} limit = ${name}_LIMIT[0][i], sum = q[i], size = ${name}_size(q[i]), tiny;
             for (j = 0; j < ${NAME}_CHANNELS; j++) {
                 sum -= ${name}_M[i][j] * v[j];
                 size += ${name}_size(${name}_M[i][j] * v[j]);
             }
             tiny = size * $rounding;
-            e[i] = sign[i] * v[i] > 0.0 ? v[i] : 0.0;
+            e[i] = sign[i] * v[i] > 0.0${f} ? v[i] : 0.0${f};
             f[i] = sum > limit ? limit : (sum < -limit ? -limit : sum);
-            if (sign[i] != 0.0)
+            if (sign[i] != 0.0${f})
                 f[i] = sign[i] * limit;
             if (wrong)
                 continue;
             wrong = 1;
-            if (sign[i] == 0.0 && sum > limit + tiny)
-                sign[i] = 1.0;
-            else if (sign[i] == 0.0 && sum < -limit - tiny)
-                sign[i] = -1.0;
-            else if (sign[i] != 0.0 && sign[i] * v[i] * ${name}_M[i][i] < -tiny)
-                sign[i] = 0.0;
+            if (sign[i] == 0.0${f} && sum > limit + tiny)
+                sign[i] = 1.0${f};
+            else if (sign[i] == 0.0${f} && sum < -limit - tiny)
+                sign[i] = -1.0${f};
+            else if (sign[i] != 0.0${f} && sign[i] * v[i] * ${name}_M[i][i] < -tiny)
+                sign[i] = 0.0${f};
             else
                 wrong = 0;
         }
@@ -402,7 +450,7 @@ static void ${name}_limit(const double q[${NAME}_CHANNELS], double e[${NAME}_CHA
 }
 """
 _LIMITED = """    {
-        double q[${NAME}_CHANNELS], e[${NAME}_CHANNELS], f[${NAME}_CHANNELS];
+        ${real} q[${NAME}_CHANNELS], e[${NAME}_CHANNELS], f[${NAME}_CHANNELS];
         int more = 0;
         for (i = 0; i < ${NAME}_CHANNELS; i++) {
             q[i] = ${name}_SENT[i] < ${NAME}_CHANNELS ? out[${name}_SENT[i]] : next[${name}_SENT[i] - ${NAME}_CHANNELS];
@@ -428,7 +476,7 @@ _LIMITED = """    {
 
 def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
     """The file's text; numbers are hexadecimal, so that no compiler's decimal conversion matters."""
-    system, name = block.system, block.name
+    system, name, dtype = block.system, block.name, block.dtype
     words = {
         "name": name,
         "NAME": name.upper(),
@@ -441,22 +489,27 @@ def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
         "m": system.inputs,
         "n": system.order,
         "T": repr(system.T),
+        "real": "float" if block.single else "double",
+        "f": "f" if block.single else "",
         "ticks": _TICKS,
         "tables": "\n\n".join(
-            _table(f"{'' if name == 'coupling' and letter == 'D' else 'static '}const double {name}_{letter}", matrix)
+            _table(
+                f"{'' if name == 'coupling' and letter == 'D' else 'static '}const", f"{name}_{letter}", matrix, dtype
+            )
             for letter, matrix in (("A", system.A), ("B", system.B), ("C", system.C), ("D", system.D))
         ),
         "tests": "\n\n".join(
-            _table(f"static const double test_{side}", values)
+            _table("static const", f"test_{side}", values, dtype)
             for side, values in (("input", test.inputs), ("output", test.outputs))
         ),
     }
     loose = name == "coupling"
     words["limit_defined"] = words["limited"] = ""
     if limiter := block.limiter:
-        words |= {"turns": str(_turns(system.inputs)), "rounding": PIVOT_ROUNDING.hex()}
-        tables = (("LIMIT", limiter.limit[None]), ("M", _box_matrix(limiter)), ("KICK", limiter.kick))
-        words["tables"] += "".join("\n\n" + _table(f"static const double {name}_{of}", rows) for of, rows in tables)
+        words |= {"turns": str(_turns(system.inputs)), "rounding": _rounding(block.single).hex() + words["f"]}
+        tables = (("LIMIT", _limits(limiter, dtype)[None]), ("M", _box_matrix(limiter)), ("KICK", limiter.kick))
+        of_limiter = (_table("static const", f"{name}_{of}", rows, dtype) for of, rows in tables)
+        words["tables"] += "".join("\n\n" + table for table in of_limiter)
         rows = ", ".join(map(str, limiter.sent_rows))
         words["tables"] += f"\n\nstatic const int {name}_SENT[{system.inputs}] = {{{rows}}};"
         words["limit_defined"] = Template(_LIMIT_DEFINED).substitute(words)
@@ -472,13 +525,14 @@ def _comment_c(lines: Iterable[str]) -> Iterable[str]:
         yield from textwrap.wrap(harmless, 108, initial_indent=" * ", subsequent_indent=" *     ")
 
 
-def _table(head: str, values: Array) -> str:
-    rows = ",\n".join(_row(row) for row in np.asarray(values))
-    return f"{head}[{len(values)}][{values.shape[1]}] = {{\n{rows}\n}};"
+def _table(storage: str, name: str, values: Array, dtype: type[np.floating]) -> str:
+    real, suffix = ("float", "f") if dtype is np.float32 else ("double", "")
+    rows = ",\n".join(_row(row, suffix) for row in np.asarray(values).astype(dtype))
+    return f"{storage} {real} {name}[{len(values)}][{values.shape[1]}] = {{\n{rows}\n}};"
 
 
-def _row(values: Array) -> str:
-    text = ", ".join(float(v).hex() for v in values)
+def _row(values: Array, suffix: str) -> str:
+    text = ", ".join(float(v).hex() + suffix for v in values)
     return "\n".join(textwrap.wrap(f"{{{text}}}", 112, initial_indent="    ", subsequent_indent="     "))
 
 

@@ -3,13 +3,14 @@
  * the port you plug in (some boards call their native USB SerialUSB), that its core has availableForWrite() and it returns
  * more than 0 on an idle line (print it once: where it is always 0, nothing is ever sent), and what it returns then. Two
  * axes send an INFO of 68 bytes and STATEs of 32; where the idle line takes less than both at once, they wait in `queue`
- * and leave piece by piece, which delays a STATE: the host measures that as part of the round trip. Put haptic_link.h and
- * haptic_frame.h beside it.
+ * and leave piece by piece, which delays a STATE: the host measures that as part of the round trip. Put haptic_link.h,
+ * haptic_frame.h and board_watchdog.h beside it.
  *
  * Yours to change: the pins, the numbers of INFO (measure them; docs/protocol.md says what the host does with each), and
  * the functions below them. Everything that keeps hands whole is in haptic_link.h: leave it as it is. */
 #include <Arduino.h>
 
+#include "board_watchdog.h"
 #include "haptic_link.h"
 
 static const uint8_t AXES = 2;
@@ -86,33 +87,6 @@ static void serialWrite(const uint8_t *data, size_t n)
 
 static uint32_t timeUs() { return (uint32_t)micros(); }
 
-/* The board's own watchdog. Without one a loop that hangs leaves the last PWM standing, and hl_tick, which would take it
- * away, is never called. Reset, the pins float and ENABLE is pulled down. */
-#if defined(__IMXRT1062__) /* Teensy 4: the RTWDOG of the i.MX RT1060, on its 32 kHz clock */
-static void watchdogStart()
-{
-  CCM_CCGR5 |= CCM_CCGR5_WDOG3(3);
-  noInterrupts();
-  WDOG3_CNT = 0xD928C520u; /* unlock */
-  while (!(WDOG3_CS & WDOG_CS_ULK)) {}
-  WDOG3_TOVAL = WATCHDOG_MS * 32;
-  WDOG3_WIN = 0;
-  WDOG3_CS = WDOG_CS_EN | WDOG_CS_UPDATE | WDOG_CS_CLK(1) | WDOG_CS_CMD32EN;
-  while (!(WDOG3_CS & WDOG_CS_RCS)) {}
-  interrupts();
-}
-static void watchdogFeed() { WDOG3_CNT = 0xB480A602u; }
-#elif defined(__AVR__)
-#include <avr/wdt.h>
-static void watchdogStart() { wdt_enable(WDTO_30MS); }
-static void watchdogFeed() { wdt_reset(); }
-#elif defined(BOARD_WATCHDOG) /* yours: void BOARD_WATCHDOG(uint32_t ms) starts it with ms > 0, and feeds it with 0 */
-static void watchdogStart() { BOARD_WATCHDOG(WATCHDOG_MS); }
-static void watchdogFeed() { BOARD_WATCHDOG(0); }
-#else
-#error "no watchdog for this board: define BOARD_WATCHDOG (see above)"
-#endif
-
 /* ---- the loop: leave as it is ----------------------------------------------------------------------------------- */
 
 void setup()
@@ -137,7 +111,7 @@ void setup()
   Serial.begin(2000000); /* boards with native USB ignore the rate */
   if (!hl_init(&device, &info)) /* a number above is impossible: ENABLE stays low */
     for (;;) delay(1000);
-  watchdogStart();
+  watchdogStart(WATCHDOG_MS);
   due = timeUs() + PERIOD_US;
 }
 

@@ -21,7 +21,7 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.tick import Process, StepBuffer
 from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, load, save
-from haptic_loop.design.export import process_block, sequential, trial
+from haptic_loop.design.export import process_block, sequential, single_precision_error, trial
 from haptic_loop.design.files import InputError, one_command
 
 SPRINGS = SpringDamper((300.0, 200.0), (0.0, 0.0))  # no state at all
@@ -171,6 +171,37 @@ def test_the_c_file_repeats_its_test_vector_to_the_last_bit(place, name, what):
         done = run(compiled([source], *flags, "-DHAPTIC_LOOP_TEST"))
         assert (done.returncode, done.stderr) == (0, "")
         assert "repeat to the last bit" in done.stdout
+
+
+@needs_cc
+@pytest.mark.parametrize(("name", "limit"), [("pair", "12,5"), ("star", "2"), ("free", "3,2,1,2"), ("pair", None)])
+def test_single_precision_repeats_its_own_test_vector(limited_files, name, limit, capsys):
+    folder = limited_files[0]
+    out, words = folder / f"{name}-float.c", ["--force-limit", limit] if limit else []
+    words += ["--process", "--float", "--out", str(out), "--json", "-"]
+    assert main([str(folder / f"{name}.json"), *words]) == 0
+    assert "differs from double precision by at most" in json.loads(capsys.readouterr().out)["single"]
+    assert "double" not in re.sub(r"/\*.*?\*/", "", out.read_text(), flags=re.DOTALL)
+    done = run(compiled([out], "-O2", "-DHAPTIC_LOOP_TEST"))
+    assert (done.returncode, done.stdout) == (0, "process: 64 ticks repeat to the last bit\n")
+
+
+@pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
+def test_the_error_of_single_precision_is_below_its_bound(data):
+    """Coefficients, inputs and sums are rounded to 2^-24: each row errs by gamma_(N+2) |row| |v|, carried on by A."""
+    block = process_block(Stored.of(PAIR, data))
+    G, inputs = block.system, trial(block).inputs
+    single, double = sequential(G, inputs, dtype=np.float32), sequential(G, inputs)
+    z = sequential(Lti(G.A, G.B, np.eye(G.order), np.zeros_like(G.B), T), inputs, dtype=np.float32).astype(float)
+    terms = G.order + G.inputs + 2
+    gamma = terms * 2.0**-24 / (1 - terms * 2.0**-24)
+    local = gamma * (np.abs(z) @ np.abs(G.A).T + np.abs(inputs) @ np.abs(G.B).T)
+    carried = [np.abs(G.C @ np.linalg.matrix_power(G.A, n)) for n in range(len(z))]
+    for k in range(len(z)):
+        own = gamma * (np.abs(G.C) @ np.abs(z[k]) + np.abs(G.D) @ np.abs(inputs[k]))
+        bound = own + sum(carried[k - 1 - i] @ local[i] for i in range(k))
+        assert (np.abs(single[k] - double[k]) <= 1.01 * bound).all()
+    assert 0 < single_precision_error(block)[0] < 1e-4 * single_precision_error(block)[1]
 
 
 @needs_cc

@@ -1,0 +1,97 @@
+/* Two axes on a Teensy 4 that run an exported tick by themselves: quadrature encoders, PWM and direction, an enable line and a
+ * dead-man switch. Beside it: haptic_alone.h, board_watchdog.h, and coupling-process.c from
+ *
+ *     python -m design.export coupling.json --process --without-theta --force-limit 8 --out coupling-process.c
+ *
+ * Keys over USB: h home (the handles stand in the middle of their travel), a arm, s stop. Yours to change: the numbers below. */
+#include <Arduino.h>
+
+#include "board_watchdog.h"
+#include "coupling-process.c"
+#include "haptic_alone.h"
+
+static const uint8_t AXES = PROCESS_CHANNELS;
+static const uint8_t ENCODER_A[] = {2, 4}, ENCODER_B[] = {3, 5}, MOTOR_PWM[] = {9, 10}, MOTOR_DIRECTION[] = {7, 8};
+static const uint8_t ENABLE = 6;   /* of both drivers; pulled down outside: an unpowered board means no force */
+static const uint8_t DEADMAN = 12; /* closed to ground while it is held: let go, unplugged and broken all read HIGH */
+static const uint8_t PWM_BITS = 12;
+static const double FULL_FORCE = 12.0, METRES_PER_COUNT = 10e-6; /* [N] at full PWM */
+static const ha_limits LIMITS = {0.05, 1.0, 8.0, METRES_PER_COUNT};
+static const uint32_t PERIOD_US = (uint32_t)(1e6 * PROCESS_PERIOD + 0.5);
+
+static_assert(PROCESS_CHANNELS <= 2, "pins for two axes are named above");
+static ha_runner runner;
+static volatile int32_t position[2];
+static int32_t home[2];
+static uint32_t due;
+
+static void edge(uint8_t axis) /* one count for every edge of channel A */
+{
+  bool same = digitalRead(ENCODER_A[axis]) == digitalRead(ENCODER_B[axis]);
+  position[axis] = position[axis] + (same ? 1 : -1);
+}
+static void edge0() { edge(0); }
+static void edge1() { edge(1); }
+
+static void writeForces(const double *force)
+{
+  for (uint8_t a = 0; a < AXES; a++) {
+    double steps = (force[a] < 0 ? -force[a] : force[a]) / FULL_FORCE * ((1 << PWM_BITS) - 1);
+    digitalWrite(MOTOR_DIRECTION[a], force[a] < 0 ? HIGH : LOW);
+    analogWrite(MOTOR_PWM[a], (int)(steps + 0.5));
+  }
+  digitalWrite(ENABLE, runner.phase >= HA_TESTING ? HIGH : LOW);
+}
+
+static void report() /* phase and cause; left out where the line is busy */
+{
+  const uint8_t line[3] = {(uint8_t)('0' + runner.phase), (uint8_t)('0' + runner.cause), '\n'};
+  if (Serial.availableForWrite() >= 3) Serial.write(line, 3);
+}
+
+void setup()
+{
+  for (uint8_t a = 0; a < AXES; a++) {
+    pinMode(ENCODER_A[a], INPUT_PULLUP);
+    pinMode(ENCODER_B[a], INPUT_PULLUP);
+    pinMode(MOTOR_PWM[a], OUTPUT);
+    pinMode(MOTOR_DIRECTION[a], OUTPUT);
+    attachInterrupt(digitalPinToInterrupt(ENCODER_A[a]), a ? edge1 : edge0, CHANGE);
+  }
+  pinMode(ENABLE, OUTPUT);
+  digitalWrite(ENABLE, LOW);
+  pinMode(DEADMAN, INPUT_PULLUP);
+  analogWriteResolution(PWM_BITS);
+  Serial.begin(2000000);
+  watchdogStart(20);
+  due = (uint32_t)micros() + PERIOD_US;
+}
+
+void loop()
+{
+  uint32_t late = (uint32_t)micros() - due;
+  if (late >= 0x80000000u) return; /* not due yet */
+  if (late > PERIOD_US) {          /* a whole period was lost: stop, and do not catch up */
+    ha_stop(&runner, HA_LATE);
+    due += late;
+  }
+  due += PERIOD_US;
+  watchdogFeed();
+  writeForces(runner.force); /* of the sample before: theta = 1 */
+  double x[PROCESS_CHANNELS];
+  int key = Serial.available() > 0 ? Serial.read() : -1;
+  noInterrupts();
+  for (uint8_t a = 0; a < AXES; a++) {
+    if (key == 'h' && runner.phase <= HA_READY) home[a] = position[a];
+    x[a] = METRES_PER_COUNT * (position[a] - home[a]);
+  }
+  interrupts();
+  if (key == 'h' && runner.phase <= HA_READY) ha_home(&runner);
+  bool held = digitalRead(DEADMAN) == LOW;
+  if (key == 'a' && held) ha_arm(&runner);
+  if (key == 's') ha_stop(&runner, HA_ASKED);
+  if (!held) ha_stop(&runner, HA_DEADMAN);
+  ha_tick(&runner, &LIMITS, x);
+  static uint8_t ticks;
+  if (++ticks % 128 == 0) report();
+}

@@ -1,0 +1,229 @@
+"""Sketches that run an exported tick without a host, on a simulated ATmega328P and Cortex-M7 (make firmware)."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from haptic_loop.cli import design, export
+from haptic_loop.design.coupling_file import load
+from haptic_loop.design.export import process_block, sequential
+
+pytestmark = pytest.mark.firmware
+
+ROOT = Path(__file__).parents[2]
+FIRMWARE, BOARDS = ROOT / "hw/firmware", ROOT / "tests/firmware"
+CORE = Path("/usr/share/arduino/hardware/arduino/avr")
+AVR = ["-mmcu=atmega328p", "-DF_CPU=16000000L", "-DARDUINO=10819", "-DARDUINO_ARCH_AVR", "-DDECIMAL_DIG=17", "-Os"]
+AVR += ["-ffp-contract=off", "-ffunction-sections", "-fdata-sections", "-Wl,--gc-sections", "-I."]
+AVR += [f"-I{CORE / 'cores/arduino'}", f"-I{CORE / 'variants/standard'}", f"-I{FIRMWARE}"]
+VECTOR = """
+#define main test_main
+#include "coupling-process.c"
+#undef main
+#include <avr/interrupt.h>
+#include <avr/sleep.h>
+int main(void) { GPIOR0 = (unsigned char)(10 + test_main()); cli(); sleep_mode(); for (;;) {} }
+"""
+M7 = ["-mcpu=cortex-m7", "-mthumb", "-mfpu=fpv5-d16", "-mfloat-abi=hard", "-O2", "-ffp-contract=off", "-fno-exceptions"]
+M7 += ["-fno-rtti", "-Wall", "-Wextra", "-Werror", "-I.", f"-I{FIRMWARE}", f"-I{BOARDS}", "-T", str(BOARDS / "m7.ld")]
+M7 += ["--specs=rdimon.specs"]
+QEMU = ["qemu-system-arm", "-M", "mps2-an500", "-nographic", "-monitor", "none", "-serial", "none"]
+QEMU += ["-semihosting-config", "enable=on,target=native", "-kernel"]
+
+
+def build(folder, *command):
+    subprocess.run([*map(str, command)], check=True, cwd=folder)
+
+
+def exported(folder, limit, *scenario, single=False):
+    """Design, prove and export the process of a scenario by the commands, and return its block."""
+    assert design.main([*scenario, "--out", str(folder / "coupling.json")]) == 0
+    words = ["--process", "--without-theta", "--force-limit", str(limit), *["--float"] * single]
+    assert export.main([str(folder / "coupling.json"), *words, "--out", str(folder / "coupling-process.c")]) == 0
+    stored = load(folder / "coupling.json")
+    return process_block(stored, with_theta=False, force_limit=(limit,) * stored.loop.channels)
+
+
+class Board:
+    """A simulated board that is asked tick by tick."""
+
+    def __init__(self, *command, said=subprocess.DEVNULL):
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen([*map(str, command)], stdin=pipe, stdout=pipe, stderr=said, text=True)
+
+    def tick(self, *order):
+        self.process.stdin.write(" ".join(map(str, order)) + "\n")
+        self.process.stdin.flush()
+        while (words := self.process.stdout.readline().split())[:1] == ["Loaded"]:
+            pass  # simavr says so on standard output
+        return words
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.stdin.close()
+        self.process.wait(timeout=60)
+        self.process.stdout.close()
+
+
+class Handle:
+    """A mass with damping, moved by a force that is held for T: v decays to f/b."""
+
+    def __init__(self, mass, damping, T):
+        self.b, self.x, self.v = damping, 0.0, 0.0
+        self.decay = np.exp(-damping / mass * T)
+        self.lag, self.T = (1 - self.decay) * mass / damping, T
+
+    def push(self, force):
+        end = force / self.b
+        self.x += end * self.T + (self.v - end) * self.lag
+        self.v = end + (self.v - end) * self.decay
+
+
+# the Hapkit: single precision on eight bits
+
+
+@pytest.fixture(scope="module")
+def hapkit(tmp_path_factory):
+    """The folder with the sketch, the test vector and the board, and the exported block."""
+    folder = tmp_path_factory.mktemp("hapkit")
+    block = exported(folder, 4.8, "--scenario", str(ROOT / "examples/hapkit.toml"), single=True)
+    core = CORE / "cores/arduino"
+    plain, plus = [*core.glob("*.c")], [*core.glob("*.cpp")]
+    build(folder, "avr-gcc", *AVR, "-w", "-std=gnu11", "-c", *plain)
+    build(folder, "avr-gcc", *AVR, "-w", "-x", "assembler-with-cpp", "-c", *core.glob("*.S"))
+    build(folder, "avr-g++", *AVR, "-w", "-std=gnu++11", "-fno-exceptions", "-fno-threadsafe-statics", "-c", *plus)
+    parts = [*folder.glob("*.o")]
+    cxx = ["avr-g++", *AVR, "-std=gnu++11", "-fno-exceptions", "-fno-threadsafe-statics", "-Wall", "-Wextra"]
+    build(folder, *cxx, "-DMARK(what)=(GPIOR0=(what))", "-x", "c++", "-c", FIRMWARE / "hapkit.ino", "-o", "sketch.o")
+    build(folder, "avr-gcc", *AVR, "sketch.o", *parts, "-lm", "-o", "hapkit.elf")
+    (folder / "vector.c").write_text(VECTOR)
+    build(folder, "avr-gcc", *AVR, "-std=gnu99", "-w", "-DHAPTIC_LOOP_TEST", "vector.c", "-lm", "-o", "vector.elf")
+    build(folder, "gcc", "-Wall", "-Wextra", "-Werror", BOARDS / "avr_board.c", "-o", "board", "-lsimavr", "-lm")
+    return folder, block
+
+
+f32 = np.float32
+PER_RADIAN = f32(0.09) * f32(0.005) / f32(0.073)
+PER_COUNT = PER_RADIAN * f32(3.14159265) / f32(1024)
+HOME, DUTY = f32(-0.045), f32(255) * PER_RADIAN / f32(0.03)
+
+
+def paddle(folder, ticks, hand, motor=1.0, sensor=1.0, held=lambda k: True):
+    """A session in which the hand pushes with hand(k) [N]: counts, and the board's four numbers per tick."""
+    handle, counts, told = Handle(0.07, 0.5, 1.25e-3), [], []
+    with (folder / "said.txt").open("w") as said, Board(folder / "board", folder / "hapkit.elf", 1, said=said) as board:
+        for k in range(ticks):
+            seen = 0.045 + sensor * (handle.x - 0.045) if k > 225 else handle.x
+            counts.append(300 + round(seen / float(PER_COUNT)))
+            millivolts = int((counts[-1] % 1024 + 0.5) * 5000 / 1023)  # which the converter rounds down
+            key = "h" if k == 5 else "a" if k == 230 else "."
+            told.append([int(word) for word in board.tick(millivolts, key, int(held(k)))])
+            *_, pwm, negative = told[-1]
+            if 5 < k < 220:  # from the stop to the middle
+                handle.x = 0.045 * min(1, k / 200)
+            handle.push(motor * (-1) ** negative * pwm / 255 * 0.03 / float(PER_RADIAN) + hand(k))
+    causes = re.findall(r"^(\d)(\d) ", (folder / "said.txt").read_text(), re.MULTILINE)
+    return np.array(counts), np.array(told), causes[-1] if causes else None
+
+
+def swing(k):
+    """Push slowly, and at times for 30 ms by more than the limit."""
+    return 3 * np.sin(2 * np.pi * 1e-3 * (k - 700)) + 2.2 * (k % 250 < 30) if k > 700 else 0.0
+
+
+def test_the_hapkit_repeats_the_test_vector(hapkit):
+    folder, _ = hapkit
+    assert subprocess.run([folder / "board", folder / "vector.elf"], check=False).returncode == 10  # 0 ticks differ
+
+
+def test_the_hapkits_forces_are_those_of_python(hapkit, capsys):
+    """Its forces are those of Python's tick to the last step of the PWM, with the limiter at work."""
+    folder, block = hapkit
+    counts, told, state = paddle(folder, 1900, swing)
+    start = int(np.argmax(told[:, 0] > 3000))  # the first tick of the coupling
+    x = PER_COUNT * (counts - counts[5]).astype(f32) + HOME
+    f = sequential(block.system, (x[start:] - x[start])[:, None], block.limiter, f32)[:, 0]
+    gain = np.minimum(np.cumsum(np.full(len(f), f32(1.25e-3) / f32(0.25)), dtype=f32), f32(1))
+    force = np.clip(-gain * f, f32(-4.8), f32(4.8))
+    duty = np.minimum(np.abs(force) * DUTY + f32(0.5), f32(255)).astype(int)
+    assert told[-1, 0] > 3000, state  # it still runs
+    assert duty.max() > 240
+    np.testing.assert_array_equal(told[start + 1 :, 2:].T, [duty[:-1], force[:-1] < 0])
+    limited = np.abs(f) >= f32(4.79999)
+    ticks = {"linear": told[start:][~limited], "limited": told[start:][limited]}
+    assert ticks["limited"][:, 1].max() < 20_000
+    with capsys.disabled():
+        print(f"\nATmega328P, 16 MHz, {block.system.order} states in single precision, cycles at most:")
+        for name, cycles in ticks.items():
+            process, whole = cycles[:, 0].max(), cycles[:, 1].max()
+            fits = "fits" if whole < 16_000 else "does not fit, it needs T = 1.25 ms"
+            print(f"  {name} tick {process}, with sensor and motor {whole}: 1 ms has 16000, {fits}")
+
+
+@pytest.mark.parametrize(
+    ("fault", "cause"),
+    [
+        ({"motor": -1.0}, "6"),
+        ({"sensor": -1.0}, "6"),
+        ({"sensor": 0.0}, "7"),
+        ({"motor": 0.0}, "7"),
+        ({"held": lambda k: k < 1000}, "2"),
+        ({"hand": lambda k: 9.0 if 900 < k < 940 else 0.0}, "5"),
+    ],
+    ids=["reversed-motor", "reversed-sensor", "dead-sensor", "dead-motor", "switch-released", "thrown"],
+)
+def test_the_hapkit_takes_its_force_away(hapkit, fault, cause):
+    _, told, state = paddle(hapkit[0], 1400, **{"hand": swing if "held" in fault else lambda k: 0.0} | fault)
+    assert state == ("1", cause)
+    assert (told[-190:, 2] == 0).all()
+
+
+# the Teensy's processor: double precision
+
+
+@pytest.fixture(scope="module")
+def teensy(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("teensy")
+    block = exported(folder, 8.0, "--scenario", "omega-pair", "--theta", "1,1")
+    board = BOARDS / "m7_board.cpp"
+    build(folder, "arm-none-eabi-gcc", *M7, "-DVECTOR", board, "-o", "vector.elf")
+    sketch = ["-DSTUB_PERIOD_US=1200", "-x", "c++", board, FIRMWARE / "teensy.ino"]
+    build(folder, "arm-none-eabi-gcc", *M7, *sketch, "-o", "teensy.elf")
+    return folder, block
+
+
+def test_the_cortex_m7_repeats_the_test_vector(teensy):
+    done = subprocess.run([*QEMU, teensy[0] / "vector.elf"], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (0, "process: 64 ticks repeat to the last bit\n")
+
+
+def test_the_teensys_forces_are_those_of_python(teensy):
+    folder, block = teensy
+    handles = [Handle(0.25, 1.37, 1.2e-3) for _ in range(2)]
+    counts, told = [], []
+    with Board(*QEMU, folder / "teensy.elf") as board:
+        for k in range(1200):
+            counts.append([round(handle.x / 10e-6) for handle in handles])
+            told.append(board.tick(*counts[-1], "h" if k == 3 else "a" if k == 6 else ".", 1))
+            pins = np.array(told[-1][:4], int).reshape(2, 2)
+            for handle, (pwm, negative), side in zip(handles, pins, (1, -1), strict=True):
+                hand = side * (5 * np.sin(7 * 1.2e-3 * (k - 500)) + 4.0 * (k % 250 < 25)) if k > 500 else 0.0
+                handle.push((-1) ** negative * pwm / 4095 * 12 + hand)
+    pins = np.array([line[:4] for line in told], int).reshape(-1, 2, 2)
+    first = np.flatnonzero(pins[:, 1, 0])[0]  # axis 2 is tested last
+    assert told[-1][4:] == ["1", "30"]
+    start = next(k for k in range(first, 500) if not pins[k + 1].any() and not pins[k].any()) - 1
+    x = 10e-6 * (np.array(counts) - counts[3])
+    candidates = []
+    for begin in range(start - 2, start + 3):  # the first tick of the coupling is not told
+        f = sequential(block.system, x[begin:] - x[begin], block.limiter)
+        gain = np.minimum(np.cumsum(np.full(len(f), 1.2e-3 / np.float32(0.25))), 1.0)[:, None]
+        steps = np.round(np.clip(-gain * f, -8, 8) / 12 * 4095).astype(int)
+        candidates.append(np.abs(pins[begin + 1 :, :, 0] * (1 - 2 * pins[begin + 1 :, :, 1]) - steps[:-1]).max())
+    assert min(candidates) == 0
+    assert np.abs(pins[:, :, 0]).max() == round(8 / 12 * 4095)
