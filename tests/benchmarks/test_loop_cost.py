@@ -33,7 +33,7 @@ def test_exact_engine(benchmark):
 
 
 @pytest.mark.parametrize("engine", ["exact", "mujoco"])
-def test_what_the_limiter_costs_while_no_force_is_limited(benchmark, engine, monkeypatch):
+def test_the_limiter_costs_little_below_its_limits(benchmark, engine, monkeypatch):
     """The loop with the limiter beside the one that clips, in turns: the ratio of their least times. No tick asks for
     the box problem, and only those do whose forces are limited.
     """

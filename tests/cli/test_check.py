@@ -28,7 +28,7 @@ def path(tmp_path):
     return file
 
 
-def test_a_proved_coupling_exits_with_0_and_prints_only_json_on_request(path, capsys):
+def test_check_of_a_proof_exits_with_0(path, capsys):
     assert main([str(path), "--json", "-"]) == 0
     out, err = capsys.readouterr()
     result = json.loads(out)
@@ -38,7 +38,7 @@ def test_a_proved_coupling_exits_with_0_and_prints_only_json_on_request(path, ca
     assert "proved, in exact arithmetic" in err
 
 
-def test_a_changed_gain_exits_with_1_and_says_why(path, tmp_path, capsys):
+def test_a_changed_gain_exits_with_1(path, tmp_path, capsys):
     path.write_text(path.read_text().replace("878.7", "887.5"))
     assert main([str(path), "--json", str(tmp_path / "result.json")]) == 1
     assert "not proved" in capsys.readouterr().out

@@ -38,7 +38,7 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
     check_file("--json", Path("/dev/null"))
 
 
-def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path):
+def test_a_full_disk_keeps_the_old_file(tmp_path):
     path = tmp_path / "report.json"
     path.write_text("old")
 

@@ -107,7 +107,7 @@ def script(*words):
     return subprocess.run([sys.executable, "-m", "cli", *words], env=environment, capture_output=True, text=True)
 
 
-def test_the_console_script_lists_every_command_and_runs_it():
+def test_the_console_script_lists_and_runs_commands():
     listed = script().stdout
     assert all(f"({module})" in listed for module in modules())
     assert script("check", "--help").stdout.startswith("usage: python -m design.check")

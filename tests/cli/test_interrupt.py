@@ -64,7 +64,7 @@ AUDIT = ["design.audit", "--K", "2870,2320", "--B", "5.47,5.55"]  # not certifie
         ([*AUDIT, "--json", "-"], 1),
     ],
 )
-def test_a_reader_that_leaves_does_not_change_the_exit_code(command, code, tmp_path):
+def test_a_closed_pipe_keeps_the_exit_code(command, code, tmp_path):
     """As `| head -1`, but leaving before the first line, so that every write finds nobody."""
     with started("-m", *command, cwd=tmp_path) as process:
         process.stdout.close()
@@ -76,7 +76,7 @@ def test_a_reader_that_leaves_does_not_change_the_exit_code(command, code, tmp_p
         assert list(tmp_path.glob("out/*/report.json"))  # the work is done all the same
 
 
-def test_the_folder_of_a_file_that_is_named_must_exist(tmp_path):
+def test_the_folder_of_an_output_must_exist(tmp_path):
     with pytest.raises(InputError, match=r"--json .*nix/a.json: the folder .*nix does not exist"):
         check_file("--json", tmp_path / "nix/a.json")
     with pytest.raises(InputError, match=r"--out .*nix/a.json: the folder .*nix does not exist"):
@@ -106,7 +106,7 @@ def test_no_command_makes_the_folder_of_a_file(command, tmp_path, monkeypatch, c
 
 
 @pytest.mark.parametrize("asked", ["osmesa", "bogus"])
-def test_a_command_that_draws_nothing_does_not_need_what_mujoco_gl_names(asked, tmp_path):
+def test_only_drawing_commands_need_mujoco_gl(asked, tmp_path):
     command = [
         sys.executable,
         "-m",
@@ -122,7 +122,7 @@ def test_a_command_that_draws_nothing_does_not_need_what_mujoco_gl_names(asked, 
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_full_disk_behind_standard_output_is_one_line(tmp_path):
+def test_a_full_standard_output_is_one_line(tmp_path):
     """And not exit code 1, which says that what was asked does not hold."""
     if not os.path.exists("/dev/full"):
         pytest.skip("there is no /dev/full here")

@@ -79,7 +79,7 @@ def test_a_figure_is_a_field(capsys):
     assert [part.strip() for part in lines[3].strip("│").split("│")] == ["growth [1/s]", "+1.00"]
 
 
-def test_a_message_quotes_eighty_characters_and_no_control_character():
+def test_messages_quote_at_most_eighty_printable_characters():
     long, path = "y" * 300, "/tmp/" + "p" * 100 + "/a.toml"
     line = one_line(f"{path}: T = '{long}' and the device's\n x{long}\x1b[31m, 'I', 'II'")
     assert path in line

@@ -35,7 +35,7 @@ def run(command: str, *words: str) -> int:
     return import_module(f"haptic_loop.cli.{command}").main([*words, "--condition", OWN])
 
 
-def test_a_design_for_it_is_proved_and_uses_nearly_all_that_it_allows(folder):
+def test_a_design_for_it_is_proved_and_tight(folder):
     report = json.loads((folder / "design.json").read_text())
     needs = report["assessment"]["requirements"][NAME]
     assert decisive(report) == needs
@@ -76,7 +76,7 @@ def test_every_command_judges_by_it(command, words, folder, monkeypatch, capsys)
         assert "does not hold" not in text
 
 
-def test_an_audit_is_decided_by_the_condition_that_is_asked_for(folder, monkeypatch, capsys):
+def test_the_given_condition_decides_an_audit(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert (
         import_module("haptic_loop.cli.audit").main(["--coupling", "joined.json", "--condition", "any-environment"])
@@ -85,7 +85,7 @@ def test_an_audit_is_decided_by_the_condition_that_is_asked_for(folder, monkeypa
     assert "Not certified by any-environment" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_file_says_so_where_its_condition_is_not_given(folder, monkeypatch):
+def test_a_file_without_its_condition_is_explained(folder, monkeypatch):
     monkeypatch.chdir(folder)
     assert import_module("haptic_loop.cli.check").main(["joined.json", *JSON]) == 1
     assert "condition is 'joined-devices', allowed are" in Path("report.json").read_text()
@@ -106,7 +106,7 @@ def test_a_file_says_so_where_its_condition_is_not_given(folder, monkeypatch):
         (["--scenario", "one-wall"], "the loop has walls, which the condition joined-devices does not name in covers"),
     ],
 )
-def test_what_cannot_be_designed_for_it_is_said_in_a_line(words, message, folder, monkeypatch):
+def test_designs_that_do_not_take_it_are_refused(words, message, folder, monkeypatch):
     monkeypatch.chdir(folder)
     with pytest.raises(ValueError, match=message) as caught:
         run("design", *words)
@@ -177,7 +177,7 @@ def test_a_condition_that_fails_is_nowhere_claimed(command, words, code, folder,
     assert "yours to show" not in text
 
 
-def test_a_device_is_not_armed_by_another_condition_than_the_one_asked_for(folder, monkeypatch):
+def test_only_the_given_condition_arms_a_device(folder, monkeypatch):
     monkeypatch.chdir(folder)
     (folder / "never.py").write_text(NEVER)
     own = import_module("never").Never()

@@ -61,14 +61,14 @@ def test_the_default_is_the_design_for_this_environment(tmp_path):
     assert report["credible"]["until_s"] is None
 
 
-def test_where_one_environment_is_not_all_the_default_is_any_environment(tmp_path):
+def test_several_environments_default_to_any_environment(tmp_path):
     """Ranges, and limited forces before walls, are covered by any-environment alone."""
     for name in ("one-wall", "omega-pair-ranges"):
         _, report = run(tmp_path, "--scenario", name, "--no-plot", "--duration", "0.5")
         assert report["assessment"]["condition"] == "any-environment"
 
 
-def test_the_papers_case_i_is_designed_certified_and_proved(tmp_path):
+def test_case_i_is_designed_certified_and_proved(tmp_path):
     code, report = run(tmp_path, "--case", "I", "--condition", "any-environment", "--paper")
     assert code == 0
     assert set(report) >= SECTIONS
@@ -180,7 +180,7 @@ def command(*options, **kwargs):
     )
 
 
-def test_bad_input_is_one_line_on_stderr_and_exit_code_2(tmp_path):
+def test_bad_input_is_one_line_and_exit_2(tmp_path):
     process = command("--T", "7", cwd=tmp_path)
     out, err = process.communicate()
     assert process.returncode == 2
@@ -249,7 +249,7 @@ def test_a_trace_that_is_none(tmp_path, content, message):
         Trace.load_npz(path)
 
 
-def test_an_error_that_is_asked_for_chooses_the_engine_and_a_cross_check_stands_beside(tmp_path, capsys):
+def test_a_requested_error_chooses_the_engine(tmp_path, capsys):
     file = tmp_path / "r.json"
     options = ["--case", "I", "--duration", "0.4", "--no-plot", "--out", str(tmp_path)]
     assert main([*options, "--error", "1e-9", "--cross-check", "--json", str(file)]) == 0
@@ -285,7 +285,7 @@ def test_two_couplings_do_not_share_a_folder(tmp_path, monkeypatch):
     assert sorted(found) == [[K, K] for K in stiffness.values()]
 
 
-def test_a_file_is_named_with_its_folder_unless_it_lies_here(tmp_path, monkeypatch):
+def test_files_elsewhere_are_named_with_their_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = [name_of(file) for file in ("stiff.json", "a/stiff.json", "b/stiff.json", "c/../a/stiff.json")]
     assert names[0] == name_of("./stiff.json") == name_of(str(tmp_path / "stiff.json")) == "stiff"
@@ -315,7 +315,7 @@ def test_long_names_of_couplings_stay_apart():
     assert len(first) < 100
 
 
-def test_a_trace_without_a_picture_removes_the_old_picture(tmp_path):
+def test_no_plot_removes_the_old_picture(tmp_path):
     picture, options = tmp_path / "out" / "figure.png", ["--coupling", "none", "--duration", "0.01"]
     run(tmp_path, *options)
     assert picture.exists()

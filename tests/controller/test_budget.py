@@ -75,7 +75,7 @@ class Line:
 @pytest.mark.parametrize("lossless", [True, False])
 @pytest.mark.parametrize("controller", [springs, network, thief])
 @pytest.mark.parametrize("start", [1e-3, 0.3])  # [m/s]
-def test_no_passive_hand_is_ever_given_more_than_the_budget(controller, lossless, start):
+def test_no_hand_is_given_more_than_the_budget(controller, lossless, start):
     rng = np.random.default_rng(7)
     hands = Hands(rng, 40, lossless, start)
     W0, given, theta = 0.05, hands.energy(), (1, 2)
@@ -94,7 +94,7 @@ def test_no_passive_hand_is_ever_given_more_than_the_budget(controller, lossless
         assert most > 0.5 * W0  # the bound is no formality
 
 
-def test_a_coupling_on_springs_that_it_was_not_made_for():
+def test_the_budget_holds_on_stiffer_springs():
     """The optimal coupling of the default scenario on springs 2.5 times stiffer, compliant devices, lossless hands."""
     scenario, nsim = load(), 30
     coupling = design_coupling(scenario.loop("I"), "optimal", "this-environment").coupling
@@ -179,7 +179,7 @@ def test_coarse_encoders_keep_the_guarantee(told):
         assert most[0.0] > 2 * W0
 
 
-def test_the_reserve_is_the_worst_of_what_may_come_and_the_scale_the_largest_that_it_bears():
+def test_reserve_and_scale_match_brute_force():
     """Against the definition, from all packets ever sent: sum over ticks of the worst packet of an allowed age."""
     rng = np.random.default_rng(9)
     cases = (((0, 0), (0, 0), 0, 0), ((1, 2), (1, 2), 0, 0), ((0, 1), (4, 2), 0, 0), ((1, 0), (2, 3), 2, 1e-5))
@@ -233,7 +233,7 @@ def acted_on(F, x, theta, delta, **options):
     return budget.limited
 
 
-def test_a_loop_certified_for_any_environment_is_never_limited_and_a_stiffer_one_is():
+def test_any_environment_loops_are_never_limited():
     rng, eps = np.random.default_rng(10), 0.05
     scenario = load()
     coupling = certified((1 - eps) * np.array(scenario.delta))
@@ -250,7 +250,7 @@ def test_a_loop_certified_for_any_environment_is_never_limited_and_a_stiffer_one
 
 
 @pytest.mark.parametrize("theta", [0, 1, 2, 5])
-def test_a_delayed_spring_within_its_limit_is_never_limited(theta):
+def test_delayed_springs_within_bounds_are_never_limited(theta):
     rng, eps = np.random.default_rng(11), 0.05
     most = (1 - eps) * DELTA / ((theta + 0.5) * T)
     ramps = np.abs((np.arange(600)[:, None, None] + rng.integers(0, 60, (1, 2, 40))) % 80 - 40.0) * 1e-3
@@ -261,7 +261,7 @@ def test_a_delayed_spring_within_its_limit_is_never_limited(theta):
     assert acted_on(beyond, x, (theta, theta), DELTA, **options).max() > 0
 
 
-def test_a_cap_below_the_energy_that_the_user_stores_limits_most_ticks():
+def test_a_cap_below_stored_energy_limits_most_ticks():
     """1000 N/m over 2 cm store 0.2 J."""
     x = 0.02 * np.sin(2 * np.pi * 1.0 * T * np.arange(8000))[:, None, None]
     spring = Lti.constant([[1000.0]], T)
@@ -270,7 +270,7 @@ def test_a_cap_below_the_energy_that_the_user_stores_limits_most_ticks():
     assert 0.5 < share[0.05] < 0.8
 
 
-def test_what_is_told_late_is_worth_as_much_and_what_cannot_be_is_noticed():
+def test_late_reports_count_and_impossible_ones_are_noticed():
     rng = np.random.default_rng(12)
     now, later = (EnergyBudget([1.0], T, Packets([0], [2]), start=5.0) for _ in range(2))
     dx = rng.normal(size=(50, 1, 1)) * 1e-4
@@ -290,7 +290,7 @@ def test_what_is_told_late_is_worth_as_much_and_what_cannot_be_is_noticed():
         later.tell(3, sent[3])
 
 
-def test_what_is_not_a_number_is_sent_as_nothing():
+def test_a_force_that_is_not_finite_becomes_zero():
     budget = EnergyBudget(DELTA, T, Packets((0, 0)), start=1.0, nsim=3)
     sent = budget.limit([[np.nan, 1.0, 1e300], [1.0, 2.0, np.inf]], np.zeros((2, 3)))
     assert np.isfinite(sent).all()
@@ -325,7 +325,7 @@ def active_environment():
     return Networks(FIGURE_4.contacts, (M, D - 4.0 * np.diag([0, 0, 1.0]), K)).E(T)
 
 
-def test_the_shell_makes_a_mass_with_negative_damping_passive():
+def test_the_shell_makes_an_active_mass_passive():
     """What the port of the environment gives never exceeds W0, with any motion; and the scale is the largest."""
     rng, W0, nsim = np.random.default_rng(13), 0.01, 40
     E = active_environment()
@@ -355,7 +355,7 @@ def certified(delta, theta=(1, 2)):
     return design_coupling(loop, "spring-damper", "any-environment").coupling
 
 
-def test_hands_behind_shell_and_coupling_are_never_given_more_than_its_budget():
+def test_hands_behind_the_shell_get_its_budget():
     """The certificate for any environment, with a mass of negative damping, and with one that talks nonsense."""
     E = active_environment()
     V = certified(DELTA).compliance(T)
@@ -377,7 +377,7 @@ def test_hands_behind_shell_and_coupling_are_never_given_more_than_its_budget():
     assert most["active"] > 0.1 * 0.02
 
 
-def test_the_shell_leaves_a_passive_implicit_environment_as_it_is():
+def test_the_shell_leaves_implicit_passive_environments_alone():
     rng = np.random.default_rng(14)
     E, V = environment(FIGURE_4, T), SpringDamper([879.0, 552.0], [0.39, 0.52]).compliance(T)
     shell, x, F = Shell(V, start=1e-12, nsim=20), motions(rng, 2000, 20), E.feedback(V)

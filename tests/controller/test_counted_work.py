@@ -52,7 +52,7 @@ def test_an_inner_budget_never_exceeds_the_outer_one():
         spend(2.0)
 
 
-def test_a_clock_ends_work_only_if_it_is_given():
+def test_only_a_given_clock_ends_work():
     with pytest.raises(TooLong), within(np.inf, clock=lambda: True):
         spend(0.0)
     spend(0.0)

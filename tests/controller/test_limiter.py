@@ -193,7 +193,7 @@ def test_the_short_tick_is_the_tick(channels, weakest):
 
 @pytest.mark.parametrize("walls", [0, 1, 2])
 @pytest.mark.parametrize("limited", [False, True])
-def test_a_tick_of_many_laws_is_each_of_them_alone(walls, limited):
+def test_a_stack_of_laws_ticks_like_each_alone(walls, limited):
     """Walls and springs that differ from law to law, states that press into them and forces beyond their limits."""
     laws = []
     for k in range(6):
@@ -231,7 +231,7 @@ def test_a_wall_and_every_limit_at_once(i):
 
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("channel", [0, 1])
-def test_the_first_tick_that_a_limiter_bends_is_found(channel, sign):
+def test_the_first_limited_tick_is_found(channel, sign):
     limiter = loop_of(FIGURE_4, (1, 2), (0, 0)).law(STIFF, LIMITS, (10.0, 10.0))
     buffer = StepBuffer(closed(limiter), 10, 2)
     sent, other = (buffer.after[:, limiter.sent_rows[i], 0] for i in (channel, 1 - channel))
@@ -256,7 +256,7 @@ def test_limiter_and_environment_are_passive_without_lag():
     assert energy.max() > 0.5
 
 
-def test_a_clipped_cycle_gives_energy_however_slow_and_a_limited_one_does_not():
+def test_clipped_cycles_give_energy_limited_ones_none():
     """Two hands around a circle of 4 cm: clipping each force by itself gives 0.616 J a turn whatever the speed."""
     coupling, rho = SpringDamper([5832.0, 2545.0], [0.187, 1.386]), (11.4167, 11.4167)
     limit = np.array(LIMITS)[:, None]

@@ -73,7 +73,7 @@ def test_sampled_responses_obey_the_same_algebra(m):
         close(sampled.G - at_one / (z - 1)[..., None, None], quotient.at(z))
 
 
-def test_a_sampled_split_keeps_what_z_loses_near_one():
+def test_a_sampled_split_keeps_digits_near_one():
     """He[K/(z-1)] = -K/2 on the whole circle; 1 - cos w from z itself is off by 1e-16/w^2."""
     z = np.exp(1j * np.geomspace(1e-8, 3, 50))[None]
     split = Sampled.of(Lti.constant([[800.0]], 1e-3), z).over_z_minus_one()[1]
@@ -85,7 +85,7 @@ def test_quotient_at_one(blocks):
     close(G.split_at_one()[1].at(Z), (G.at(Z) - G.dc()) / (Z - 1)[:, None, None])
 
 
-def test_without_its_pole_a_block_over_z_minus_one_keeps_its_hermitian_part(blocks):
+def test_splitting_the_pole_keeps_the_hermitian_part(blocks):
     """Of blocks whose G(1) is symmetric; exactly (3 + 1/z has G(1) = 4, and leaves -1/z - 2)."""
     G = blocks[0] + (blocks[0].dc().T - blocks[0].dc()) / 2
     at_one, regular = G.over_z_minus_one()
@@ -103,7 +103,7 @@ def test_a_delay_line_is_a_power_of_z(steps):
     close(D.at(Z), np.array([np.diag([z ** -float(n) for n in steps]) for z in Z]))
 
 
-def test_delays_at_the_outputs_are_powers_of_z_wherever_they_stand(blocks):
+def test_output_delays_are_powers_of_z(blocks):
     """Behind a block, before it, in a loop, branching, and in a ring of delays that no input reaches."""
     G = blocks[0]
     T, loop = G.T, delay((3, 0), G.T) @ G @ delay((1, 4), G.T)
@@ -142,7 +142,7 @@ def test_blocks_prove_their_shapes():
         Lti.constant([[1.0]], 1e-3).D[0, 0] = 2.0
 
 
-def test_a_block_is_built_without_writing_its_matrices_as_text():
+def test_building_a_block_formats_no_matrices():
     """Thousands are built in a search, and the text of one costs more than its arithmetic."""
 
     class Unwritable(np.ndarray):
@@ -181,7 +181,7 @@ def at_rest(G):
     return [[G.D[i, j] + sum(G.C[i, k] * X[k][j] for k in range(n)) for j in range(G.inputs)] for i in range(G.outputs)]
 
 
-def test_an_exact_block_at_rest_is_made_of_its_parts_at_rest(blocks):
+def test_exact_blocks_at_rest_combine_their_parts(blocks):
     G, H = map(exact, blocks)
     late = hstack(G, delay((1, 2), G.T)) @ Lti.diag(H, 2 * H).rows([0, 3, 1, 2])
     for whole in (G, G @ H, delay((2, 0), G.T) @ G.feedback(H), G @ np.array(H.D), late):

@@ -71,7 +71,7 @@ def test_an_element_is_put_among_springs_and_walls():
         Network(("a",), elements=(Hardening(("a", "ground"), 100.0, 2e-3),) * 4)
 
 
-def test_a_block_is_the_network_whose_numbers_it_has():
+def test_a_block_equals_the_network_of_its_numbers():
     """Alone, and beside springs and walls; over Fractions it is exact."""
     E = environment(INERT, T)
     alone = Network(INERT.contacts, block=Block.of(E))
@@ -130,7 +130,7 @@ def test_no_narrow_resonance_hides_from_passivity(width):
     assert seen == {True, False}
 
 
-def test_the_floor_of_a_hermitian_part_is_below_every_sample():
+def test_the_bound_is_below_every_sample():
     """Random stable blocks: below a dense sweep around every pole, and by no more than was asked for."""
     rng = np.random.default_rng(11)
     for _ in range(30):
@@ -149,7 +149,7 @@ def test_the_floor_of_a_hermitian_part_is_below_every_sample():
         assert floor >= sampled - 2e-3 * abs(sampled)
 
 
-def test_networks_at_the_edge_of_passivity_are_accepted_as_blocks():
+def test_blocks_of_barely_passive_networks_are_accepted():
     """A free mass, a spring and a chain between two contacts store all energy: the block gets a soft spring."""
     between = (Spring(("a", "m"), 1000.0), Spring(("m", "b"), 700.0))
     for network in (
@@ -174,7 +174,7 @@ class Gel:
         return Network(self.contacts, (Spring(self.contacts, 600.0, 2.0),)).E(T)
 
 
-def test_maxwell_elements_are_passive_though_rounding_leaves_no_zero_of_their_static_stiffness():
+def test_maxwell_elements_are_passive_despite_rounding():
     """E(1) = 0 out of k b/T/(k + b/T): a spring and a damper in series, by backward Euler, between two contacts."""
     rng, below = np.random.default_rng(0), 0
 
@@ -196,7 +196,7 @@ def test_maxwell_elements_are_passive_though_rounding_leaves_no_zero_of_their_st
         Block.of(maxwell(500.0, 6.0, T, less=1e-5))
 
 
-def test_a_scenario_takes_an_environment_of_one_s_own():
+def test_a_scenario_takes_an_own_environment():
     own = load().replace(environment=Gel())
     same = load().replace(environment=Network(Gel.contacts, (Spring(Gel.contacts, 600.0, 2.0),)))
     np.testing.assert_allclose(own.loop("I").E().at(SQUARE), same.loop("I").E().at(SQUARE), rtol=2e-6)

@@ -61,7 +61,7 @@ def test_without_coupling_both_delays_only_shift(theta, psi):
     assert not shifted[:n].any()
 
 
-def test_psi_is_inside_the_loop_and_theta_is_not():
+def test_only_psi_is_inside_the_loop():
     coupling = SpringDamper([900.0], [0.5])
     E, z = wall(500.0, 1.0), np.exp(1j * np.array([0.1, 1.0, 2.0]))
     V, e = coupling.compliance(T).at(z)[:, 0, 0], E.at(z)[:, 0, 0]
@@ -155,7 +155,7 @@ def test_a_step_of_an_encoder_is_finite():
             process(wall(1000.0), step=step)
 
 
-def test_a_net_and_a_line_hear_the_tick_of_the_whole_run():
+def test_passivity_layers_count_ticks_of_the_run():
     """A later block of a run begins at tick `first`."""
     heard = []
 

@@ -69,7 +69,7 @@ def test_a_constant_delay_is_the_linear_block():
     np.testing.assert_allclose(np.concatenate(forces[:4]), np.concatenate(forces[4:]), rtol=1e-12, atol=1e-12)
 
 
-def test_the_age_stays_within_the_range_and_grows_by_one_at_most():
+def test_ages_stay_in_range_and_grow_by_one():
     varying_delay = VaryingDelay((1, 0), (4, 3))
     delays = varying_delay.draw(np.random.default_rng(2), 5000)
     age = ages(delays[:, :, None])[10:, :, 0]
@@ -78,7 +78,7 @@ def test_the_age_stays_within_the_range_and_grows_by_one_at_most():
     assert np.diff(age, axis=0).max() == 1
 
 
-def test_wanted_ages_are_realised_by_delays_within_the_range():
+def test_every_allowed_age_sequence_has_delays():
     rng = np.random.default_rng(3)
     wanted = np.full((400, 2), 3)
     for k in range(1, 400):
@@ -134,7 +134,7 @@ def test_impossible_ranges_are_refused(fields, message):
 
 
 @pytest.mark.parametrize("pattern", ["constant", "adversarial"])
-def test_patterns_that_depend_on_the_loop_ask_for_its_delays(pattern):
+def test_patterns_of_the_loop_need_its_delays(pattern):
     with pytest.raises(ValueError, match="give its delays"):
         VaryingDelay((1,), (2,), pattern).draw(np.random.default_rng(0), 10)
 

@@ -45,7 +45,7 @@ def walled(network: Network, coupling, theta, psi) -> Process:
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3, 50.0])
-def test_a_wall_gives_back_no_more_than_it_has_stored(damping):
+def test_walls_return_at_most_their_stored_energy(damping):
     """f[k] (x[k] - x[k-1]) >= potential now less potential before, tick by tick; rounding of 1e-12 of the stiffness."""
     x = wander(2000, 1, 20)
     f = drive(walled(one(700.0, damping, 0.004), NoCoupling(), [0], [0]), x).f[:2000]
@@ -84,7 +84,7 @@ def test_wall_forces_that_are_not_determined_are_refused():
         Law(Lti.constant(np.ones((1, 2)), T), (), (Wall(("a", GROUND), 1.0),) * 2)
 
 
-def test_a_wall_behind_a_coupling_against_a_root_finder():
+def test_a_wall_behind_a_coupling_matches_root_finding():
     """u = x - y, K y + B (y - y-)/T = wall(u) = f, one equation a tick, solved by bisection to 1e-13 m."""
     K, B, stiffness, damping, gap = 900.0, 0.4, 3000.0, 2.0, 2e-3
     x = wander(400, 1, 1)[:, 0, 0]
@@ -138,7 +138,7 @@ BOXED = Network(
 
 @pytest.mark.parametrize("coupling", [NoCoupling(), SpringDamper([2e4, 1e4], [1.0, 0.0])], ids=["none", "stiff"])
 @pytest.mark.parametrize("psi", [(0, 0), (0, 2)])
-def test_a_wall_that_always_touches_is_the_linear_spring_damper(coupling, psi):
+def test_a_touching_wall_is_a_spring_damper(coupling, psi):
     """Walls a metre inside: differences of two runs follow the environment with springs in the walls' place."""
     walls = (Wall(("contact 1", GROUND), 5000.0, 3.0, -1.0), Wall(FIGURE_4.contacts, 2000.0, 1.0, -1.0))
     network = Network(BOXED.contacts, BOXED.springs, BOXED.masses, walls)
@@ -187,7 +187,7 @@ def boxed(scenario):
 
 
 @pytest.mark.parametrize(("name", "humans", "seconds"), [("exact", 200, 6.0), ("mujoco", 20, 3.0)])
-def test_random_hands_on_walls_come_to_rest_under_any_environment(name, humans, seconds):
+def test_any_environment_hands_on_walls_come_to_rest(name, humans, seconds):
     """Walls of 20000 and 2000 N/m hit at up to 0.3 m/s, a coupling certified for whatever is passive.
 
     The speed falls from the first quarter to the last in every run, though contact is made thousands of times.
@@ -231,7 +231,7 @@ def test_both_engines_see_the_same_contacts():
     assert np.abs(exact.s[:, 0] - own.s[:, 0]).max() < 1e-6 * np.abs(exact.s[:, 0]).max()
 
 
-def test_a_run_reports_the_contact_and_who_covers_it(tmp_path):
+def test_a_run_reports_contact_and_its_certificate(tmp_path):
     def run(*options):
         main(["--scenario", "one-wall", "--duration", "3", "--engine", "exact", "--no-plot", *options,
               "--out", str(tmp_path), "--json", str(tmp_path / "r.json")])  # fmt: skip
@@ -268,7 +268,7 @@ def test_this_environment_is_asked_of_every_frozen_state():
     assert "no walls" in (requirements_of(late, SOFT)["any-environment"].reason or "")
 
 
-def test_a_stiffer_coupling_is_promised_for_walls_that_make_and_break():
+def test_stiffer_couplings_are_certified_for_switching_walls():
     """K = 1200 N/m behind one sample of delay, where any-environment ends at 1033; 1772 N/m is certified in each frozen
     state, and not for what switches between them."""
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1200.0], [0.5])
@@ -281,7 +281,7 @@ def test_a_stiffer_coupling_is_promised_for_walls_that_make_and_break():
     assert requirement(loop.at(held(loop.network, [False])), coupling, "this-environment").ratio == 0
 
 
-def test_a_coupling_with_a_model_of_its_own_cannot_face_walls():
+def test_couplings_with_a_model_refuse_walls():
     class Model(Coupling):
         holds_model = True
 

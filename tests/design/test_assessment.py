@@ -67,7 +67,7 @@ def test_a_forged_certificate_proves_nothing():
     assert (assessment.guarantee, assessment.certificate) == (None, None)
 
 
-def test_the_forces_of_a_guarantee_are_those_that_run():
+def test_a_guarantee_names_the_forces_that_run():
     limited, clipped = assess(LOOP, HERE_ONLY), assess(LOOP, HERE_ONLY, limiter=False)
     assert limited.force_limits.rho is not None
     assert "limiter" in limited.facts

@@ -79,7 +79,7 @@ def test_closed_forms_of_a_rigid_wall(K, B, theta, this_environment, any_environ
 
 
 @pytest.mark.parametrize(("theta", "proved"), [(0, True), (1, True), (1, False)])
-def test_a_coupling_before_a_rigid_wall_is_proved_and_stored_like_any_other(theta, proved, tmp_path):
+def test_rigid_wall_couplings_are_proved_and_stored(theta, proved, tmp_path):
     """It needs 500 and 1500 N/m times T; a wall that is never left, so that nothing else is promised."""
     loop, coupling = wall(1000, 0, theta, delta=1.51 if proved else 1.49)
     needs = certify(loop, coupling)
@@ -105,7 +105,7 @@ def test_what_a_rigid_wall_cannot_have():
         msgspec.structs.replace(loop, ranges=Ranges(masses={"tip": (1.0, 2.0)}))
 
 
-def test_a_wall_is_the_limit_of_a_stiff_environment():
+def test_a_rigid_wall_is_the_stiff_limit():
     ground = Network(("a",), (Spring(("a", GROUND), 1e9),))
     loop, coupling = wall(2000, 0.4, 1)
     ratio = requirement(loop.at(ground), coupling, "this-environment").ratio
@@ -135,7 +135,7 @@ def test_the_papers_gains_and_their_figures():
     assert "B = 5.47 N s/m alone uses up delta = 1.37" in outcome["margins"]["any-environment"]["stiffest"]["reason"]
 
 
-def test_the_any_environment_gains_as_the_literature_rounds_them():
+def test_rounded_any_environment_gains_of_the_literature():
     """(879, 552) / (.39, .52) are 0.02 % beyond Theorem 4, and far inside the this-environment condition."""
     outcome = report(*pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
     assert needs(outcome, "this-environment")["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
@@ -147,7 +147,7 @@ def test_the_any_environment_gains_as_the_literature_rounds_them():
 @pytest.mark.parametrize(
     "subject", [pair(SAFE), wall(900, 0.3, 1), wall(300, 0.1, 2)], ids=["pair", "wall", "late wall"]
 )
-def test_just_inside_is_certified_and_just_outside_is_not(subject, condition):
+def test_certification_changes_exactly_at_the_edge(subject, condition):
     loop, coupling = subject
     needs = requirement(loop, coupling, condition)
     assert needs.certified
@@ -193,7 +193,7 @@ def test_remedies_are_tried_and_mild():
     assert {helping["condition"] for helping in report(*wall(5000, 0))["helps"]} == {"this-environment"}
 
 
-def test_a_delayed_environment_needs_a_multiplier_that_the_default_scenario_has_not():
+def test_delayed_environments_need_a_multiplier():
     needs = requirement(*pair(SAFE, psi=(1, 1)), "any-environment")
     assert not needs.certified
     assert "the environment alone uses up" in needs.reason
@@ -340,7 +340,7 @@ BAD = [
 
 @pytest.mark.usefixtures("files")
 @pytest.mark.parametrize(("options", "message"), BAD, ids=[options or "nothing" for options, _ in BAD])
-def test_bad_calls_get_one_line_and_exit_code_2(run, options, message):
+def test_bad_calls_are_one_line_and_exit_2(run, options, message):
     code, out, err = run(*options.split())
     assert (code, out) == (2, "")
     assert err.startswith("error: ")
@@ -385,7 +385,7 @@ def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):
 # time
 
 
-def test_what_would_take_minutes_is_not_begun_and_what_does_is_given_up(monkeypatch):
+def test_long_computations_are_refused_or_ended(monkeypatch):
     """A sweep of the pair is estimated at .16 ms, a search at sixty times that."""
     monkeypatch.setattr(budgets, "SWEEPS", 5e-3)
     told = report(PAIR, SOFT)

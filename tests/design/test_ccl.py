@@ -32,7 +32,7 @@ def inner():
 
 
 @pytest.mark.parametrize(("order", "diagonal"), [(1, True), (2, True), (1, False), (2, False)])
-def test_a_spring_damper_is_a_member_of_every_family(order, diagonal):
+def test_every_family_contains_the_spring_damper(order, diagonal):
     gains = SpringDamper([500.0, 900.0], [0.4, 1.0])
     loop = asked(delta=(2.0, 0.8))
     family = FixedOrder(Shaping(loop), None, order, diagonal)
@@ -72,12 +72,12 @@ def test_the_inequalities_are_affine_in_the_unknowns(diagonal):
     np.testing.assert_allclose(everything((one + two) / 2), middle, atol=1e-9 * np.abs(middle).max())
 
 
-def test_the_inner_approximation_reaches_the_optimum_of_its_order(inner, structured):
+def test_the_inner_approximation_reaches_its_optimum(inner, structured):
     assert inner.objective <= 9.8
     assert inner.objective < structured.objective
 
 
-def test_what_is_returned_is_certified_from_the_coupling_alone(inner):
+def test_results_are_certified_from_the_coupling_alone(inner):
     loop = asked()
     V = inner.coupling.V
     assert V.order == 2
@@ -88,7 +88,7 @@ def test_what_is_returned_is_certified_from_the_coupling_alone(inner):
     assert this_environment(F, DELTA).certified
 
 
-def test_every_step_of_the_descent_is_feasible_and_better():
+def test_every_descent_step_is_feasible_and_better():
     loop = asked((0, 0))
     family = FixedOrder(Shaping(loop))
     gains = spring_damper.design(asked((0, 0), delta=(1.36, 1.36))).coupling
@@ -108,7 +108,7 @@ def test_the_fixed_pole_reference_agrees(inner):
     assert reference.requirement.certified
 
 
-def test_more_poles_never_hurt_and_the_structured_poles_are_beaten(structured):
+def test_more_poles_never_hurt(structured):
     problem = FixedPoles(Shaping(asked()))
     gains = structured.coupling
     rate = gains.B / (gains.B + gains.K * T)

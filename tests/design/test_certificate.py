@@ -46,7 +46,7 @@ def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loo
 
 
 @pytest.mark.parametrize("psi", [(1, 1), (1, 0)])
-def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
+def test_environment_delay_is_proved_with_its_multiplier(psi):
     """Theorem 4 with psi >= 1: the design's Phi is stored, and only for this environment is anything promised."""
     loop = change(DEFAULT, psi=psi, environment=SOFT_NETWORK)
     found = spring_damper.design(loop)
@@ -64,7 +64,7 @@ def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
     assert not verify(change(stored, certificate=forged)).proved
 
 
-def test_a_model_too_large_to_prove_in_seconds_is_said_so():
+def test_models_too_large_to_prove_are_reported():
     loop = change(DEFAULT, theta=(400, 400), delta=(600.0, 600.0))
     with pytest.raises(NotProved, match="over 806 states takes long: up to 800 are tried"):
         prove(loop, SpringDamper((4.0, 4.0), (0.5, 0.5)), "this-environment")
@@ -91,7 +91,7 @@ def certified(loop: Loop, coupling, condition: str) -> Stored:
         (SpringDamper((400.0, 300.0), (0.0, 0.5)), "any-environment", None),
     ],
 )
-def test_safe_gains_are_proved_and_proved_again_from_the_file(tmp_path, coupling, condition, ratio):
+def test_safe_gains_are_proved_again_from_files(tmp_path, coupling, condition, ratio):
     stored = certified(DEFAULT, coupling, condition)
     assert stored.certificate.proof == "rational"
     if ratio:  # the figures of the design notes, to the digits that they have
@@ -123,7 +123,7 @@ def test_no_coupling_is_proved_where_the_damping_suffices():
 
 
 @pytest.mark.parametrize(("K", "B"), [(1000.0, 0.0), (500.0, 0.3), (30.0, 2.0)])
-def test_one_channel_without_delay_is_colgates_condition_to_one_part_in_a_million(K, B):
+def test_proofs_reach_colgates_condition_within_a_millionth(K, B):
     needed = K * 1e-3 / 2 + B
     assert verify(certified(wall(K, B, needed * (1 + 1e-6)), NoCoupling(), "this-environment")).proved
     with pytest.raises(NotProved, match="needs"):
@@ -155,7 +155,7 @@ def test_a_static_asymmetry_is_refused():
             prove(change(DEFAULT, environment=anchored), V, condition)
 
 
-def test_environment_delay_is_proved_by_the_this_environment_condition_only():
+def test_only_this_environment_proves_environment_delay():
     loop = change(DEFAULT, psi=(1, 1), delta=(2.5, 2.5))
     damped = SpringDamper((2000.0, 2000.0), (3.0, 3.0))
     assert verify(certified(loop, damped, "this-environment")).proved
@@ -163,7 +163,7 @@ def test_environment_delay_is_proved_by_the_this_environment_condition_only():
         prove(loop, damped, "any-environment")
 
 
-def test_the_proof_succeeds_exactly_where_the_sweep_says_so():
+def test_proof_and_sweep_agree_on_both_sides():
     """60 random loops; between 1 - 1e-4 and 1 either outcome is fair."""
     rng = np.random.default_rng(7)
     outcomes = []
@@ -213,7 +213,7 @@ def test_tampering_is_rejected_with_the_reason():
         assert any(part in verdict.reason for part in reason.split("|")), verdict.reason
 
 
-def test_a_forger_who_repairs_the_digests_still_has_to_prove():
+def test_repaired_digests_do_not_forge_a_proof():
     good = certified(DEFAULT, STIFF, "this-environment")
     starved = change(DEFAULT, delta=(1.36, 1.36))
     forged = change(prove(change(DEFAULT, delta=(1.38, 1.38)), STIFF, "this-environment"), available=(1.36, 1.36))
@@ -251,7 +251,7 @@ def test_a_forger_who_repairs_the_digests_still_has_to_prove():
         (b"7806.0", b"NaN", ", 'NaN,': JSON is malformed"),
     ],
 )
-def test_a_bad_file_is_one_line_that_names_the_field(tmp_path, old, new, names):
+def test_a_bad_file_is_one_line(tmp_path, old, new, names):
     path = tmp_path / "coupling.json"
     save(certified(DEFAULT, STIFF, "this-environment"), path)
     text = path.read_bytes()
@@ -280,7 +280,7 @@ def test_coefficients_that_no_coupling_has_are_refused():
         _ComplianceForm((), (), ((),), ((-1e13,),))
 
 
-def test_an_entry_of_a_proof_beyond_floating_point_is_no_proof():
+def test_proof_entries_beyond_floating_point_are_rejected():
     good = certified(DEFAULT, STIFF, "this-environment")
     rows = [list(row) for row in good.certificate.matrices["P"]]
     rows[0][0] = "1" + "0" * 400
@@ -297,7 +297,7 @@ def cancelling(size: float) -> Compliance:
 
 
 @pytest.mark.parametrize("condition", ["this-environment", "any-environment"])
-def test_a_realisation_that_rounding_makes_another_system_is_refused(condition):
+def test_realisations_changed_by_rounding_are_refused(condition):
     """Over the rationals the modes are not there. The tick in floating point keeps some of them."""
     loop = change(wall(1000.0, 0.0, 5.0), theta=(1,), lam=(1,))
     assert verify(certified(loop, cancelling(1.0), condition)).proved
@@ -326,7 +326,7 @@ def test_the_bound_on_rounding_holds_for_a_tick():
         assert np.abs(off).max() > 0
 
 
-def test_beside_a_sharp_resonance_what_runs_is_what_is_proved():
+def test_near_sharp_resonances_proof_and_run_agree():
     """A gram beside 50 kg: both exactly, at a rational point of the circle beside the peak.
 
     The Schur form of either misses it by more than the two are apart; the bound holds, and the filter is proved.
@@ -378,7 +378,7 @@ def test_limits_are_checked_before_anything_is_built(monkeypatch, loop, coupling
             prove(loop, coupling, condition)
 
 
-def test_a_proof_with_endless_digits_is_refused_in_a_moment(tmp_path):
+def test_proofs_with_endless_digits_are_refused_quickly(tmp_path):
     good = certified(DEFAULT, STIFF, "this-environment")
     rows = [[f"1/{10**600 + 2 * (9 * i + j) + 1}" for j in range(9)] for i in range(9)]
     reason = verify(change(good, certificate=sealed(change(good.certificate, matrices={"P": tuple(map(tuple, rows))}))))
@@ -402,7 +402,7 @@ def test_a_name_that_stands_twice_is_refused(tmp_path, name):
         load(path)
 
 
-def test_what_is_no_regular_file_or_too_large_is_one_line(tmp_path):
+def test_irregular_or_huge_files_are_one_line(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="pipe: is not a regular file, expected a file"):
         load(tmp_path / "pipe")
@@ -417,7 +417,7 @@ def test_what_is_no_regular_file_or_too_large_is_one_line(tmp_path):
 # what is asked, and of what
 
 
-def test_any_environment_asks_the_same_of_a_coupling_as_its_state_space_behind_walls_too():
+def test_any_environment_ignores_the_realisation_and_walls():
     own = ANY_ENVIRONMENT.required(PAIR, SOFT)
     whole = ANY_ENVIRONMENT.required(PAIR, Compliance(SOFT.compliance(PAIR.T)))
     assert max(own.required) == pytest.approx(max(whole.required), rel=1e-6)
@@ -431,7 +431,7 @@ def test_any_environment_asks_the_same_of_a_coupling_as_its_state_space_behind_w
 # time
 
 
-def test_exact_arithmetic_that_takes_too_long_is_given_up_in_one_line(monkeypatch):
+def test_too_long_exact_arithmetic_ends_in_one_line(monkeypatch):
     stored = certified(PAIR, STIFF, "this-environment")
     monkeypatch.setattr(budgets, "EXACT", 0.0)
     words = "exact arithmetic was given up after the work of 0 s: these are too many digits over many states"
@@ -466,7 +466,7 @@ def test_a_body_that_only_dampers_drag_is_proved(network):
                 assert not expected
 
 
-def test_the_proof_succeeds_exactly_where_the_sweep_says_so_on_any_network():
+def test_proof_and_sweep_agree_on_any_network():
     """`make validate` does so for 500."""
     found = list(proofs(11, 60))
     assert [row for row in found if not row.holds] == []
@@ -501,7 +501,7 @@ def test_walls_without_a_solution_are_refused(monkeypatch):
         design_certificate._blocks(loop, coupling, THIS_ENVIRONMENT, [1.0] * 4)
 
 
-def test_a_long_delay_is_proved_stored_and_read_again(tmp_path):
+def test_a_long_delay_is_proved_from_its_file(tmp_path):
     """Scenarios take up to a thousand samples of delay: so do files."""
     loop, soft = scenario().replace(theta=(1, 101)).loop("I"), SpringDamper((400.0, 5.0), (0.0, 0.0))
     kept = Stored.of(loop, soft, prove(loop, soft, "this-environment"))

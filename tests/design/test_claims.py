@@ -102,7 +102,7 @@ def supplied(F, dx):
     return np.cumsum((f * dx + DELTA / T * dx**2).sum(axis=1))
 
 
-def test_a_certified_force_map_never_gives_more_than_the_devices_dissipate():
+def test_certified_forces_give_less_than_devices_dissipate():
     E = environment(FIGURE_4, T)
     rng = np.random.default_rng(2)
     for coupling in (STIFF, SOFT):
@@ -129,7 +129,7 @@ def random_pairs(links, count):
 
 @pytest.mark.parametrize("links", [1, 2])
 @pytest.mark.parametrize("coupling", [STIFF, SOFT], ids=["this environment", "any environment"])
-def test_certified_loops_come_to_rest_with_every_random_human(coupling, links):
+def test_certified_loops_rest_with_random_humans(coupling, links):
     base = load()
     for devices in (base.device, (RigidDevice(), RigidDevice())):
         for pair in random_pairs(links, 60):
@@ -192,7 +192,7 @@ def test_index_25_of_the_default_environment_is_infinite(case):
     assert np.linalg.norm(mismatch_at(z, E, *LOOPS[case]), 2, axis=(1, 2)).min() > 50
 
 
-def test_no_reading_of_figure_4_gives_the_printed_index():
+def test_no_reading_of_figure_4_reproduces_tau():
     """Both springs between any two of {contacts, mass, ground}, the mass free or held by a contact: 66 readings.
 
     On a grid (25) comes out too small, never too large, and already that is far above the printed figures.
@@ -233,7 +233,7 @@ def test_a_rigid_wall_is_not_the_worst_environment():
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_the_theorem_4_line_is_the_worst_lossless_environment(seed):
+def test_theorem_4_is_the_worst_lossless_environment(seed):
     """1/(q + 1/W) with Re q >= 0 fills a disk, so a reactance q reaches the line; and it is a passive environment."""
     rng = np.random.default_rng(seed)
     K, B, theta = np.exp(rng.uniform(4, 9)), np.exp(rng.uniform(-3, 2)), int(rng.integers(0, 4))
@@ -294,7 +294,7 @@ def test_no_linear_coupling_is_stiffer():
     assert min(ratios) >= 1 - 1e-6
 
 
-def test_the_loop_shaping_premise_cannot_hold_under_theorem_4():
+def test_theorem_4_excludes_the_loop_shaping_premise():
     """sigma_max(L(1)) >= k (V_1(1) + V_2(1)) >= 0.8175 for any V that Theorem 4 admits; 1.13 for the designed one."""
     E1 = 800 * 700 / 1500 * np.array([[1, -1], [-1, 1]])
     floor = np.array(THETA) + 1.0
@@ -313,7 +313,7 @@ def test_the_loop_shaping_premise_cannot_hold_under_theorem_4():
         assert (size.min(), size.max()) == (pytest.approx(low, abs=1e-3), pytest.approx(high, abs=5e-3))
 
 
-def test_the_environments_static_stiffness_is_a_pole_that_no_storage_excludes():
+def test_no_storage_excludes_the_static_pole():
     """v'(A'PA - P)v = 0 for the eigenvector of the pole at z = 1, whatever P."""
     E = environment(FIGURE_4, T)
     one = np.eye(2)
@@ -414,7 +414,7 @@ def test_what_the_multiplier_costs():
     assert seen == {True, False}
 
 
-def test_one_sample_inside_the_environment_already_needs_more_than_the_devices_have():
+def test_one_environment_sample_exceeds_the_devices_damping():
     """sup over frequency of the largest eigenvalue of -He E-hat, psi = 1: 1.479 N s/m, at every Phi <= s I."""
     hat = figure_4_at(Z) * (Z**-1 / RATE)[:, None, None]
     least = -np.linalg.eigvalsh((hat + np.conj(np.swapaxes(hat, 1, 2))) / 2)[:, 0]

@@ -46,7 +46,7 @@ def need(loop, coupling, rho=None):
         (3000.0, 2.4, 0, (0.12e-3, 0.6e-3), 5.3171),
     ],
 )
-def test_latency_and_walls_need_at_most_the_known_damping(k, damping, theta, latency, most):
+def test_latency_and_walls_need_the_known_damping(k, damping, theta, latency, most):
     """Separate code, with m = 0 and both parts of a period charged apart, needs more; the frozen contact needs less."""
     loop = loop_of(Network(("tip",), walls=(wall(k, damping),)), theta=theta, latency=(latency,))
     touched = loop_of(Network(("tip",), (Spring(("tip", GROUND), k, damping),)), theta=theta)

@@ -120,7 +120,7 @@ def test_what_is_not_the_solvers_fault_passes_through(error, monkeypatch):
         LEAST_TRACE.solve("it")
 
 
-def test_a_failure_carries_the_problem_and_what_was_tried(monkeypatch):
+def test_a_failure_carries_problem_and_attempts(monkeypatch):
     answering(monkeypatch, *[WRONG["lie"]] * len(LADDER))
     with pytest.raises(DesignFailed, match="the thing could not be solved") as caught:
         LEAST_TRACE.solve("the thing")
@@ -145,7 +145,7 @@ def test_unbounded_is_a_failure():
         bounds(lambda x: -x).solve("the request")
 
 
-def test_an_optimum_that_the_caller_refuses_is_not_used():
+def test_a_refused_optimum_is_not_used():
     answers = iter([False, True])
     LEAST_TRACE.solve("it", accept=lambda x: next(answers))
     assert next(answers, None) is None

@@ -56,7 +56,7 @@ def test_singular_values_and_effective_impedance_by_hand():
             np.testing.assert_allclose(part.damping[k], np.diag(G).imag / omega, atol=ROUNDING * size / omega)
 
 
-def test_a_wall_without_delay_is_perceived_as_its_spring():
+def test_an_undelayed_wall_feels_like_its_spring():
     felt = curves(wall(1000.0), judge(wall(1000.0), NoCoupling()), HZ).perceived
     np.testing.assert_allclose(felt.stiffness[:, 0], 1000.0, rtol=1e-12)
     np.testing.assert_allclose(felt.damping[:, 0], 0.0, atol=1e-12)
@@ -92,7 +92,7 @@ def test_demand_by_hand():
 @pytest.mark.parametrize(
     "coupling", [NoCoupling(), PUBLISHED["I"], SOFT, Compliance(SOFT.compliance(T))], ids=lambda c: str(c)[:9]
 )
-def test_the_curve_reaches_the_required_damping_and_no_more(coupling):
+def test_the_curves_maximum_is_the_required_damping(coupling):
     judged = judge(PAIR, coupling)
     hz = grid(PAIR, [judged])
     for condition, demand in curves(PAIR, judged, hz).demands.items():
@@ -116,7 +116,7 @@ def test_the_curve_with_delay_in_the_environment():
     assert 0 < demand.max() == pytest.approx(judged.requirements["any-environment"].ratio, rel=1e-9)
 
 
-def test_required_damping_is_what_is_perceived_with_the_hold():
+def test_required_damping_is_perceived_with_the_hold():
     """One channel: T Im[F e^-jw/2] / (2 sin(w/2)), the damping half a sample later, is lowest at -required."""
     loop = wall(900.0, 0.4, theta=2)
     judged = judge(loop, SpringDamper([2000.0], [0.3]))
@@ -156,7 +156,7 @@ def test_other_devices_other_delays_and_no_pictures(tmp_path):
     assert np.shape(outcome["ideal"]["stiffness"])[1] == 3
 
 
-def test_a_design_that_does_not_exist_leaves_the_others(tmp_path, capsys):
+def test_a_missing_design_leaves_the_others(tmp_path, capsys):
     base = ["--psi", "1,1", "--no-plot", "--out", str(tmp_path)]
     assert main(["--coupling", "none,spring-damper", *base]) == 1
     assert "spring-damper: not possible" in capsys.readouterr().out

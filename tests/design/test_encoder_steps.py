@@ -17,7 +17,7 @@ LOOP = Loop(T, (0, 1), (0, 0), (0, 1), (1.37, 1.37), FIGURE_4)
 F = LOOP.F(SpringDamper([879.0, 552.0], [0.39, 0.52]))
 
 
-def test_the_friction_that_a_step_of_ten_micrometres_needs():
+def test_friction_needed_by_ten_micrometre_steps():
     assert l1_gain(F).sum(axis=1) == pytest.approx([10019.6547, 7563.3655], abs=1e-4)
     assert encoder_friction(F, [STEP, STEP]) == pytest.approx([0.050098, 0.037817], abs=1e-6)
     assert encoder_friction(F, [0.0, 0.0]) == pytest.approx([0.0, 0.0])
@@ -36,7 +36,7 @@ def test_a_published_bound_pays_for_no_encoder_step():
     assert declared.covered
 
 
-def test_the_bound_is_above_the_sum_and_close_to_it():
+def test_the_bound_is_above_and_close():
     total, X = np.abs(F.D), F.B
     for _ in range(60_000):
         total, X = total + np.abs(F.C @ X), F.A @ X
@@ -58,7 +58,7 @@ def test_taps_delays_and_unstable_maps():
 
 
 @pytest.mark.parametrize("amplitude", [0.05, 3.0, 100.0])
-def test_quantised_loops_take_no_more_than_damping_and_friction(amplitude):
+def test_quantised_loops_gain_no_energy(amplitude):
     """sum f'dx + dx' D dx + W |dx| >= 0 from rest, on motions around an edge of a step; without W some take more."""
     requirement = this_environment(F, LOOP.delta)
     delta, W = np.array(requirement.required) * (1 + 1e-9), encoder_friction(F, [STEP, STEP])

@@ -50,7 +50,7 @@ def test_a_stored_float_is_its_shortest_decimal():
     assert rational(np.float64(0.1)) == Fraction(1, 10)
 
 
-def test_definiteness_agrees_with_the_eigenvalues_of_random_integer_matrices():
+def test_definiteness_agrees_with_eigenvalues():
     rng = np.random.default_rng(1)
     seen = set()
     for _ in range(300):
@@ -68,7 +68,7 @@ def test_definiteness_agrees_with_the_eigenvalues_of_random_integer_matrices():
     assert seen == {True, False}
 
 
-def test_singular_matrices_are_semidefinite_only_without_a_negative_direction():
+def test_singular_matrices_with_negative_directions_are_rejected():
     rng = np.random.default_rng(2)
     for rank in range(1, 5):
         half = rng.integers(-5, 6, (6, rank))
@@ -82,7 +82,7 @@ def test_singular_matrices_are_semidefinite_only_without_a_negative_direction():
         definiteness(Matrix.of([[1, 2], [3, 9]]))
 
 
-def test_a_matrix_definite_by_less_than_the_rounding_is_not_proved():
+def test_definiteness_below_rounding_is_not_proved():
     tiny = Fraction(1, 2**400)
     S = Matrix.of([[Fraction(1), 1 - tiny], [1 - tiny, Fraction(1)]])
     assert definiteness(S).definite
@@ -114,7 +114,7 @@ def test_coarse_rounding_never_proves_what_elimination_refuses(monkeypatch):
     assert proved > 50
 
 
-def test_entries_beyond_all_proportion_prove_nothing_and_say_so_quietly(recwarn):
+def test_huge_entries_prove_nothing(recwarn):
     for size in (10**200, 10**400, 10**4000):
         assert not strictly_positive(Matrix.of([[1, size], [size, 1]]))
         assert not strictly_positive(Matrix.of([[Fraction(1, size), 1], [1, 1]]))
@@ -126,7 +126,7 @@ def hilbert(n: int, shift: Fraction = Fraction(0)) -> Matrix:
     return Matrix.of([[Fraction(1, i + j + 1) - (shift if i == j else 0) for j in range(n)] for i in range(n)])
 
 
-def test_definiteness_is_proved_beyond_the_reach_of_double_precision():
+def test_definiteness_is_proved_beyond_double_precision():
     """Hilbert's matrices, condition 5e5 to 2e28: against elimination, on both sides of the least eigenvalue."""
     for n in (5, 12, 20):
         low, high = Fraction(0), Fraction(1, n)
@@ -150,7 +150,7 @@ def test_the_exact_inverse_is_an_inverse():
 
 @pytest.mark.parametrize("coupling", COUPLINGS, ids=lambda c: type(c).__name__)
 @pytest.mark.parametrize(("theta", "psi"), [((1, 2), (0, 0)), ((0, 3), (1, 0))])
-def test_the_exact_force_map_is_the_one_that_runs(coupling, theta, psi):
+def test_the_exact_force_map_is_what_runs(coupling, theta, psi):
     F = force_map(environment(FIGURE_4, rational(T)), coupling, theta, psi)
     running = force_map(environment(FIGURE_4, T), coupling, theta, psi)
     rng = np.random.default_rng(4)
@@ -170,7 +170,7 @@ def test_the_static_stiffness_is_exactly_symmetric_and_semidefinite():
     assert str(definiteness(Matrix.of(F1))) == "the leading minor of order 2 is zero"
 
 
-def test_exact_delays_and_moving_sums_are_those_that_run():
+def test_exact_delays_and_sums_are_what_runs():
     z = 1.1 * np.exp(0.4j)
     window = [sum(z**-k for k in range(n + 1)) for n in (0, 3)]
     np.testing.assert_allclose(at(moving_sum((0, 3), rational(T)), z), np.diag(window), rtol=1e-12)
@@ -208,7 +208,7 @@ def kyp(G: Lti, P: np.ndarray) -> np.ndarray:
     return np.block([[P - G.A.T @ P @ G.A, cross.T], [cross, G.D + G.D.T - G.B.T @ P @ G.B]])
 
 
-def test_the_kyp_matrix_is_what_a_step_adds_to_the_storage():
+def test_the_kyp_matrix_is_the_storage_increase():
     """x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du), for every x and u: the energy that goes in less what is stored."""
     rng = np.random.default_rng(6)
     G, half = random_exact(rng, 3, 2), rng.integers(-5, 6, (3, 3))
@@ -220,7 +220,7 @@ def test_the_kyp_matrix_is_what_a_step_adds_to_the_storage():
 
 
 @pytest.mark.parametrize(("bits", "finer"), [(16, 16), (32, 16), (48, 112), (192, 192)])
-def test_what_rounding_changes_of_the_kyp_matrix_is_within_its_bound(bits, finer):
+def test_rounding_of_the_kyp_matrix_is_bounded(bits, finer):
     """Beside the exact matrix of the rounded P, in the same scaled states and channels, whatever their units are."""
     rng, fullest = np.random.default_rng(16), 0.0
     for _ in range(30):
@@ -271,7 +271,7 @@ def test_what_floating_point_refuses_exact_arithmetic_refuses_too():
     assert indefinite > 10
 
 
-def test_states_that_no_input_reaches_are_left_out_and_those_that_cancel_do_no_harm():
+def test_unreachable_states_are_left_out():
     A = [[0.5, 0, 0, 0], [0, 0.5, 0, 0], [1, -1, 0.2, 0], [0, 0, 0.3, 0.1]]
     B, C = [[1], [1], [0], [0]], [[0.1, 0, 0.1, 0.1]]
     G = Lti(*(numbers(part, Fraction(1)) for part in (A, B, C, [[1]])), Fraction(1))
@@ -284,7 +284,7 @@ def test_states_that_no_input_reaches_are_left_out_and_those_that_cancel_do_no_h
     np.testing.assert_allclose(at(reached(late), 1.3j), at(late, 1.3j), rtol=1e-12)
 
 
-def test_a_riccati_equation_with_a_wrong_answer_proves_nothing(monkeypatch):
+def test_a_wrong_riccati_solution_proves_nothing(monkeypatch):
     G = Lti(*([[v]] for v in (0.5, 1, 0.5, 1)), Fraction(1))
     for wrong in (-1.0, 100.0):
         monkeypatch.setattr(exact, "_riccati", lambda *words, p=wrong: np.array([[p]]))
@@ -293,14 +293,14 @@ def test_a_riccati_equation_with_a_wrong_answer_proves_nothing(monkeypatch):
         assert "negative direction" in reason
 
 
-def test_numbers_beyond_floating_point_are_left_to_exact_arithmetic(recwarn):
+def test_exact_arithmetic_takes_numbers_beyond_floats(recwarn):
     G = Lti(*([[v]] for v in (0.5, 1, 0.5, 10**308)), Fraction(1))  # D + D' overflows
     assert prove_positive_real(G, Matrix.of([[1]])) is None
     assert prove_positive_real(G, Matrix.of([[-1]])) is not None
     assert not recwarn.list
 
 
-def test_a_model_of_more_states_than_are_tried_is_told_so():
+def test_models_with_too_many_states_are_reported():
     assert exact.too_large(exact.LARGEST) is None
     assert exact.too_large(exact.LARGEST + 1) == "a proof over 801 states takes long: up to 800 are tried"
 

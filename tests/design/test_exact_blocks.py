@@ -188,14 +188,14 @@ def test_the_multiplier_that_a_delayed_spring_asks(psi):
     assert_limit(lambda phi: certificate._block(delayed_environment_demand(delayed, [phi])), (psi - 0.5) * 1000 * T)
 
 
-def test_the_multiplier_that_a_delayed_spring_and_damper_ask():
+def test_the_multiplier_of_a_delayed_spring_damper():
     """K T/2 + B, at w = 0 no, at w = pi yes."""
     E = loop(to_ground(700.0, damping=0.9), (0,), (1,))
     delayed = E.sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
     assert_limit(lambda phi: certificate._block(delayed_environment_demand(delayed, [phi])), 700 * T / 2 + 0.9)
 
 
-def test_the_multiplier_of_figure_4_against_a_dense_sweep():
+def test_figure_4s_multiplier_matches_a_dense_sweep():
     def short(w):
         z = np.exp(1j * w)
         return np.linalg.eigvalsh(-T * he((z / (z - 1))[:, None, None] * (late(z, (1, 2)) @ figure_4(z)))).max(axis=1)
@@ -368,7 +368,7 @@ def test_every_vertex_of_a_range_is_proved():
 
 
 @pytest.mark.usefixtures("disarmed")
-def test_delay_in_the_environment_is_proved_with_its_multiplier():
+def test_environment_delay_needs_its_multiplier():
     K, environment_needs = 900.0, 0.5 * 100 * T
     asked, coupling, a = loop(to_ground(100.0), (1,), (1,)), SpringDamper((K,), (0.0,)), 1 / 900.0
     phi = environment_needs * (1 + CLOSE)
@@ -380,7 +380,7 @@ def test_delay_in_the_environment_is_proved_with_its_multiplier():
 
 
 @pytest.mark.usefixtures("disarmed")
-def test_a_range_of_delays_is_proved_by_its_own_block():
+def test_delay_ranges_are_proved_by_their_block():
     K = 1000.0
     asked = loop(to_ground(K, K), (1, 1)).switching(DelayRange((0, 0), (1, 1)))
     limits = [T * (a / 2 + (K / 2) ** 2 / (2 * a) + K) for a in ALPHA]
@@ -401,7 +401,7 @@ def forged(asked: Loop, coupling, made, **changes) -> str | None:
 NEGATIVE = "the KYP matrix has a negative direction, beyond the error bound of floating point"
 
 
-def test_the_proof_of_one_condition_does_not_serve_the_other():
+def test_proofs_serve_only_their_own_condition():
     asked, coupling = loop(to_ground(1000.0), (1,), delta=(2.0,)), SpringDamper((800.0,), (0.0,))
     here, anywhere = (prove(asked, coupling, condition) for condition in ("this-environment", "any-environment"))
     assert len(here.matrices["P"]) == len(anywhere.matrices["P"])  # it is not the size that gives it away
@@ -412,7 +412,7 @@ def test_the_proof_of_one_condition_does_not_serve_the_other():
     assert forged(soft, coupling, prove(soft, coupling, "this-environment"), matrices=anywhere.matrices) is not None
 
 
-def test_the_proof_of_the_nominal_environment_does_not_serve_a_vertex():
+def test_the_nominal_proof_does_not_serve_vertices():
     asked = loop(to_ground(1000.0), (1,), delta=(1.5 * 1600 * T * 1.001,))
     asked = change(asked, ranges=Ranges((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),)))
     made = prove(asked, NoCoupling(), "this-environment")
@@ -425,7 +425,7 @@ def test_the_proof_of_the_nominal_environment_does_not_serve_a_vertex():
 
 
 @pytest.mark.parametrize(("condition", "name"), [("this-environment", "F(1)"), ("any-environment", "V(1)")])
-def test_a_static_part_that_is_asymmetric_by_1e_12_is_refused(condition, name):
+def test_a_slightly_asymmetric_static_part_is_refused(condition, name):
     asked = loop(to_ground(900.0, 700.0), (1, 0), delta=(3.0, 3.0))
 
     def crossed(other):
@@ -437,7 +437,7 @@ def test_a_static_part_that_is_asymmetric_by_1e_12_is_refused(condition, name):
     assert forged(asked, skew, made) == f"{name} is not exactly symmetric"
 
 
-def test_an_asymmetry_of_1e_12_is_refused_behind_delay_and_for_switching_too():
+def test_slight_asymmetry_is_refused_behind_delay_and_switching():
     asked = loop(to_ground(100.0, 80.0), (0, 0), (1, 1), delta=(5.0, 5.0))
     phi = [0.1, 0.1]
 
@@ -455,7 +455,7 @@ def test_an_asymmetry_of_1e_12_is_refused_behind_delay_and_for_switching_too():
             certificate._blocks(there, skew, condition, multiplier)
 
 
-def test_a_static_stiffness_that_is_indefinite_by_1e_12_is_refused():
+def test_a_slightly_indefinite_static_stiffness_is_refused():
     """1000 N/m less 1000^2 (0.001 + 1e-18): nothing of it is left in floating point."""
     asked = loop(to_ground(1000.0, 1000.0), (0, 0), delta=(2.0, 2.0))
 
@@ -471,7 +471,7 @@ def test_a_static_stiffness_that_is_indefinite_by_1e_12_is_refused():
         certificate._blocks(switching, model(1e-18), SWITCHING, ALPHA)
 
 
-def test_a_multiplier_is_below_the_damping_and_covers_the_environment(monkeypatch):
+def test_multipliers_lie_between_environment_and_damping(monkeypatch):
     K, a = 900.0, 1 / 900.0
     asked, coupling, phi = loop(to_ground(100.0), (1,), (1,), (4.0,)), SpringDamper((K,), (0.0,)), 0.1
     made = prove(asked, coupling, "any-environment", [phi])
@@ -503,7 +503,7 @@ def test_figures_are_held_to_a_millionth():
     assert forged(asked, STIFF, made, margin=2 * made.margin).startswith(f"margin is {2 * made.margin:.9g}, the sweep")
 
 
-def test_the_figures_of_switching_are_held_to_a_millionth():
+def test_switching_figures_hold_to_a_millionth():
     soft = SOFT
     asked = loop(FIGURE_4, (1, 2), delta=(1.37, 1.37)).switching(DelayRange((1, 1), (2, 2)))
     made = prove(asked, soft, "this-environment")

@@ -139,7 +139,7 @@ def test_force_limits_that_no_certificate_covers_are_refused(place, limited_file
 
 
 @pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
-def test_the_process_of_the_simulator_differs_by_rounding_alone(data):
+def test_export_and_simulator_differ_by_rounding(data):
     """It sums by BLAS, in any order: each tick each side is wrong by at most gamma_N |row| |v|, carried on by A."""
     block = process_block(Stored.of(PAIR, data))
     test, G = trial(block), block.system
@@ -165,7 +165,7 @@ def test_the_process_of_the_simulator_differs_by_rounding_alone(data):
 @needs_cc
 @pytest.mark.parametrize("what", [[], ["--process"]], ids=["coupling", "process"])
 @pytest.mark.parametrize("name", COUPLINGS)
-def test_the_c_file_repeats_its_test_vector_to_the_last_bit(place, name, what):
+def test_the_c_file_repeats_its_test_vector(place, name, what):
     source = export(place, name, *what)
     for flags in (["-O2"], ["-O3", "-march=native"]):  # sums may not be reordered, so vector units change nothing
         done = run(compiled([source], *flags, "-DHAPTIC_LOOP_TEST"))
@@ -242,7 +242,7 @@ int main(void)
 
 
 @needs_cc
-def test_other_code_closes_the_loop_around_springs_of_its_own(place):
+def test_other_code_can_close_the_loop(place):
     """u = x - d, f = 900 u with V from the C file, against F = (I + E V)^-1 E with E = 900 I."""
     source = export(place, "gains")
     driver = place / "driver.c"
@@ -254,7 +254,7 @@ def test_other_code_closes_the_loop_around_springs_of_its_own(place):
     np.testing.assert_allclose(f, sequential(F, x), atol=1e-13)  # a few roundings of forces up to 1 N
 
 
-def test_the_process_is_the_force_map_of_the_paper():
+def test_the_process_is_the_papers_force_map():
     """C (zI - A)^-1 B + D at three frequencies is Theta (I + E V)^-1 E, by the formulas of (6) and (26)."""
     system = process_block(Stored.of(PAIR, SOFT)).system
     E = environment(FIGURE_4, T)
@@ -274,7 +274,7 @@ def test_without_theta_the_link_is_the_delay():
     assert "NOT included" in " ".join(without.about)
 
 
-def test_a_file_says_what_it_is_and_repeats_byte_for_byte(place):
+def test_an_export_is_repeatable_byte_for_byte(place):
     first = export(place, "gains", "--process").read_text()
     assert "Certified for any passive environment" in first
     assert export(place, "gains", "--process").read_text() == first
@@ -282,7 +282,7 @@ def test_a_file_says_what_it_is_and_repeats_byte_for_byte(place):
     assert "NOT CERTIFIED: the file carries no certificate" in export(place, "full").read_text()
 
 
-def test_a_certificate_that_does_not_hold_is_said_and_exits_with_1(place, tmp_path, capsys):
+def test_an_uncertified_export_exits_with_1(place, tmp_path, capsys):
     changed = tmp_path / "changed.json"
     changed.write_text((place / "gains.json").read_text().replace("878.7", "1878.7"))
     out = tmp_path / "changed.c"

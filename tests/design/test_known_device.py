@@ -232,7 +232,7 @@ def test_a_lighter_motor_breaks_the_inequality():
         assert (sides[:, 0] < sides[:, 1]).any()
 
 
-def test_the_tail_costs_no_more_than_what_is_stored():
+def test_the_tail_costs_at_most_the_storage():
     """Step 5: v = v(NT) exp(-t/beta) costs (c0 beta + c2/beta) v^2/2, and dx = -beta dv over any interval."""
     rng = np.random.default_rng(5)
     for _ in range(200):
@@ -248,7 +248,7 @@ def test_the_tail_costs_no_more_than_what_is_stored():
 
 
 @pytest.mark.parametrize("theta", [0, 2])
-def test_the_block_is_the_energy_of_forces_and_periods(theta):
+def test_the_block_is_the_energy_of_periods(theta):
     """x'block x summed over the ticks of a motion that ends equals sum f'(dx + beta dv) + sum L, from rest."""
     rng = np.random.default_rng(theta)
     loop, F, beta = one(1e-3, 1.3, theta), wall(900.0, 0.7, theta, 1e-3), np.array([3e-5])
@@ -283,7 +283,7 @@ def test_sums_over_aliases_have_a_closed_form():
 
 
 @pytest.mark.parametrize("coupling", ["none", "I"])
-def test_the_proof_gives_away_little_for_the_papers_loop(coupling):
+def test_the_proof_is_tight_for_the_papers_loop(coupling):
     """Theorem A, which no condition undercuts for equal devices, is a tenth of a percent below Theorem B."""
     F = KNOWN.F(NoCoupling() if coupling == "none" else PUBLISHED["I"])
     exact = necessary_share(F, KNOWN)
@@ -481,7 +481,7 @@ def test_bounds_of_q_enclose_it_and_are_checked():
 SPRING = Network(("tip",), (Spring(("tip", GROUND), 1000.0),))
 
 
-def test_a_file_proves_it_again_and_forgeries_are_refused():
+def test_files_prove_it_and_forgeries_are_refused():
     coupling = PUBLISHED["I"]
     assert not required_damping(KNOWN, coupling, "this-environment").certified
     certificate = prove(KNOWN, coupling, "known-device")
@@ -527,7 +527,7 @@ def test_one_beta_serves_all_environments_of_ranges():
     assert certificate.required[0] == pytest.approx(1.37 * max(each), rel=2e-3)
 
 
-def test_a_coupling_for_any_environment_is_proved_from_its_file():
+def test_any_environment_couplings_are_proved_from_files():
     loop, coupling = change(KNOWN, theta=(0, 1), lam=(0, 1)), SpringDamper([4000.0, 1300.0], [6.0, 2.5])
     assert not required_damping(loop, coupling, "any-environment").certified
     certificate = prove(loop, coupling, "known-device-any")
@@ -623,7 +623,7 @@ def test_the_stiffest_linear_coupling_is_attained(theta, stiffness):
     assert prove(loop, found.coupling, "known-device-any").proof == "rational"
 
 
-def test_what_known_devices_do_not_cover_is_refused_by_designs():
+def test_designs_refuse_what_known_devices_exclude():
     with pytest.raises(ValueError, match="not covered"):
         design_coupling(KNOWN, "spring-damper", "known-device", limiter=True)
     with pytest.raises(ValueError, match="no guaranteed bounds"):
@@ -635,7 +635,7 @@ def test_what_known_devices_do_not_cover_is_refused_by_designs():
 
 
 @pytest.mark.parametrize("name", ["known-device", "known-device-any"])
-def test_a_map_agrees_with_the_sweep_of_one_coupling(name):
+def test_a_map_agrees_with_single_sweeps(name):
     """A stack of spring-dampers before a rigid wall: to three hundredths, and never above the plain condition."""
     loop = one(1e-3, 1.37, environment=RIGID_WALL)
     K, B = (part.ravel() for part in np.meshgrid([1500.0, 4000.0], [0.4, 1.2, 3.0]))
@@ -667,7 +667,7 @@ def random_walls(rng, T):
 
 
 @pytest.mark.parametrize("theta", [0, 1])
-def test_no_hand_and_no_environment_grow_above_the_requirement(theta):
+def test_no_pair_grows_above_the_requirement(theta):
     """Lossless hands before lossless environments behind a coupling at 1.01 of what it needs; some grow at 0.6."""
     T, rng = 1e-3, np.random.default_rng(theta)
     loop = one(T, 1.0, theta)
@@ -744,7 +744,7 @@ def pushed_and_limited(loop, delta, coupling, stiffness, limit, drawn, ticks=400
     return energy
 
 
-def test_walls_and_the_limiter_come_free_before_any_environment():
+def test_any_environment_gets_walls_and_limiter_free():
     """Under known-device-any at 1.01 no lossless hand gains energy at a limited one-sided wall; at a tenth some do."""
     T, rng = 1e-3, np.random.default_rng(4)
     loop, coupling = one(T, 1.0), SpringDamper([3500.0], [5.0])

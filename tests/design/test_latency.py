@@ -168,7 +168,7 @@ def test_forged_weights_are_refused():
     assert "more than the latency of device 1" in verify(change(stored, certificate=forged)).reason
 
 
-def test_a_channel_that_latches_at_the_tick_has_no_row_of_its_own():
+def test_channels_without_latency_have_no_row():
     F = PAIR.F(SOFT)
     none, plain = latency_demand(F, PAIR.delta, [(0.0, 0.0)] * 2), this_environment_demand(F, PAIR.delta)
     w = frequencies(F, points=100)
@@ -231,7 +231,7 @@ def grown(damping, latencies, mean, seed=3):
 
 
 @pytest.mark.parametrize("mean", [1, 100, None])
-def test_no_hand_grows_at_the_requirement_and_some_do_below(mean):
+def test_hands_grow_only_below_the_requirement(mean):
     latencies = np.linspace(0, TAU, 3)
     need = required_damping(
         change(WALL, latency=((0.0, TAU),)), SpringDamper([1e9], [0.0]), "this-environment"
@@ -241,7 +241,7 @@ def test_no_hand_grows_at_the_requirement_and_some_do_below(mean):
     assert grown(0.6 * need, latencies, mean) > 0
 
 
-def test_a_design_for_late_forces_uses_the_damping_and_beats_a_whole_sample():
+def test_latency_designs_beat_a_whole_sample():
     loop = change(PAIR, latency=((0.0, TAU),) * 2)
     found = design_coupling(loop, "spring-damper", "this-environment")
     assert 0.99 < found.requirement.ratio < 1
@@ -288,7 +288,7 @@ class OneSampleMore(ThisEnvironment):
         (OneSampleMore(), change(PAIR, theta=(1, 2))),
     ],
 )
-def test_a_condition_of_ones_own_is_required_and_proved_as_the_shipped_one_is(own, shipped, tmp_path):
+def test_own_conditions_are_proved_like_ours(own, shipped, tmp_path):
     found, wanted = (required_damping(*asked) for asked in ((PAIR, SOFT, own), (shipped, SOFT, "this-environment")))
     assert found.required == pytest.approx(wanted.required, rel=1e-8)
     assert found.condition == own.name

@@ -44,7 +44,7 @@ def test_the_block_of_one_channel():
     np.testing.assert_allclose(hermitian(sampled.free.G + sampled.gain.G)[0, 0], expected, atol=1e-6)
 
 
-def test_the_block_is_the_energy_of_a_limited_loop():
+def test_the_block_is_a_limited_loops_energy():
     """Motions that begin and end at rest in the same place: sum of f'dx + dx'D dx - (M f_e)'de, in time, against the
     mean of the block's form over the circle; M = z + sum_j c_j sum_{i<j} (z - z^-i)."""
     rng = np.random.default_rng(3)
@@ -261,12 +261,12 @@ def test_a_storage_matrix_of_something_else_proves_nothing(stored):
         ({"ranges": Ranges(masses={"mass": (0.9, 1.1)})}, "not for ranges"),
     ],
 )
-def test_loops_that_are_not_covered_are_refused_in_words(change, reason):
+def test_uncovered_loops_are_refused(change, reason):
     loop = msgspec.structs.replace(PAIR, **change)
     assert reason in str(required_damping(loop, BUILT, LIMITER).reason)
 
 
-def test_delay_in_the_environment_is_open_under_any_environment():
+def test_any_environment_does_not_cover_delayed_limits():
     loop = msgspec.structs.replace(PAIR, psi=(1, 1))
     some = Certificate(
         "any-environment", (), (1.0, 1.0), PAIR.delta, 1.37, "any passive environment", "rational", {}, {}, "", {}
@@ -292,7 +292,7 @@ def test_a_spring_damper_designed_with_the_block():
         design(PAIR, "this-environment", switching=((1, 1), (2, 2)), limiter=True)
 
 
-def test_the_command_stores_a_coupling_that_is_proved_with_limited_forces(tmp_path):
+def test_the_command_stores_proofs_of_limited_forces(tmp_path):
     out = tmp_path / "limited.json"
     assert design_main(["--condition", "this-environment", "--limiter", "--out", str(out)]) == 0
     stored = load(out)
@@ -302,7 +302,7 @@ def test_the_command_stores_a_coupling_that_is_proved_with_limited_forces(tmp_pa
         design_main(["--coupling", "ccl", "--limiter", "--out", str(out)])
 
 
-def test_the_best_multiplier_attains_its_bound_and_no_other_does_better():
+def test_the_best_multiplier_attains_its_bound():
     """Delays of 0 and 3 samples, where lines through the worst directions never settled: 1.263, not 31."""
     loop = msgspec.structs.replace(PAIR, theta=(0, 3), lam=(0, 0))
     G, rho = loop.sent(BUILT), LIMITER.rho(loop)
@@ -312,7 +312,7 @@ def test_the_best_multiplier_attains_its_bound_and_no_other_does_better():
         assert limiter(G, loop.theta, loop.delta, rho, c).ratio > found.ratio * (1 - 1e-3)
 
 
-def test_the_parts_of_the_block_that_a_search_makes_are_those_of_the_block():
+def test_searched_parts_equal_the_block():
     sampled = LimiterLoop(PAIR)
     x = np.array([7.0, 6.5, 0.2, 0.9, 0.3, 0.6])
     G = Sampled.of(PAIR.sent(sampled.coupling(x)), on_circle(sampled.conditions)[None])

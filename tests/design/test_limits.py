@@ -34,7 +34,7 @@ def test_more_rungs_are_never_worse_than_the_bound():
     assert rms[-1] - 1 < bound(LOOP).rms_db < rms[-1]
 
 
-def test_the_printed_gains_have_the_figures_worked_out_by_hand():
+def test_the_printed_gains_match_hand_calculation():
     E = environment(LOOP.environment, LOOP.T)
     expected = this_environment(force_map(E, PUBLISHED["I"], LOOP.theta, LOOP.psi), LOOP.delta)
     assert certify(LOOP, PUBLISHED["I"])["this-environment"].required == expected.required

@@ -92,7 +92,7 @@ def test_the_realisation_16_and_its_quotient():
     np.testing.assert_allclose(y2, v_hat(V - theta_hat(theta))[1].at(Z), atol=1e-9)  # the home of the formula
 
 
-def test_the_regular_part_of_e_hat_has_its_hermitian_part():
+def test_e_hats_regular_part_keeps_the_hermitian_part():
     E = unit_environment(environment(FIGURE_4, T), DELTA)
     regular, printed = e_hat_regular(E, (0, 2)), e_hat_printed(E, (0, 2))
     np.testing.assert_allclose(hermitian(regular.at(Z)), hermitian(printed.at(Z)), atol=1e-9)
@@ -163,7 +163,7 @@ def test_15_as_printed_is_strictly_infeasible():
     assert strength(lemma1(Ports.same(regular), P, np.zeros((2, 2)), -np.eye(2)), P) > 1e-3
 
 
-def test_2_as_printed_is_strictly_infeasible_for_v_hat():
+def test_2_as_printed_is_infeasible_for_v_hat():
     V = unit_coupling(SpringDamper([300, 300], [0.3, 0.3]).compliance(T), DELTA)
     printed = balanced(v_hat_printed(V, (1, 2)))
     P = cp.Variable((printed.order,) * 2, symmetric=True)
@@ -210,7 +210,7 @@ def scalar_any_environment(V, E, theta, psi, delta):
     return phi, (excess - phi / (1 - phi / delta) if phi < delta else -np.inf)
 
 
-def test_analysis_with_environment_delay_agrees_with_lemma_4_by_hand():
+def test_environment_delay_agrees_with_lemma_4():
     rng = np.random.default_rng(3)
     verdicts = []
     for _ in range(50):

@@ -49,7 +49,7 @@ def test_any_environment_figures():
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_any_environment_of_a_spring_damper_is_the_trigonometric_maximum(seed):
+def test_any_environment_is_the_trigonometric_maximum(seed):
     """max |K T vt + B (1 - z^-n)|^2 / (4 (K T/2 + B)), on a grid of a million points."""
     rng = np.random.default_rng(seed)
     theta, K, B = int(rng.integers(0, 6)), np.exp(rng.uniform(4, 9)), np.exp(rng.uniform(-3, 2))
@@ -134,7 +134,7 @@ def test_a_free_mass_is_not_refused_by_rounding(mass):
     assert this_environment(F, [1.37]).required[0] == pytest.approx(1.3659, rel=3e-3)
 
 
-def test_moving_a_delay_between_force_and_measurement_changes_nothing():
+def test_force_and_measurement_delays_are_interchangeable():
     """Remark 3 of the paper, for stability: only the sum of the two delays of a channel matters."""
     from haptic_loop.controller.delay import delay
 
@@ -180,7 +180,7 @@ def test_the_least_multiple_is_a_generalised_eigenvalue(n):
     np.testing.assert_allclose(least_multiple(free, gain), expected, rtol=1e-9)
 
 
-def test_the_regular_part_has_the_hermitian_part_of_the_whole():
+def test_the_regular_part_keeps_the_hermitian_part():
     """E z/(z-1) less its pole, on the circle."""
     z = np.exp(1j * np.array([0.1, 0.7, 2.9]))
     whole = E.at(z) * (z / (z - 1))[:, None, None]
@@ -197,7 +197,7 @@ def test_supremum_finds_a_needle():
     assert w == pytest.approx(1.2345, abs=1e-6)
 
 
-def test_with_a_multiplier_the_factor_is_the_least_by_definition():
+def test_the_factor_with_multiplier_is_least():
     """He[H/(1-z)] >= H* Delta_V H with H = V - Theta-hat/s, (11) to (14): met at s, kept above, missed below."""
     V, theta, delta, phi = SpringDamper([300.0, 200.0], [0.2, 0.3]).compliance(T), (1, 2), np.array(DELTA), (0.37, 0.1)
     w = np.linspace(0.05, 3.1, 23)
@@ -216,7 +216,7 @@ def test_with_a_multiplier_the_factor_is_the_least_by_definition():
     assert (least(0.999 * s) < 0).all()
 
 
-def test_weights_for_separate_humans_gain_nothing_where_the_loop_is_reciprocal():
+def test_weights_gain_nothing_in_reciprocal_loops():
     """Each human's energy weighed by d > 0 turns F/delta into sqrt(d) F/delta sqrt(d)^-1: never a smaller need."""
     F = force_map(environment(FIGURE_4, 1.2e-3), SpringDamper([900.0, 600.0], [0.4, 0.6]), (1, 2), (0, 0))
     rng, z = np.random.default_rng(8), np.exp(1j * np.geomspace(1e-2, 3.1, 60))
@@ -227,7 +227,7 @@ def test_weights_for_separate_humans_gain_nothing_where_the_loop_is_reciprocal()
         assert (np.linalg.eigvalsh((weighed + np.conj(np.swapaxes(weighed, 1, 2))) / 2)[:, -1] >= need - 1e-9).all()
 
 
-def test_a_map_that_is_nothing_but_rounding_needs_nothing():
+def test_a_map_of_rounding_needs_no_damping():
     """Two equal states that cancel, seen from other coordinates: F = 0, and in floating point 1e-13 of no symmetry."""
     turn = np.random.default_rng(3).normal(size=(2, 2))
     B, back = np.array([[1e3, 70.0], [-1e3, -70.0]]), np.linalg.inv(turn)
@@ -239,5 +239,5 @@ def test_a_map_that_is_nothing_but_rounding_needs_nothing():
     assert found.ratio < 1e-9
 
 
-def test_a_gain_with_a_negative_direction_is_never_enough():
+def test_an_indefinite_gain_is_never_enough():
     assert least_multiple(np.eye(2)[None], np.diag([-1.0, 1.0])[None]) == np.inf

@@ -22,7 +22,7 @@ def window(theta, delta, factor=1.0):
 
 @pytest.mark.parametrize("theta", range(5))
 @pytest.mark.parametrize("factor", [0.9, 0.98, 1.02, 1.5])
-def test_a_scaled_moving_average_needs_so_much_less_damping(theta, factor):
+def test_scaled_moving_averages_need_less_damping(theta, factor):
     """V and the window vanish together at its zeros, where nothing is asked: s = 1/factor at every frequency."""
     needs = any_environment(window(theta, 1.3, factor), [theta], [1.3])
     assert needs.reason is None

@@ -92,7 +92,7 @@ def test_the_sweep_that_knows_no_solver_certifies_it(name):
 
 
 @pytest.mark.parametrize("name", ["n0", "n3"])
-def test_the_proof_is_one_of_the_coupling_as_stored(name, tmp_path):
+def test_the_proof_is_of_the_stored_coupling(name, tmp_path):
     """The file's matrix proves the block built again from the decimals, and nothing of a filter that is scaled up."""
     loop, found = loop_of(name), best(name)
     stored = Stored.of(loop, found.coupling, found.certificate)
@@ -106,7 +106,7 @@ def test_the_proof_is_one_of_the_coupling_as_stored(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["n0", "n2", "n4"])
-def test_static_stiffness_is_exactly_a_share_of_the_environments(name):
+def test_static_stiffness_is_an_exact_share(name):
     """In fractions F(1) = g E(1), and so it stays symmetric where the springs are others."""
     loop, coupling = loop_of(name), best(name).coupling
     total = sum(np.vectorize(lambda v: Fraction(repr(float(v))), otypes=[object])(R) for R in coupling.R)
@@ -121,13 +121,13 @@ def test_static_stiffness_is_exactly_a_share_of_the_environments(name):
 
 
 @pytest.mark.parametrize("name", ["n0", "n3", "n4", "o12"])
-def test_the_bound_is_below_what_is_reached_and_close_to_it(name):
+def test_the_bound_is_below_and_close(name):
     limit = bound(loop_of(name), knots=16)
     assert limit.rms < best(name).figures.rms_mismatch
     assert best(name).figures.rms_mismatch_db - limit.rms_db < 4.0
 
 
-def test_the_causal_part_of_a_function_is_that_of_a_transform():
+def test_causal_parts_match_the_transform():
     grid = np.sort(np.concatenate([[0.05, 0.3], np.random.default_rng(0).uniform(0.05, 0.3, 9)]))
     heights = np.random.default_rng(1).normal(size=(11, 2))
     heights[[0, -1]] = 0
@@ -141,7 +141,7 @@ def test_the_causal_part_of_a_function_is_that_of_a_transform():
 
 
 @pytest.mark.parametrize("channels", [3, 4])
-def test_the_bound_of_walls_side_by_side_is_that_of_one(channels):
+def test_parallel_walls_have_one_walls_bound(channels):
     """Each is a problem of its own."""
     one, several = (bound(wall(3000.0, 3, 1.0, channels=n), knots=4) for n in (1, channels))
     assert several.rms == pytest.approx(one.rms, rel=0.02)
@@ -153,7 +153,7 @@ def test_there_is_no_bound_where_nothing_is_lost():
     assert bound(loop_of("o02"), knots=30).rms == 0
 
 
-def test_where_the_environment_is_safe_itself_nothing_is_put_before_it():
+def test_safe_environments_get_no_coupling():
     found = best("o02")
     assert isinstance(found.coupling, NoCoupling)
     assert found.proved
@@ -181,7 +181,7 @@ def test_every_rung_is_reported_as_it_is_finished():
         ([(0.8, 0.5), (0.7, 0.6), (0.699, 0.6), (0.6, 0.6), (0.58, 0.6), (0.578, 0.6)], 4),
     ],
 )
-def test_a_climb_goes_on_over_small_steps_and_says_what_it_leaves(monkeypatch, script, taken):
+def test_a_search_continues_over_small_gains(monkeypatch, script, taken):
     one, steps = best("n3"), iter(script)
 
     def rung(climb, taps, poles, before, floor, least):
@@ -200,7 +200,7 @@ def test_a_climb_goes_on_over_small_steps_and_says_what_it_leaves(monkeypatch, s
         assert "renders 0.200 of the stiffness" in found.ladder[2].left
 
 
-def test_sixteen_samples_of_delay_beside_slow_poles_are_proved_and_keep_some_stiffness():
+def test_sixteen_samples_beside_slow_poles_are_proved():
     """P has a condition of 1e15 there, so that it is stored whole; without a heavier weight g would be .017."""
     springs = [Spring(("a", "m"), 600.0, 0.3), Spring(("b", "m"), 600.0, 0.3), Spring(("m", "ground"), 300.0, 0.5)]
     network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.4})
@@ -241,7 +241,7 @@ def test_there_is_always_an_answer(seed):
     assert found.figures.rms_mismatch < 1.001
 
 
-def test_of_equal_couplings_the_one_is_taken_that_errs_least_where_the_environment_hardly_answers():
+def test_ties_prefer_less_error_at_small_forces():
     """Hands of case I that move together get a hundredth of the force: it is right to a few percent at 0.6 Hz, too."""
     loop, found = loop_of("n0"), best("n0")
     z = on_circle(np.array([2 * np.pi * 0.6 * loop.T]))
@@ -282,7 +282,7 @@ def test_no_wall_is_stiffer_than_the_moments_allow(theta):
 # further demands -----------------------------------------------------------------------------------------------------
 
 
-def test_switching_delays_hold_by_a_formula_of_their_own():
+def test_switching_delays_match_a_separate_formula():
     """[[He F/(z-1) + (delta - alpha T/2)/T, .], [(hi - lo)/2 G, 2 alpha]] > 0 for some alpha, F of the mean delay."""
     loop = loop_of("n3")
     found = design(loop.switching(DelayRange((4,), (6,))), Options(ladder=((4, 3),)))
@@ -332,7 +332,7 @@ def test_demands_are_kept_together(further, asked):
     assert bool(found.certificate.limiter) == further.get("limiter", False)
 
 
-def test_a_range_gets_a_coupling_that_is_proved_where_the_best_rung_is_not():
+def test_ranges_fall_back_to_a_proved_basis():
     """A ton on a soft spring: at a vertex the exact proof needs more room than the rungs leave at first."""
     contact = Spring(("a", "m"), 1000.0)
     network = Network(contacts=("a",), springs=(contact, Spring(("m", "ground"), 1.0)), masses={"m": 1000.0})
@@ -343,7 +343,7 @@ def test_a_range_gets_a_coupling_that_is_proved_where_the_best_rung_is_not():
     assert found.figures.rms_mismatch < 10 ** (-4 / 20)  # the environment scaled down reaches -3.05 dB
 
 
-def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
+def test_range_couplings_are_proved_at_every_vertex():
     loop = loop_of("n3")
     nominal = best("n3")
     assert not robustness(loop, nominal.coupling).certified
@@ -359,7 +359,7 @@ def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
     assert nominal.figures.rms_mismatch < found.figures.rms_mismatch < 10 ** (1 / 20) * nominal.figures.rms_mismatch
 
 
-def test_a_thinned_sweep_finds_the_environment_that_asks_the_most(monkeypatch):
+def test_a_thinned_sweep_finds_the_worst_environment(monkeypatch):
     network = Network(
         ("a", "b", "c"),
         tuple(Spring((end, "hub"), 300.0 + 40 * i, 0.2) for i, end in enumerate(("a", "b", "c", "ground"))),
@@ -374,7 +374,7 @@ def test_a_thinned_sweep_finds_the_environment_that_asks_the_most(monkeypatch):
 
 
 @pytest.mark.parametrize(("name", "objective"), [("n3", "rms"), ("n3", "sup"), ("n2", "rms")])
-def test_a_design_for_every_spring_and_mass_is_proved_at_each_and_costs_little(name, objective):
+def test_robust_designs_are_proved_and_cost_little(name, objective):
     loop = loop_of(name)
     found = spread(loop, best(name).coupling, replace(SHORT, objective=objective))
     assert found.proved == found.environments == 1 + len(vertices(loop.network))
@@ -383,7 +383,7 @@ def test_a_design_for_every_spring_and_mass_is_proved_at_each_and_costs_little(n
     assert found.price_db < 2.5
 
 
-def test_the_price_of_a_range_is_at_most_that_of_the_nominal_design_scaled_down(monkeypatch):
+def test_robustness_costs_at_most_scaling_down(monkeypatch):
     def nothing(self, start, *args, **how):
         return 1e-3 * start
 
@@ -395,7 +395,7 @@ def test_the_price_of_a_range_is_at_most_that_of_the_nominal_design_scaled_down(
     assert found.proved == found.environments
 
 
-def test_the_price_of_a_range_is_that_of_the_limiter_that_covers_the_nominal_design(monkeypatch):
+def test_robustness_price_keeps_the_limiter(monkeypatch):
     """A tenth of the environment: with a lag of .01 or .1 of the damping no multiplier covers it, with .5 one does."""
     monkeypatch.setattr(Problem, "solve", lambda self, start, *args, **how: 1e-3 * start)
     springs = [Spring(("a", "m"), 300.0, 0.1), Spring(("m", "b"), 500.0, 0.2), Spring(("m", "ground"), 30.0)]
@@ -406,7 +406,7 @@ def test_the_price_of_a_range_is_that_of_the_limiter_that_covers_the_nominal_des
     assert found.proved >= 1
 
 
-def test_a_part_of_what_delays_forbid_leaves_a_bound(monkeypatch):
+def test_partial_delay_constraints_leave_a_bound(monkeypatch):
     loop = loop_of("n3")
     whole = bound(loop, knots=8).rms
     monkeypatch.setattr("haptic_loop.design.bound._MOST_FORBIDDEN", 2)
@@ -426,7 +426,7 @@ def test_a_bound_says_what_it_does_not_know():
     assert limited.words.endswith("dB rms, even without latency and the limiter")
 
 
-def test_the_rms_bound_is_one_of_the_largest_error_too():
+def test_the_rms_bound_bounds_the_supremum():
     """|M|_F <= sqrt(m) |M| and |E|_F >= |E|, so rms <= sqrt(m) sup."""
     for name in ("n0", "n2", "n4"):
         figures = best(name).figures
@@ -467,7 +467,7 @@ def test_the_barrier_finds_what_a_cone_solver_finds():
     assert Program(A, b, c, (block,)).feasible(np.linalg.solve(U, y))
 
 
-def test_an_inequality_by_entries_is_the_one_that_is_written_out():
+def test_entrywise_inequalities_equal_dense_ones():
     """He[left X right], each entry of X a sum of two functions, and a further unknown that makes it positive."""
     rng = np.random.default_rng(4)
     k, r = 5, 3
@@ -483,7 +483,7 @@ def test_an_inequality_by_entries_is_the_one_that_is_written_out():
         np.testing.assert_allclose(np.triu(one), np.triu(other), atol=1e-12)
 
 
-def test_three_devices_by_entries_are_those_of_the_dense_program(monkeypatch):
+def test_entrywise_program_equals_dense_for_three_devices(monkeypatch):
     loop = loop_of("n5")
     case = program.Case(loop, loop.E(), (program.this_environment(loop),))
     problem = Problem(span_of(loop.E(), 3, 2), (case,), Options(), 0.05)
@@ -503,7 +503,7 @@ ORDINARY = {
 
 
 @pytest.mark.parametrize("name", ORDINARY)
-def test_the_optimum_over_a_basis_is_the_one_of_a_dense_cone_program(name, monkeypatch):
+def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
     """Four taps and three poles, the condition at many frequencies, by cvxpy: the same objective to 0.1 dB."""
     monkeypatch.setattr("haptic_loop.design.program.SOFT", (0.0, 0.3))  # what the cone program does not have
     monkeypatch.setattr("haptic_loop.design.program._EVEN", 0.0)
@@ -565,7 +565,7 @@ def filter_with_sum() -> ForceFilter:
     return ForceFilter([0.0, 0.0, 0.5, 0.9], [[-1.9, 0.91], [-0.3, 0.02]], R)
 
 
-def test_a_filter_is_the_sum_of_its_functions_in_every_arithmetic():
+def test_filters_sum_their_functions_in_every_arithmetic():
     R, T = filter_with_sum(), 1e-3
     z = on_circle(np.array([0.05, 0.4, 1.7, 3.1]))
     sources = np.vstack([np.eye(3), np.ones(3)])
@@ -615,7 +615,7 @@ def test_what_no_filter_can_be(poles, pairs, R, message):
         ForceFilter(poles, pairs, R)
 
 
-def test_a_basis_has_more_for_few_than_for_many():
+def test_a_basis_is_larger_for_few_devices():
     eight, beside = (span_of(loop_of("n8").E(), 4, 3, full=most) for most in (8, 5))
     assert isinstance(eight, Span)
     assert eight.used.all()
@@ -654,7 +654,7 @@ def test_a_longer_period_is_a_smaller_damping():
     assert found.figures.rms_mismatch_db == pytest.approx(design(less, SHORT).figures.rms_mismatch_db, abs=0.02)
 
 
-def test_a_wall_whose_force_latches_late_is_as_stiff_as_the_closed_form_says():
+def test_late_walls_match_their_closed_form():
     """K of (delta/t2 - 3K/2)(delta/(T - t1) - K/2) = K^2, theta = 0: a plain share is found, and filters beat it."""
     T, t2, delta = 1.2e-3, 0.13e-3, 0.5
     K = 1000 * delta / 0.841354  # switching in [0, t2]: this wall needs all of delta
@@ -666,7 +666,7 @@ def test_a_wall_whose_force_latches_late_is_as_stiff_as_the_closed_form_says():
 
 
 @pytest.mark.parametrize("name", ["n0", "n2", "n4"])
-def test_forces_that_are_limited_are_part_of_the_design(name):
+def test_limited_forces_are_part_of_designs(name):
     """By matrices of our own: [[Theta G/(z-1) + D, -rho z^-n], [N G + 2 D, D - rho z^-n + rho M/z]] on a dense grid."""
     loop = loop_of(name)
     found = design(loop, replace(SHORT, limiter=True))
@@ -697,7 +697,7 @@ def test_limited_forces_are_not_proved_for_ranges():
 
 
 @pytest.mark.parametrize("seed", [11, 12, 14])
-def test_whatever_the_loop_there_is_an_answer_and_a_proof(seed):
+def test_every_loop_gets_an_answer_and_proof(seed):
     """Drawn at the ends of what devices and objects are: 15 samples, 54 kg on .08 N/m, dampings of .04 N s/m."""
     found = design(hostile(np.random.default_rng(seed)), Options(ladder=((4, 3),)))
     assert found.proved

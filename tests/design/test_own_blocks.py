@@ -64,7 +64,7 @@ def test_a_multiplier_without_entries_is_swept(coupling):
     assert required_damping(PAIR, coupling, LimitedForces(0.01, 0)).ratio >= here.ratio - 1e-9
 
 
-def test_a_proof_with_a_multiplier_without_entries_is_verified():
+def test_proofs_with_empty_multipliers_are_verified():
     proved = Stored.of(PAIR, SOFT, prove(PAIR, SOFT, PerWall()))
     assert verify(proved, PerWall()).proved
 
@@ -131,13 +131,13 @@ class Empty(PerWall):
         (Empty(), "the demand of condition empty is None, expected a Demand"),
     ],
 )
-def test_a_demand_that_is_none_is_refused_by_name(own, message):
+def test_an_invalid_demand_is_refused_by_name(own, message):
     for ask in (required_damping, prove):
         with pytest.raises(ValueError, match=message):
             ask(PAIR, SOFT, own)
 
 
-def test_the_right_multiplier_must_be_all_that_is_on_file(tmp_path, capsys):
+def test_files_hold_exactly_the_right_multiplier(tmp_path, capsys):
     wall = Wall(("tip", GROUND), 3000.0, gap=0.0)
     network = Network(("tip",), (Spring(("tip", GROUND), 20.0, 0.3),), {"tip": 0.05}, (wall,))
     loop, coupling = Loop(1e-3, (1,), (0,), (1,), (1.3,), network), SpringDamper([1000.0], [0.5])

@@ -63,7 +63,7 @@ def _beyond() -> dict[str, tuple]:
 
 
 @pytest.mark.parametrize("name", BEYOND)
-def test_what_it_does_not_name_it_does_not_cover(name):
+def test_a_condition_covers_only_what_it_names(name):
     loop, coupling = _beyond()[name]
     found = required_damping(loop, coupling, Plain())
     assert np.isinf(found.ratio)
@@ -72,7 +72,7 @@ def test_what_it_does_not_name_it_does_not_cover(name):
         prove(loop, coupling, Plain())
 
 
-def test_a_subclass_names_its_own_and_a_stored_proof_is_refused_by_one_that_does_not():
+def test_proofs_are_refused_by_conditions_that_cover_less():
     loop = change(PAIR, T_max=2e-3)
     assert required_damping(loop, SOFT, Uneven()).ratio == pytest.approx(
         required_damping(PAIR, SOFT, Plain()).ratio * 2e-3 / PAIR.T, rel=1e-9
@@ -87,7 +87,7 @@ def test_a_subclass_names_its_own_and_a_stored_proof_is_refused_by_one_that_does
     assert "T_max" in str(required_damping(loop, SOFT, More()).reason)
 
 
-def test_ranges_that_it_names_are_proved_at_every_vertex():
+def test_named_ranges_are_proved_at_every_vertex():
     loop = load("omega-pair-ranges").loop("I")
     own, shipped = (required_damping(loop, SOFT, condition) for condition in (Everywhere(), "this-environment"))
     assert own.ratio == pytest.approx(shipped.ratio, rel=1e-9)
@@ -108,7 +108,7 @@ def test_a_name_of_ours_is_refused(taken):
         assert "condition Steal: its name is" in str(verify(ours, own).reason)
 
 
-def test_a_map_and_a_comparison_ask_it_as_they_ask_ours():
+def test_maps_and_comparisons_take_own_conditions():
     """One by one, where ours is asked as a stack; and over frequency."""
     scenario, K, B = load("omega-pair"), np.array([300.0, 4e3]), np.array([0.1, 1.0])
     plain, ours = Plain(), "this-environment"
@@ -132,7 +132,7 @@ class Shifting(SwitchingDelays):
     name, covers = "shifting", ("varying_delay",)
 
 
-def test_the_multiplier_of_ones_own_is_searched_stored_and_checked():
+def test_own_multipliers_are_searched_stored_and_checked():
     loop, own = PAIR.switching(DelayRange(PAIR.theta, tuple(n + 1 for n in PAIR.theta))), Shifting()
     found, shipped = required_damping(loop, SOFT, own), required_damping(loop, SOFT, SWITCHING)
     assert found.required == shipped.required
@@ -157,7 +157,7 @@ class Anywhere(Plain):
         return "any passive environment"
 
 
-def test_what_it_says_of_environments_is_said_and_what_limits_are_proved_for_too():
+def test_own_conditions_state_environments_and_limits():
     stiff, own = SpringDamper([2000.0, 1500.0], [0.2, 0.2]), Anywhere()
     needs = requirements_of(PAIR, stiff, own=own)
     assert assess(PAIR, stiff, condition=own).guarantee.any_environment
@@ -188,7 +188,7 @@ class Mean(Coupling):
         return Compliance(self._V(PAIR.T, self.kept)).form()
 
 
-def test_a_coupling_is_the_system_that_its_file_gives_back():
+def test_a_coupling_equals_its_stored_form():
     assert isinstance(filed(PAIR, Mean(400.0)), Compliance)
     assert filed(PAIR, SOFT) is SOFT
     certificate = prove(PAIR, Mean(400.0), "this-environment")

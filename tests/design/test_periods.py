@@ -28,7 +28,7 @@ STIFF, SOFT = SpringDamper([7806, 3137], [0.105, 1.68]), SpringDamper([500, 350]
 change = msgspec.structs.replace
 
 
-def test_a_report_on_switching_delays_is_for_the_longest_period(tmp_path):
+def test_switching_reports_use_the_longest_period(tmp_path):
     """Also of the buffer that makes the delay the largest one."""
     needs = []
     for more in ([], ["--T-max", "1.8e-3"]):
@@ -51,7 +51,7 @@ def test_the_longest_period_scales_the_required_damping(condition):
     assert uneven.available == LOOP.delta
 
 
-def test_so_it_does_with_delays_that_switch_and_with_the_multiplier_of_a_delayed_environment():
+def test_longest_period_scales_switching_and_multipliers():
     switching = change(LOOP, varying_delay=DelayRange((0, 1), (1, 2)))
     even, uneven = (required_damping(change(switching, T_max=longest), SOFT, SWITCHING) for longest in (None, LONG))
     assert uneven.required == pytest.approx([1.6 * b for b in even.required], rel=1e-6)  # of the search for alpha
@@ -84,7 +84,7 @@ def test_the_any_environment_line_by_hand():
     assert any_environment(V, [1], [1.0], LONG).required[0] == pytest.approx(need, rel=1e-4)  # of the samples
 
 
-def test_the_damping_of_a_tick_is_exact_over_the_rationals():
+def test_damping_per_tick_is_exact():
     longer = loop_of(1e-3, [1.37], T_max=1.6e-3)
     assert even_damping(longer, Fraction(1, 1000))[0] == Fraction(137, 100) / Fraction(16, 10)
     F = LOOP.F(SOFT, exact=True)
@@ -97,7 +97,7 @@ def test_the_damping_of_a_tick_is_exact_over_the_rationals():
 
 
 @pytest.mark.parametrize("condition", ["this-environment", "any-environment"])
-def test_a_certificate_of_uneven_periods_is_proved_stored_and_verified(condition):
+def test_uneven_period_certificates_are_proved_from_files(condition):
     loop = change(LOOP, T_max=LONG)
     stored = Stored.of(loop, SOFT, prove(loop, SOFT, condition))
     again = msgspec.json.decode(msgspec.json.encode(stored), type=Stored)
@@ -106,7 +106,7 @@ def test_a_certificate_of_uneven_periods_is_proved_stored_and_verified(condition
     assert digest(change(LOOP, T_max=None)) == digest(LOOP) != digest(loop)
 
 
-def test_a_design_for_uneven_periods_is_certified_for_them():
+def test_uneven_period_designs_are_certified():
     loop = change(LOOP, T_max=LONG)
     found = design(loop, "this-environment")
     requirement = requirements_of(loop, found.coupling)["this-environment"]
@@ -164,7 +164,7 @@ def grown(damping, mean, seed=7):
 
 
 @pytest.mark.parametrize("mean", [50, 1000, None])
-def test_no_hand_grows_at_the_requirement_of_the_longest_period_and_some_do_below(mean):
+def test_hands_grow_only_below_the_longest_periods_requirement(mean):
     need = required_damping(ONE, COUPLING, "this-environment").required[0]
     assert need == pytest.approx(1.244099, rel=1e-6)
     assert grown(1.01 * 1.6 * need, mean) == 0

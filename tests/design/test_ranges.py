@@ -69,7 +69,7 @@ def scenario_file(tmp_path_factory):
 # the ranges
 
 
-def test_vertices_are_the_ends_of_every_range_and_what_may_be_absent():
+def test_vertices_are_range_ends_and_absences():
     ranges = Ranges(
         (
             UncertainSpring(("contact 1", "mass"), (640.0, 960.0), (0.5, 1.0), absent=True),
@@ -101,12 +101,12 @@ def test_a_contact_that_is_made():
     assert any(300 < spring.stiffness < 500 for spring in drawn)
 
 
-def test_a_vertex_that_is_the_environment_is_not_listed_twice():
+def test_the_nominal_environment_is_no_second_vertex():
     ranges = Ranges(masses={"mass": (1.0, 2.0)})
     assert [m.network.masses["mass"] for m in members(FIGURE_4, ranges)] == [1.0, 2.0]
 
 
-def test_samples_lie_inside_and_do_not_depend_on_their_number():
+def test_samples_lie_inside_whatever_their_number():
     drawn = inside(FIGURE_4, SMALL, 40, seed=3)
     assert [m.network for m in inside(FIGURE_4, SMALL, 7, seed=3)] == [m.network for m in drawn[:7]]
     stiffness = np.array([m.network.springs[0].stiffness for m in drawn])
@@ -125,7 +125,7 @@ def chain(links: int) -> tuple[Network, Ranges]:
 
 
 @pytest.mark.parametrize("links", [8, 11, 30])
-def test_of_many_vertices_any_three_parameters_have_every_combination_of_ends(links):
+def test_any_three_parameters_meet_in_all_ends(links):
     chosen = members(*chain(links))[1:]
     ends = np.array([[spring.stiffness for spring in member.network.springs] for member in chosen])
     assert len(ends) == 128
@@ -167,7 +167,7 @@ def test_the_number_of_parameters_is_limited():
         ("[ranges]\nspring = 1", "did you mean `springs`"),
     ],
 )
-def test_ranges_that_make_no_sense_is_refused_by_name(ranges, message):
+def test_impossible_ranges_are_refused_by_name(ranges, message):
     with pytest.raises(InputError, match=message):
         parse(f"{TEXT}\n{ranges}")
 
@@ -198,7 +198,7 @@ def least_room(network: Network, coupling, points: int = 2000) -> float:
     return float(np.linalg.eigvalsh(T / 1.37 * (H + np.conj(np.swapaxes(H, 1, 2))) / 2 + np.eye(2)).min())
 
 
-def test_the_force_map_of_each_vertex_is_that_of_its_raw_matrices(robust):
+def test_vertex_force_maps_match_raw_matrices(robust):
     w = np.array([1e-3, 0.04, 0.3, 2.0])
     for member in LOOP.members():
         F = force_map(environment(member.network, T), robust.coupling, THETA, (0, 0)).at(np.exp(1j * w))
@@ -207,7 +207,7 @@ def test_the_force_map_of_each_vertex_is_that_of_its_raw_matrices(robust):
         np.testing.assert_allclose(F, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
 
 
-def test_one_filter_holds_at_every_vertex_where_that_of_the_environment_alone_does_not(robust, nominal_only):
+def test_one_filter_holds_at_every_vertex(robust, nominal_only):
     rooms = [least_room(m.network, robust.coupling) for m in LOOP.members()]
     alone = [least_room(m.network, nominal_only.coupling) for m in LOOP.members()]
     # two thousandths of the damping are the design's own margin
@@ -244,13 +244,13 @@ def test_ranges_however_wide_have_an_answer():
 # the proof
 
 
-def test_every_vertex_is_proved_and_the_file_says_these_ranges(stored):
+def test_every_vertex_is_proved_and_stored(stored):
     assert stored.certificate.guarantee == "these ranges"
     assert set(stored.certificate.matrices) == {"P", "P1", "P2", "P3"}
     assert verify(stored).proved
 
 
-def test_a_broken_proof_of_one_vertex_is_rejected_by_name(stored, tmp_path):
+def test_a_broken_vertex_proof_is_rejected(stored, tmp_path):
     matrices = dict(stored.certificate.matrices)
     rows = [list(row) for row in matrices["P2"]]
     rows[0][0] = f"-{rows[0][0]}".replace("--", "")
@@ -270,7 +270,7 @@ def test_wider_ranges_are_another_claim(stored):
     assert not verify(smuggled).proved
 
 
-def test_a_coupling_for_one_environment_is_not_proved_for_the_ranges(nominal_only):
+def test_nominal_couplings_are_not_proved_for_ranges(nominal_only):
     with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.40"):
         prove(LOOP, nominal_only.coupling, "this-environment")
     part = check_ranges(LOOP, nominal_only.coupling, samples=8).part()
@@ -286,7 +286,7 @@ def test_nothing_is_promised_where_a_sample_inside_violates(robust):
     assert not broken.proved
 
 
-def test_a_fixed_coupling_may_be_promised_ranges_or_any_environment():
+def test_fixed_couplings_may_cover_ranges():
     for gains, any_environment in (((878.7, 551.8), True), ((2000.0, 1500.0), False)):
         check = check_ranges(LOOP, SpringDamper(gains, (0.3865, 0.522)), samples=8)
         assert check.proved
@@ -296,7 +296,7 @@ def test_a_fixed_coupling_may_be_promised_ranges_or_any_environment():
         assert prove(LOOP, data, "this-environment").guarantee == "these ranges"
 
 
-def test_files_without_ranges_have_the_digest_that_they_always_had():
+def test_files_without_ranges_keep_their_digest():
     """Made before there were ranges, for this loop and coupling."""
     plain = LOOP.at(FIGURE_4)
     expected = "b8cae9c8ced7f5c0abcd4246af3ea609fa292b47b365d074618a2702234f644a"
@@ -307,7 +307,7 @@ def test_files_without_ranges_have_the_digest_that_they_always_had():
 # the commands
 
 
-def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, tmp_path, capsys):
+def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys):
     file, report = tmp_path / "c.json", tmp_path / "r.json"
     common = ["--scenario", str(scenario_file), "--json", str(report)]
 
@@ -384,6 +384,6 @@ def test_a_vertex_that_does_not_exist(scenario_file, tmp_path, options, message)
         run_main(["--scenario", str(scenario_file), "--out", str(tmp_path), *options])
 
 
-def test_ranges_that_are_not_there_cannot_be_drawn_from(tmp_path):
+def test_missing_ranges_cannot_be_sampled(tmp_path):
     with pytest.raises(InputError, match="--environments ranges: the scenario has no ranges"):
         validate_main(["--environments", "ranges", "--out", str(tmp_path)])

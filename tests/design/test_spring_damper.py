@@ -62,7 +62,7 @@ def test_a_damper_of_nothing_is_zero(condition):
     assert found.requirement.certified
 
 
-def test_the_objective_is_the_norm_of_the_coupling_returned():
+def test_the_objective_is_the_returned_norm():
     loop = asked()
     found = design(loop)
     V = found.coupling.compliance(T)
@@ -150,7 +150,7 @@ def test_the_gain_set_is_exact(theta, sigma, most_stored):
 
 @pytest.mark.parametrize("phi", [0.0, 0.3])
 @pytest.mark.parametrize("theta", [0, 1, 4])
-def test_the_gain_set_is_the_block_of_its_condition(theta, phi):
+def test_the_gain_set_equals_its_block(theta, phi):
     """k/2 + b - |c|^2 is |W|^2 times the block of any-environment for V = 1/W, less its row of the multiplier."""
     loop = Loop(1.0, (theta,), (0,), (0,), (1 / (1 - RESERVE),), WALL)
     unit, z = loop.channel(0).at(WALL), np.exp(1j * np.linspace(1e-3, np.pi, 50))[None]
@@ -197,7 +197,7 @@ def test_delay_in_the_environment(psi):
     assert this_environment(force_map(loop.E(), found.coupling, loop.theta, psi), DELTA).certified
 
 
-def test_without_a_multiplier_the_delayed_condition_is_the_plain_one():
+def test_zero_multiplier_gives_the_plain_condition():
     for gains in random_starts(10, seed=4):
         V = gains.compliance(T)
         plain = any_environment(V, (1, 2), DELTA)
@@ -206,7 +206,7 @@ def test_without_a_multiplier_the_delayed_condition_is_the_plain_one():
 
 
 @pytest.mark.parametrize(("case", "rms_db"), [("I", -10.98), ("II", -7.99)])
-def test_the_this_environment_design_spends_the_environments_own_damping(case, rms_db):
+def test_this_environment_designs_use_the_objects_damping(case, rms_db):
     loop = asked(CASES[case])
     found = design(loop, "this-environment")
     assert 20 * np.log10(found.objective) <= rms_db
@@ -216,20 +216,20 @@ def test_the_this_environment_design_spends_the_environments_own_damping(case, r
     assert not any_environment(found.coupling.compliance(T), loop.theta, DELTA).certified
 
 
-def test_the_this_environment_design_keeps_a_delayed_environment_stable():
+def test_this_environment_designs_stabilise_delayed_environments():
     loop = asked((0, 0), psi=(1, 1), delta=(2.0, 2.0))
     found = design(loop, "this-environment")
     assert found.requirement.ratio <= 1 - RESERVE
     assert force_map(loop.E(), found.coupling, loop.theta, loop.psi).is_stable()
 
 
-def test_a_search_that_finds_nothing_does_not_claim_that_there_is_nothing():
+def test_failed_searches_claim_no_impossibility():
     with pytest.raises(DesignFailed, match="no spring-damper was found") as caught:
         design(asked((0, 0), psi=(1, 1), delta=(0.5, 0.5)), "this-environment")
     assert not isinstance(caught.value, Infeasible)
 
 
-def test_what_is_proposed_instead_holds_when_it_is_done():
+def test_proposed_changes_hold_when_made():
     """Each proposal, designed with all its rungs, passes the sweep; best first, and never what was asked for."""
     loop = asked((0, 0), psi=(1, 1))
     words = instead(loop, "spring-damper", "any-environment")
@@ -275,7 +275,7 @@ def test_an_unknown_condition_is_refused():
         design(asked(), "both")
 
 
-def test_a_long_delay_is_designed_for_in_seconds_and_passes_a_dense_sweep():
+def test_long_delay_designs_pass_a_dense_sweep():
     """50 samples; |y|^2 <= 4 delta (K T/2 + B) at 200001 frequencies, 1/125 of a ripple apart in phase."""
     made = stiffest(asked(theta=(50, 50)))
     z, n = np.exp(1j * np.linspace(0, np.pi, 200_001)), 51
@@ -289,7 +289,7 @@ def test_a_long_delay_is_designed_for_in_seconds_and_passes_a_dense_sweep():
 
 @pytest.mark.parametrize("sampled", [SampledLoop, LimiterLoop, partial(SwitchingLoop, lo=(0, 2), hi=(1, 2))])
 @pytest.mark.parametrize("psi", [(0, 0), (1, 0)])
-def test_the_slopes_of_the_conditions_are_those_of_differences(sampled, psi):
+def test_slopes_match_finite_differences(sampled, psi):
     """Derivatives by hand against central differences, whose own error is 1e-8 of rounding."""
     at = sampled(load().replace(psi=psi).loop("I"))
     x = np.array([6.5, 6.1, 0.3, 0.45, *(-0.7, 0.6)[: at.active.size]])
@@ -313,7 +313,7 @@ def test_what_would_take_minutes_is_refused_at_once():
         spring_damper.design_with(late, "this-environment")
 
 
-def test_a_search_for_many_devices_ends_where_one_from_every_start_does(monkeypatch):
+def test_many_device_searches_match_exhaustive_starts(monkeypatch):
     """It goes on from the likeliest start only, with the limiter at once: within a twentieth of the rms."""
     usual = design(asked(CASES["I"]), "this-environment", limiter=True).objective
     monkeypatch.setattr(spring_damper, "FEW", 1)

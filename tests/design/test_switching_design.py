@@ -79,7 +79,7 @@ def test_requests_that_make_no_sense_are_refused(options, tmp_path):
         main([*options, "--out", str(tmp_path / "c.json")])
 
 
-def test_any_environment_is_not_designed_for_delays_that_vary():
+def test_any_environment_designs_refuse_varying_delays():
     with pytest.raises(ValueError, match="this-environment condition only"):
         design(load().loop("I"), "any-environment", switching=RANGE)
 

@@ -73,7 +73,7 @@ def test_the_proof_survives_the_file(stored, file):
     assert proof.margin == pytest.approx(1.37 / proof.required[0])
 
 
-def test_what_is_on_file_is_a_witness_on_a_dense_sweep(stored):
+def test_stored_multipliers_pass_a_dense_sweep(stored):
     """From the numbers of the file alone, without the code that proves: the condition at 20000 frequencies, and
     the KYP inequality in floating point."""
     proof = stored.certificate
@@ -98,7 +98,7 @@ def test_other_ranges_are_proved_too(lo, hi):
 
 
 @pytest.mark.parametrize("coupling", [SOFT, STIFF])
-def test_every_constant_delay_of_the_range_asks_no_more(coupling):
+def test_constant_delays_in_range_need_no_more(coupling):
     """Why a file that is proved for switching covers constants: by the energy, which knows no z."""
     switching = switching_sweep(sent(coupling), (1, 0), (2, 3), DELTA).ratio
     for theta in product((1, 2), (0, 1, 2, 3)):
@@ -106,7 +106,7 @@ def test_every_constant_delay_of_the_range_asks_no_more(coupling):
         assert this_environment(F, DELTA).ratio <= switching * (1 + 1e-9)
 
 
-def test_what_is_not_safe_under_switching_is_not_certified_as_such():
+def test_unsafe_switching_is_not_certified():
     assert prove(PAIR, STIFF, "this-environment").facts == ()
     with pytest.raises(NotProved, match=r"^delays switching within \[1, 2\] samples: needs 2\.04"):
         prove(LOOP, STIFF, "this-environment")
@@ -142,7 +142,7 @@ def forged(stored: Stored, loop: Loop = LOOP, **fields) -> str:
     return verdict.reason
 
 
-def test_a_forger_who_repairs_the_digests_still_has_to_prove(stored):
+def test_repaired_digests_do_not_forge_a_proof(stored):
     P, alpha = stored.certificate.matrices["P"], stored.certificate.multipliers["alpha"]
     begins = "delays switching within [1, 2] samples: "
     assert forged(stored, required=(1.0, 1.0)).startswith(f"{begins}required is [1.0, 1.0], the sweep finds [1.07")
@@ -183,7 +183,7 @@ def test_a_multiplier_below_zero_lends_no_damping():
         ({"lo": [1, 1], "high": [2, 2]}, "unknown field `high`"),
     ],
 )
-def test_a_range_that_makes_no_sense_is_no_file(file, tmp_path, fields, message):
+def test_impossible_ranges_make_no_file(file, tmp_path, fields, message):
     text = json.loads((tmp_path / "proof.json").read_text())
     text["loop"]["varying_delay"] = fields
     (tmp_path / "bad.json").write_text(json.dumps(text))
@@ -192,7 +192,7 @@ def test_a_range_that_makes_no_sense_is_no_file(file, tmp_path, fields, message)
     assert message in str(error.value)
 
 
-def test_a_loop_has_a_range_of_delays_or_ranges():
+def test_delay_ranges_and_ranges_exclude_each_other():
     ranges = Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 840.0)),))
     with pytest.raises(ValueError, match="varying_delay and ranges: switching delays are judged in one environment"):
         change(LOOP, ranges=ranges)
@@ -250,7 +250,7 @@ def test_a_run_says_what_the_file_covers(run, file):
     assert narrow["varying_delay"]["on_file"] == {"lo": [1, 1], "hi": [2, 2]}
 
 
-def test_what_the_file_does_not_cover_is_judged_anew(run, file, constant_file):
+def test_uncovered_loops_are_judged_anew(run, file, constant_file):
     wide = run(file, "--varying-delay", "0,3")
     line = (
         "the file proves delays switching within [1, 2] samples: delays switching within [0, 3] samples are judged anew"
@@ -293,7 +293,7 @@ def test_validate_and_audit_say_the_same(file, constant_file, tmp_path, capsys):
     assert any("judged anew" in note for note in outcome["notes"])
 
 
-def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, monkeypatch):
+def test_without_proof_files_keep_constant_delays(tmp_path, capsys, monkeypatch):
     """A limit on states between the two models: said in the report, and the file claims no switching."""
     monkeypatch.setattr(positive_real, "LARGEST", exact_block(LOOP, SOFT, (1.0, 1.0)).order - 1)
     out = str(tmp_path / "c.json")
@@ -308,7 +308,7 @@ def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, m
     assert verify(load(out)).proved
 
 
-def test_a_design_for_a_range_without_its_theta_is_refused(tmp_path):
+def test_ranges_without_theta_are_refused(tmp_path):
     options = ["--condition", "this-environment", "--varying-delay", "2,3", "--out", str(tmp_path / "c.json")]
     with pytest.raises(
         ValueError, match=r"--varying-delay: theta is \[1, 2\], outside of its varying_delay, \[2, 3\] samples"
@@ -356,7 +356,7 @@ def test_certify_judges_every_vertex_of_the_ranges(K, certified):
     assert found.proof == ("rational" if certified else "sampled")
 
 
-def test_the_bridge_says_how_long_a_force_may_be_held(tmp_path):
+def test_the_bridge_reports_the_longest_hold(tmp_path):
     """Ages under isolated missed answers, from the line itself, lie within what the file proves."""
     loop = change(LOOP, theta=(1, 1), lam=(1, 1))
     save(Stored.of(loop, SOFT, prove(loop, SOFT, "this-environment")), tmp_path / "one.json")

@@ -63,14 +63,14 @@ def test_a_spring_needs_what_its_longest_delay_needs(lo, hi):
 
 
 @pytest.mark.parametrize("theta", [(1, 2), (0, 3)])
-def test_a_range_of_one_delay_is_the_this_environment_condition(theta):
+def test_one_delay_gives_the_this_environment_condition(theta):
     F = force_map(environment(FIGURE_4, T), STIFF, theta, (0, 0))
     found = switching_sweep(sent(), theta, theta, DELTA)
     assert found.required == pytest.approx(this_environment(F, DELTA).required, rel=1e-12)
     assert found.frequency_hz == pytest.approx(this_environment(F, DELTA).frequency_hz, rel=1e-4)
 
 
-def test_the_least_factor_is_that_of_a_convex_solver():
+def test_the_least_factor_matches_a_convex_solver():
     """An SDP in (s, alpha) at 13 frequencies: its optimum is the multiplier's bound there, from other code."""
     lo, hi = (0, 1), (3, 2)
     G, delta = sent(), np.array([1.37, 0.9])
@@ -111,7 +111,7 @@ def test_a_dense_sweep_agrees(lo, hi):
     assert found.bound == pytest.approx(found.ratio, rel=1e-5)
 
 
-def test_the_energy_holds_for_the_worst_ages_of_any_motion():
+def test_the_energy_bound_holds_for_worst_ages():
     """The claim itself, without z: sum f'dx + sum dx'(Delta/T)dx >= 0 from rest, with ages chosen against it."""
     G, lo, hi = sent(), 1, 3
     needed = np.array(switching_sweep(G, (lo, lo), (hi, hi), DELTA).required)
@@ -225,7 +225,7 @@ def test_audit_refuses_a_range_without_the_constant(tmp_path, varying_delay, mes
         main(["--K", "879,552", "--B", "0.39,0.52", "--varying-delay", varying_delay, "--out", str(tmp_path)])
 
 
-def test_the_multiplier_is_the_best_one_in_random_loops():
+def test_the_multiplier_is_best_in_random_loops():
     """One to five channels, stars of random springs: the bound over all multipliers meets the requirement."""
     rng = np.random.default_rng(5)
     for channels in (1, 2, 3, 4, 5, 2, 3):
@@ -243,7 +243,7 @@ def test_the_multiplier_is_the_best_one_in_random_loops():
         assert found.ratio == pytest.approx(found.bound, rel=2e-6)
 
 
-def test_for_many_devices_the_multiplier_is_that_of_springs(monkeypatch):
+def test_many_devices_use_the_springs_multiplier(monkeypatch):
     """Of springs the best one; of these gains it asks a few percent more than the best, and any multiplier is safe."""
     best, spring = required_damping(loop_of((1, 1), (2, 2)), SOFT, SWITCHING), Lti.constant([[800.0]], T)
     monkeypatch.setattr(environments, "_MOST_ROWS", 1)

@@ -88,7 +88,7 @@ def test_integral_of_what_is_only_rounding():
     assert sum(asked) < 500_000
 
 
-def test_a_map_that_is_the_environment_itself_has_no_mismatch():
+def test_the_environment_itself_has_no_mismatch():
     """What is left of F - Lambda E in other coordinates is rounding, which no halving makes smaller."""
     assert transparency(E, E, (0, 0)).rms_mismatch < 1e-10
     state = np.eye(E.order) + np.triu(np.ones((E.order, E.order)), 1)

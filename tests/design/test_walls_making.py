@@ -132,7 +132,7 @@ def test_the_block_is_the_definition():
         assert (ours + ours.conj().T) == pytest.approx(whole + whole.conj().T, rel=1e-9, abs=1e-6)
 
 
-def test_without_walls_to_speak_of_it_is_the_plain_condition():
+def test_vanishing_walls_give_the_plain_condition():
     soft = held(1e-6)
     plain = this_environment(soft.at(change(soft.environment, walls=())).F(COUPLING), soft.delta)
     assert required_damping(soft, COUPLING, "this-environment").required == pytest.approx(plain.required, rel=1e-6)
@@ -180,7 +180,7 @@ def test_six_facts_hold_at_every_transition():
     assert (before * dp >= -scale * 1e3 * (k + b)).all()
 
 
-def test_the_slope_form_covers_every_wall_up_to_it():
+def test_the_slope_form_covers_softer_walls():
     """Its two inequalities with kw = k + 2b, at random transitions of random walls."""
     rng = np.random.default_rng(1)
     n = 200_000
@@ -361,7 +361,7 @@ def swinging(loop, coupling, damping, seed=11):
 
 
 @pytest.mark.parametrize(("damping", "short"), [(0.0, 0.8), (2.0, 0.55)])
-def test_hands_come_to_rest_at_the_requirement_and_some_swing_below(damping, short):
+def test_hands_rest_at_the_requirement_not_below(damping, short):
     loop, coupling = pressed_at_rest(damping), SpringDamper([1300.0], [0.45])
     need = required_damping(loop, coupling, "this-environment").required[0]
     fastest, made = swinging(loop, coupling, 1.02 * need)
@@ -370,7 +370,7 @@ def test_hands_come_to_rest_at_the_requirement_and_some_swing_below(damping, sho
     assert swinging(loop, coupling, short * need)[0] > 0.5  # for ever, the wall made and left
 
 
-def test_a_design_before_a_wall_with_a_damper_spends_the_damping_and_is_proved():
+def test_damped_wall_designs_are_tight_and_proved():
     """Stiffer than any passive environment allows, and softer than what every frozen state alone allows (1772 N/m)."""
     wall = Wall(("tip", GROUND), 3000.0, 2.0, 0.005)
     loop = Loop(1e-3, (1,), (0,), (1,), (1.37,), Network(("tip",), walls=(wall,)))

@@ -72,7 +72,7 @@ def point_of(member: Member) -> np.ndarray:
 # the regions
 
 
-def test_a_region_for_every_way_in_which_the_contacts_can_be():
+def test_every_set_of_contacts_has_a_region():
     ranges = Ranges(
         (
             UncertainSpring(("contact 1", "mass"), (640.0, 960.0), (0.5, 1.0), absent=True),
@@ -89,7 +89,7 @@ def test_a_region_for_every_way_in_which_the_contacts_can_be():
     assert lost.at("x", np.array([600.0, 1.5])).network.springs[0] == Spring(("contact 1", "mass"), 0, 0)
 
 
-def test_the_corners_of_the_regions_are_the_vertices_of_the_ranges():
+def test_region_corners_are_the_vertices():
     corners = {
         str(region.at("", np.array(corner)).network)
         for region in regions(FIGURE_4, RANGED.ranges)
@@ -116,7 +116,7 @@ def test_a_peak_is_found_wherever_it_lies(top):
     assert found.worst[0].ratio > 0.99
 
 
-def test_of_many_parameters_the_worst_vertex_is_found_and_a_budget_ends_the_search():
+def test_many_parameters_find_the_worst_vertex():
     """A need that is most where odd parameters are at their upper ends, the others at their lower."""
     region = cube(10)
     signs = np.array([1, -1] * 5)
@@ -133,7 +133,7 @@ def test_of_many_parameters_the_worst_vertex_is_found_and_a_budget_ends_the_sear
     assert len(short.worst) == 1
 
 
-def test_two_regions_are_both_searched_and_their_worst_comes_first():
+def test_both_regions_are_searched_worst_first():
     one, other = cube(1), cube(2)
     found = search([one, other], lambda m: float(point_of(m).sum()))
     assert found.worst[0].ratio == 21  # the upper ends of [0, 10] and [1, 11]
@@ -156,7 +156,7 @@ def test_progress_ends_at_its_total():
 # a coupling that is certified at every vertex and at 64 random points, and violated on an edge
 
 
-def test_a_violation_on_an_edge_is_found_where_a_dense_sweep_by_hand_has_it(known):
+def test_edge_violations_match_a_dense_sweep(known):
     """The springs at their upper ends: between 0.5 and 2 kg the resonance moves from one vertex to the other."""
     masses = np.linspace(0.5, 2.0, 151)
     edge = [needed(Network(FIGURE_4.contacts, STIFF, {"mass": m}), VERTICES_ONLY) for m in masses]
@@ -168,7 +168,7 @@ def test_a_violation_on_an_edge_is_found_where_a_dense_sweep_by_hand_has_it(know
     assert found.member.network.masses["mass"] == pytest.approx(masses[np.argmax(edge)], abs=0.02)
 
 
-def test_neither_the_vertices_nor_random_points_see_it_but_no_set_is_promised(known):
+def test_violations_between_vertices_take_the_guarantee_away(known):
     assert known.certificate is not None
     assert len(known.at_samples) == 64
     assert all(r.certified for r in (*known.at_members, *known.at_samples))
@@ -193,7 +193,7 @@ def test_its_file_is_stored_for_the_environment_alone(known, tmp_path):
     assert (stored.loop.ranges, stored.certificate.guarantee) == (None, "this environment")
 
 
-def test_design_check_searches_again_and_rejects_a_file_that_was_made_without(tmp_path, capsys):
+def test_design_check_repeats_the_search(tmp_path, capsys):
     file = tmp_path / "c.json"
     save(Stored.of(EDGE, VERTICES_ONLY, prove(EDGE, VERTICES_ONLY, "this-environment")), file)
     assert verify(load(file)).proved  # of the vertices it is a proof
@@ -207,7 +207,7 @@ def test_design_check_searches_again_and_rejects_a_file_that_was_made_without(tm
 # the design
 
 
-def test_a_design_for_ranges_is_kept_between_their_ends_by_a_dense_sweep():
+def test_range_designs_hold_between_their_ends():
     found = optimal.design(MASS, Options(ladder=((4, 3), (8, 6))))
     assert found.proved
     E = np.array([needed_by_filter(with_mass(mass), found.coupling) for mass in np.geomspace(0.25, 4.0, 120)])

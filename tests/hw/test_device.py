@@ -78,7 +78,7 @@ def armed(**changes) -> Rig:
 # ---- before it runs --------------------------------------------------------------------------------------------------
 
 
-def test_it_is_silent_until_configured_and_answers_who_it_is():
+def test_an_unconfigured_device_only_answers_info():
     rig = Rig(config=None)
     assert [rig.tick() for _ in range(5)] == [[]] * 5
     rig.say(Hello())
@@ -99,7 +99,7 @@ def test_it_is_silent_until_configured_and_answers_who_it_is():
         (CONFIG._replace(cap=(1, 20_001)), Refused.CAP),
     ],
 )
-def test_a_config_that_does_not_suit_the_device_is_refused(config, reason):
+def test_unsuitable_configs_are_refused(config, reason):
     rig = Rig(config=None)
     rig.say(config)
     assert rig.tick() == [Ack(config_crc(config), reason)]
@@ -108,7 +108,7 @@ def test_a_config_that_does_not_suit_the_device_is_refused(config, reason):
     assert rig.tick()[0].refused == Refused.ACCEPTED
 
 
-def test_a_config_is_refused_while_the_motors_may_carry_a_force():
+def test_configs_are_refused_while_forces_act():
     rig = armed()
     other = CONFIG._replace(theta=3)
     for phase in (Phase.ARMED, Phase.HOLDING, Phase.HOLDING, Phase.HOLDING, Phase.HOLDING, Phase.RAMP, Phase.RAMP):
@@ -131,7 +131,7 @@ def test_who_it_is_waits_until_the_motors_rest():
     assert heard == [[State]] * 3 + [[Info, State], [State]]
 
 
-def test_forces_before_arming_move_nothing_and_arming_needs_its_own_command():
+def test_forces_act_only_after_arming():
     rig = Rig()
     for _ in range(10):
         rig.answer((9000, 9000))
@@ -149,7 +149,7 @@ def test_forces_before_arming_move_nothing_and_arming_needs_its_own_command():
 
 @pytest.mark.parametrize("theta", [1, 2, 3, 15])
 @pytest.mark.parametrize("first_tick", [0, 65_500])
-def test_a_force_acts_at_tick_k_plus_theta_exactly(theta, first_tick):
+def test_forces_act_at_k_plus_theta(theta, first_tick):
     """A staircase: 10 k answers tick k (counted from arming); at tick k the device carries 10 (k - theta)."""
     rig = Rig(CONFIG._replace(theta=theta), first_tick)
     rig.arm()
@@ -161,7 +161,7 @@ def test_a_force_acts_at_tick_k_plus_theta_exactly(theta, first_tick):
         assert rig.at == (Phase.ARMED, Cause.NONE)
 
 
-def test_reordered_frames_act_in_their_order_and_the_first_of_two_counts():
+def test_reordered_and_doubled_frames_act_in_order():
     rig = armed(theta=3)
     for k in range(30):
         if k % 2:  # the answers to two ticks, the later one first
@@ -185,7 +185,7 @@ def test_late_early_and_misaddressed_frames_are_not_used():
     assert rig.state.misses == (rig.device.misses) & 0xFF == 2  # this one, and the tick of the CONFIG
 
 
-def test_with_theta_zero_a_force_acts_as_soon_as_it_comes():
+def test_theta_zero_forces_act_on_arrival():
     """The answer to a tick is latched within it, whenever it comes; the margin is what was left of the tick."""
     rig = Rig(CONFIG._replace(theta=0))
     rig.answer(command=Command.ARM, after=200)
@@ -215,7 +215,7 @@ def test_with_theta_zero_a_force_is_latched_once():
         assert rig.device.applied == (3 * k, -3 * k)
 
 
-def test_with_theta_zero_late_answers_are_missed_and_held_through():
+def test_theta_zero_late_answers_are_held_through():
     rig = Rig(CONFIG._replace(theta=0, hold=2, ramp=2))
     rig.answer(command=Command.ARM)
     rig.tick()
@@ -235,7 +235,7 @@ def test_with_theta_zero_late_answers_are_missed_and_held_through():
     assert rig.at == (Phase.STOPPED, Cause.WATCHDOG)
 
 
-def test_with_theta_zero_idle_begins_the_ramp_at_the_next_tick():
+def test_theta_zero_idle_ramps_at_once():
     rig = Rig(CONFIG._replace(theta=0, ramp=2))
     rig.answer(command=Command.ARM)
     rig.tick()
@@ -247,7 +247,7 @@ def test_with_theta_zero_idle_begins_the_ramp_at_the_next_tick():
     assert rig.forces == (50, 50)
 
 
-def test_the_margin_says_how_long_before_its_latch_a_force_came():
+def test_the_margin_is_time_before_the_latch():
     for theta, after, margin in [(1, 300, 900), (2, 300, 2100), (15, 0, 18_000), (1, 1200, 0), (1, 60_000, -32_767)]:
         rig = Rig(CONFIG._replace(theta=theta))
         k = rig.device.k
@@ -272,7 +272,7 @@ def test_the_margin_says_how_long_before_its_latch_a_force_came():
 # ---- the ways to rest ------------------------------------------------------------------------------------------------
 
 
-def test_the_watchdog_holds_four_ticks_then_ramps_to_zero():
+def test_the_watchdog_holds_then_ramps_out():
     """0.25 of the force a tick at ramp = 4: 4.8 ms at T = 1.2 ms."""
     rig = armed()
     rig.answer((1001, -999))
@@ -287,7 +287,7 @@ def test_the_watchdog_holds_four_ticks_then_ramps_to_zero():
     assert rig.at == (Phase.STOPPED, Cause.WATCHDOG)
 
 
-def test_whoever_is_armed_and_says_nothing_is_held_as_long_as_one_who_falls_silent():
+def test_silent_hosts_are_held_equally_long():
     rig = armed()
     seen = [rig.tick() and rig.at for _ in range(9)]
     assert [phase for phase, _ in seen] == [Phase.HOLDING] * 4 + [Phase.RAMP] * 3 + [Phase.STOPPED] * 2
@@ -297,7 +297,7 @@ def test_whoever_is_armed_and_says_nothing_is_held_as_long_as_one_who_falls_sile
     assert [rig.tick() and rig.device.phase for _ in range(5)] == [Phase.HOLDING] * 4 + [Phase.RAMP]
 
 
-def test_holding_keeps_the_force_as_it_is_even_on_its_way():
+def test_holding_keeps_the_present_force():
     """The slew rate was still letting it rise: nothing moves without a fresh frame."""
     rig = armed(slew=(100, 100))
     rig.answer((1000, -1000))
@@ -328,7 +328,7 @@ ENDINGS = {
 
 
 @pytest.mark.parametrize("cause", ENDINGS)
-def test_every_stop_ramps_down_keeps_its_first_cause_and_never_runs_again_by_itself(cause):
+def test_stops_ramp_down_and_keep_their_cause(cause):
     rig = armed()
     rig.answer((4000, 0))
     rig.tick()
@@ -363,7 +363,7 @@ def test_a_stop_before_arming_needs_no_ramp():
 
 
 @pytest.mark.parametrize(("press", "cause"), [("device", Cause.ESTOP_DEVICE), ("host", Cause.ESTOP_HOST)])
-def test_an_emergency_stop_is_zero_at_once_and_stays(press, cause):
+def test_emergency_stops_are_zero_at_once(press, cause):
     rig = armed()
     rig.answer((4000, 0))
     rig.tick()
@@ -384,7 +384,7 @@ def test_an_emergency_stop_is_zero_at_once_and_stays(press, cause):
     assert rig.at == (Phase.ESTOP, cause)
 
 
-def test_an_emergency_stop_before_configuration_lets_nothing_be_configured():
+def test_emergency_stops_forbid_configuration():
     rig = Rig(config=None)
     rig.device.estop()
     rig.say(CONFIG)
@@ -394,7 +394,7 @@ def test_an_emergency_stop_before_configuration_lets_nothing_be_configured():
 # ---- limits ----------------------------------------------------------------------------------------------------------
 
 
-def test_cap_and_slew_hold_per_axis_whatever_is_asked():
+def test_cap_and_slew_hold_per_axis():
     rig = armed(cap=(3000, 2000), slew=(700, 2500))
     seen = []
     for force in [(32_767, -32_768)] * 6 + [(-32_768, 32_767)] * 6:
@@ -423,7 +423,7 @@ def test_counters_wrap():
     assert (rig.state.crc_errors, rig.state.misses) == (300 % 256, 301 % 256)
 
 
-def test_frames_for_other_devices_are_counted_and_not_obeyed():
+def test_other_devices_frames_are_not_obeyed():
     rig = armed()
     k = rig.device.k
     rig.say(Force(Command.RUN, k + 1, k, (900,)), Force(9, k + 1, k, (0, 0)), Ack(1, 0), INFO, rig.state)

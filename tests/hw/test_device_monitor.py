@@ -80,7 +80,7 @@ def test_a_device_that_obeys_is_never_found_out(seed):
 
 
 @pytest.mark.parametrize(("phase", "force"), [(Phase.ARMED, (8000, 8000)), (Phase.HOLDING, (1, 0))])
-def test_a_force_that_nobody_asked_for_is_a_fault_after_a_few_ticks(phase, force):
+def test_unrequested_forces_are_faults(phase, force):
     told = CommandMonitor(CONFIG)
     told.unlike(state(0), 1)
     for tick in range(1, _PATIENCE):
@@ -91,7 +91,7 @@ def test_a_force_that_nobody_asked_for_is_a_fault_after_a_few_ticks(phase, force
         told.unlike(state(_PATIENCE, (force[0] * _PATIENCE, force[1]), phase), 1)
 
 
-def test_a_device_that_is_wrong_every_other_tick_is_found_out_later():
+def test_intermittent_wrong_devices_are_found_later():
     told = CommandMonitor(CONFIG)
     told.unlike(state(0), 1)
     for tick in range(1, 9):
@@ -121,7 +121,7 @@ def test_a_session_stops_where_a_disarmed_device_pushes(scenario, rungs):
     )
 
 
-def test_an_obedient_device_on_a_bad_line_is_left_alone(scenario, rungs):
+def test_bad_lines_do_not_accuse_good_devices(scenario, rungs):
     faults = tuple(
         map(FaultInjection.parse, ("up:drop=0.05@0", "down:flip=0.05@0", "reorder=0.03@0", "duplicate=0.1@0"))
     )
@@ -156,7 +156,7 @@ def hand_driven(scenario, rungs):
     return session, send
 
 
-def test_a_leap_of_the_tick_number_skips_neither_ramp_nor_jump(scenario, rungs):
+def test_tick_leaps_skip_no_check(scenario, rungs):
     session, send = hand_driven(scenario, rungs)
     for _ in range(6):
         send(Phase.ARMED)
@@ -187,7 +187,7 @@ def test_a_device_that_stops_telling_margins_is_stopped(scenario, rungs):
     assert session.cause == "90 % of the last 200 STATEs told no margin: nobody can say how late answers are"
 
 
-def test_a_device_that_keeps_every_other_state_to_itself_is_stopped(scenario, rungs):
+def test_devices_hiding_every_second_state_are_stopped(scenario, rungs):
     """A force is judged from one tick to the next: where a fifth of the ticks is untold, nobody can."""
     session, send = hand_driven(scenario, rungs)
     for _ in range(250):
@@ -201,7 +201,7 @@ def test_a_device_that_keeps_every_other_state_to_itself_is_stopped(scenario, ru
     assert session.cause == "no STATE came of 20 % of 200 ticks: nobody can say what the device did"
 
 
-def test_a_device_that_holds_longer_than_agreed_is_stopped(scenario, rungs):
+def test_devices_holding_too_long_are_stopped(scenario, rungs):
     session, send = hand_driven(scenario, rungs)
     for _ in range(250):
         send(Phase.ARMED)
@@ -212,7 +212,7 @@ def test_a_device_that_holds_longer_than_agreed_is_stopped(scenario, rungs):
     assert (session.stage, session.cause) == (Stage.STOPPED, "the device holds a force for 5 ticks, 4 are agreed")
 
 
-def test_an_emergency_stop_is_told_until_the_device_has_latched_it(scenario, rungs):
+def test_emergency_stops_repeat_until_latched(scenario, rungs):
     session, _ = hand_driven(scenario, rungs)
     session.estop("space bar", 0)
     told = session.take(State(Phase.DISARMED, 900, 0, 0, 0, 0, 0, (0, 0), (0, 0)), 0)
@@ -222,7 +222,7 @@ def test_an_emergency_stop_is_told_until_the_device_has_latched_it(scenario, run
 
 @pytest.mark.parametrize("configuring", [False, True])
 @pytest.mark.parametrize("status", [Phase.ARMED, Phase.DISARMED])
-def test_a_device_that_drives_before_anybody_asked_is_told_to_stop(scenario, configuring, status):
+def test_devices_driving_unasked_are_stopped(scenario, configuring, status):
     """Whatever its status says; one that goes on for 50 ms once it was asked to be configured is a fault."""
     session, port = Session(scenario, SafetyLimits((12.0, 12.0))), FakePort()
     driver = Driver(session, SerialDevice(port, lambda: 1e-6 * port.now), lambda ages: (), lambda: port.now)
@@ -241,7 +241,7 @@ def test_a_device_that_drives_before_anybody_asked_is_told_to_stop(scenario, con
         assert (session.stage, session.cause) == (Stage.STOPPED, "the device drives, and nobody asked it to")
 
 
-def test_a_clock_that_is_made_of_ticks_is_found_by_the_host(scenario, rungs):
+def test_fake_device_clocks_are_found(scenario, rungs):
     """The device's clock says T, its STATEs come every 2 T: 10 % of 200 ticks are behind after 20 of them."""
     session, send = hand_driven(scenario, rungs)
     assert session.link.last
@@ -323,7 +323,7 @@ def test_skipped_answers_are_older_than_the_youngest():
     assert result.link_delay(300.0, 0.99, 0.0) == 6  # 1600 us, not the 1000 us of the youngest
 
 
-def test_a_lost_answer_is_missing_and_has_no_age():
+def test_lost_answers_have_no_age():
     """Every tenth FORCE is lost: the next echo skips it, and 15 ticks later its latch is missed."""
     measurement, misses = Measurement(500, 15, 1e-3, 0.2), 0
     for k in range(1, 5000):
@@ -378,7 +378,7 @@ def test_an_identification_closes_no_loop_that_could_grow(scenario):
     assert growths(recorder.trace(session.units, scenario.T, plain(report))) == []
 
 
-def test_an_estop_is_repeated_where_nobody_says_that_it_was_heard(scenario):
+def test_estops_repeat_until_acknowledged(scenario):
     """The first STOP may be lost, and the STATEs that would show it too."""
     session = Session(scenario, SafetyLimits((12.0, 12.0)))
     session.start(0)

@@ -57,7 +57,7 @@ def test_both_dead_encoders_are_found_at_arming(scenario, rungs):
 
 @pytest.mark.parametrize(("step", "most"), [(1e-6, 0.13), (1e-5, 0.25), (1e-4, 0.8)])
 @pytest.mark.parametrize("held", [True, False])
-def test_live_encoders_answer_a_force_that_one_hardly_feels(scenario, rungs, step, most, held):
+def test_live_encoders_answer_a_faint_force(scenario, rungs, step, most, held):
     """Newtons until encoders of 1 to 100 um have answered, held by the scenario's hands and free."""
     still = scenario if held else nobody(scenario)
     forces = []
@@ -111,7 +111,7 @@ def test_axes_are_tested_one_after_another():
 
 
 @pytest.mark.parametrize("cap", [0.05, 12.0])
-def test_the_test_force_alternates_grows_and_stays_within_the_cap(cap):
+def test_the_test_force_stays_within_the_cap(cap):
     test, kept = arming_test(cap=cap), []
 
     def still(k, applied):
@@ -147,7 +147,7 @@ def test_swapped_axes_are_named():
         *((2.3, True, True), (0.45, True, False)),
     ],
 )
-def test_a_motion_twice_or_half_of_what_the_mass_predicts_is_refused(scale, held, refused):
+def test_motions_off_by_two_are_refused(scale, held, refused):
     if refused:
         with pytest.raises(SafetyStop, match=r"axis 1 moves .* times as far as a free handle of 0\.25 kg"):
             played(arming_test(held), masses(scale=scale))
@@ -155,7 +155,7 @@ def test_a_motion_twice_or_half_of_what_the_mass_predicts_is_refused(scale, held
         played(arming_test(held), masses(scale=scale))
 
 
-def test_the_expected_motion_is_that_of_the_exact_plant():
+def test_the_expected_motion_is_the_exact_plants():
     """Against the simulation's own matrices, of a motor and a handle, under a force that changes at every tick."""
     device = load().device[0]
     scene = build((device,), (Human((Link(0.0, 0.0, 0.0),)),), ())
@@ -183,7 +183,7 @@ def test_noise_at_rest_widens_both_tests(scenario, rungs, noise):
     assert "axis 1" in later.cause
 
 
-def test_the_noise_is_the_least_range_in_a_tenth_of_a_second():
+def test_noise_is_the_least_short_range():
     noise, draw = EncoderNoise(2, T), np.random.default_rng(2)
     for k in range(400):
         moving = 50 * k if k < 250 else 12_500
@@ -197,7 +197,7 @@ def test_the_noise_is_the_least_range_in_a_tenth_of_a_second():
 
 
 @pytest.mark.parametrize(("newton", "found"), [(0.5, True), (-0.5, True), (0.2, False)])
-def test_an_encoder_that_stands_still_under_a_constant_force_is_dead(newton, found):
+def test_still_encoders_under_force_are_dead(newton, found):
     monitor = EncoderMonitor((1e-6,), (STEP,), T)
     for _ in range(round(0.45 / T)):
         monitor.check((0,), (round(newton / STEP),), 1)
@@ -250,7 +250,7 @@ def test_the_impulse_decides(axis, sign, newton, after):
     return None
 
 
-def test_a_coarse_encoder_gets_the_time_that_a_heavy_hand_needs_to_turn():
+def test_coarse_encoders_get_more_time():
     """8 sqrt(q M F) with 0.1 mm, 2.5 kg and 5 N is 0.283 N s, 57 ms: 48 ticks."""
     monitor = EncoderMonitor((1e-4,), (STEP,), T)
     monitor.check((0,), (0,), 1)
@@ -293,12 +293,12 @@ def test_handles_off_centre_are_left_in_peace(scenario, rungs, place):
     assert not any("positions count" in event.cause for event in away.log)
 
 
-def test_the_range_counts_from_the_middle_all_the_same(scenario, rungs):
+def test_the_range_counts_from_the_middle(scenario, rungs):
     session, _ = session_with(nobody(scenario), rungs, "axis2:jump=99.5", "axis1:jump=-101", seconds=0.2)
     assert "encoder 1 is at -101 mm, its range is" in session.cause
 
 
-def test_a_fault_of_an_axis_that_is_not_there_is_refused(scenario):
+def test_faults_of_missing_axes_are_refused(scenario):
     with pytest.raises(ValueError, match="is for axis3, the scenario has 2 channels"):
         Emulator(scenario, (FaultInjection.parse("axis3:freeze"),))
     with pytest.raises(InputError, match="does not happen to one axis"):

@@ -285,7 +285,7 @@ def test_the_traffic_visits_every_state_cause_and_refusal(episodes):
 
 
 @needs_gcc
-def test_the_c_side_equals_the_python_side_byte_for_byte(library, episodes):
+def test_c_and_python_agree_byte_for_byte(library, episodes):
     compared = 0
     for (seed, *_), (about, script, answers, _) in zip(EPISODES, episodes, strict=True):
         firmware, expected = Firmware(library, about), iter(answers)
@@ -359,7 +359,7 @@ def test_a_firmware_with_impossible_numbers_never_runs(library, wrong):
 
 
 @needs_gcc
-def test_the_headers_need_no_library_no_float_and_no_heap(tmp_path):
+def test_the_headers_need_no_library_or_heap(tmp_path):
     """Only C99 headers that every compiler has; an object file's undefined symbols say what it calls."""
     text = (HEADER / "haptic_frame.h").read_text() + (HEADER / "haptic_link.h").read_text()
     assert sorted(line for line in text.splitlines() if line.startswith("#include")) == [
@@ -456,7 +456,7 @@ def test_the_example_sketch_arms_follows_and_stops(sketch):
 
 
 @needs_gxx
-def test_the_example_sketch_counts_edges_and_obeys_its_button(sketch):
+def test_the_sketch_counts_edges_and_obeys_its_button(sketch):
     sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
     sketch.run(1200)
     for level_b, level_a in [(0, 1), (1, 0), (0, 1), (1, 0), (1, 1)]:  # A after B: falling counts, the last one back
@@ -476,7 +476,7 @@ def test_the_example_sketch_counts_edges_and_obeys_its_button(sketch):
 
 
 @needs_gxx
-def test_the_example_sketch_does_not_wait_for_a_host_that_reads_nothing_nor_catch_up(sketch):
+def test_the_sketch_never_waits_for_the_host(sketch):
     sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
     sketch.run(1200)
     sketch.lib.stub_room(0)
@@ -490,7 +490,7 @@ def test_the_example_sketch_does_not_wait_for_a_host_that_reads_nothing_nor_catc
 
 @needs_gxx
 @pytest.mark.parametrize("room", [1, 31, 63])
-def test_a_board_with_a_small_write_buffer_sends_whole_frames(sketch, room):
+def test_small_write_buffers_send_whole_frames(sketch, room):
     """A pass of the loop every 50 us: 24 pieces in a period. What has no time to leave is dropped whole."""
     sketch.lib.stub_room(room)
     sketch.feed(Hello(7))
@@ -504,7 +504,7 @@ def test_a_board_with_a_small_write_buffer_sends_whole_frames(sketch, room):
 
 
 @needs_gxx
-def test_the_boards_watchdog_is_fed_by_ticks_and_nothing_else(sketch):
+def test_only_ticks_feed_the_boards_watchdog(sketch):
     """Ticks feed it; a loop that turns on a clock that stands still, or one that hangs, does not."""
     sketch.run(100_000)
     assert not sketch.lib.stub_bites()
@@ -555,7 +555,7 @@ class Hand:
 
 
 @pytest.mark.parametrize(("theta", "hold", "ramp"), [(0, 4, 5), (1, 4, 5), (2, 4, 5), (3, 0, 1), (15, 2, 8)])
-def test_after_the_hosts_death_zero_comes_after_theta_hold_and_ramp(device, theta, hold, ramp):
+def test_host_death_ends_in_zero_force(device, theta, hold, ramp):
     device.armed(theta, hold, ramp)
     device.answer(Command.RUN, (1000, -1000), theta)  # the last one
     forces = []
@@ -581,7 +581,7 @@ def test_a_ramp_is_the_same_at_zero_force(device):
     assert phases == [Phase.RAMP] * 4 + [Phase.STOPPED]
 
 
-def test_an_emergency_stop_takes_the_place_of_an_earlier_cause(device):
+def test_emergency_stops_replace_earlier_causes(device):
     device.armed()
     device.tell(Stop(0))
     device.device.fault()
@@ -593,7 +593,7 @@ def test_an_emergency_stop_takes_the_place_of_an_earlier_cause(device):
     assert device.state().cause == Cause.ESTOP_HOST  # of emergency stops the first stays, too
 
 
-def test_what_late_double_and_wrong_theta_forces_leave_behind(device):
+def test_late_double_and_mistimed_forces_are_counted(device):
     """Late: echo and a margin below zero, no force. Double and wrong theta: nothing at all. None counts as an error."""
     device.armed(theta=2)
     before = device.state()
@@ -628,7 +628,7 @@ def test_a_hello_of_another_version_is_answered(device):
     assert (type(about), about.version) == (Info, 2)
 
 
-def test_the_deadman_is_told_in_every_state_and_changes_nothing_else(device):
+def test_the_deadman_is_reported_in_every_state(device):
     device.armed()
     assert not device.state().deadman
     for held in (True, False, True):
@@ -642,7 +642,7 @@ def test_the_deadman_is_told_in_every_state_and_changes_nothing_else(device):
         )
 
 
-def test_a_config_leaves_the_counters_and_forgets_the_forces(device):
+def test_configs_keep_counters_and_forget_forces(device):
     device.armed(theta=2)
     device.device.receive(b"\x05nonsense\0", device.now)
     device.tell(Force(2, shifted(device.k, 2), device.k, (500, 0)), Stop(0))
@@ -656,7 +656,7 @@ def test_a_config_leaves_the_counters_and_forgets_the_forces(device):
     assert (state.echo, state.margin_us, state.applied) == (0, -32768, (0, 0))
 
 
-def test_a_line_of_text_before_a_frame_costs_that_frame_at_most(device):
+def test_text_costs_one_frame_at_most(device):
     """Boot messages, and the noise of another baud rate, up to the next delimiter."""
     device.device.receive(b"Booting v1.2 ...\r\n", 0)
     device.tell(Hello())

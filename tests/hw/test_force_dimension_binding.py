@@ -98,7 +98,7 @@ def test_forces_reach_the_axes_they_are_for(session):
     ("index", "words"),
     [("3", "is in reset mode"), ("9", "reports error 7"), ("0", "has no power"), ("5", "has switched its forces off")],
 )
-def test_a_status_that_is_not_well_stops_the_session(session, index, words):
+def test_bad_status_stops_the_session(session, index, words):
     assert session[index].startswith(f"device sn4712 {words}")
 
 

@@ -151,7 +151,7 @@ def held_session(scenario, sdk, seconds=0.5, cap=12.0, watch=lambda session: Non
     return session, recorder, made
 
 
-def test_a_session_with_a_device_that_the_host_clocks(scenario, tmp_path):
+def test_a_session_may_be_clocked_by_the_host(scenario, tmp_path):
     """Handshake, delay, certificate, forces, ramp, replay: the same session as over the serial link."""
     sdk = StandIn(scenario)
     sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * (t - 0.7)) * (t > 0.7)  # still while it is armed
@@ -180,7 +180,7 @@ def test_a_session_with_a_device_that_the_host_clocks(scenario, tmp_path):
     assert replay.main([str(tmp_path / "trace.npz")]) == 0
 
 
-def test_the_certificate_says_what_changes_when_the_host_is_the_clock(scenario):
+def test_certificates_say_that_the_host_clocks(scenario):
     """T at most T_max, and a latency of part of a sample where a link of a whole tick is charged otherwise."""
     _, _, (made,) = held_session(scenario, StandIn(scenario), seconds=0.1)
     assert made.assessment.loop.theta == scenario.theta  # no tick is added for the link
@@ -194,7 +194,7 @@ def test_the_certificate_says_what_changes_when_the_host_is_the_clock(scenario):
     assert said == f"forces act as they come: certified for {kept}, as measured"
 
 
-def test_microseconds_are_charged_where_a_link_costs_a_tick(scenario):
+def test_host_clocks_charge_microseconds_not_ticks(scenario):
     """The same coupling: 0.13 ms after a sample, and a tick after it."""
     judged, link = timed(scenario.replace(theta=(0, 1)), Ages((50,) * 50 + (130,) * 50), 1.0, 0.0, at_once=True)
     assert judged.latency[1] == pytest.approx((50e-6, 130e-6))
@@ -259,7 +259,7 @@ def test_a_device_that_is_unplugged_is_lost(scenario):
     assert sdk.force.tolist() == [0.0, 0.0]
 
 
-def test_motors_that_saturate_are_a_fault_of_the_device(scenario):
+def test_saturated_motors_are_device_faults(scenario):
     """What they then push is not what was certified."""
     sdk = StandIn(scenario)
 
@@ -298,7 +298,7 @@ def test_the_emergency_stop_is_at_once(scenario):
 # without the maker's library, and bad input
 
 
-def test_without_the_library_the_import_fails_with_one_clear_line(monkeypatch):
+def test_a_missing_library_is_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "forcedimension_core", None)
     with pytest.raises(InputError) as error:
         bridge.main(["--port", "force-dimension", "--arm", "--no-preflight", "--no-dead-man"])
@@ -418,7 +418,7 @@ def test_the_serial_link_has_the_same_four_calls():
         [device.exchange(None) for _ in range(300)]  # first what has come in before
 
 
-def test_a_silent_line_is_asked_again_and_never_waited_for():
+def test_silent_lines_are_asked_again():
     port = FakePort()
     device = SerialDevice(port, lambda: 1e-6 * port.now)
     assert [device.info() for _ in range(700)] == [None] * 700
@@ -426,7 +426,7 @@ def test_a_silent_line_is_asked_again_and_never_waited_for():
     assert [type(m) for m in Decoder().feed(port.sent)] == [Hello] * 4
 
 
-def test_a_flood_of_other_frames_keeps_nobody_from_looking_at_the_time():
+def test_floods_of_frames_do_not_stop_time_outs():
     """INFO for ever: every call comes back, so that the session's time-outs end it."""
     flood = FakePort()
     flood.wait, flood.read = lambda seconds: True, lambda: encode(info_of(scenario_of())) * 50

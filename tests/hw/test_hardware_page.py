@@ -29,7 +29,7 @@ IN_WORDS = ("no FORCE arrives; cable pulled", "10 % of answers late")  # causes 
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
-def test_the_table_of_faults_shows_what_the_rehearsal_gives(row, scenario, rungs):
+def test_the_pages_fault_table_is_the_rehearsals(row, scenario, rungs):
     fault, ends, cause, zero = row
     shown = [re.search(r"[\d.]+", part)[0] for part in zero.split(";")]
     names = CALLED.get(fault, (fault,))
@@ -42,7 +42,7 @@ def test_the_table_of_faults_shows_what_the_rehearsal_gives(row, scenario, rungs
         assert cause in outcomes[0].cause
 
 
-def test_a_dead_encoder_or_channel_is_found_as_soon_as_the_page_says(scenario, rungs):
+def test_dead_encoders_are_found_in_time(scenario, rungs):
     names = ("encoder dies", "encoder 2 dies", "a channel of encoder 1 dies", "a channel of encoder 2 dies")
     times = [
         _rehearse_case(next(c for c in CASES if c.name == name), scenario, rungs)[1].zero_force_ms for name in names
@@ -54,7 +54,7 @@ def test_the_table_of_faults_is_there():
     assert len(ROWS) == 10
 
 
-def test_the_defaults_of_the_delay_are_those_of_the_page():
+def test_delay_defaults_match_the_page():
     words = "It times 800 answers and takes the 99th percentile and 0.1 ms more"
     assert words in PAGE
     args = bridge._parser().parse_args([])
@@ -62,7 +62,7 @@ def test_the_defaults_of_the_delay_are_those_of_the_page():
     assert int(args.measure) == LinkSettings().measure == 800
 
 
-def test_the_garbage_collector_is_frozen_and_off_while_the_bridge_runs():
+def test_the_bridge_runs_without_garbage_collection():
     before, frozen = gc.isenabled(), gc.get_freeze_count()
     with _no_collections():
         assert not gc.isenabled()
@@ -72,7 +72,7 @@ def test_the_garbage_collector_is_frozen_and_off_while_the_bridge_runs():
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_a_serial_port_asks_its_driver_for_low_latency(known, monkeypatch):
+def test_serial_ports_ask_for_low_latency(known, monkeypatch):
     """A driver that does not know it is no error."""
     asked = []
 

@@ -187,7 +187,7 @@ def test_the_swing_reaches_its_speed_within_its_travel():
 
 
 @pytest.mark.parametrize("name", HANDS)
-def test_a_hand_or_finger_on_the_handle_is_found_out(odd, name):
+def test_hands_on_the_handle_are_detected(odd, name):
     """Its damping, 0.1 to 3 N s/m, is not the device's; its spring says that it is there."""
     assert re.search(r"handle is sprung by .* a hand or a finger rests on it", odd[name])
 
@@ -197,7 +197,7 @@ def sitting(odd, *names):
     return [Estimate(odd[name], None, Viscosity(0.5, 0.0, 0.0, None, 0.0)) for name in names]
 
 
-def test_a_hand_that_only_damps_is_found_out_by_a_sitting_without_it(odd):
+def test_damping_hands_are_detected_by_two_sittings(odd):
     """Its 0.3 N s/m are nowhere in the record that has them: that one's bound alone is 30 % above the truth of 1."""
     assert odd["firm"].delta == pytest.approx(1.29, abs=0.01)
     for sittings in ([("firm", "ideal"), ("ideal", "ideal")], [("ideal", "ideal"), ("firm", "ideal")]):
@@ -217,7 +217,7 @@ def test_a_hand_that_only_damps_is_found_out_by_a_sitting_without_it(odd):
     assert first.delta == min(odd["ideal"].delta, odd["late 0.3"].delta) <= 1
 
 
-def test_a_hand_too_faint_to_be_found_out_is_not_credited_either(odd):
+def test_undetectable_hands_add_no_damping(odd):
     """8 % more damping may be a device's own scatter; the least bound counts, so one record without it is enough."""
     assert odd["faint"].delta > 1.05
     for order in (("faint", "ideal"), ("ideal", "faint")):
@@ -229,7 +229,7 @@ def test_a_hand_too_faint_to_be_found_out_is_not_credited_either(odd):
         settled([sitting(odd, "ideal")])
 
 
-def test_the_command_takes_two_sittings_and_refuses_what_only_one_of_them_damps(tmp_path):
+def test_damping_in_one_sitting_is_refused(tmp_path):
     """In virtual time, a dashpot of 0.3 N s/m at the handles in the first one: two records of three agree."""
     for sittings, code in ((2, 1), (3, 0)):
         out, options = tmp_path / str(sittings), ["--rehearse", "--scenario", "omega-pair-rigid", "--measure", "60"]
@@ -258,7 +258,7 @@ def test_the_command_takes_two_sittings_and_refuses_what_only_one_of_them_damps(
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_second_sitting_waits_until_every_handle_was_taken_elsewhere(axis, sign, monkeypatch):
+def test_a_second_sitting_waits_for_moved_handles(axis, sign, monkeypatch):
     """By 5 mm or more. Where it arms by itself, whoever did so has 5 s (here 0.2) to let go, and again later."""
     monkeypatch.setattr("haptic_loop.hw.session._LET_GO_US", 200_000)
     scenario = nobody(load("omega-pair-rigid"))
@@ -357,7 +357,7 @@ def test_a_bound_never_exceeds_what_is_declared(coarse):
     assert [e.delta for e in capped([found], scenario, session)] == [0.48]
 
 
-def test_a_record_that_cannot_tell_the_frictions_apart_gives_no_bound():
+def test_ambiguous_friction_gives_no_bound():
     """A short record of small motions, a few encoder steps long: most of it is a standstill."""
     T, step = 1.2e-3, 5e-5
     force = chirp(1, T, 1, 1.0, (8.0, 60.0), 0.5).signal[:, 0]
@@ -366,7 +366,7 @@ def test_a_record_that_cannot_tell_the_frictions_apart_gives_no_bound():
         identify(x, force, T, step, rigid=True)
 
 
-def test_a_trace_whose_forces_have_another_shape_is_refused():
+def test_traces_with_other_forces_are_refused():
     two, one = np.zeros((3, 2)), np.zeros((3, 1))
     with pytest.raises(ValueError, match="f has 1 channels, x has 2"):
         Trace(np.arange(3.0), x=two, f=one, x_handle=two, v_handle=two, w=two, meta={})

@@ -26,7 +26,7 @@ LAB = load("omega-pair").replace(theta=(0, 0))
 TAU = 130  # [us] of an emulated link
 
 
-def test_the_plant_feels_the_last_force_until_the_answer_comes():
+def test_the_last_force_holds_until_the_answer():
     """The trace's positions, again, from its forces alone, by exponentials before and after each latch."""
     session = session_for(LAB, LinkSettings(measure=60))
     session.record = recorder = Recorder(2)
@@ -70,7 +70,7 @@ def test_a_link_slower_than_a_period_is_refused():
         timed(LAB, Ages((1150,) * 100), 0.99, 100.0, at_once=True)
 
 
-def test_the_spread_of_the_ticks_is_what_certificates_are_for():
+def test_certificates_cover_the_spread_of_ticks():
     ages = Ages((130,) * 100, 0, (1200,) * 50 + (1201,) * 49 + (3000,))
     even, link = timed(LAB, ages, 0.9, 100.0)
     assert (even.T_max, link) == (None, 1)  # a microsecond is what their clock can tell
@@ -102,7 +102,7 @@ def test_the_report_names_the_latency():
     assert made.name == "spring-damper for theta = [0, 0] and 30 to 230 us"
 
 
-def test_a_session_is_certified_and_replayed_bit_for_bit(tmp_path, capsys):
+def test_a_session_replays_bit_for_bit(tmp_path, capsys):
     file = tmp_path / "r.json"
     options = ["--rehearse", "--theta", "0", "--latch", "arrival", "--duration", "0.3", "--no-plot"]
     assert bridge([*options, "--out", str(tmp_path), "--json", str(file)]) == 0

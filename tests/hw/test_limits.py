@@ -30,7 +30,7 @@ INFO = Info(PROTOCOL, "test", 7, 1_200_000, (1_370_000,) * 2, (10**6,) * 2, (400
 
 
 @given(st.tuples(numbers, numbers), st.tuples(numbers, numbers), st.floats(0, 1))
-def test_no_force_leaves_that_is_not_finite_and_within_the_cap(asked, previous, gain):
+def test_forces_are_finite_and_within_the_cap(asked, previous, gain):
     """Python's max and min let nan through as the cap: shape never does, whatever comes."""
     before = tuple(
         max(-cap, min(cap, p)) if math.isfinite(p) else 0.0 for p, cap in zip(previous, LIMITS.cap, strict=True)
@@ -92,7 +92,7 @@ def test_limits_cannot_be_loosened(field, least, most):
             limits(value)
 
 
-def test_what_a_device_is_told_is_what_the_limits_say():
+def test_devices_are_sent_limited_forces():
     """0.25 s and 2000 N/s in ticks of 1.2 ms and steps of 0.4 mN; 4 ticks held and 5 ms to zero."""
     config = SafetyLimits((12.0, 3.0)).configuration(INFO, 2)
     assert (config.theta, config.hold, config.ramp, config.ramp_in) == (2, 4, 5, 209)
@@ -123,7 +123,7 @@ def test_a_displacement_that_is_no_number_never_passes(x):
         LIMITS.check_speed((x,), (0.0,), 1)
 
 
-def test_what_is_just_at_a_limit_is_within_it():
+def test_values_at_a_limit_are_allowed():
     LIMITS.check_speed((1e-3, 0.0), (0.0, 0.0), 1e-3)
     LIMITS.check_jump((3e-3, 0.0), (0.0, 0.0), 1)
     LIMITS.check_jolt((3e-3, 0.0), (0.0, 0.0), (0.0, 0.0))
@@ -203,7 +203,7 @@ def test_the_wire_carries_what_the_motor_does():
     assert units.positions((1000, -1)) == pytest.approx((1e-3, -1e-6))
 
 
-def test_the_probe_is_the_longest_delay_whose_margin_can_be_told():
+def test_the_probe_uses_the_longest_measurable_delay():
     assert probe_delay(1.2e-3) == 15
     assert probe_delay(5e-3) == 6
     assert probe_delay(0.03) == 1
@@ -229,7 +229,7 @@ def test_a_device_too_coarse_or_impossible_is_refused(change, reason):
     assert any(reason in one for one in SafetyLimits((12.0, 12.0)).objections(INFO._replace(**change), load(), None))
 
 
-def test_a_force_step_is_never_more_than_the_slew_limit():
+def test_force_steps_obey_the_slew_limit():
     """Else one step, the least that can be sent, would be the jump that the limit is there against."""
     slow = SafetyLimits((12.0, 12.0), slew=100.0)  # 0.12 N in a tick
     assert slow.objections(INFO._replace(force_step=(100_000, 100_000), hard_limit=(120, 120)), load(), None) == []
@@ -237,7 +237,7 @@ def test_a_force_step_is_never_more_than_the_slew_limit():
     assert "0.13 N, at most 0.12 N" in reason
 
 
-def test_an_encoder_that_shakes_is_found_though_no_step_is_too_large():
+def test_shaking_encoders_are_found():
     limits = SafetyLimits((12.0,))
     limits.check_jolt((2e-3,), (0.0,), (0.0,))  # a jump that the other check allows, too
     limits.check_jolt((4e-3,), (2e-3,), (0.0,))  # at constant speed
@@ -258,7 +258,7 @@ def on(channel, value, rest=0.0):
 
 
 @pytest.mark.parametrize(("channel", "sign"), MIRRORED)
-def test_every_motion_check_is_for_both_channels_and_signs(channel, sign):
+def test_motion_checks_cover_channels_and_signs(channel, sign):
     for name, inside, outside, check in (
         (f"encoder {channel + 1} jumped by", 2.9e-3, 3.1e-3, lambda x: LIMITS.check_jump(x, (0.0, 0.0), 1)),
         (f"encoder {channel + 1} shakes", 2.9e-3, 3.1e-3, lambda x: LIMITS.check_jolt(x, (0.0, 0.0), (0.0, 0.0))),
@@ -274,7 +274,7 @@ def test_every_motion_check_is_for_both_channels_and_signs(channel, sign):
 
 
 @pytest.mark.parametrize(("channel", "sign"), MIRRORED)
-def test_the_cap_and_the_slew_limit_are_for_both_channels_and_signs(channel, sign):
+def test_cap_and_slew_cover_channels_and_signs(channel, sign):
     cap, step = LIMITS.cap[channel], LIMITS.slew * T
     for asked, last, sent, clipped, slowed in (
         (cap - 0.1, cap - 0.2, cap - 0.1, False, False),
@@ -292,7 +292,7 @@ def test_the_cap_and_the_slew_limit_are_for_both_channels_and_signs(channel, sig
 
 @pytest.mark.parametrize("channel", [0, 1])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_force_that_is_none_is_found_on_both_channels(channel, value):
+def test_invalid_forces_are_found_on_both_channels(channel, value):
     with pytest.raises(SafetyStop, match="which is no force"):
         LIMITS.shape(on(channel, value), (0.0, 0.0), 0.0, T)
     with pytest.raises(SafetyStop, match="which is no force"):
@@ -300,7 +300,7 @@ def test_a_force_that_is_none_is_found_on_both_channels(channel, value):
 
 
 @pytest.mark.parametrize(("channel", "sign"), MIRRORED)
-def test_a_motor_gets_hot_by_the_square_of_its_force(channel, sign):
+def test_motor_heat_grows_with_squared_force(channel, sign):
     """At twice what it stands for long, after tau ln(4/3); at 0.99 of it, never. Cold again after a while."""
     limits = SafetyLimits((12.0, 12.0), continuous=(2.0, 2.0), thermal=5.0)
     heat, ticks = Heat(limits, T), 0
@@ -325,7 +325,7 @@ def test_a_motor_gets_hot_by_the_square_of_its_force(channel, sign):
 
 
 @pytest.mark.parametrize(("channel", "sign"), MIRRORED)
-def test_what_the_device_says_is_checked_on_both_channels_and_signs(channel, sign):
+def test_device_reports_are_checked_on_all_channels(channel, sign):
     config = Config(1, 4, 5, 0, (20000, 15000), (600, 600))
 
     def said(tick, steps, phase=Phase.ARMED):
@@ -349,16 +349,16 @@ def test_what_the_device_says_is_checked_on_both_channels_and_signs(channel, sig
 
 
 @pytest.mark.parametrize(("T", "watchdog"), [(3e-4, 6000), (1.2e-3, 6000), (3e-3, 15_000), (4e-3, 20_000)])
-def test_the_watchdog_is_five_ticks_and_no_less_than_a_busy_host_needs(T, watchdog):
+def test_the_watchdog_suits_busy_hosts(T, watchdog):
     assert watchdog_for(T) == watchdog
 
 
-def test_a_period_whose_five_ticks_are_too_long_is_refused():
+def test_too_long_watchdog_periods_are_refused():
     with pytest.raises(ValueError, match=r"at most 0\.004 s"):
         watchdog_for(4.1e-3)
 
 
-def test_a_force_step_is_judged_by_what_the_output_can_really_do():
+def test_force_steps_are_judged_by_the_output():
     """Eight bits of PWM for 12 N: fine for a cap of 2 N, too coarse for one of 0.5 N; twelve bits are not."""
     eight = INFO._replace(force_step=(47_059,) * 2, hard_limit=(255,) * 2)
     twelve = INFO._replace(force_step=(2930,) * 2, hard_limit=(4095,) * 2)

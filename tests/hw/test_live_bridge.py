@@ -115,7 +115,7 @@ def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
     assert replay.main(["out/bridge-I/trace.npz"]) == 0
 
 
-def test_an_interrupt_while_forces_act_is_130_after_a_ramp(tmp_path, capsys, monkeypatch):
+def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):
     """The whole command: the gain comes down to zero in 100 ms, and the exit code tells of the interrupt."""
     monkeypatch.chdir(tmp_path)
     look = IncidentLog.update
@@ -306,7 +306,7 @@ class Designing:
 
 
 @pytest.mark.parametrize(("typed", "stage"), [(b"a", Stage.DISARMED), (b"aq", Stage.FINISHED)])
-def test_a_key_typed_during_the_design_does_not_arm(typed, stage):
+def test_keys_typed_during_design_do_not_arm(typed, stage):
     """It waits in the terminal's buffer until the session is disarmed: it is read before; other keys still count."""
     keyboard, person = os.pipe()
     session = Designing()
@@ -325,7 +325,7 @@ def test_a_key_typed_during_the_design_does_not_arm(typed, stage):
     os.close(keyboard)
 
 
-def test_ctrl_c_does_not_wait_for_the_end_of_a_design(emulator, scenario):
+def test_ctrl_c_ends_a_running_design(emulator, scenario):
     def plan(ages):
         os.kill(os.getpid(), signal.SIGINT)
         for _ in range(1000):
@@ -345,7 +345,7 @@ def test_an_exception_stops_the_device_first(emulator, scenario):
         run(emulator, scenario, plan)
 
 
-def test_a_coupling_that_is_not_certified_is_not_armed(emulator, scenario):
+def test_uncertified_couplings_are_not_armed(emulator, scenario):
     def plan(ages):
         return [certified_coupling(scenario, "I", "published", None, 1)]
 
@@ -425,7 +425,7 @@ def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
 
 
 @pytest.mark.parametrize("module", [bridge, identify])
-def test_delays_that_vary_in_the_scenario_are_refused_by_name(module, scenario, tmp_path, monkeypatch):
+def test_varying_delays_of_scenarios_are_refused(module, scenario, tmp_path, monkeypatch):
     """The link has the delays that it has; a table that nothing reads would promise something else."""
     monkeypatch.setattr(
         module.options, "scenario_from", lambda args: scenario.replace(varying_delay=VaryingDelay((1, 1), (2, 2)))

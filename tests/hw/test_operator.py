@@ -30,14 +30,14 @@ def test_a_session_arms_by_itself_once(scenario, rungs, start):
     assert stages(session).count(Stage.ARMING) == 1
 
 
-def test_late_answers_in_ramp_in_never_reach_full_gain(scenario, rungs):
+def test_late_answers_never_reach_full_gain(scenario, rungs):
     """A tenth of 200 ticks is late long before the 209 ticks of the ramp are over."""
     session = rehearsal_of(scenario, rungs, Operator(True, 5.0), "down:jitter=0.0008@0").run_until_armed(2.0)
     assert Stage.DISARMING in stages(session)
     assert Stage.ARMED not in stages(session)
 
 
-def test_the_time_is_over_after_full_gain_whatever_key_is_pressed(scenario, rungs):
+def test_sessions_end_after_their_time_at_full_gain(scenario, rungs):
     operator = Operator(True, 0.3)
     rehearsal = rehearsal_of(scenario, rungs, operator)
     session = rehearsal.run_until_armed(0.4)

@@ -40,7 +40,7 @@ def rehearsal_of(scenario, rungs, operator):
 
 
 @pytest.mark.parametrize("until", [0.0, 0.4, 0.9])
-def test_a_deadman_that_is_let_go_ramps_the_forces_out(scenario, rungs, until):
+def test_releasing_the_deadman_ramps_out(scenario, rungs, until):
     """A second after somebody showed up last, by the planned ramp of 100 ms."""
     shown = []
 
@@ -60,7 +60,7 @@ def test_a_deadman_that_is_let_go_ramps_the_forces_out(scenario, rungs, until):
     assert 1e-6 * (at[Stage.FINISHED] - at[Stage.DISARMING]) == pytest.approx(0.1, abs=0.005)
 
 
-def test_a_deadman_that_is_held_lets_the_session_go_on(scenario, rungs):
+def test_holding_the_deadman_continues_the_session(scenario, rungs):
     session = rehearsal_of(scenario, rungs, Operator(True, 1.5, lambda: True)).run_until_armed(3.0)
     assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
 
@@ -83,7 +83,7 @@ def test_the_deadman_at_the_device(scenario, rungs):
     assert [event.stage for event in session.log[-3:]] == [Stage.ARMED, Stage.DISARMING, Stage.FINISHED]
 
 
-def test_a_deadman_let_go_before_the_gain_rises_ends_at_once(scenario, rungs):
+def test_releasing_the_deadman_early_ends_at_once(scenario, rungs):
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
     faults = (FaultInjection.parse("letgo@0"),)
     rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults)
@@ -128,7 +128,7 @@ def test_a_first_session_is_gentle(scenario):
     assert (limits.cap, limits.speed, limits.continuous) == ((12.0, 12.0), 0.5, (3.0, 3.0))
 
 
-def test_a_session_stops_where_the_damping_is_no_longer_known(scenario):
+def test_sessions_stop_outside_the_known_damping(scenario):
     """The speed that hw.identify wrote is the session's default limit, and no option exceeds it."""
     slow = scenario.replace(device=tuple(replace(d, credible_speed=0.5) for d in scenario.device))
     assert limits_from(_parser().parse_args(["--rehearse"]), slow)["speed"] == 0.5
@@ -145,7 +145,7 @@ def test_a_live_device_asks_for_a_deadman(scenario, monkeypatch):
         assert args.deadman == asked
 
 
-def test_a_session_of_forces_that_were_cut_has_not_finished(scenario, rungs):
+def test_sessions_with_clipped_forces_have_not_finished(scenario, rungs):
     """A cap of 10 mN: more than half of the forces at full gain are at it."""
     recorder, session = Recorder(2), Session(scenario, SafetyLimits((0.01, 0.01)), LinkSettings(measure=60))
     session.record = recorder
@@ -202,7 +202,7 @@ def test_the_incident_log_survives_sigkill(tmp_path):
     assert lines[2]["counters"]["states"] == 0
 
 
-def test_the_incident_log_tells_every_stage_and_every_second(scenario, rungs, tmp_path):
+def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
     log = IncidentLog(tmp_path / "log")
     rehearsal = rehearsal_of(scenario, rungs, Operator(True, 2.0))
     log.attach(rehearsal.session)
@@ -258,7 +258,7 @@ def rehearsed(tmp_path_factory):
     return found
 
 
-def test_a_rehearsal_has_the_stages_and_files_of_a_session(rehearsed):
+def test_rehearsals_have_a_sessions_stages_and_files(rehearsed):
     report, _, out = rehearsed[0]
     stages = ["connecting", "configuring", "measuring", "measured", "configuring", "disarmed", "arming", "armed"]
     assert [event["stage"] for event in report["session"]["log"]] == [*stages, "disarming", "finished"]

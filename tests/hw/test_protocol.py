@@ -197,7 +197,7 @@ def test_the_pieces_do_not_matter(sent, rng):
     assert decoder.rejected == 0
 
 
-def test_every_error_of_one_or_two_bits_is_seen():
+def test_one_and_two_bit_errors_are_detected():
     """All 248 single and 30628 double flips of a STATE frame: none is taken for a message, though COBS spreads them."""
     frame = encode(STATE)
     bits = range(8 * (len(frame) - 1))
@@ -224,7 +224,7 @@ def test_it_finds_its_feet_after_garbage():
         assert tally == {"crc_errors": 0, "malformed": 0, "oversize": 0} | counted, garbage
 
 
-def test_a_line_that_never_ends_fills_no_memory_and_counts_once():
+def test_endless_lines_fill_no_memory():
     decoder = Decoder()
     for _ in range(1000):
         assert decoder.feed(b"\xaa" * 997) == []
@@ -331,7 +331,7 @@ def test_mutated_commands_arm_nothing_and_move_nothing():
     assert device.phase == Phase.ARMED
 
 
-def test_mutated_forces_at_an_armed_device_only_bring_it_to_rest():
+def test_mutated_frames_only_bring_devices_to_rest():
     """They count as missed: the last force is held, ramped down, and stays at zero."""
     rng = random.Random(3)
     for _ in range(300):

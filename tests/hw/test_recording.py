@@ -64,7 +64,7 @@ def test_a_replay_is_identical_bit_by_bit(trace):
     assert np.abs(link["sent"]).max() > 1000
 
 
-def test_a_session_armed_twice_is_replayed_with_both_couplings(scenario, rungs, tmp_path):
+def test_twice_armed_sessions_replay_both_couplings(scenario, rungs, tmp_path):
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, rungs, "down:jitter=0.0007@0.45", recorder=recorder)
     session = rehearsal.run_until_armed(1.2)
@@ -109,7 +109,7 @@ def test_a_trace_of_sim_run_is_no_session(scenario, rungs, tmp_path):
         load(path)
 
 
-def test_a_trace_whose_recipe_is_broken_is_bad_input(trace, tmp_path):
+def test_broken_recipes_are_bad_input(trace, tmp_path):
     result, _ = load(trace[0][0])
     broken = Trace(
         result.t, result.x, result.f, result.x_handle, result.v_handle, result.w, result.meta | {"replay": {}}
@@ -173,7 +173,7 @@ def test_a_trace_changed_by_hand_is_refused(trace, tmp_path, name):
             replay_command.main([str(tmp_path / "trace.npz")])
 
 
-def test_an_empty_or_a_damaged_trace_is_one_line(trace, tmp_path):
+def test_damaged_traces_are_one_line(trace, tmp_path):
     with np.load(trace[0][0]) as archive:
         empty = {name: archive[name][:0] if archive[name].ndim else archive[name] for name in archive.files}
     np.savez_compressed(tmp_path / "empty.npz", **empty)

@@ -33,7 +33,7 @@ from tests.checks.faults import CASES, Fault, _rehearse_case, at, person
 # faults
 
 
-def test_a_session_whose_device_is_deaf_to_stop_has_not_finished(scenario, rungs):
+def test_deaf_devices_do_not_finish_sessions(scenario, rungs):
     """Nothing at this end of the line can take the force away; it can be said, and the exit code not be 0."""
     planned = _rehearse_case(
         Fault("planned", Stage.FINISHED, faults=at("stuck"), action=person("stop")), scenario, rungs
@@ -58,7 +58,7 @@ def test_there_are_enough_faults():
     assert len({case.name for case in CASES}) == len(CASES)
 
 
-def test_faults_that_do_not_stop_leave_the_forces_alone(scenario, rungs):
+def test_harmless_faults_leave_forces_alone(scenario, rungs):
     """A frame that comes twice, on either side, changes no force."""
     plain = rehearsal_of(scenario, rungs)
     twice = rehearsal_of(scenario, rungs, "duplicate=0.5@0.3")
@@ -68,7 +68,7 @@ def test_faults_that_do_not_stop_leave_the_forces_alone(scenario, rungs):
     np.testing.assert_array_equal([m.applied for m in plain.moments], [m.applied for m in twice.moments])
 
 
-def test_a_device_that_repeats_itself_is_lost_while_its_bytes_keep_coming(scenario, rungs):
+def test_repeating_devices_count_as_lost(scenario, rungs):
     """Time-outs are looked at between bytes: the same STATE for ever is no life."""
     rehearsal = rehearsal_of(scenario, rungs)
     session = rehearsal.run_until_armed(0.5)
@@ -179,7 +179,7 @@ def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
     assert np.abs(forces - exact.f).max() < bound
 
 
-def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
+def test_sessions_equal_simulation_but_for_rounding(scenario, rungs):
     """An independent loop: held plant by expm, encoders rounded, F of the whole delay, forces rounded to steps."""
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)
@@ -209,7 +209,7 @@ def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
     ("ages", "expected"),
     [([130] * 100, 1), ([1150] * 100, 2), ([130] * 995 + [9000] * 5, 1), ([130] * 900 + [2000] * 100, 2)],
 )
-def test_theta_is_a_quantile_with_a_guard_not_the_maximum(ages, expected):
+def test_theta_is_a_guarded_quantile(ages, expected):
     assert Ages(tuple(ages)).link_delay(1200.0, 0.99, 100.0) == expected
 
 
@@ -230,7 +230,7 @@ def test_the_host_and_the_link_share_the_delay(scenario, rungs):
     np.testing.assert_allclose(on_host, F.at(z), rtol=1e-9, atol=1e-9)  # two orders of the same sums
 
 
-def test_a_delay_that_the_protocol_cannot_carry_waits_in_the_host(scenario):
+def test_long_delays_wait_in_the_host(scenario):
     """Of 16 and 17 ticks, 15 are the line's: the host's forces come one and two ticks after their displacement."""
     (made,) = certified_couplings(scenario.replace(theta=(16, 17)), "I", None, None, 1, spare=0)
     controller = made.controller((12.0, 12.0))
@@ -255,7 +255,7 @@ def test_nothing_uncertified_is_loaded(scenario, rungs):
     assert (session.stage, session.cause) == (Stage.REFUSED, "the coupling is not certified")
 
 
-def test_a_softer_coupling_takes_over_once_a_person_arms_it(scenario, rungs):
+def test_reserves_take_over_after_arming(scenario, rungs):
     """10 % late answers: ramp-out, the coupling for one tick more, disarmed; only arm() brings the forces back."""
     faults = (FaultInjection.parse("down:jitter=0.0007@0.45"),)
     rehearsal = Rehearsal(session_with(scenario), Emulator(scenario), lambda ages: rungs, faults)
@@ -291,7 +291,7 @@ def assert_in_reserve(rungs):
         assert needs[1] < min(needs[0], 1)
 
 
-def test_an_optimal_coupling_has_another_for_one_tick_more_in_reserve(optimal_rungs, capsys):
+def test_optimal_couplings_have_a_reserve(optimal_rungs, capsys):
     fast, soft = optimal_rungs
     assert (fast.chosen.kind, soft.chosen.kind) == ("optimal", "optimal")
     assert (fast.link, soft.link) == (1, 2)
@@ -368,7 +368,7 @@ def test_a_wrong_fault_is_one_line(text, words):
     assert "\n" not in str(error.value)
 
 
-def test_forces_at_the_cap_are_limited_under_the_guarantee_and_replay(scenario, rungs, tmp_path):
+def test_limited_forces_replay_under_their_guarantee(scenario, rungs, tmp_path):
     """A cap of 0.3 N: the limiter keeps every force within it, a third of the ticks are limited, and |f| <= cap."""
     recorder = Recorder(2)
     session = Session(scenario, SafetyLimits((0.3, 0.2)), FAST)
@@ -395,7 +395,7 @@ class _Thief:
         return -2.0 * np.sign(way)
 
 
-def test_a_budget_under_the_bridge_stands_by_while_the_coupling_is_certified_and_replays(scenario, rungs, tmp_path):
+def test_the_bridges_budget_stands_by_and_replays(scenario, rungs, tmp_path):
     recorder = Recorder(2)
     settings = LinkSettings(measure=100, energy_budget=(0.05, np.inf))
     run = rehearsal_of(scenario, rungs, recorder=recorder, settings=settings)
@@ -408,9 +408,7 @@ def test_a_budget_under_the_bridge_stands_by_while_the_coupling_is_certified_and
 
 
 @pytest.mark.parametrize("faults", [(), ("down:drop=0.02@0.5",)], ids=["clean", "lossy"])
-def test_a_thief_under_the_bridge_is_limited_and_hands_get_no_more_than_the_budget(
-    scenario, rungs, monkeypatch, tmp_path, faults
-):
+def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_path, faults):
     """And the replay repeats what the budget did, bit by bit."""
     for module in ("control", "recording"):
         monkeypatch.setattr(f"haptic_loop.hw.{module}.host_controller", lambda scenario, *given: _Thief(scenario.T))

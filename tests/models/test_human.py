@@ -53,7 +53,7 @@ def test_every_frequency_is_decided_without_a_grid(seed, n):
         Impedance(A, B, C, [[-least - 1e-2 * size]])
 
 
-def test_what_lags_is_passive_and_what_lags_twice_is_not():
+def test_one_lag_is_passive_two_are_not():
     """g/(1 + tau s) has the real part g/(1 + (tau w)^2); its square turns negative above w = 1/tau."""
     assert Impedance([[-20.0]], [[20.0]], [[3.0]], [[0.0]]).order == 1
     twice = [[-20.0, 0.0], [20.0, -20.0]], [[20.0], [0.0]], [[0.0, 3.0]], [[0.0]]
@@ -118,7 +118,7 @@ def test_a_pure_spring_and_damper_is_a_link():
         (([[0.0]], [[1.0]], [[-1.0]], 1.0), "stiffness has a negative"),
     ],
 )
-def test_no_spring_of_the_wrong_kind_is_split_off(parts, message):
+def test_no_negative_spring_is_split_off(parts, message):
     with pytest.raises(ValueError, match=message):
         state_space(*parts)
 
@@ -154,7 +154,7 @@ def test_a_lever_moves_what_it_should():
     np.testing.assert_allclose(got.A[2:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
 
 
-def test_the_same_hand_as_bodies_and_as_a_state_space():
+def test_bodies_and_state_space_agree():
     """The muscle's own coordinates as states: tension's length e and the tissue's speed u, e' = v - u."""
     tissue, elastic, damping = 0.004, 400.0, 9.0
     A = [[0.0, -1.0], [elastic / tissue, -damping / tissue]]
@@ -177,7 +177,7 @@ MJCF = """<mujoco><worldbody>
 </worldbody></mujoco>"""
 
 
-def test_a_hand_drawn_in_mjcf_is_the_chain_that_it_shows():
+def test_mjcf_hands_equal_their_chain():
     """The arm carries the wrist, on whose far side is the handle; the ring is welded to it."""
     port = from_mjcf(MJCF, pull="shoulder")
     chain = Human((Link(0.15, 5.0, 800.0), Link(1.2, 8.0, 150.0)))
@@ -210,7 +210,7 @@ def test_mjcf_that_is_no_passive_network_is_refused(was, now, message):
 # persons
 
 
-def test_a_person_s_arms_may_be_of_any_kind():
+def test_a_persons_arms_may_differ():
     """Against the nodal equations of the hands and the body, with an arm that lags and a cross spring."""
     g, tau, person = 12.0, 0.05, Person((1, 2), 3.0, 20.0, 700.0, Cross(1.0, 40.0))
     lags, link = state_space([[-1 / tau]], [[g / tau]], [[1.0]], 0.5, mass=0.25), Link(0.3, 3.0, 200.0)
@@ -230,7 +230,7 @@ def test_a_person_s_arms_may_be_of_any_kind():
 # many hands at once
 
 
-def test_many_hands_of_any_class_are_each_one_s_matrices():
+def test_crowds_stack_each_hands_matrices():
     rng = np.random.default_rng(5)
     devices = [CompliantDevice(), DEVICE]
 
@@ -247,7 +247,7 @@ def test_many_hands_of_any_class_are_each_one_s_matrices():
         np.testing.assert_allclose(together.B[i], alone.B, rtol=1e-14)
 
 
-def test_chains_are_the_same_by_their_numbers_and_by_their_classes():
+def test_chains_equal_their_classes():
     links = np.exp(np.random.default_rng(1).uniform(-1, 4, (5, 2, 2, 3)))
     bodies = np.exp(np.random.default_rng(2).uniform(-1, 4, (5, 1, 5)))
     crowd = Crowd(links, ((1, 2),), bodies)
@@ -276,7 +276,7 @@ def test_ports_that_cannot_be_are_refused(call, message):
 
 
 @pytest.mark.parametrize(("d", "b"), [(2.0, 1.5), (2.0, 2.0), (1.0, 1.5)])
-def test_a_dead_time_is_said_as_its_pade_form(d, b):
+def test_dead_times_take_their_pade_form(d, b):
     """d + b (1 - s tau/2)/(1 + s tau/2), of exp(-s tau) the same to (w tau)^3/12: passive just where d >= b."""
     tau = 0.05
     parts = [[-2 / tau]], [[1.0]], [[4 * b / tau]], d - b

@@ -13,7 +13,7 @@ HAND = Human((Link(0.3, 3.0, 200.0),))
 ARM = Human((Link(0.1, 5.0, 800.0), Link(1.0, 8.0, 150.0)))
 
 
-def test_compliant_device_with_a_hand_is_the_two_mass_oscillator():
+def test_compliant_device_is_a_two_mass_oscillator():
     d, h = CompliantDevice(transmission_damping=0.2), HAND.links[0]
     got = plant(build([d], [HAND]).model)
     M = np.diag([d.motor_mass, d.handle_mass + h.mass])
@@ -63,7 +63,7 @@ def test_several_channels_do_not_touch_each_other():
 TWO_HANDS = Person((1, 2), 20.0, 15.0, 900.0, Cross(2.0, 60.0))
 
 
-def test_a_person_in_both_hands_is_two_arms_on_one_body():
+def test_a_person_is_two_arms_on_one_body():
     """Against the matrices written out by hand: rigid devices, an arm of one link and one of two."""
     d, (one,), (near, far), p = RigidDevice(), HAND.links, ARM.links, TWO_HANDS
     scene = build([d, d], [HAND, ARM], [p])
@@ -92,7 +92,7 @@ def test_a_person_in_both_hands_is_two_arms_on_one_body():
     np.testing.assert_allclose(tapped, [[1, 0], [0, 1], [0, 0], [0, 0]], atol=1e-12)
 
 
-def test_a_heavy_body_without_a_cross_spring_is_ground():
+def test_a_heavy_body_acts_as_ground():
     separate = plant(build([CompliantDevice()] * 2, [HAND, ARM]).model).A
     held = plant(build([CompliantDevice()] * 2, [HAND, ARM], [Person((1, 2), 1e3, 1e6, 1e9)]).model).A
     n = separate.shape[0] // 2
@@ -159,7 +159,7 @@ def test_without_input_the_energy_never_increases(seed):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_port_at_motor_and_encoder_dissipates_its_damping(seed):
+def test_the_motor_port_dissipates_its_damping(seed):
     """Re Z >= damping at every frequency, whoever holds the handle: the OSP level of the compliant device."""
     human = Population(links=2).draw(np.random.default_rng(seed), 1)
     linear = plant(build([CompliantDevice()], human).model)
@@ -194,7 +194,7 @@ def test_population_is_log_uniform_and_reproducible():
     assert abs(masses.std() - (high - low) / np.sqrt(12)) < 0.05
 
 
-def test_voluntary_motion_is_smooth_and_its_velocity_its_derivative():
+def test_voluntary_velocity_is_the_motions_derivative():
     t = np.linspace(0, 3, 30001)
     hand = Voluntary(0.015, 0.6, 0.6, 1.0)
     x, v = hand.force(t, 1.0, 0.0), hand.force(t, 0.0, 1.0)
@@ -231,7 +231,7 @@ def test_impossible_bodies_cannot_be_built(call, message):
 
 
 @pytest.mark.parametrize(("name", "device"), [("compliant", CompliantDevice()), ("rigid", RigidDevice())])
-def test_the_file_of_a_device_is_the_scene_that_is_assembled_from_it(name, device):
+def test_device_files_equal_their_assembled_scene(name, device):
     """What a viewer opens has the matrices, the limit and the names of one device with an everyday hand."""
     drawn = mujoco.MjModel.from_xml_path(str(_FILES / f"{name}.xml"))
     assembled = build([device], [Human((Link(0.3, 3.0, 200.0),))])
@@ -248,7 +248,7 @@ def test_the_file_of_a_device_is_the_scene_that_is_assembled_from_it(name, devic
     assert drawn.opt.disableflags == assembled.model.opt.disableflags
 
 
-def test_the_xml_of_a_scene_opens_with_shapes_and_the_same_matrices():
+def test_saved_scenes_reopen_with_equal_matrices():
     scene = build([CompliantDevice(damping=2.0), RigidDevice(mass=0.4)], [ARM, HAND], [TWO_HANDS])
     opened = mujoco.MjModel.from_xml_string(scene.xml)
     np.testing.assert_allclose(plant(opened).A, plant(scene.model).A, rtol=1e-14)

@@ -99,7 +99,7 @@ def test_a_slow_scene_stands_still_between_its_steps(tmp_path):
         before = port.u
 
 
-def test_two_axes_of_a_contact_take_a_full_spring(tmp_path):
+def test_two_axes_take_a_full_spring_matrix(tmp_path):
     """G = Q diag Q': a free contact obeys m (v+ - v)/h = G (u0 - u) in both directions."""
     text = f'<mujoco><worldbody><body name="tip" euler="20 30 40">{FREE}</body></worldbody></mujoco>'
     G = np.array([[900.0, 300.0], [300.0, 400.0]])
@@ -208,7 +208,7 @@ def test_rows_follow_the_law_of_the_lemma(tmp_path, scene):
 # ---- a linear model
 
 
-def test_the_linear_model_of_a_linear_scene_is_its_network(tmp_path):
+def test_linear_scenes_linearise_to_their_network(tmp_path):
     """From 0.1 to 100 Hz, relative to the largest E: rounding of positions over the step of the differences."""
     scene, z = world(tmp_path, LINE), np.exp(2j * np.pi * np.geomspace(0.1, 100, 60) * T)
     E = environment_by_hand(NETWORK, z, T)
@@ -268,7 +268,7 @@ def test_what_is_no_contact_is_refused(tmp_path, text, message):
     assert "\n" not in str(caught.value)
 
 
-def test_defaults_of_a_scene_do_not_reach_the_slides(tmp_path):
+def test_scene_defaults_do_not_reach_slides(tmp_path):
     plain = world(tmp_path, with_body(f'<body name="left">{FREE}</body>'))
     joint = '<default><joint damping="3" armature="1" frictionloss="2" range="-1 1" limited="true"/></default>'
     dressed = world(

@@ -145,7 +145,7 @@ def test_validate_is_the_commands_verdict(tmp_path):
     assert report["worst"]["spectral_radius"] == findings.radius.max()
 
 
-def test_a_design_is_certified_and_goes_where_a_coupling_goes():
+def test_designs_are_certified_and_act_as_couplings():
     loop = load().loop("I")
     found = design_coupling(loop, condition="any-environment")
     requirements = certify(loop, found)
@@ -165,7 +165,7 @@ def test_delays_that_vary_are_simulated():
     assert first.meta["stability"] is None
 
 
-def test_periods_are_drawn_by_the_seed_that_is_reported():
+def test_the_reported_seed_draws_the_periods():
     scenario = load().replace(period={"min": 0.8e-3, "max": 1.6e-3}, duration=0.1)
     for seed in (0, 1):
         trace = simulate(scenario, SOFT, seed=seed)
@@ -243,7 +243,7 @@ def test_an_argument_of_another_type_is_named(call, message):
     assert message in str(caught.value)
 
 
-def test_every_field_of_a_result_has_its_line_in_help():
+def test_help_describes_every_result_field():
     results = [value for name in haptic_loop.__all__ if is_dataclass(value := getattr(haptic_loop, name))]
     results = [kind for kind in results if not issubclass(kind, Coupling)]
     assert {kind.__name__ for kind in results} == {
@@ -281,7 +281,7 @@ def test_a_stored_design_runs_as_the_design(tmp_path):
         simulate(SHORT, "none.json")
 
 
-def test_a_trace_is_a_data_frame_where_pandas_is():
+def test_a_trace_converts_to_pandas():
     trace = simulate(SHORT)
     pandas = pytest.importorskip("pandas")
     frame = trace.to_frame()
@@ -318,7 +318,7 @@ def test_a_trace_draws_itself(tmp_path):
         (np.full(2, np.nan), r"array\(\[nan, nan\]\), shape \(2,\),"),
     ],
 )
-def test_a_wrong_answer_of_an_environment_is_one_line(answer, shown):
+def test_wrong_environment_answers_are_one_line(answer, shown):
     design = design_coupling(LOOP, condition="any-environment")
     with pytest.raises(InputError, match=rf"^environment .*{shown} expected an array of 2 finite forces \[N\], shape"):
         simulate(SHORT, design, environment=lambda u: answer)
@@ -347,7 +347,7 @@ print(sorted({name.partition(".")[0] for name in sys.modules} & set(sys.argv[1:]
     assert done.stdout == "[]\n"
 
 
-def test_an_inerter_to_ground_is_a_mass_at_its_node():
+def test_a_grounded_inerter_is_a_mass():
     """The same needs, proved."""
     loop = load("omega-pair").loop("I")
     own = (*loop.network.springs, Spring(("mass", "ground"), 1.0, inertance=0.25))

@@ -79,7 +79,7 @@ def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown,
 
 
 @pytest.mark.parametrize("command", IN_TEXT)
-def test_a_design_that_a_sentence_names_can_be_had(command, place):
+def test_designs_named_in_sentences_exist(command, place):
     done = run(command, place)
     assert done.returncode == 0, done.stderr
 
@@ -109,7 +109,7 @@ def test_code_that_a_page_shows_is_the_code(page):
     assert regenerate.sourced(TEXTS[page]) == TEXTS[page]
 
 
-def test_a_page_gets_the_lines_that_it_asks_for():
+def test_pages_get_the_lines_they_request():
     page = "<!-- output: certified -->\n```console\n$ python -m x\nold\n```\nafter\n```console\n$ python -m x\n```\n"
     fresh = regenerate.renewed(page, {"python -m x": "noise\nis certified  \nmore noise\n"})
     assert fresh == page.replace("old", "is certified")
@@ -123,7 +123,7 @@ def test_what_counts_as_the_same_line():
     assert not same_line("case I", "case II")
 
 
-def test_what_counts_as_the_same_where_it_is_measured():
+def test_measured_lines_compare_without_times():
     row = "│ RK4 x 1 │ 1.8e-06 │ -3.0e-01 │ right │ 9.2586 │ 83.781 │ 128 │"
     for other, same in [
         (row.replace("128", " 61"), True),
@@ -149,7 +149,7 @@ def test_measured_blocks_are_compared_but_for_times(monkeypatch, tmp_path, capsy
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_block_of_a_page_ends_before_the_next_begins(page):
+def test_page_blocks_do_not_overlap(page):
     fences = re.findall(r"^.*```.*$", TEXTS[page], re.MULTILINE)
     assert len(fences) % 2 == 0
     assert set(fences[1::2]) <= {"```"}, "a block's end is lost, and with it what follows"

@@ -39,7 +39,7 @@ SAYS = {
 ASKS = {"limits_of_any_coupling": ("damping",)}
 
 
-def test_a_device_without_damping_ends_the_example_with_one_line(tmp_path):
+def test_missing_damping_ends_the_example_clearly(tmp_path):
     text = (ROOT / "examples/your_own_device.py").read_text()
     assert '"damping": 0.9' in text
     (tmp_path / "mine.py").write_text(text.replace('"damping": 0.9', '"damping": 0.0'))

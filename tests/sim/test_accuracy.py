@@ -56,7 +56,7 @@ def test_bad_duration():
         main(["--duration", "x"])
 
 
-def test_a_run_says_up_to_when_its_devices_could_have_done_it():
+def test_runs_say_when_they_stop_being_credible():
     """Figure 5 leaves them at 7.35 s: force of the transmission and speed of the motor, from the positions alone."""
     scenario = load()
     simulation = assemble(scenario, NoCoupling())

@@ -32,7 +32,7 @@ def test_it_finds_what_random_humans_do_not():
     assert all(row.worst.destabilises for row in rows)
 
 
-def test_nobody_destabilises_a_loop_with_the_damping_it_requires():
+def test_nobody_destabilises_sufficient_damping():
     rows = attempts(LOOPS, np.array([-1e-3]), generations=12)
     assert not any(row.worst.destabilises for row in rows)
     # lossless hands come to the edge: 0 from below, to the rounding of the eigenvalues
@@ -67,7 +67,7 @@ def test_one_person_in_both_hands_is_found_too(monkeypatch):
     assert mode.growth == pytest.approx(worst.growth, rel=1e-9)
 
 
-def test_one_person_in_both_hands_fails_against_the_required_damping(monkeypatch):
+def test_one_person_cannot_beat_the_required_damping(monkeypatch):
     """The condition asks nothing of how humans hang together."""
     both_hands(monkeypatch)
     light = SCENARIO.replace(device=(RigidDevice(mass=0.02),) * 2)
@@ -88,7 +88,7 @@ def test_the_person_found_is_kept_for_a_replay(tmp_path, monkeypatch):
     assert stability["spectral_radius"] == pytest.approx(found["spectral_radius"], abs=1e-12)
 
 
-def test_the_human_found_is_concrete_and_the_search_repeatable():
+def test_the_adversarys_search_is_repeatable():
     F = assemble(SCENARIO, NoCoupling()).F
     worst, again = (search(SCENARIO, F, seed=4, generations=5) for _ in range(2))
     assert worst == again

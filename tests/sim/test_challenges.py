@@ -6,7 +6,7 @@ from tests.checks.challenges import ENOUGH, GUARANTEES, challenges
 
 
 @pytest.mark.parametrize("name", GUARANTEES)
-def test_what_a_guarantee_asks_is_enough_and_far_less_is_not(name):
+def test_requirements_suffice_and_much_less_fails(name):
     """No motion and no lossless hand takes more than it may, at any tick; with too little some motion does."""
     rows = list(challenges(0, loops=1, hands=12, seconds=1.0, names=[name]))
     assert [row.factor for row in rows] == [ENOUGH, GUARANTEES[name][1]]

@@ -140,7 +140,7 @@ def test_a_lost_scheduler_leaves_what_is_done(cluster, tmp_path):
     assert not whole.lost
 
 
-def test_a_cluster_whose_workers_are_all_lost_is_given_up(cluster, tmp_path, monkeypatch):
+def test_clusters_without_workers_are_given_up(cluster, tmp_path, monkeypatch):
     """Dask itself waits for ever; what is done is kept, and nothing of it is done again."""
     monkeypatch.setattr(shards, "_LOOK", 0.1)
     monkeypatch.setattr(shards, "_DESERTED", 0.3)

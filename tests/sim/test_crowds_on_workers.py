@@ -57,7 +57,7 @@ def test_a_killed_worker_changes_nothing():
     same(found, validate(QUESTION))
 
 
-def test_workers_that_die_again_and_again_leave_what_is_done(tmp_path, monkeypatch):
+def test_dying_workers_leave_finished_work(tmp_path, monkeypatch):
     """Then the command goes on where it was, and ends with what it would have found at once."""
     whole = validate(QUESTION)
     table = Table(QUESTION, tmp_path)

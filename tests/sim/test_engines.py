@@ -142,7 +142,7 @@ def test_a_diverging_run_is_reported_not_reset(engine, capfd, tmp_path, monkeypa
     assert not Path("MUJOCO_LOG.TXT").exists()
 
 
-def test_profiler_clock_is_put_back_and_changes_no_result(simulation, monkeypatch):
+def test_the_profiler_clock_is_restored(simulation, monkeypatch):
     pointer = mujoco_engine._profiler_clock()
     assert isinstance(pointer, ctypes.c_void_p)
     before = pointer.value
@@ -198,6 +198,6 @@ class Lost:
         return False
 
 
-def test_an_engine_that_leaves_the_range_of_numbers_is_named(simulation):
+def test_diverging_engines_are_named(simulation):
     with pytest.raises(InputError, match=r"engine .*:Lost: a tick from rest leaves the range of numbers"):
         simulated_growth(simulation, None, None, Lost)

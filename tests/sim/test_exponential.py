@@ -119,7 +119,7 @@ def test_growth_is_the_exact_loops(stiffness, coupling):
         assert abs(simulated_growth(loop, "RK4", 4) - exact_growth(loop)) > 1e-5
 
 
-def test_a_run_is_the_exact_engines_through_saturation_and_all():
+def test_runs_equal_the_exact_engine_at_saturation():
     """Half the devices' forces are clipped here; what MuJoCo clips and what the exact engine clips is the same."""
     devices = tuple(device.__class__(force_limit=0.05) for device in SCENARIO.device)
     loop = assemble(SCENARIO.replace(device=devices), PUBLISHED["I"])
@@ -258,7 +258,7 @@ def test_the_default_follows_from_the_scene(simulation):
     assert default_substeps(rubbing, EXPONENTIAL) == 4
 
 
-def test_an_engine_without_a_name_of_its_integrator_takes_the_default(simulation):
+def test_engines_default_to_their_integrator(simulation):
     rubbing = assemble(RUBBING, PUBLISHED["I"])
     for loop, integrator, substeps in ((simulation, EXPONENTIAL, 1), (rubbing, "RK4", 4)):
         named = knocked(loop, make_engine(loop, "mujoco", integrator, substeps), 100).s
@@ -282,7 +282,7 @@ def test_what_is_refused_is_named(simulation, call, message):
         call(simulation)
 
 
-def test_a_heavy_hand_on_a_light_handle_needs_no_substeps():
+def test_heavy_hands_need_no_substeps():
     """The hard case of the rule: a 1 g handle without human damping, where Runge-Kutta asks for 24 steps at least."""
     device = CompliantDevice(handle_mass=1e-3)
     human = Human((Link(0.0, 0.0, 300.0),))
@@ -298,14 +298,14 @@ def cheapest(loop, error, ticks):
     return pick(compare_engines(loop, error, ticks), error)
 
 
-def test_the_cheapest_on_a_smooth_scene_is_one_exponential_step(simulation):
+def test_smooth_scenes_choose_one_exponential_step(simulation):
     found = cheapest(simulation, 1e-9, 500)
     assert (found.integrator, found.substeps) == (EXPONENTIAL, 1)
     assert found.position_relative_rms < 1e-11
     assert found.cpu_s > 0
 
 
-def test_where_devices_rub_the_asked_error_is_kept_with_the_fewest_steps():
+def test_friction_keeps_the_error_with_fewest_steps():
     """The reference knows 64 steps, which the search does not look at."""
     loop, ticks = assemble(RUBBING, PUBLISHED["I"]), 500
 
@@ -370,7 +370,7 @@ def test_a_wrong_verdict_is_shown_and_never_chosen():
     assert pick(list(choices.values()), 1.0).verdict_correct
 
 
-def test_speed_against_error_is_of_the_run_with_its_budget_and_its_delays():
+def test_engines_are_compared_on_the_actual_run():
     scenario, found = SCENARIO.replace(duration=0.5, varying_delay=VaryingDelay((1, 1), (3, 2))), []
     for net in (None, EnergyNet(0.0)):
         done = run_scenario(scenario, NoCoupling(), settings=EngineSettings(error=1e-9), net=net)
@@ -382,7 +382,7 @@ def test_speed_against_error_is_of_the_run_with_its_budget_and_its_delays():
     assert found[0] != found[1]  # the budget acts
 
 
-def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
+def test_the_cross_check_finds_wrong_matrices(monkeypatch):
     """The exponential engine with a J that is off by one part in a thousand; RK4 knows no J."""
     loop = assemble(SCENARIO.replace(duration=0.5), PUBLISHED["I"])
     sound = cross_check(
@@ -403,7 +403,7 @@ def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
 # ---- the exponential of many small matrices
 
 
-def test_it_is_the_exponential_over_many_sizes_and_norms():
+def test_phi_matches_expm_for_many_sizes():
     rng = np.random.default_rng(0)
     for n in (1, 4, 14):
         matrices = rng.normal(size=(40, n, n)) * np.geomspace(1e-8, 30, 40)[:, None, None]

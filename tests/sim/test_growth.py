@@ -55,13 +55,13 @@ def test_a_person_and_an_encoder_are_no_oscillation():
     assert found.reason == "nothing oscillates above 1.1 um"
 
 
-def test_what_shows_at_the_very_end_only_is_told_of():
+def test_late_oscillations_are_reported():
     found = growth(motion(6.0, (2e-5, 84.0, 60.0)), T, STEP)
     assert found.growth_rate_per_s is None
     assert found.reason.startswith("something oscillates, too briefly for a rate, above")
 
 
-def test_a_strong_mode_that_decays_does_not_hide_a_weak_one_that_grows():
+def test_decaying_modes_do_not_hide_growing_ones():
     found = growth(motion(6.0, (3e-4, 20.0, -0.8), (2e-5, 90.0, 1.0)), T, STEP)
     assert found.trend == "grows"
     assert found.frequency_hz == pytest.approx(90.0, abs=1.5)
@@ -169,7 +169,7 @@ def alike():
 
 
 @pytest.mark.parametrize("engine", ["exact", "mujoco"])
-def test_a_mode_that_nothing_excites_is_called_so_and_the_verdict_is_the_exact_one(engine):
+def test_unexcited_modes_take_the_exact_verdict(engine):
     """By symmetry the hands, which move alike, do no work on the mode in which the devices move against each other."""
     scenario = alike()
     quiet = stability_of(*ran(scenario, engine))
@@ -186,7 +186,7 @@ def ran(scenario, engine):
     return simulation, run(simulation, make_engine(simulation, engine, *settle(simulation, engine)[:2]))
 
 
-def test_no_trace_of_a_random_loop_says_the_opposite_of_its_eigenvalues():
+def test_no_trace_contradicts_its_eigenvalues():
     """Number 11 is of two devices that nothing joins: one would buzz, only the other is moved.
 
     `make validate` does so for 460.
@@ -199,7 +199,7 @@ def test_no_trace_of_a_random_loop_says_the_opposite_of_its_eigenvalues():
 
 
 @pytest.mark.parametrize("T", [0.11, 0.25, 0.6, 1.0, 1e3, 1e300])
-def test_ticks_too_long_for_a_window_give_a_reason(T):
+def test_too_long_ticks_give_a_reason(T):
     x = np.sin(np.arange(400) / 7)[:, None]
     found = growth(x, T, np.array([1e-9]))
     assert found.growth_rate_per_s is None

@@ -96,7 +96,7 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
     )
 
 
-def test_saturation_breaks_a_certificate_and_damped_hands_mend_it():
+def test_clipping_breaks_certificates_that_damped_hands_mend():
     """Section 7's counterexample: certified for the linear loop, yet with lossless hands clipping goes on for ever."""
     assert requirements_of(load().loop("I"), STIFF)["this-environment"].certified
     far, near, frequency = sustained(0.0, near=100)
@@ -106,7 +106,7 @@ def test_saturation_breaks_a_certificate_and_damped_hands_mend_it():
     assert sustained(0.1)[:2] == (0, 0)
 
 
-def test_encoder_steps_move_the_trace_by_less_than_a_step():
+def test_encoder_steps_move_traces_less_than_a_step():
     """Steps of 1e-5 m: both engines stay within one of the ideal encoder; left alone the devices come to rest."""
     scenario = load().replace(duration=5.0)
     coarse = scenario.replace(device=tuple(CompliantDevice(encoder_step=1e-5) for _ in range(2)))

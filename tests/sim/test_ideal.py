@@ -40,7 +40,7 @@ def record_of(simulation: Simulation, seconds: float) -> Trace:
 
 
 @pytest.mark.parametrize(("case", "late"), [("I", (1, 2)), ("II", (0, 0))])
-def test_the_ideal_force_is_the_networks_for_the_measured_motion(case, late):
+def test_the_ideal_force_follows_the_measured_motion(case, late):
     simulation = assemble(SCENARIO, PUBLISHED["I"])
     record = record_of(simulation, 2.0)
     alike = force_error(simulation, record, SCENARIO.loop(case).lam)
@@ -53,7 +53,7 @@ def test_the_ideal_force_is_the_networks_for_the_measured_motion(case, late):
     assert alike.error_percent == pytest.approx(100 * error, rel=1e-6)
 
 
-def test_the_response_is_the_convolution_with_the_impulse_response():
+def test_responses_equal_impulse_convolution():
     G = assemble(SCENARIO, SpringDamper([900.0, 500.0], [0.4, 0.5])).F
     x = np.random.default_rng(0).normal(size=(120, 2))
     impulse = [G.D, *(G.C @ np.linalg.matrix_power(G.A, n) @ G.B for n in range(119))]
@@ -61,7 +61,7 @@ def test_the_response_is_the_convolution_with_the_impulse_response():
     np.testing.assert_allclose(response(G, x), y, atol=1e-9 * np.abs(y).max())
 
 
-def test_a_loop_without_coupling_is_ideal_even_where_its_motors_clip():
+def test_uncoupled_loops_are_ideal_despite_clipping():
     """F = Theta E = Lambda E: what it asks for is exactly right, and it is unstable."""
     simulation = assemble(SCENARIO.replace(theta=(2, 3)), NoCoupling())
     record = record_of(simulation, 6.0)

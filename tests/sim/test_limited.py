@@ -44,7 +44,7 @@ def test_which_limiter_a_coupling_may_have():
     assert "needs 1.385" in refused.reason
 
 
-def test_the_limiter_that_a_file_proves_is_the_one_that_runs(tmp_path):
+def test_the_proved_limiter_is_what_runs(tmp_path):
     """beta = 0.03 on file, where 0.01 is usual; in a loop with other damping the same beta with a multiplier anew."""
     scenario, path = weak(12.0, 5.657), tmp_path / "own.json"
     loop = scenario.loop("I")
@@ -91,13 +91,13 @@ def test_ticks_in_stretches_are_ticks_one_by_one(engine, apart, limit):
         np.testing.assert_allclose(getattr(found, name), rows, rtol=0, atol=apart * np.abs(rows).max())
 
 
-def test_a_run_within_one_stretch_feels_every_outside_force():
+def test_single_stretches_feel_every_outside_force():
     simulation = assemble(weak(1e3, 1e3).replace(duration=0.1), BUILT, (11.4167, 11.4167))
     found, expected = run(simulation, "exact"), run(simulation, tick_by_tick(make_engine(simulation, "exact")))
     np.testing.assert_allclose(found.s, expected.s, rtol=0, atol=1e-12 * np.abs(expected.s).max())
 
 
-def test_limited_and_clipped_runs_agree_while_no_force_is_at_its_limit():
+def test_limited_and_clipped_runs_agree_below_limits():
     scenario = weak(1e3, 1e3)
     limited, clipped = (run(assemble(scenario, BUILT, lag), "exact") for lag in ((11.4167, 11.4167), None))
     np.testing.assert_allclose(limited.f, clipped.f, atol=1e-10)

@@ -93,7 +93,7 @@ def test_the_model_of_a_pair_may_stay_behind():
     assert "knows none" in sweep.refusals["any-environment"]
 
 
-def test_a_wall_without_coupling_and_delay_needs_half_the_stiffness_times_T_plus_the_damping():
+def test_bare_walls_match_colgates_condition():
     scenario = load("one-wall").replace(environment=WALL, theta=(0,))
     sweep = around(scenario, NoCoupling())
     K, B = np.array([100.0, 900.0, 3000.0]), np.array([0.1, 0.9, 0.0])
@@ -102,14 +102,14 @@ def test_a_wall_without_coupling_and_delay_needs_half_the_stiffness_times_T_plus
     np.testing.assert_allclose(needed, K * scenario.T / 2 + B, rtol=1e-6)
 
 
-def test_what_no_environment_changes_is_the_same_in_all():
+def test_constant_requirements_are_equal_in_all_cells():
     sweep = around(PAIR, SpringDamper([800.0, 500.0], [0.4, 0.5]))
     assert sweep.conditions == ("this-environment", "any-environment")
     ratios = sweep.ratios("any-environment", np.array([50.0, 5e3]), np.array([0.1, 3.0]))
     assert ratios[0] == ratios[1] == sweep.requirement("any-environment", 1.0, 1.0).ratio < 1
 
 
-def test_the_population_meets_the_filter_in_the_environment_of_the_cell(optimal):
+def test_hands_meet_the_cells_own_environment(optimal):
     """Eigenvalues of the loops one by one, with the force map that `sim.run` closes."""
     sweep = around(PAIR, optimal["omega-pair"])
     crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 1, 12, 1)

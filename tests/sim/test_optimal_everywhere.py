@@ -57,7 +57,7 @@ def files(tmp_path_factory):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_its_file_is_proved_again_and_drives_the_process(files, form):
+def test_its_file_proves_and_drives_the_process(files, form):
     """The forces are the convolution with an impulse response that comes from R, Psi and E on a circle |z| = 1.05."""
     scenario, _, path = files[form]
     stored, loop = load_file(path), scenario.loop("I")
@@ -78,7 +78,7 @@ def test_its_file_is_proved_again_and_drives_the_process(files, form):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_it_runs_by_command_alone_and_in_a_batch(files, form, tmp_path):
+def test_single_runs_equal_batched_runs(files, form, tmp_path):
     _, name, path = files[form]
     common = ["--scenario", name, "--coupling", str(path), "--no-plot", "--json", str(tmp_path / "r.json")]
     asked = [*common, "--duration", "0.2", "--out", str(tmp_path)]
@@ -108,7 +108,7 @@ def test_its_forces_are_limited_as_the_file_proves(files):
 
 @pytest.mark.skipif(CC is None, reason="neither gcc nor cc is here: exported C files are not compiled")
 @pytest.mark.parametrize("form", FORMS)
-def test_its_process_is_exported_and_repeats_to_the_last_bit(files, form, tmp_path):
+def test_its_export_repeats_to_the_last_bit(files, form, tmp_path):
     out, limit = tmp_path / "p.c", ["--force-limit", "3"] if form == "filter" else []
     assert export.main([str(files[form][2]), "--process", *limit, "--out", str(out)]) == 0
     built = [str(CC), "-std=c99", "-ffp-contract=off", "-DHAPTIC_LOOP_TEST", str(out), "-o", str(tmp_path / "p"), "-lm"]
@@ -125,7 +125,7 @@ class _Never(Executor):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_the_live_window_runs_it_as_the_simulator_does(files, form):
+def test_the_live_window_equals_the_simulator(files, form):
     scenario, _, path = files[form]
     shown = first_loop(Menu("I", given=str(path)), scenario, GIVEN)
     running = live.LiveLoop(shown, _Never(), (), np.inf)

@@ -82,7 +82,7 @@ def test_both_engines_simulate_it_and_agree():
         assert record.meta["stability"]["verdict"] == "stable"
 
 
-def test_its_matrices_give_the_run_that_its_bodies_give():
+def test_matrices_and_bodies_give_equal_runs():
     """No body, but the same hand: the same trace to rounding."""
     bodies, space = (
         simulate(held_by(hand, hand), PUBLISHED["I"], engine="exact") for hand in (Muscle(), MuscleBySpace())
@@ -104,7 +104,7 @@ def test_the_tissue_s_mass_goes_to_nothing():
     assert off[0] / off[1] == pytest.approx(2.0, abs=0.1)
 
 
-def test_an_impedance_runs_in_mujoco_exactly_by_exponentials_and_to_second_order_by_runge_kutta():
+def test_impedances_have_the_expected_order():
     simulation = assemble(held_by(Light(), MuscleBySpace()), PUBLISHED["I"])
     exact = run(simulation, "exact")
     assert rms(run(simulation).s, exact.s) < 1e-10  # rounding
@@ -113,7 +113,7 @@ def test_an_impedance_runs_in_mujoco_exactly_by_exponentials_and_to_second_order
     assert np.log2(coarse / fine) == pytest.approx(2.0, abs=0.1)
 
 
-def test_an_impedance_runs_in_uneven_ticks_with_forces_that_latch_late():
+def test_impedances_run_in_uneven_late_ticks():
     uneven = {"period": Periods(1e-3, 1.2e-3), "latency": ((1e-4, 5e-4), (0.0, 3e-4)), "duration": 0.3}
     simulation = assemble(held_by(Light(), MuscleBySpace()).replace(**uneven), PUBLISHED["I"])
     exact = run(simulation, "exact")
@@ -131,7 +131,7 @@ def test_where_devices_rub_runge_kutta_moves_an_impedance():
     assert rms(coarse, fine) < 1e-4  # of first order where a device sticks
 
 
-def test_a_population_of_impedances_is_validated_in_both_engines():
+def test_impedance_populations_agree_in_both_engines():
     found = validate(held_by(Light(), Light()).replace(population=Muscles(Light)), None, humans=20, duration=0.3)
     assert 0 < (found.exact > 0).sum() < 20
     assert not found.disagreements.any()
@@ -150,7 +150,7 @@ class Muscles:
         return [self.kind(*np.exp(rng.uniform(low, high))) for _ in range(n)]
 
 
-def test_a_population_of_such_hands_is_validated_in_both_engines():
+def test_own_hand_populations_agree_in_both_engines():
     """Uncoupled, some of the hands set the loop off; the engines agree on which, and repeats repeat."""
     scenario = SCENARIO.replace(population=Muscles())
     found = validate(scenario, None, humans=40, duration=0.5)
@@ -184,14 +184,14 @@ class Mixed:
         return [hand for _ in range(n) for hand in Muscles((Muscle, Light)[rng.integers(2)]).draw(rng, 1)]
 
 
-def test_the_adversary_finds_nobody_where_there_is_enough_damping():
+def test_the_adversary_fails_against_enough_damping():
     """The published gains need 1.3987 N s/m."""
     scenario = SCENARIO.replace(delta=(1.42, 1.42), population=Mixed())
     worst = search_population(scenario, assemble(scenario, PUBLISHED["I"]).F, generations=5)
     assert not worst.destabilises
 
 
-def test_the_command_s_adversary_takes_a_population_from_a_file(tmp_path):
+def test_the_adversary_takes_a_population_file(tmp_path):
     file, report = tmp_path / "who.py", tmp_path / "r.json"
     file.write_text(
         "import numpy as np\nfrom haptic_loop.models.human import Port\n"
@@ -242,7 +242,7 @@ def test_a_person_may_hold_with_such_hands():
     assert rms(exact.x, alone.x) > 1e-3
 
 
-def test_a_scenario_keeps_it_and_says_what_is_none():
+def test_scenarios_keep_own_hands():
     scenario = held_by(Muscle(), Human((Link(0.3, 3.0, 200.0),)))
     assert scenario.replace(theta=(2, 2)).human == scenario.human
     assert len({held_by(Muscle(mass=m), Muscle()).digest for m in (0.2, 0.3, 0.3)}) == 2

@@ -47,7 +47,7 @@ def test_a_budget_that_does_not_act_changes_nothing(engine):
 
 @pytest.mark.parametrize("vary", [False, True], ids=["constant", "switching and lost"])
 @pytest.mark.parametrize("start", [0.0, 0.01])
-def test_no_hand_is_given_more_than_the_budget_by_a_hostile_loop(start, vary):
+def test_hostile_loops_cannot_exceed_the_budget(start, vary):
     """The optimal coupling on springs 2.5 times stiffer; the users' work does not count, so nobody is given more."""
     coupling = design_coupling(load().loop("I"), "optimal", "this-environment").coupling
     scenario = stiffer(load().replace(duration=4.0), 2.5)
@@ -84,7 +84,7 @@ def test_walls_stand_behind_a_budget_too():
     assert given(simulation, poor) <= 1e-9
 
 
-def test_the_shell_bounds_what_an_environment_of_ones_own_gives():
+def test_the_shell_bounds_own_environments():
     """A force that pushes along the motion: without shell it drives the hands, with it it gives 2 mJ at most."""
     coupling = design_coupling(SHORT.loop("I"), "spring-damper", "any-environment").coupling
     V, energies = coupling.compliance(SHORT.T), {}
@@ -111,7 +111,7 @@ def test_the_shell_bounds_what_an_environment_of_ones_own_gives():
         netted(assemble(SHORT, NoCoupling()), Plugged(lambda u: u))
 
 
-def test_the_report_of_a_run_says_what_the_budget_did(tmp_path):
+def test_reports_say_what_the_budget_did(tmp_path):
     options = [
         "--energy-budget",
         "0,0.0005",
@@ -128,7 +128,7 @@ def test_the_report_of_a_run_says_what_the_budget_did(tmp_path):
     assert part["guarantee"].startswith("no passive hand is given any energy beyond")
 
 
-def test_no_hand_is_given_more_than_the_budget_in_uneven_periods():
+def test_uneven_periods_cannot_exceed_the_budget():
     """It reserves for the longest tick; the loop without a coupling, which grows, takes what it is given."""
     scenario = stiffer(load().replace(duration=4.0, period={"min": 0.4e-3, "max": 1.6e-3}), 20)
     simulation = assemble(scenario, NoCoupling())

@@ -50,7 +50,7 @@ def trace(f, x=None):
     return Trace(T * np.arange(len(f)), x, f, x, x, np.zeros((len(f), 1)), {})
 
 
-def test_a_run_is_drawn_whole_and_where_it_turns():
+def test_a_run_is_drawn_with_its_turns():
     t = np.arange(4000)
     f = np.stack([np.sin(t / 300), np.sin(t / 300 + 1)], axis=1)
     f[2500:2600, 1] += 0.2 * np.sin(np.arange(100) * 2 * np.pi / 12)  # 83 Hz
@@ -61,7 +61,7 @@ def test_a_run_is_drawn_whole_and_where_it_turns():
     assert plots._sharpest(trace(f[:20]), 83.0) == slice(0, 20)
 
 
-def test_every_sample_of_a_run_is_on_the_picture(drawn):
+def test_pictures_contain_every_sample(drawn):
     steps = np.random.default_rng(0).normal(size=(1200, 3))
     steps[60:] *= 1e-3
     f = steps.cumsum(axis=0)  # turns sharply in its first ticks only: there is something to zoom into
@@ -81,7 +81,7 @@ def test_every_sample_of_a_run_is_on_the_picture(drawn):
     ]
 
 
-def test_a_handle_near_its_encoder_is_drawn_and_says_how_near(drawn):
+def test_nearby_handles_are_drawn_with_their_distance(drawn):
     x = np.sin(np.arange(3000) / 300)[:, None]
     run = replace(trace(1e3 * x, x), x_handle=1.004 * x)  # 4 mm beside 1 m: one line in the picture
     (axis, _) = plots.draw_run(run, title="t", frequency_hz=80.0).axes
@@ -113,7 +113,7 @@ def test_names_walls_and_curves_that_coincide(drawn):
         np.testing.assert_allclose(spans, edges + T)
 
 
-def test_an_onset_is_drawn_at_its_size_and_slope_and_what_is_not_credible_is_grey(drawn):
+def test_onsets_keep_size_and_implausible_parts_are_grey(drawn):
     t = T * np.arange(6000)
     swing = 1e-6 * np.exp(1.4 * t) * np.cos(2 * np.pi * 84 * t)
     handle = 0.015 * np.sin(2 * np.pi * 0.6 * t)
@@ -180,7 +180,7 @@ def report(available=(1.37, 1.37), psi=(0, 0)):
     return SimpleNamespace(**data, sigma_E=[[4.0, 2.0]] * 3, couplings=couplings, conditions=names)
 
 
-def test_what_binds_is_marked_on_its_curve_or_above_the_picture(drawn):
+def test_binding_frequencies_are_marked(drawn):
     here, anywhere = drawn(plots.plot_required_damping, report()).axes
     np.testing.assert_allclose(lines(here)["soft"], np.transpose([HZ, 1.37 * np.array([0.1, 0.25, 0.5])]))
     marks = {line.get_marker(): line.get_xydata()[0] for line in here.lines if line.get_marker() in "o^"}
@@ -194,7 +194,7 @@ def test_what_binds_is_marked_on_its_curve_or_above_the_picture(drawn):
     assert anywhere.get_title() == "any passive environment (with a multiplier of this one)"
 
 
-def test_singular_values_and_what_is_felt_stand_as_reported(drawn):
+def test_drawn_singular_values_are_the_reported_ones(drawn):
     figure = drawn(plots.plot_singular_values, report())
     assert [axis.get_title() for axis in figure.axes] == ["soft", "stiff"]
     assert legend(figure) == ["E, the environment", "F, what the devices see", "M, the mismatch"]
@@ -255,7 +255,7 @@ def test_a_map_shows_verdicts_edges_and_points(drawn):
     assert figure.get_suptitle() == title
 
 
-def test_a_map_of_an_environment_shows_what_was_designed_for(drawn):
+def test_environment_maps_mark_their_design_point(drawn):
     springs = [SimpleNamespace(B=1.0, K=15.0), SimpleNamespace(B=9.0, K=15.0)]
     fixed = SimpleNamespace(kind="spring-damper", contact_springs=springs)
     empty = SimpleNamespace(points=[], effects=told().simulation.effects, nonlinear=False)

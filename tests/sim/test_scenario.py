@@ -46,7 +46,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("old", "new", "message"), BAD, ids=[new for _, new, _ in BAD])
-def test_a_bad_scenario_gets_one_line_that_names_the_field(old, new, message):
+def test_bad_scenarios_are_one_line(old, new, message):
     assert old in TEXT
     with pytest.raises(InputError) as caught:
         parse(TEXT.replace(old, new, 1), "mine.toml")
@@ -55,7 +55,7 @@ def test_a_bad_scenario_gets_one_line_that_names_the_field(old, new, message):
     assert "\n" not in str(caught.value)
 
 
-def test_a_scenario_needs_no_hands_and_no_delay_inside_and_hears_of_all_that_it_lacks():
+def test_scenarios_need_only_five_fields():
     bare = """
 name = "bare"
 T = 1e-3
@@ -134,7 +134,7 @@ def test_replacing_nothing_changes_nothing(name):
     assert same.digest == scenario.digest
 
 
-def test_what_a_script_has_becomes_what_a_file_has():
+def test_scripts_and_files_make_equal_scenarios():
     """Lists, numpy's arrays and numbers, whole numbers where any are allowed."""
     scenario = load().replace(theta=[1, 3], psi=np.array([1, 0]), T=np.float64(1e-3), duration=2, delta=np.ones(2))
     assert (scenario.theta, scenario.psi, scenario.delta) == ((1, 3), (1, 0), (1.0, 1.0))
@@ -217,7 +217,7 @@ def test_a_device_of_the_catalogue_with_overrides():
     assert load().replace(device=[{"device": "falcon", "damping": 0.5}] * 2).delta == (0.5, 0.5)
 
 
-def test_more_devices_than_a_run_can_take_are_refused():
+def test_too_many_devices_are_refused():
     text = """
 name = "many"
 T = 1e-3
@@ -239,7 +239,7 @@ springs = [{springs}]
         channels(50)
 
 
-def test_longer_hands_than_a_run_can_take_are_refused():
+def test_too_long_hands_are_refused():
     one = Link(mass=0.3, damping=3.0, stiffness=200.0)
     assert len(Human(links=(one,) * 500).links) == 500
     with pytest.raises(ValueError, match=r"links has 501 entries, allowed are 1 to 500"):
@@ -250,7 +250,7 @@ def test_longer_hands_than_a_run_can_take_are_refused():
         parse(FALCON.format(device='"omega.3"').replace("human = [", f"human = [{human},", 1))
 
 
-def test_a_spring_at_its_limit_has_no_stiffer_neighbour():
+def test_the_stiffest_spring_has_no_stiffer_vertex():
     network = FIGURE_4.__class__(contacts=("a",), springs=(Spring(("a", "ground"), 1e12),))
     with pytest.raises(InputError, match=r"10 % can be computed: stiffness between a and ground is .*allowed are"):
         vertices(network)
@@ -289,11 +289,11 @@ def test_a_device_that_is_not_known_well_enough(device, message):
     assert message in str(caught.value)
 
 
-def test_delays_that_make_too_many_states_are_refused_with_their_number():
+def test_too_many_delay_states_are_refused():
     with pytest.raises(ValueError, match=r"1998 samples in all, allowed are 1000: each is a state, .* about 80 s"):
         load().replace(theta=(999, 999))
 
 
-def test_a_trace_that_does_not_fit_into_memory_is_refused_before_the_run():
+def test_traces_beyond_memory_are_refused_early():
     with pytest.raises(InputError, match=r"duration: 1e\+06 s need .* GiB of .*, .* are free: allowed are .* s"):
         run(assemble(load().replace(duration=1e6), NoCoupling()))

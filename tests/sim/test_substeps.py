@@ -72,7 +72,7 @@ def test_euler_once_per_period_hides_the_instability(substeps, wrong):
     assert any("WRONG VERDICT" in remark for remark in _check_substeps(loop, "Euler", substeps)) == wrong
 
 
-def test_a_default_that_would_be_wrong_is_doubled_or_refused():
+def test_wrong_default_steps_are_doubled_or_refused():
     loop = assemble(SCENARIO, NoCoupling())
     assert default_substeps(loop, "Euler") == 4
     with pytest.raises(InputError, match="discrete gives no verdict to rely on"):
@@ -84,7 +84,7 @@ def test_a_default_that_would_be_wrong_is_doubled_or_refused():
     assert simulated_growth(near, "Euler", default_substeps(near, "Euler")) > 0
 
 
-def test_outside_the_stable_region_is_refused_with_what_to_use():
+def test_unstable_steps_are_refused_with_advice():
     loop = assemble(STIFF, PUBLISHED["I"])
     with pytest.raises(InputError, match=r"the mode at 688.* outside the stable region of RK4; use --substeps 26"):
         _check_substeps(loop, "RK4", 1)

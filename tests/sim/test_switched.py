@@ -51,7 +51,7 @@ def own_hold() -> HeldPlant:
     return HeldPlant(step[:n, :n], step[:n, n:], continuous.C, T)
 
 
-def test_the_product_of_mode_matrices_is_the_simulated_map():
+def test_mode_products_equal_the_simulated_map():
     """60 ticks of random ages on both channels, from a random state: the loop tick by tick against one product."""
     rng, ticks, depth = np.random.default_rng(0), 60, (3, 2)
     wanted = np.tile(depth, (ticks, 1))
@@ -79,14 +79,14 @@ def test_the_product_of_mode_matrices_is_the_simulated_map():
     np.testing.assert_allclose(xi[states:][: G.order], buffer.z[ticks, :, 0], atol=1e-11 * size)
 
 
-def test_constant_delays_give_the_trace_of_the_constant_loop():
+def test_constant_delay_lines_equal_constant_loops():
     delays = np.tile(np.array([1, 2])[None, :, None], (300, 1, 1))
     varying = close_loop(with_delays(ASSEMBLY, delays), "exact", ticks=300)
     constant = close_loop(ASSEMBLY, "exact", ticks=300)
     np.testing.assert_allclose(varying.s, constant.s, rtol=0, atol=1e-12 * np.abs(constant.s).max())
 
 
-def test_the_worst_period_grows_more_than_any_constant_delay():
+def test_switching_can_grow_beyond_constant_delays():
     """(1, 2) is certified; switching within 1 to 2 makes the loop with its ordinary humans grow, exactly."""
     worst = _worst_switching(ASSEMBLY, VaryingDelay((1, 1), (2, 2), "adversarial"))
     assert worst.growth > 1.5  # found by a search: 2.05 1/s at the time of writing
@@ -261,7 +261,7 @@ def test_both_engines_see_the_population_grow_alike():
     np.testing.assert_allclose(seen.mujoco[kept], seen.exact[kept], atol=1e-2)
 
 
-def test_the_mismatch_that_a_run_reports_is_that_of_the_constant_delays():
+def test_runs_report_the_constant_delays_mismatch():
     """The process of a loop that switches holds G without Theta; what is felt is still F."""
     moved = with_delays(ASSEMBLY, np.ones((5, 2, 1), dtype=int))
     z = np.exp(1j * np.linspace(0.001, 3, 50))

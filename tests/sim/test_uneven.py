@@ -63,7 +63,7 @@ def test_both_engines_move_from_latch_to_latch(ticks):
     assert abs(rk4[1] - exact.s).max() < abs(rk4[0] - exact.s).max() / 8  # of fourth order
 
 
-def test_time_adds_up_and_the_blocks_of_a_run_do_not_matter():
+def test_block_sizes_do_not_change_runs():
     simulation = assemble(PAIR.replace(period=Periods(recorded=(1e-3, 2e-3, 0.5e-3)), duration=3.0), SOFT)
     trace = run(simulation, "exact")
     assert trace.t[:5] == pytest.approx([0, 1e-3, 3e-3, 3.5e-3, 4.5e-3])
@@ -73,13 +73,13 @@ def test_time_adds_up_and_the_blocks_of_a_run_do_not_matter():
     np.testing.assert_array_equal(again.s, trace.s[:1500])
 
 
-def test_forces_that_latch_at_ticks_of_length_T_are_the_plain_loop():
+def test_even_ticks_without_latency_are_plain():
     plain = run(assemble(PAIR, SOFT), "exact")
     same = run(assemble(PAIR.replace(latency=((0.0, 0.0),) * 2, period=Periods(PAIR.T, PAIR.T)), SOFT), "exact")
     assert abs(same.x - plain.x).max() < 1e-13 * abs(plain.x).max()
 
 
-def test_the_eigenvalues_of_a_late_loop_are_those_of_its_map_over_a_tick():
+def test_late_loops_match_their_map():
     """A latency that is constant makes a linear loop with the held forces as states."""
     tau = 3e-4
     simulation = assemble(PAIR.replace(latency=((tau, tau),) * 2), SOFT)
@@ -97,7 +97,7 @@ def test_the_eigenvalues_of_a_late_loop_are_those_of_its_map_over_a_tick():
     assert float(dominant_mode(close(simulation.plant, F)).growth) == pytest.approx(growth, abs=1e-9)
 
 
-def test_what_is_drawn_lies_within_its_range_and_comes_from_the_seed():
+def test_draws_lie_in_range_and_are_seeded():
     scenario = PAIR.replace(period=DRAWN, latency=LATE)
     one, same, other = (scenario.timing(seed, 4000) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.period, same.period)
@@ -165,7 +165,7 @@ def test_periods_vary_beside_delays():
     assert len(run(simulation, "exact").t) == scenario.samples
 
 
-def test_at_the_requirement_no_hand_gains_energy_and_below_it_some_grow(monkeypatch):
+def test_hands_gain_energy_only_below_the_requirement(monkeypatch):
     """The suite's check, in short; with less damping than the condition asks it must find what is wrong."""
     rows = list(uneven.uneven_ticks(0, 3))
     assert [(row.ticks, row.drawn) for row in rows[:3]] == [("periods", True), ("periods", False), ("latency", True)]
@@ -175,7 +175,7 @@ def test_at_the_requirement_no_hand_gains_energy_and_below_it_some_grow(monkeypa
     assert not all(row.holds for row in uneven.uneven_ticks(0, 2, 600))
 
 
-def test_the_positions_at_the_latch_are_those_of_the_plant():
+def test_latch_positions_are_the_plants():
     """Two devices that one person joins, the second latching first: from there on its new force moves the first."""
     rng = np.random.default_rng(4)
     A = np.block([[np.zeros((2, 2)), np.eye(2)], [-300 * np.array([[2, -1], [-1, 2]]), -2 * np.eye(2)]])
@@ -193,7 +193,7 @@ def test_the_positions_at_the_latch_are_those_of_the_plant():
     np.testing.assert_allclose(seen @ np.concatenate([s, held, w, f]), [second[0], first[1]], rtol=1e-12)
 
 
-def test_what_a_tick_dissipates_is_at_least_what_is_counted_at_the_latch():
+def test_counted_dissipation_is_a_lower_bound():
     """Mechanical energy that two devices lose in a tick, joined by springs, less the work of the forces before and
     after the latch: never below the count, and within a percent of it in most ticks."""
     late, delta, F, T = np.array([1e-4, 4e-4]), np.array([1.37, 1.1]), PAIR.loop("I").F(SOFT), PAIR.T
@@ -218,7 +218,7 @@ def test_what_a_tick_dissipates_is_at_least_what_is_counted_at_the_latch():
     assert np.median(np.array(lost) / counted) < 1.01
 
 
-def test_the_audit_of_late_forces_sees_what_a_coupling_gives():
+def test_the_energy_audit_sees_late_forces():
     """Nothing at any tick with one that is certified; without one some loops give energy, all of them unstable."""
     late = PAIR.replace(latency=LATE)
     for coupling, gives in ((SOFT, False), (NoCoupling(), True)):

@@ -76,7 +76,7 @@ HELD = SCENARIO.replace(person=(Person((2, 1), 20.0, 1.0, 100.0),))
 
 
 @pytest.mark.parametrize("devices", DEVICES.values(), ids=DEVICES)
-def test_people_in_both_hands_are_stacked_and_simulated_alike(devices):
+def test_stacked_people_equal_single_ones(devices):
     """Each row of the crowd is the scene built for it, and MuJoCo's map agrees with the exact one as for others."""
     scenario = HELD.replace(device=devices)
     ((_, people),) = asked(scenario).crowds(range(20))
@@ -93,7 +93,7 @@ def test_people_in_both_hands_are_stacked_and_simulated_alike(devices):
     np.testing.assert_array_equal(people.links, next(asked(SCENARIO).crowds(range(20)))[1].links)
 
 
-def test_both_engines_simulate_a_person_who_moves_both_hands():
+def test_both_engines_agree_on_a_person():
     """RK4 x 4 against the exact solution, voluntary motion and its reaction on the body included."""
     scenario = HELD.replace(duration=1.5)
     simulation = assemble(scenario, PUBLISHED["I"])
@@ -105,7 +105,7 @@ def test_both_engines_simulate_a_person_who_moves_both_hands():
     np.testing.assert_allclose(mujoco.s[:, n:], exact.s[:, n:], atol=1e-4 * np.abs(exact.s).max())
 
 
-def test_a_scenario_with_a_person_is_validated_with_random_people(tmp_path):
+def test_persons_are_validated_with_random_people(tmp_path):
     text = (load.__globals__["SCENARIOS"] / "omega-pair.toml").read_text()
     text += (
         "\n[[person]]\nholds = [1, 2]\nmass = 30.0\ndamping = 80.0\nstiffness = 900.0\ncross = { stiffness = 40.0 }\n"
@@ -203,7 +203,7 @@ def test_designed_coupling_holds_for_everyone():
     assert (traced.settling < 1).all()
 
 
-def test_without_coupling_most_are_unstable_and_the_energy_audit_sees_it():
+def test_uncoupled_loops_are_mostly_unstable():
     findings = validate(Validation(SCENARIO, NoCoupling(), 0, 200, 1, "exact", 2.0))
     assert unstable(findings.exact).mean() > 0.6
     assert findings.energy.min() < 0
@@ -215,7 +215,7 @@ def test_what_a_disagreement_is():
     assert disagree(exact, other).tolist() == [True, True, False, False]
 
 
-def test_the_command_and_the_replay_of_its_worst_human(tmp_path):
+def test_the_worst_human_replays(tmp_path):
     out, file = tmp_path / "out", tmp_path / "r.json"
     options = ["--case", "none", "--humans", "30", "--engine", "exact", "--duration", "0.5"]
     assert main([*options, "--out", str(out), "--json", str(file)]) == 0
@@ -276,7 +276,7 @@ def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
     assert report["humans"] == examine_module._BATCH
 
 
-def test_ctrl_c_ends_the_batches_that_run_in_other_processes():
+def test_ctrl_c_ends_other_processes_batches():
     """A batch of an hour and a half of simulated time each would otherwise be waited for."""
     scenario = load("omega-pair")
     question = Validation(scenario, SpringDamper([500, 500], [0.4, 0.4]), 0, 250, 1, "mujoco", 50_000.0)
@@ -291,7 +291,7 @@ def test_ctrl_c_ends_the_batches_that_run_in_other_processes():
 
 
 @pytest.mark.parametrize("duration", [0.5, 60.0])
-def test_hands_that_had_no_time_to_rest_are_no_verdict(duration):
+def test_restless_short_traces_give_no_verdict(duration):
     """Against the slowest eigenvalue of the same humans, by the exact engine."""
     question = Validation(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
     found = validate(question)
@@ -374,7 +374,7 @@ class OwnEngine(ExactEngine):
 
 
 @pytest.mark.parametrize("delays", [None, VaryingDelay((1, 2), (2, 3), "random")])
-def test_an_engine_of_one_s_own_decides_of_everyone(delays):
+def test_own_engines_judge_every_hand(delays):
     """Made anew for each set of humans, it says of the period and of the traces what the stacked exact engine says."""
     scenario = load().replace(varying_delay=delays)
     found = examine_module._examine(Validation(scenario, PUBLISHED["I"], 0, 6, MIXED, OwnEngine, 0.5), range(6))
@@ -384,7 +384,7 @@ def test_an_engine_of_one_s_own_decides_of_everyone(delays):
     assert not found.disagreements.any()
 
 
-def test_an_engine_of_one_s_own_needs_even_ticks():
+def test_own_engines_need_even_ticks():
     question = Validation(load().replace(latency=((0.0, 1e-4),) * 2), PUBLISHED["I"], 0, 2, 1, OwnEngine, 0.5)
     with pytest.raises(InputError, match=r"OwnEngine: uneven ticks \(period, latency\) run in mujoco and exact"):
         examine_module._examine(question, range(2))
@@ -408,7 +408,7 @@ def test_no_trace_contradicts_the_eigenvalues_of_slow_loops():
     assert (np.abs(found.trace[decided]) * 1.5 >= 4 - 1e-9).all()  # four times of decay or growth
 
 
-def test_a_trace_too_short_for_its_rate_does_not_vote():
+def test_short_traces_do_not_vote():
     """A decay of 0.331 1/s that a fit to 2 s gives as a growth of 0.168 1/s: only MuJoCo's map may contradict."""
     found = slow_loops(4, 0, 0.3)
     rates = {name: np.full(4, value) for name, value in (("exact", -0.331), ("mujoco", -0.331), ("trace", 0.168))}

@@ -146,7 +146,7 @@ def test_rest_is_where_a_held_position_leads(published):
     assert np.allclose(F.C @ z + F.D @ x, F.at(1.0 + 0j).real @ x, atol=1e-8)
 
 
-def test_a_switch_keeps_the_plant_and_starts_the_process_at_rest(none):
+def test_switching_keeps_the_plant_state(none):
     running, alone = session(none), session(none)
     before = running.frame(0.5)
     press(running, "7")
@@ -202,7 +202,7 @@ def test_events_are_spelt_as_they_are_read():
     assert parse_script("3:push2=-1.5 1:restart", 2) == ((1.0, _Restart()), (3.0, _Push(2, -1.5)))
 
 
-def test_keys_that_cannot_be_met_leave_the_loop_running(none):
+def test_impossible_keys_leave_the_loop_running(none):
     running = session(none)
     press(running, "Down", "Down")  # theta is 1 and 2
     frame = running.frame(0.1)
@@ -213,7 +213,7 @@ def test_keys_that_cannot_be_met_leave_the_loop_running(none):
     assert running.prepared.label == "none"
 
 
-def test_the_loop_goes_on_while_a_coupling_is_made(none):
+def test_the_loop_runs_during_a_design(none):
     later = Later()
     running = LiveLoop(none, later)
     press(running, "7", "Up")
@@ -280,7 +280,7 @@ def test_the_mouse_is_one_more_passive_hand(none):
     assert np.allclose(held.B, expected.B, rtol=0, atol=1e-12)
 
 
-def test_the_mouse_draws_the_handle_and_lets_it_go():
+def test_the_mouse_draws_and_releases_handles():
     soft = replace_theta(first_loop(Menu("I"), SCENARIO, "published"), (0, 0))
     assert dominant_mode(close(_gripped(soft.simulation.scene, 1, SCENARIO.T), soft.simulation.F)).growth < 0
     running, quiet = session(soft), session(soft)
@@ -500,7 +500,7 @@ def test_flat_pictures_show_where_things_are(none):
     assert middle(0.05) - middle(0.0) == pytest.approx(0.05 * 520 / 0.42, abs=1.0)
 
 
-def test_an_interrupted_film_is_as_long_as_it_got(tmp_path, monkeypatch):
+def test_interrupted_films_keep_their_frames(tmp_path, monkeypatch):
     made, picture = [], FlatPictures.picture
 
     def interrupted(self, frame):
@@ -533,7 +533,7 @@ def test_mp4_is_what_ffmpeg_makes_of_the_pictures(tmp_path, monkeypatch):
         drawing.save_film(tmp_path / "b.mp4", iter(pictures), 10)
 
 
-def test_case_none_begins_without_a_coupling_and_takes_one_later(tmp_path):
+def test_case_none_takes_a_coupling_later(tmp_path):
     """Nothing designed for "none" exists: what is asked for later is designed for case I."""
     where, told = str(tmp_path / "a.gif"), tmp_path / "a.json"
     words = ("--case", "none", "--script", "0.1:designed", "--duration", "0.3", "--fps", "5")

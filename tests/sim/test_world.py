@@ -205,7 +205,7 @@ def test_this_environment_says_nothing_of_a_world():
         (Compliance(Lti.constant([[1e-3, 0.0], [0.0, 0.0]], T)), "is not symmetric and positive definite"),
     ],
 )
-def test_a_coupling_that_no_world_can_use_is_one_line(coupling, message):
+def test_couplings_unfit_for_worlds_are_one_line(coupling, message):
     with pytest.raises(InputError, match=message) as caught:
         simulate(load("world-peg"), coupling)
     assert "\n" not in str(caught.value)

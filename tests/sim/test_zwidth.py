@@ -106,7 +106,7 @@ def test_no_cell_of_the_widest_plane_is_lost(scenario):
 
 
 @pytest.mark.parametrize(("theta", "least"), [(0, 1.6154), (1, 1.8630), (2, 2.3639)])
-def test_before_a_wall_a_map_asks_what_designs_ask(theta, least):
+def test_maps_before_walls_match_designs(theta, least):
     """K = 2000, B = 2 before 3000 N/m, 2 N s/m: the figures of docs/theory.md; the frozen contact asks less."""
     network = Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, 2.0),))
     sweep = CouplingSweep(PAIR.device[:1], PAIR.population, Loop(T, (theta,), (0,), (0,), (DELTA,), network))
@@ -122,13 +122,13 @@ def test_before_a_wall_a_map_asks_what_designs_ask(theta, least):
     assert frozen.required[0] < least - 5e-3 or theta == 0
 
 
-def test_a_wall_without_delay_needs_half_the_stiffness_times_T_plus_the_damping():
+def test_undelayed_walls_match_colgates_condition():
     K, B = np.random.default_rng(0).uniform([[1], [0]], [[6000], [3]], (2, 50))
     for needed in wall(0, K, B):
         np.testing.assert_allclose(needed, K * T / 2 + B, rtol=1e-10)
 
 
-def test_a_spring_one_sample_late_needs_one_and_a_half_KT_and_against_anything_two():
+def test_a_late_spring_needs_the_closed_form():
     K = np.geomspace(10, 5000, 9)
     # the supremum is at w -> 0, of which the map sees 1e-5 rad/sample
     for needed, share in zip(wall(1, K, 0 * K), (1.5, 2), strict=True):
@@ -158,7 +158,7 @@ def test_the_force_maps_are_those_of_single_couplings():
         np.testing.assert_allclose(stack[i].at(z), F.at(z), rtol=1e-8)
 
 
-def test_a_velocity_filter_is_a_spring_in_series_with_the_damper():
+def test_a_velocity_filter_is_a_series_spring():
     """Backward Euler of that network is another derivation of the filtered coupling."""
     cutoff, K, B = 30.0, 900.0, 1.3
     tau = 1 / (2 * np.pi * cutoff)
@@ -222,7 +222,7 @@ def test_the_population_is_decided_as_one_by_one(links):
     assert np.isneginf(crowd.growth(F, half)[0][15:]).all()
 
 
-def test_a_cell_that_the_leading_humans_leave_stable_is_asked_of_all():
+def test_cells_without_unstable_leaders_test_everyone():
     """One unstable human outside the leading ones must still be found."""
     sweep = rigid(1)
     crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 0, 40, 1)
@@ -354,7 +354,7 @@ def test_friction_stops_what_grows_from_a_millimetre():
     assert held.differ.all()
 
 
-def test_a_coarse_encoder_makes_a_stable_loop_oscillate_by_its_steps():
+def test_coarse_encoders_make_stable_loops_oscillate():
     calm = points(rigid(1), [300.0, 800.0], [0.0, 0.05], threshold=1e-5)
     coarse = points(with_devices(rigid(1), encoder_step=2e-4), [300.0, 800.0], [0.0, 0.05], threshold=1e-5)
     assert not calm.oscillates.any()
@@ -510,7 +510,7 @@ def test_bad_input_is_one_line(options, message, tmp_path, capsys, monkeypatch):
     assert error.count("\n") == 1
 
 
-def test_a_map_is_of_late_forces_and_of_the_longest_period(tmp_path):
+def test_maps_cover_latency_and_longest_periods(tmp_path):
     """1000 N/m before a rigid wall needs 0.7749 N s/m at 0.13 ms of 1.2 ms, 1.8 as a whole sample; 0.9 up to 1.8."""
     file = tmp_path / "r.json"
     wall = [
