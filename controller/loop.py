@@ -281,7 +281,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
 
     def channel(self, i: int) -> Loop:
         """Device i alone, at a rigid wall: any-environment is of the same gains whatever is behind them."""
-        own, known = slice(i, i + 1), self.known_devices
+        own, known, late, span = slice(i, i + 1), self.known_devices, self.latency, self.varying_delay
         return Loop(
             self.T,
             self.theta[own],
@@ -289,7 +289,9 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
             (0,),
             self.delta[own],
             RIGID_WALL,
+            varying_delay=span and DelayRange(span.lo[own], span.hi[own]),
             T_max=self.T_max,
+            latency=late and late[own],
             T_min=self.T_min,
             known_devices=known and known[own],
         )

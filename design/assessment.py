@@ -247,8 +247,6 @@ def covered_limits(
     `proof` belongs to the coupling: its limiter is taken where the proof holds in this loop; where it does not, one of
     the same beta is searched. What `known` contains is not proved again (design.certificate.recheck).
     """
-    if loop.varying_delay:
-        return ForceLimits(None, "limited forces and delays that switch are not proved together here")
     for each in requirements.values():
         if each.certified and each.lag is not None:
             return ForceLimits(each.lag, f"{each.condition} covers limited forces")
@@ -476,7 +474,8 @@ def assess(
     requirements = requirements_of(here, coupling, known, own=own)
     ranges = check_ranges(loop, coupling, ranges_seed, ranges_samples, progress, searched, known)
     if loop.varying_delay:
-        requirements[SWITCHING.name] = judged(loop.at(network), coupling, SWITCHING)
+        switched = (SWITCHING, ANY_ENVIRONMENT) if not any(loop.psi) else (SWITCHING,)
+        requirements |= {each.name: judged(loop.at(network), coupling, each) for each in switched}
     if limiter_proof is None and known and known.limiter:
         limiter_proof = known.limiter
     plugged = shelled(network if environment is None else environment)
@@ -519,8 +518,6 @@ def _force_limits(
     """Find the limiter for a loop, or say why forces are clipped."""
     if limiter is False:
         return ForceLimits(None, "forces are clipped, as asked")
-    if loop.varying_delay:
-        return ForceLimits(None, "limited forces and delays that switch are not proved together here")
     return covered_limits(loop, coupling, requirements, proof, known)
 
 
@@ -577,6 +574,9 @@ def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
     if limits.energy_budget is not None:
         return _account(assessment, "whatever computes the forces"), None
     if loop.varying_delay:
+        anywhere = requirements[ANY_ENVIRONMENT.name]
+        if anywhere.certified and anywhere.guarantee == ANY and not any(loop.psi):
+            return _stated(assessment, anywhere, ANY), None
         needs = requirements[SWITCHING.name]
         if not needs.certified:
             return None, f"delays that switch within {loop.varying_delay} are not covered: {needs.shortfall}"
@@ -614,7 +614,7 @@ def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
     if any(loop.psi):
         return None, f"psi is {', '.join(map(str, loop.psi))}: a shell needs an environment without delay"
     if loop.varying_delay:
-        return None, "the shell needs constant delays: any-environment does not cover delays that switch"
+        return None, "the shell needs constant delays: its account is not proved for delays that switch"
     if not needs.certified or needs.guarantee != ANY:
         return None, f"the coupling is not certified for any environment: {needs.shortfall}"
     world = not callable(assessment.environment)

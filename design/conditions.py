@@ -478,9 +478,8 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
     if not V.is_stable():
         return refused("the coupling V has a pole on or outside the unit circle")
     demand = any_environment_demand(V, loop, phi)
-    V1 = demand.static["V(1)"]
-    if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
-        return refused("the static compliance V(1) is not symmetric")
+    if reason := asymmetric(demand.static["V(1)"]):
+        return refused(reason)
     if phi is not None and uncovered(loop.E(), loop.psi, phi)[0] > 0:
         return refused("E-hat + Phi is not passive for this multiplier")
     least = partial(least_scale, demand) if phi is not None else partial(_scale_beside_zeros, V, demand)
@@ -494,6 +493,12 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
 _VANISHES = 1e-5
 #: What stands there in place of its passivity, beside V(1), and the ratio from which on nothing else does.
 _SOFTENED, _NEVER = 1e-12, 1e6
+
+
+def asymmetric(V1: Array) -> str | None:
+    """Why a static compliance is refused: it is not symmetric, beyond rounding."""
+    skew, size = np.abs(V1 - V1.T).max(), max(float(np.abs(V1).max()), 1e-300)
+    return "the static compliance V(1) is not symmetric" if skew > 1e-9 * size else None
 
 
 def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
@@ -607,13 +612,15 @@ def this_environment_ratios(at: _Responses, poles: Complex, loop: Loop) -> Array
     return np.where(sound, np.maximum(suprema(needed, *frequencies_of_many(poles, longest)), 0.0), np.inf)
 
 
-def any_environment_ratios(V: _Responses, count: int, loop: Loop, phi: Sequence[float] | None = None) -> Array:
-    """The same of any-environment for `count` couplings; phi (m,) [N s/m] is the multiplier that psi >= 1 needs."""
+def any_environment_ratios(
+    V: _Responses, count: int, loop: Loop, demand: Callable[[Sampled], Demand[Sampled]]
+) -> Array:
+    """The same of any-environment for `count` couplings, by the block of their responses."""
 
     def needed(w: Array) -> Array:
-        return _least_scales(any_environment_demand(V(on_circle(w)), loop, phi))
+        return _least_scales(demand(V(on_circle(w))))
 
-    return suprema(needed, *frequencies_of_many(np.zeros((count, 0), dtype=np.complex128), max(loop.theta)))
+    return suprema(needed, *frequencies_of_many(np.zeros((count, 0), dtype=np.complex128), max(loop.delays.hi)))
 
 
 def _least_scales(demand: Demand[Sampled]) -> Array:

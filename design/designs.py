@@ -128,10 +128,6 @@ def design_by_kind(
     if asked not in able:
         raise ValueError(f"condition is {asked!r}, for {kind} allowed are {', '.join(able)}")
     made_for = able[asked]
-    constant = msgspec.structs.replace(loop, varying_delay=None)
-    if made_for.beyond(loop) and not made_for.beyond(constant):
-        # Design for the constant delays where the condition does not cover delays that switch. The assessment says so.
-        loop = constant
     if chosen.model and loop.environment.walls:
         reason = f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls"
         raise ValueError(f"{reason}{_before_walls(loop)}")
@@ -142,11 +138,14 @@ def design_by_kind(
     further = {name: value for name, value in further.items() if name in chosen.takes}
     made = partial(getattr(import_module(f"haptic_loop.design.{chosen.module}"), chosen.function), **further, **options)
 
-    if loop.latency and "latency" not in made_for.covers:
-        raise ValueError(f"latency: {made_for.beyond(loop)}, or design for this-environment")
+    if loop.latency and (reason := made_for.beyond(loop)):
+        raise ValueError(f"latency: {reason}")
     if own:
         return replace(_with_less_damping(loop, made, own), condition=own.name, own=own, phi=None)
-    if chosen.model or made_for.guarantee(loop) == ANY or not (loop.latency or loop.environment.walls):
+    anywhere = made_for.guarantee(loop) == ANY
+    if anywhere and (loop.latency or loop.varying_delay) and kind != "moving-average":
+        return _with_less_damping(loop, made, made_for)
+    if chosen.model or anywhere or not (loop.latency or loop.environment.walls):
         return made(loop)
     return _with_less_damping(loop, made, made_for)
 
@@ -185,11 +184,13 @@ _UNUSED, _MOST_ROUNDS = 0.005, 6
 def _with_less_damping(loop: Loop, made: Callable[[Loop], Design], condition: Condition) -> Design:
     """The design for less damping, so that the condition asks for no more than is available.
 
-    It is made for forces that latch at the tick, and walls that all touch; the condition is about the loop as it is.
+    It is made for forces that latch at the tick, and walls that all touch; for any environment for the longest delay,
+    where delays switch. The condition is about the loop as it is.
     """
     share, best, shortfall = 1.0, None, ""
     for _ in range(_MOST_ROUNDS):
-        part = msgspec.structs.replace(loop, latency=None, delta=tuple(share * d for d in loop.delta))
+        constant = loop.delayed(loop.delays.hi) if condition.guarantee(loop) == ANY else loop
+        part = msgspec.structs.replace(constant, latency=None, delta=tuple(share * d for d in loop.delta))
         found = made(part)
         needs = condition.judge(loop.at(loop.environment), found.coupling)
         shortfall = needs.shortfall

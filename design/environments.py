@@ -64,7 +64,7 @@ class Multiplied(Condition):
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         return self.block(self.map(loop, coupling, exact), loop, multiplier)
 
-    def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
+    def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
         """The multiplier that a search begins with; the one of a block of many rows, whose search would take long."""
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
@@ -183,8 +183,11 @@ class _Search:
         count, bound = self._searched.size, 0.0
         units = np.eye(self._units.size)[self._searched] * self._units
         self._plain = [self._scaled(tuple(x)) for x in (0 * self._units, *units)]
-        by = np.abs(np.diagonal(self._parts(self._grid[[0, -1]])[1], axis1=2, axis2=3)).max(axis=1)
-        self._root = 1 / np.sqrt(np.where(by[-1] > 0, by[-1], np.maximum(by.max(axis=0), 1e-300)))
+        constant, by = (
+            np.abs(np.diagonal(part, axis1=-2, axis2=-1)).max(axis=-2) for part in self._parts(self._grid[[0, -1]])
+        )
+        sizes = [by[-1], by.max(axis=0), constant, np.ones_like(constant)]  # of rows: the first that is not 0
+        self._root = 1 / np.sqrt(np.select([size > 0 for size in sizes], sizes))
         low = [Inequality.least([i], float(v)) for i, v in enumerate(self._least)]
         high = [Inequality.most([i], float(v)) for i, v in enumerate(self._most)]
         blocks = [*low, Inequality.least([count], 0.0), *high, *self._rooms(count)]
@@ -281,13 +284,13 @@ class ThisEnvironment(Multiplied):
         hands = hands_side(loop)
         return hands if hands.unknowns(loop) else None
 
-    def usual(self, G: Lti, loop: Loop) -> Sequence[float]:
+    def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
         """The start of each multiplier; alpha is half the width times a device's largest own force per displacement.
 
         Of many devices, whose multipliers are not searched, the best share of it is taken.
         """
         unknowns, usual = self.unknowns(loop), super().usual(G, loop)
-        if not loop.varying_delay:
+        if not loop.varying_delay or G is None:
             return usual
         w, m = frequencies(G, points=60), loop.channels
         most = _half_widths(loop) * np.abs(np.diagonal(G.at(on_circle(w))[:, :m, :m], axis1=1, axis2=2)).max(axis=0)
@@ -349,7 +352,7 @@ class ThisEnvironment(Multiplied):
 
         if multiplier is not None:
             return most(multiplier)[0]
-        usual, hardest = most(tuple(v for each in self.unknowns(loop) for v in each.start or each.units))
+        usual, hardest = most(self.usual(None, loop))
         best, _ = most(super().required(hardest, coupling).multiplier)
         return min(usual, best, key=lambda requirement: requirement.ratio)
 

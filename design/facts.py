@@ -13,7 +13,7 @@ import numpy as np
 
 from haptic_loop.controller.arithmetic import Number, numbers, rational
 from haptic_loop.controller.loop import Loop
-from haptic_loop.controller.lti import Array, Block, constant_like
+from haptic_loop.controller.lti import Array, Block, Lti, as_like, constant_like
 from haptic_loop.design.frame import Collected, Demand, Input, Weights, even_damping, less_advance
 
 Values = Mapping[str, Sequence[Any]]  # of the multipliers, by name
@@ -416,9 +416,7 @@ def compose(
     values = values or {}
     path: list[Weights] = [(1,)] * loop.channels
     if late:
-        switch = any(isinstance(fact, Switching) for fact in facts)
-        spans = zip(loop.delays.lo, loop.delays.hi, strict=True) if switch else zip(loop.theta, loop.theta, strict=True)
-        path = [[Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)] for lo, hi in spans]
+        path = _paths(loop, any(isinstance(fact, Switching) for fact in facts))
     hands, T = hands_side(loop), G.T
     walls = len(loop.environment.walls) if any(isinstance(fact, Walls) for fact in facts) else 0
     block: Collected[Block] = Collected(T, path, walls, hands.inputs(loop, T))
@@ -450,3 +448,32 @@ def _take(block: Collected[Any], hands: HandsSide, loop: Loop, values: Values, s
         rest[:1] = [damping - idle + (rest[0] if rest else 0)]
         damping = idle
     block.take(damping, rest)
+
+
+def _paths(loop: Loop, switch: bool) -> list[Weights]:
+    """The weights of Theta, channel by channel; of delays that switch the mean of both ends."""
+    spans = zip(loop.delays.lo, loop.delays.hi, strict=True) if switch else zip(loop.theta, loop.theta, strict=True)
+    return [[Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)] for lo, hi in spans]
+
+
+def compose_any(
+    V: Block, loop: Loop, facts: Sequence[Fact] = (), values: Values | None = None, scaled: bool = False
+) -> Demand[Block]:
+    """The block of the loop's hands' side before any passive object behind the coupling V, without delay in between.
+
+    On the inputs of hands and facts and, last in the order of rows, df_e, the steps of the forces as they leave: its
+    own row is V(1)/2 - (V - V(1))/(z-1). Raises ValueError for values that are no multipliers.
+    """
+    values, hands, T = values or {}, hands_side(loop), V.T
+    path = _paths(loop, any(isinstance(fact, Switching) for fact in facts))
+    block: Collected[Lti] = Collected(T, path, 0, hands.inputs(loop, T), any_object=True)
+    _take(block, hands, loop, values, scaled)
+    for fact in facts:
+        fact.enter(block, loop, values)
+    steps = [block.input("df_e", i) for i in range(loop.channels)]
+    for i, row in enumerate(steps):
+        block.force(row, i, (1,))
+    _, free, gain = block.build(None)
+    V1, regular = V.over_z_minus_one()
+    place = np.eye(block.size, dtype=int)[:, steps]
+    return Demand(as_like(V, free) - place @ regular @ place.T, constant_like(V, gain), {"V(1)": V1})

@@ -108,7 +108,14 @@ class Input:
 class Collected(Generic[AnyBlock]):
     """What hands' side and facts enter: inputs, weights of forces, rows, and constant terms."""
 
-    def __init__(self, T: Number, path: Sequence[Weights], walls: int, hands: Sequence[Input]) -> None:
+    def __init__(
+        self, T: Number, path: Sequence[Weights], walls: int, hands: Sequence[Input], any_object: bool = False
+    ) -> None:
+        """Begin with the rows of the hands' inputs.
+
+        With `any_object` the displacement that a force multiplies is relative to what a passive object behind the
+        forces as they leave does: x[k] - x[k-1] beside f_e[k] is taken off (docs/theory.md, "any environment").
+        """
         self.T, self.channels, self.walls = T, len(path), walls
         self.path, self.hands = path, hands  # path: per channel the weights of the nominal delay of its forces
         self.places: dict[tuple[str, int], int] = {}  # (name, channel or wall) -> input
@@ -122,8 +129,11 @@ class Collected(Generic[AnyBlock]):
         self._gain: list[tuple[int, int, Any]] = []
         self._keep: list[tuple[int, float]] = []
         for i in hands:
-            row = self.input(i.name, i.channel)
-            self.sums(row, i.channel, product(path[i.channel], i.moved))
+            row, weights = self.input(i.name, i.channel), product(path[i.channel], i.moved)
+            if any_object:
+                self.steps(row, i.channel, less_advance(weights, i.follows))
+                continue
+            self.sums(row, i.channel, weights)
             if i.follows:
                 self._into.append((i.channel, row, (1,)))
 

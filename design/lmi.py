@@ -24,14 +24,31 @@ from numpy.typing import NDArray
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
-from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.controller.lti import Array, Block, Lti, Sampled
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design import conditions
-from haptic_loop.design.conditions import Condition, Demand, delayed_environment_demand, even_damping, uncovered
+from haptic_loop.design.conditions import (
+    Demand,
+    asymmetric,
+    delayed_environment_demand,
+    even_damping,
+    uncovered,
+    unsound,
+)
 from haptic_loop.design.cone import ConeProgram, Inequality
+from haptic_loop.design.environments import Multiplied
 from haptic_loop.design.exact import require_size
+from haptic_loop.design.facts import Fact, HandsSide, Switching, Unknowns, compose_any, hands_side
 from haptic_loop.design.frequency import Response, frequencies, on_circle, supremum
-from haptic_loop.design.result import DesignFailed, Environments, Infeasible, NotProved, Requirement, refusal
+from haptic_loop.design.result import (
+    DesignFailed,
+    Environments,
+    Infeasible,
+    NotProved,
+    Requirement,
+    from_ratio,
+    refusal,
+)
 
 #: Designs ask for (1 - RESERVE) of the available damping, so that they are certified as stored.
 RESERVE = 1e-4
@@ -278,25 +295,45 @@ def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
     )
 
 
-#: Why any-environment says nothing of forces that latch between ticks.
-LATE = "a latency of a fraction of a sample is derived for this environment only: count it as a whole sample of theta"
-
-
-class _AnyEnvironment(Condition):
+class _AnyEnvironment(Multiplied):
     """Theorem 4 of the paper: safe around every passive environment; with psi >= 1 around this one.
 
-    Its multiplier is then Phi (m,) [N s/m]. Walls are covered without delay in the environment, and refused with it.
+    Its multiplier is then Phi (m,) [N s/m]. Walls are covered without delay in the environment, and refused with it; so
+    are a latency and delays that switch, which have a block of their own (design.facts.compose_any).
     """
 
     name, source, separable = "any-environment", "the paper's Theorem 4", True
-    covers = tuple(name for name in conditions.BEYOND if name != "latency")
+    covers = conditions.BEYOND
 
-    def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
+    def facts(self, loop: Loop) -> tuple[Fact, ...]:
+        """The facts of the environment's side that its block needs."""
+        return (Switching(),) if loop.varying_delay else ()
+
+    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
+        return tuple(each for part in (hands_side(loop), *self.facts(loop)) for each in part.unknowns(loop))
+
+    def hands(self, loop: Loop) -> HandsSide | None:
+        hands = hands_side(loop)
+        return hands if hands.unknowns(loop) else None
+
+    def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
         V = coupling.compliance(loop.period(exact))
         assert V is not None  # where it is None, `required` refuses
         if exact:
-            require_size(V.order + sum(loop.theta))
-        return conditions.any_environment_demand(V, loop)
+            require_size(V.order + sum(loop.delays.hi))
+        return V
+
+    def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
+        return self._composed(G, loop, multiplier)
+
+    def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
+        return self._composed(G, loop, multiplier, scaled=True)
+
+    def _composed(self, V: Block, loop: Loop, multiplier: Any, scaled: bool = False) -> Demand[Block]:
+        if not _in_frame(loop):
+            return conditions.any_environment_demand(V, loop)
+        values = self.named(loop, () if multiplier is None else multiplier)
+        return compose_any(V, loop, self.facts(loop), values, scaled)
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
         """The least Phi, None where none is needed; and why it says nothing of the loop, whatever the coupling."""
@@ -312,9 +349,10 @@ class _AnyEnvironment(Condition):
             return "with delay in the environment its multiplier is of a linear one: no walls"
         if loop.levels and any(loop.psi):
             return f"{conditions.FULL_LEVELS} where the environment is late (psi >= 1)"
-        if loop.varying_delay:
-            return "delays that switch are covered in one environment: ask this-environment, or for a constant delay"
-        return LATE if loop.latency else None
+        if _in_frame(loop) and any(loop.psi):
+            what = "a latency" if loop.latency else "delays that switch"
+            return f"with delay in the environment its multiplier is of whole, constant samples: no {what}"
+        return None
 
     def not_varied(self, loop: Loop) -> str | None:
         return (
@@ -323,6 +361,8 @@ class _AnyEnvironment(Condition):
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
         V = coupling.compliance(loop.T)
+        if V is not None and _in_frame(loop):
+            return partial(conditions.least_scale, self.block(V, loop, multiplier or self.usual(None, loop)))
         phi = multiplier if any(loop.psi) else None
         if V is None or (phi is None and any(loop.psi)):
             return None
@@ -330,7 +370,14 @@ class _AnyEnvironment(Condition):
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
         count = len(coupling.sampled(np.array([[1j]]), loop.T).G)
-        return conditions.any_environment_ratios(lambda z: coupling.sampled(z, loop.T), count, loop, multiplier)
+
+        def demand(V: Sampled) -> Demand[Sampled]:
+            """The block, with the usual multipliers of a latency in a range and of delays that switch."""
+            if _in_frame(loop):
+                return self.block(V, loop, self.usual(None, loop))
+            return conditions.any_environment_demand(V, loop, multiplier)
+
+        return conditions.any_environment_ratios(lambda z: coupling.sampled(z, loop.T), count, loop, demand)
 
     def _without(self, coupling: Coupling) -> str:
         """Why it says nothing of a coupling that has no V(z)."""
@@ -343,6 +390,8 @@ class _AnyEnvironment(Condition):
         reason, V = self.beyond(loop), coupling.compliance(loop.T)
         if reason or V is None:
             return refusal(self.name, loop.delta, reason or self._without(coupling))
+        if _in_frame(loop):
+            return self._in_frame(V, loop, multiplier)
         if not any(loop.psi):
             channels = None if loop.levels else coupling.channels(loop.T)
             if channels:
@@ -357,9 +406,23 @@ class _AnyEnvironment(Condition):
         found = conditions.any_environment(V, loop, np.array([float(p) for p in multiplier]))
         return replace(found, multiplier=tuple(multiplier))
 
+    def _in_frame(self, V: Lti, loop: Loop, multiplier: Any) -> Requirement:
+        if self.unknowns(loop):
+            return self.required_of(V, loop, multiplier)
+        asked = self.block(V, loop)
+        if not V.is_stable():
+            return refusal(self.name, loop.delta, "the coupling V has a pole on or outside the unit circle")
+        if reason := unsound(asked.free, loop.delta) or self.unsound_static(V, loop, asked):
+            return refusal(self.name, loop.delta, reason)
+        ratio, w = supremum(partial(conditions.least_scale, asked), np.concatenate([[0.0], frequencies(V)]))
+        return from_ratio(self.name, ratio, loop.delta, w / (2 * np.pi * loop.T))
+
+    def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
+        return asymmetric(asked.static["V(1)"])
+
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
         if not any(loop.psi):
-            return super().exact_demands(loop, coupling)
+            return super().exact_demands(loop, coupling, multiplier)
         T = loop.period(exact=True)
         V = coupling.compliance(T)
         assert V is not None
@@ -371,19 +434,24 @@ class _AnyEnvironment(Condition):
         }
 
     def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
-        return {"Phi": loop.channels} if any(loop.psi) else {}
+        return {"Phi": loop.channels} if any(loop.psi) else super().multiplier_sizes(loop)
 
     def members(self, loop: Loop) -> tuple[Member, ...]:
         return ()
 
     def lag(self, loop: Loop) -> tuple[float, ...] | None:
-        return None if any(loop.psi) or loop.varying_delay else (0.0,) * loop.channels
+        return None if any(loop.psi) else (0.0,) * loop.channels
 
     def guarantee(self, loop: Loop) -> Environments:
         return "this environment" if any(loop.psi) else "any passive environment"
 
 
 ANY_ENVIRONMENT = _AnyEnvironment()
+
+
+def _in_frame(loop: Loop) -> bool:
+    """Whether the block is one of the frame, because forces latch late or their delays switch."""
+    return bool(loop.latency or loop.varying_delay)
 
 
 # ----------------------------------------------------------------------------------------------------

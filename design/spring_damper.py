@@ -22,6 +22,7 @@ from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import even_damping, theta_hat, this_environment
 from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.environments import LIMITER
+from haptic_loop.design.facts import Latency
 from haptic_loop.design.frequency import on_circle, peaks, too_long
 from haptic_loop.design.gain_search import (
     FEW,
@@ -505,11 +506,85 @@ def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
     """
     if condition == KNOWN_DEVICE_ANY.name:
         return stiffest_linear(loop)
+    if (loop.latency or loop.varying_delay) and not ANY_ENVIRONMENT.beyond(loop):
+        return _stiffest_in_frame(loop)
     started = time.perf_counter()
     phi = least_phi(loop)
     weight, terms = loop.T / (2 * even_damping(loop)), np.array(loop.theta) + 1
     coupling = MovingAverage(weight, terms.tolist(), RESERVE / (1 - RESERVE) * terms**2 * weight)
     return _verified(loop, coupling, phi, "stiffness", float(coupling.stiffness.sum()), 0, started)
+
+
+def _stiffest_in_frame(loop: Loop) -> Design:
+    """The stiffest linear coupling for any environment where forces latch late or delays switch; N/m, all together.
+
+    He[V/(1-z)] = chi is attained by V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k, whose series is finite, and V(1)/2 is the
+    mean of chi (docs/theory.md). The multiplier of least mean is found by a convex program, or in closed form.
+    """
+    if loop.latency and loop.varying_delay:
+        line = (
+            "moving-average: no series is known for a latency and delays that switch together, ask for a spring-damper"
+        )
+        raise DesignFailed(None, (), line)
+    started, channels = time.perf_counter(), []
+    chi = _late_chi if loop.latency else _switched_chi
+    for i in range(loop.channels):
+        terms = chi(loop, i)
+        weights = 2 * -np.diff(np.append(terms, 0.0))
+        weights[0] += 2 * RESERVE * terms[0]
+        channels.append(taps([float(f"{v:.{_TAP_DIGITS}g}") for v in weights], loop.T))
+    V = Lti.diag(*channels)
+    return _verified(loop, Compliance(V), None, "stiffness", float((1 / np.diag(V.dc())).sum()), 0, started)
+
+
+def _late_chi(loop: Loop, i: int) -> Array:
+    """chi_0, chi_1, .. of l (Q delta)^-1 l*/4 with l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta], with the best Q."""
+    (first, last), theta = (loop.latency or ())[i], loop.theta[i]
+    inverse = np.diag([last, (loop.T_max or loop.T) - first])
+    if first < last:
+        inverse = np.linalg.inv(_best_charge(loop, i, theta))
+    windows = np.array([np.ones(theta + 2), [*np.ones(theta + 1), 0.0]])
+    pairs = [(a, b) for a in (0, 1) for b in (0, 1)]
+    terms = [inverse[a, b] * np.correlate(windows[a], windows[b], "full")[theta + 1 :] for a, b in pairs]
+    return np.sum(terms, axis=0) / (4 * (1 - RESERVE) * loop.delta[i])
+
+
+def _switched_chi(loop: Loop, i: int) -> Array:
+    """chi_0, .. of |vt|^2/(4 (delta/T - alpha/2)) + h^2/(2 alpha), vt the mean window, at the alpha of least chi_0."""
+    lo, hi = loop.delays.lo[i], loop.delays.hi[i]
+    damping, half = (1 - RESERVE) * loop.delta[i] / (loop.T_max or loop.T), (hi - lo) / 2
+    window = np.where(np.arange(hi + 1) > lo, 0.5, 1.0)
+    square = np.correlate(window, window, "full")[hi:]
+    if not half:
+        return square / (4 * damping)
+    alpha = 2 * half * damping / (np.sqrt(square[0]) + half)
+    terms = square / (4 * (damping - alpha / 2))
+    terms[0] += half**2 / (2 * alpha)
+    return terms
+
+
+def _best_charge(loop: Loop, i: int, theta: int) -> Array:
+    """Q (2, 2) [1/s] of least trace of Q^-1 M, M the inner products of the windows of theta + 2 and theta + 1 terms."""
+    hands, scale = Latency(), 1 / loop.T
+    root = np.linalg.cholesky(np.array([[theta + 2.0, theta + 1.0], [theta + 1.0, theta + 1.0]]))
+    one = loop.channel(i)
+
+    def allowed(x: Array) -> Array:
+        (room,) = hands.room(one, {name: (scale * v,) for name, v in zip(_Q, x[:3], strict=True)}, 1.0)
+        return room
+
+    def cost(x: Array) -> Array:
+        Q, X = symmetric_from(x[:3], 2), symmetric_from(x[3:], 2)
+        return np.block([[X, root.T], [root, Q]])
+
+    objective = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 1.0])
+    blocks = [Inequality.of(allowed, range(6)), Inequality.of(cost, range(6))]
+    x = ConeProgram(objective, blocks).solve("the charge of a latency")
+    found = hands.allowed(one, {name: (scale * v,) for name, v in zip(_Q, x[:3], strict=True)})
+    return symmetric_from(np.array([found[name][0] for name in _Q]), 2)
+
+
+_Q = "q11", "q12", "q22"
 
 
 def _verified(

@@ -10,10 +10,12 @@ from scipy.linalg import expm
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.design.api import design_coupling
 from haptic_loop.design.certificate import prove, required_damping, verify
 from haptic_loop.design.conditions import FACTS
 from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.environments import THIS_ENVIRONMENT, LimitedForces
+from haptic_loop.design.lmi import ANY_ENVIRONMENT
 
 change = msgspec.structs.replace
 BARE, COUPLING = NoCoupling(), SpringDamper([1000.0], [0.5])
@@ -108,7 +110,7 @@ def test_every_combination_is_proved_stored_and_verified(names):
 HANDS, TICKS = 60, 12000
 
 
-def growing(loop, coupling, damping, rho, limit=3.0, seed=5):
+def growing(loop, coupling, damping, rho, limit=3.0, seed=5, ticks=TICKS):
     """How many lossless hands have more energy at the end than in the middle, at worst ages and latencies.
 
     At every tick the force of each age and each end of the latency is tried, and the one that gives most energy acts.
@@ -127,7 +129,7 @@ def growing(loop, coupling, damping, rho, limit=3.0, seed=5):
     plant = rng.standard_normal((HANDS, 2)) * (1e-2, 0.1)
     before, after = np.zeros((2, law.open.order + 1, HANDS))
     forces, applied, energy = [np.zeros(HANDS)] * (hi + 1), np.zeros(HANDS), np.zeros((2, HANDS))
-    for k in range(TICKS):
+    for k in range(ticks):
         before[-1] = plant[:, 0]
         tick(before, after)
         before[:-1] = after[1:]
@@ -144,7 +146,7 @@ def growing(loop, coupling, damping, rho, limit=3.0, seed=5):
         if most.max() > 1e6:  # [J] of hands that began with less than 0.02
             return int((most > 1.0).sum())
         plant, applied = best, used
-        at = 0 if 0.4 * TICKS < k < 0.5 * TICKS else 1 if k > 0.9 * TICKS else None
+        at = 0 if 0.4 * ticks < k < 0.5 * ticks else 1 if k > 0.9 * ticks else None
         if at is not None:
             energy[at] = np.maximum(energy[at], most)
     return int((energy[1] > 1.02 * energy[0]).sum())
@@ -160,3 +162,96 @@ def test_no_hand_gains_energy_at_the_requirement(names):
 def test_some_hands_gain_energy_far_below_the_requirement(names):
     loop, rho = combined(names)
     assert growing(loop, COUPLING, 0.5 * need(loop, COUPLING, rho), rho) > 0
+
+
+# Before any passive environment behind a coupling.
+
+ANYWHERE = SpringDamper([1000.0], [0.1])
+LATE, SWITCHED = {"latency": ((0.13e-3, 0.4e-3),)}, {"varying_delay": DelayRange((0,), (1,))}
+
+
+def anywhere(further, delta=10.0, coupling=ANYWHERE, **network):
+    loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1000.0),), **network), delta=delta, **further)
+    return loop, required_damping(loop, coupling, ANY_ENVIRONMENT).required[0]
+
+
+@pytest.mark.parametrize(
+    ("further", "theta", "needs"),
+    [
+        ({"latency": ((0.13e-3, 0.13e-3),)}, 0, 0.795),  # K (T + 3 tau)/2
+        ({"latency": ((0.0, 0.13e-3),)}, 0, 0.795),
+        ({"varying_delay": DelayRange((0,), (1,))}, 0, 2.4),  # (hi + 1)^2 K T/2
+        ({"varying_delay": DelayRange((0,), (2,))}, 0, 5.4),
+        ({"varying_delay": DelayRange((1,), (3,))}, 1, 9.6),
+    ],
+)
+def test_a_spring_before_any_environment_needs_the_closed_form(further, theta, needs):
+    loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1000.0),)), theta=theta, **further)
+    found = required_damping(loop, SpringDamper([1000.0], [0.0]), ANY_ENVIRONMENT)
+    assert found.required[0] == pytest.approx(needs, rel=1e-7)
+
+
+def test_the_requirement_before_any_environment_is_that_of_chi():
+    """He[V/(1-z)] against chi = (tau |1 + .. + z^-(theta+1)|^2 + (T - tau) |1 + .. + z^-theta|^2)/(4 delta)."""
+    tau, theta, T = 0.3e-3, 2, 1.2e-3
+    coupling = SpringDamper([900.0], [0.3])
+    loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1.0),)), T, theta, latency=((tau, tau),))
+    w = np.append(1e-5, np.linspace(1e-3, np.pi, 20001))
+    z = np.exp(1j * w)
+    V = 1 / (900.0 + 0.3 * (1 - 1 / z) / T)
+    windows = [abs(sum(z**-k for k in range(n + 1))) ** 2 for n in (theta + 1, theta)]
+    needs = ((tau * windows[0] + (T - tau) * windows[1]) / (4 * (V / (1 - z)).real)).max()
+    assert required_damping(loop, coupling, ANY_ENVIRONMENT).required[0] == pytest.approx(needs, rel=1e-7)
+
+
+@pytest.mark.parametrize("further", [LATE, SWITCHED, LATE | SWITCHED], ids=["latency", "switching", "both"])
+def test_any_environment_is_proved_stored_and_verified(further):
+    loop, least = anywhere(further)
+    enough = change(loop, delta=(1.001 * least,))
+    certificate = prove(enough, ANYWHERE, ANY_ENVIRONMENT)
+    there = {"latency": "latency", "switching": "varying_delay"}
+    assert certificate.facts == tuple(name for name in FACTS if there.get(name) in further)
+    stored = Stored.of(enough, ANYWHERE, certificate)
+    assert verify(msgspec.json.decode(msgspec.json.encode(stored), type=Stored)).proved
+    for name in certificate.multipliers:
+        fewer = {known: values for known, values in certificate.multipliers.items() if known != name}
+        assert not verify(change(stored, certificate=sealed(change(certificate, multipliers=fewer)))).proved
+    assert not required_damping(change(loop, delta=(0.999 * least,)), ANYWHERE, ANY_ENVIRONMENT).certified
+    assert "delay in the environment" in ANY_ENVIRONMENT.beyond(change(loop, psi=(1,)))
+
+
+def lossless(rng):
+    """A random chain of springs and masses from the tip to the ground."""
+    count = int(rng.integers(1, 4))
+    nodes = ["tip", *(f"node {i}" for i in range(1, count)), GROUND]
+    springs = tuple(Spring(pair, 10 ** rng.uniform(2, 6)) for pair in itertools.pairwise(nodes))
+    return Network(("tip",), springs, {node: 10 ** rng.uniform(-4, 0) for node in nodes[:-1] if rng.random() < 0.7})
+
+
+@pytest.mark.parametrize("limited", [False, True])
+@pytest.mark.parametrize("further", [LATE, SWITCHED, LATE | SWITCHED], ids=["latency", "switching", "both"])
+def test_no_hand_gains_energy_before_lossless_environments(further, limited):
+    """At worst ages and latencies, before walls with the limiter of no lag, too."""
+    rng = np.random.default_rng(11)
+    _, least = anywhere(further)
+    for seed in range(4):
+        network = change(lossless(rng), walls=(wall(3000.0, 2.0),) if limited else ())
+        loop = change(anywhere(further)[0], environment=network)
+        assert growing(loop, ANYWHERE, 1.01 * least, 0.0 if limited else None, 0.5, seed, 4000) == 0
+
+
+@pytest.mark.parametrize("further", [LATE, SWITCHED], ids=["latency", "switching"])
+def test_some_hands_gain_energy_before_a_stiff_spring_below(further):
+    loop, least = anywhere(further)
+    stiff = change(loop, environment=Network(("tip",), (Spring(("tip", GROUND), 1e6),)))
+    assert growing(stiff, ANYWHERE, 0.5 * least, None, ticks=6000) > 0
+
+
+@pytest.mark.parametrize(("theta", "tau"), [(0, 0.13e-3), (2, 0.5e-3)])
+def test_the_stiffest_coupling_counts_the_exact_latency(theta, tau):
+    """V(1) = ((theta + 1) T + tau)/(2 delta), which no linear coupling undercuts."""
+    loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1e3),)), theta=theta, latency=((tau, tau),))
+    found = design_coupling(loop, "moving-average", "any-environment")
+    limit = 2 / ((theta + 1) * 1.2e-3 + tau)
+    assert 0.999 * limit < 1 / found.coupling.compliance(1.2e-3).dc()[0, 0] < limit
+    assert prove(loop, found.coupling, "any-environment").proof == "rational"
