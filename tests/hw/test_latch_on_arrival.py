@@ -121,8 +121,8 @@ def test_a_session_replays_bit_for_bit(tmp_path, capsys):
     ("more", "said"),
     [
         (
-            ["--condition", "any-environment"],
-            "--latch arrival with --condition any-environment: a latency",
+            ["--condition", "any-environment", "--psi", "1"],
+            "--latch arrival with --condition any-environment: with delay in the environment",
         ),
         (["--energy-budget", "0.01"], "--energy-budget with --latch arrival"),
         (["--latency", "1e-4"], "latency: hw.bridge takes the ticks that it has"),
