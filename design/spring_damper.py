@@ -426,8 +426,8 @@ def _stiffest_channel(loop: Loop) -> tuple[float, float]:
     tried = [at(eta) for eta in _ETAS]
     best = int(np.argmin([value for value, _ in tried]))
     ends = _ETAS[max(best - 1, 0)], _ETAS[min(best + 1, _ETAS.size - 1)]
-    eta = minimize_scalar(lambda eta: at(eta)[0], bounds=ends, method="bounded", options={"xatol": 1e-6}).x
-    K, B = min(at(float(eta)), tried[best])
+    found: Any = minimize_scalar(lambda eta: at(eta)[0], bounds=ends, method="bounded", options={"xatol": 1e-6})
+    K, B = min(at(float(found.x)), tried[best])
     return float(f"{-K:.{_STIFF_DIGITS}g}"), float(f"{B:.{_STIFF_DIGITS}g}")
 
 
@@ -457,7 +457,8 @@ def stiffest_linear(loop: Loop) -> Design:
 
         best = int(np.argmin([needed(eta).mean() for eta in _ETAS]))
         ends = _ETAS[max(best - 1, 0)], _ETAS[min(best + 1, _ETAS.size - 1)]
-        eta = float(minimize_scalar(lambda eta: needed(eta).mean(), bounds=ends, method="bounded").x)
+        found: Any = minimize_scalar(lambda eta: needed(eta).mean(), bounds=ends, method="bounded")
+        eta = float(found.x)
         limits = needed(eta)
         series = np.fft.rfft(limits).real / _TAPS
         left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # of the terms from each on
