@@ -81,7 +81,7 @@ def main(argv: list[str]) -> int:
 
     begin = time.perf_counter()
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
-        limits = () if args.rigid else [device.force_limit for device in scenario.device]
+        limits = () if args.rigid else [device.force_limit for device in scenario.axis_devices]
         with options.refused():
             found = audit(loop, coupling, asked, args.seed, limits, move)
     notes = ()

@@ -180,7 +180,7 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
             ranges_samples=SAMPLES if args.samples is None else args.samples,
             searched=design.searched,
             limiter=args.limiter,
-            force_limit=tuple(device.force_limit for device in scenario.device),
+            force_limit=tuple(device.force_limit for device in scenario.axis_devices),
             band_hz=args.band_hz or BAND_HZ,
             progress=move,
         )

@@ -181,7 +181,7 @@ def _identified(scenario: Scenario, sittings: list[_Sitting]) -> _Report:
 
 def _table(e: Estimate, scenario: Scenario, i: int) -> str:
     """One [[device]] table for a scenario file; a transmission that was not found is the scenario's."""
-    device, mass = scenario.device[i], e.friction.mass
+    device, mass = scenario.axis_devices[i], e.friction.mass
     lines = ["[[device]]", f"damping = {e.viscous:.6g}", f"delta = {np.floor(1e6 * e.delta) / 1e6:.6f}"]
     speed = np.floor(1e3 * e.viscosity.speed) / 1e3
     lines.append(f"credible_speed = {speed:.3f}  # [m/s] of the record: delta is not known beyond it")

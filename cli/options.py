@@ -430,11 +430,11 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     names = ("theta", "psi", "lam", "latency", "delta", "T", "T_max")
     said = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
     changes: dict[str, Any] = {
-        name: value if name in ("T", "T_max") else per_channel(f"--{name}", value, scenario.channels)
+        name: value if name in ("T", "T_max") else per_channel(f"--{name}", value, len(scenario.device))
         for name, value in said.items()
     }
     if args.known_device:
-        bounds = per_channel("--known-device", args.known_device, scenario.channels)
+        bounds = per_channel("--known-device", args.known_device, len(scenario.device))
         with refused("--known-device: "):
             changes["device"] = tuple(map(_with_bounds, scenario.device, bounds))
     return scenario.replace(**changes) if changes else scenario

@@ -113,7 +113,7 @@ def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
 
 def _speed(args: argparse.Namespace, scenario: Scenario) -> float:
     """The speed [m/s] at which a session stops, within what the devices' damping is known for. Raises InputError."""
-    known = min(device.credible_speed for device in scenario.device)
+    known = min(device.credible_speed for device in scenario.axis_devices)
     if args.max_speed is None:
         return min(1.0, known)
     if args.max_speed > known:

@@ -40,15 +40,33 @@ def _check_amount(what: str, value: float, unit: str) -> None:
         raise ValueError(f"{what} is {value}, allowed are 0 to {MOST_AMOUNT[unit]:g} {unit} (a passive network)")
 
 
+_SAME_LENGTH = 1e-15  # relative: a direction that was normalised before is not changed again
+
+
+def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the direction with length 1. Raises ValueError where all its entries are zero."""
+    length = float(np.linalg.norm(direction))
+    if not 1e-9 < length < np.inf:
+        raise ValueError(f"{field} is {list(direction)}, expected a direction with finite entries that are not all 0")
+    return direction if abs(length - 1) <= _SAME_LENGTH else tuple(c / length for c in direction)
+
+
 class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A spring and a damper in parallel between two nodes."""
+    """A spring and a damper in parallel between two nodes, or points with several coordinates.
+
+    Between points it acts on every coordinate alike, or along one direction.
+    """
 
     between: tuple[str, str]
     stiffness: float  # [N/m]
     damping: float = 0.0  # [N s/m]
     inertance: float | msgspec.UnsetType = msgspec.UNSET  # [kg] of an inerter beside them
+    along: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # the direction, of unit length once it is built
 
     def __post_init__(self) -> None:
+        if self.along:
+            unit = _unit(f"along between {' and '.join(self.between)}", self.along)
+            msgspec.structs.force_setattr(self, "along", unit)
         for name, unit in (("stiffness", "N/m"), ("damping", "N s/m"), ("inertance", "kg")):
             _check_amount(f"{name} between {' and '.join(self.between)}", getattr(self, name) or 0.0, unit)
         if self.between[0] == self.between[1]:
@@ -60,15 +78,21 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A one-sided spring-damper: it pushes the first node back once it is `gap` beyond the second; see law.py."""
+    """A one-sided spring-damper: it pushes the first node back once it is `gap` beyond the second; see law.py.
+
+    Between points with several coordinates, beyond means further along `normal`, the direction into the wall.
+    """
 
     between: tuple[str, str]
     stiffness: float  # [N/m]
     damping: float = 0.0  # [N s/m], only while in contact, and never pulling
     gap: float = 0.0  # [m] free way from rest; negative where it is compressed at rest
+    normal: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # of unit length once it is built
 
     def __post_init__(self) -> None:
         ends = " and ".join(self.between)
+        if self.normal:
+            msgspec.structs.force_setattr(self, "normal", _unit(f"normal of the wall between {ends}", self.normal))
         for name, unit in (("stiffness", "N/m"), ("damping", "N s/m")):
             _check_amount(f"{name} of the wall between {ends}", getattr(self, name), unit)
         if self.stiffness == 0:
@@ -291,6 +315,7 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
     block: Block | None = None  # beside all these, of E(z) what is known by its numbers alone
     elements: tuple[Any, ...] = ()  # of one's own: their parts are put among springs and walls
     world: World | None = None  # in place of everything else
+    points: dict[str, tuple[str, ...]] = {}  # the coordinates of each point in space, nodes or ground where it is held
 
     def __post_init__(self) -> None:
         if self.world:
@@ -306,15 +331,18 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
             raise ValueError(f"block has {len(self.block.D)} channels, expected {len(self.contacts)}, as contacts")
         if len(set(self.contacts)) < len(self.contacts) or GROUND in self.contacts:
             raise ValueError(f"contacts must be different names other than {GROUND!r}, got {list(self.contacts)}")
+        for part in (*self.springs, *self.walls):
+            self._check_axes(part)
         nodes = self.nodes()
         for what, count, most in (("nodes", len(nodes), _MOST_NODES), ("springs", len(self.springs), _MOST_PARTS)):
             if count > most:
                 raise ValueError(f"the network has {count} {what}, allowed are {most}")
         for name, mass in self.masses.items():
             _check_amount(f"mass of {name!r}", mass, "kg")
-            if name not in nodes:
+            if not set(self.coordinates(name)) <= {*nodes, GROUND}:
                 raise ValueError(f"masses names {name!r}, which no spring reaches; nodes: {', '.join(nodes)}")
-        held = {node for part in (*self.springs, *self.walls) for node in part.between} | set(self.masses)
+        ends = [node for part in (*self.springs, *self.walls) for node in part.between]
+        held = {node for end in (*ends, *self.masses) for node in self.coordinates(end)}
         loose = [n for n in self.contacts if n not in held and not self.block]
         if loose:
             raise ValueError(f"contact {loose[0]!r} has neither spring nor mass nor wall, so it can render no force")
@@ -356,10 +384,30 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         walls = itertools.product((False, True), repeat=len(self.walls))
         return tuple(held(self, touching) for touching in walls)
 
+    def coordinates(self, end: str) -> tuple[str, ...]:
+        """The nodes of a point in space; any other name is a node itself."""
+        return self.points.get(end, (end,))
+
+    def _check_axes(self, part: Spring | Wall) -> None:
+        """Raise ValueError unless both ends and the direction of a part have equally many coordinates."""
+        ends = [(end, len(self.coordinates(end))) for end in part.between if end != GROUND]
+        counts = {n for _, n in ends}
+        what = f"between {' and '.join(part.between)}"
+        if len(counts) > 1:
+            shown = ", ".join(f"{end} has {n}" for end, n in ends)
+            raise ValueError(f"the part {what} joins points with different numbers of axes: {shown}")
+        name = "along" if isinstance(part, Spring) else "normal"
+        axes, direction = max(counts, default=1), getattr(part, name)
+        if direction and len(direction) != axes:
+            raise ValueError(f"{name} {what} is {list(direction)}, expected {axes} numbers, one for each axis")
+        if isinstance(part, Wall) and axes > 1 and not direction:
+            raise ValueError(f"the wall {what} has no normal, expected {axes} numbers: the direction into the wall")
+
     def nodes(self) -> list[str]:
         """Contacts first, then internal nodes in the order of their first mention."""
-        ends = (node for part in (*self.springs, *self.walls) for node in part.between if node != GROUND)
-        return list(dict.fromkeys((*self.contacts, *ends)))
+        ends = (end for part in (*self.springs, *self.walls) for end in part.between)
+        inner = (node for end in ends for node in self.coordinates(end) if node != GROUND)
+        return list(dict.fromkeys((*self.contacts, *inner)))
 
     def matrices(self, number: Callable[[float], Any] = float) -> tuple[Array, Array, Array]:
         """Mass [kg], damping [N s/m] and stiffness [N/m] over `nodes()`, each (nodes, nodes).
@@ -367,23 +415,45 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         `number` makes the entries: float, or an exact type such as Fraction.
         """
         index = {name: i for i, name in enumerate(self.nodes())}
-        M = np.diag([number(self.masses.get(name, 0.0)) for name in index])
+        mass = {node: amount for end, amount in self.masses.items() for node in self.coordinates(end)}
+        M = np.diag([number(mass.get(name, 0.0)) for name in index])
         D, K = np.zeros_like(M), np.zeros_like(M)
         for spring in self.springs:
-            ends = [(index[node], sign) for node, sign in zip(spring.between, (1, -1), strict=True) if node != GROUND]
-            for whole, amount in zip((M, D, K), spring.amounts(number), strict=True):
-                for (i, one), (j, other) in itertools.product(ends, ends):
-                    whole[i, j] += one * other * amount
+            amounts = spring.amounts(number)
+            for ends in self._lengths(spring):
+                places = [(index[node], int(sign) if sign in (1, -1) else number(sign)) for node, sign in ends]
+                for whole, amount in zip((M, D, K), amounts, strict=True):
+                    for (i, one), (j, other) in itertools.product(places, places):
+                        whole[i, j] += one * other * amount
         return M, D, K
 
-    def across(self, parts: Sequence[Spring | Wall]) -> NDArray[np.int64]:
-        """The displacement across each part, as rows over `nodes()`: +1 at its first end, -1 at its second."""
+    def _lengths(self, part: Spring | Wall) -> list[list[tuple[str, float]]]:
+        """The lengths that a part acts on, each as nodes with their coefficients: one a coordinate, or one in all."""
+        direction = part.along if isinstance(part, Spring) else part.normal
+        ends = [(self.coordinates(end), sign) for end, sign in zip(part.between, (1, -1), strict=True) if end != GROUND]
+        count = len(ends[0][0]) if ends else 0
+        if not direction:
+            return [[(nodes[i], sign) for nodes, sign in ends if nodes[i] != GROUND] for i in range(count)]
+        signed = [(node, sign * c) for nodes, sign in ends for node, c in zip(nodes, direction, strict=True)]
+        return [[(node, c) for node, c in signed if c and node != GROUND]]
+
+    def joined(self, part: Spring | Wall) -> list[list[str]]:
+        """The nodes that each length of a part joins; ground stands for a missing end."""
+        free = [[node for node, _ in ends] for ends in self._lengths(part)]
+        return [nodes if len(nodes) > 1 else [*nodes, GROUND] for nodes in free if nodes]
+
+    def across(self, parts: Sequence[Spring | Wall]) -> Array:
+        """The displacement across each part, as rows over `nodes()`: +1 at its first end, -1 at its second.
+
+        Between points with several coordinates the part has a direction, whose entries take the place of 1.
+        """
         index = {name: i for i, name in enumerate(self.nodes())}
-        rows = np.zeros((len(parts), len(index)), dtype=int)
-        for row, part in zip(rows, parts, strict=True):
-            for node, sign in zip(part.between, (1, -1), strict=True):
-                if node != GROUND:
-                    row[index[node]] = sign
+        lengths = [self._lengths(part) for part in parts]
+        whole = all(sign in (1, -1) for ends in lengths for _, sign in ends[0])
+        rows = np.zeros((len(parts), len(index)), dtype=int if whole else float)
+        for row, ends in zip(rows, lengths, strict=True):
+            for node, sign in ends[0]:
+                row[index[node]] = sign
         return rows
 
 
@@ -430,6 +500,7 @@ def environment(network: Network, T: Number) -> Lti:
 def walled_environment(network: Network, T: Number) -> Lti:
     """[x; p] -> [f; y]: as `environment`, wall forces p [N] put in and displacements y [m] across walls out."""
     across = network.across(network.walls)
+    across = across if across.dtype == int else numbers(across, T)
     adrift = _adrift(network, (*network.springs, *network.walls))
     E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, across, adrift), T)
     if not network.block:
@@ -455,7 +526,9 @@ def _adrift(network: Network, springs: Sequence[Spring | Wall]) -> list[list[int
 
     for spring in springs:
         if spring.stiffness > 0:
-            body[head(spring.between[0])] = head(spring.between[1])
+            for first, *others in network.joined(spring):
+                for other in others:
+                    body[head(first)] = head(other)
     held, inner = {head(name) for name in (*network.contacts, GROUND)}, names[len(network.contacts) :]
     groups: dict[str, list[int]] = {}
     for i, name in enumerate(inner):
@@ -472,14 +545,31 @@ def _solvable(network: Network, T: Number) -> _Matrices:
     inner = slice(len(network.contacts), None)
     if free and np.linalg.cond((M / T + D + T * K)[inner, inner]) > 1e14:
         raise ValueError(f"an internal node among {', '.join(free)} has no mass and nothing that holds it")
+    if network.points:
+        _check_held(network, K[inner, inner], free)
     return M, D, K
+
+
+_SLACK = 1e-9  # of the largest stiffness: less is rounding of directions, which are known to 1e-16
+
+
+def _check_held(network: Network, K: Array, names: Sequence[str]) -> None:
+    """Raise ValueError for a body in space that springs hold in some of its directions only, skew to the axes."""
+    adrift = _adrift(network, network.springs)
+    loose = {i for group in adrift for i in group}
+    held = [i for i in range(len(names)) if i not in loose]
+    for group, free in ((held, 0), *((group, 1) for group in adrift)):
+        stiffness = np.linalg.eigvalsh(K[np.ix_(group, group)])
+        if stiffness.size > free and stiffness[free] <= _SLACK * stiffness[-1]:
+            shown = ", ".join(names[i] for i in group)
+            raise ValueError(f"springs hold {shown} in some directions only: add one `along` a direction without any")
 
 
 def _realise(
     matrices: _Matrices,
     c: int,
     T: Any,
-    across: NDArray[np.int64] | None = None,
+    across: Array | None = None,
     adrift: Sequence[Sequence[int]] = (),
 ) -> tuple[Array, Array, Array, Array]:
     """A, B, C, D of the network (M, D, K) whose first `c` nodes are contacts; see `environment`.
@@ -542,5 +632,5 @@ def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
     """The network with the touching walls (default: all) as two-sided springs, without the others."""
     touching = [True] * len(network.walls) if touching is None else touching
     walls = zip(network.walls, touching, strict=True)
-    springs = (Spring(w.between, on * w.stiffness, on * w.damping) for w, on in walls)
+    springs = (Spring(w.between, on * w.stiffness, on * w.damping, along=w.normal) for w, on in walls)
     return msgspec.structs.replace(network, springs=(*network.springs, *springs), walls=())

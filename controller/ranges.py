@@ -165,8 +165,9 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
     a, b = uncertain.between
     field = f"ranges.springs between {a} and {b}"
     for node in (a, b):
-        if node not in (*network.nodes(), GROUND):
-            raise ValueError(f"{field}: there is no node {node!r}; nodes: {', '.join(network.nodes())}, ground")
+        if node not in (*network.points, *network.nodes(), GROUND):
+            names = network.points or network.nodes()
+            raise ValueError(f"{field}: there is no node {node!r}; nodes: {', '.join(names)}, ground")
     found = [spring for spring in network.springs if set(spring.between) == {a, b}]
     if any(spring.inertance for spring in found):
         raise ValueError(f"{field}: the spring there has an inertance, and ranges are of stiffness and damping")
@@ -185,36 +186,37 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
     if not uncertain.absent and stiffness[0] == stiffness[1] and damping[0] == damping[1]:
         raise ValueError(f"{field}: nothing is uncertain; give stiffness or damping a range, or absent = true")
     pairs = dict.fromkeys(product(stiffness, damping))
-    corners = [Spring(own.between, k, d) for k, d in pairs]
-    absent = Spring(own.between, 0.0, 0.0)
+    corners = [Spring(own.between, k, d, along=own.along) for k, d in pairs]
+    absent = Spring(own.between, 0.0, 0.0, along=own.along)
     if uncertain.absent and absent not in corners:
         corners.append(absent)
 
     def draw(rng: np.random.Generator) -> Spring:
         k, d, coin = rng.uniform(stiffness[0], stiffness[1]), rng.uniform(damping[0], damping[1]), rng.random()
-        return absent if uncertain.absent and coin < 0.5 else Spring(own.between, k, d)
+        return absent if uncertain.absent and coin < 0.5 else Spring(own.between, k, d, along=own.along)
 
-    states = [_spring_state(own.between, stiffness, damping)]
+    states = [_spring_state(own, stiffness, damping)]
     if uncertain.absent:
         states.append(_State((), lambda _: absent))
     return _Part(f"{a}-{b}", tuple(corners), own, draw, tuple(states))
 
 
-def _spring_state(between: tuple[str, str], stiffness: _Range, damping: _Range) -> _State:
+def _spring_state(own: Spring, stiffness: _Range, damping: _Range) -> _State:
     """A spring that is present; a range of no width is not a coordinate."""
     free = [low < high for low, high in (stiffness, damping)]
 
     def value(point: Sequence[float]) -> Spring:
         given = iter(point)
         k, d = (next(given) if f else limits[0] for f, limits in zip(free, (stiffness, damping), strict=True))
-        return Spring(between, float(k), float(d))
+        return Spring(own.between, float(k), float(d), along=own.along)
 
     return _State(tuple(r for f, r in zip(free, (stiffness, damping), strict=True) if f), value)
 
 
 def _mass_part(network: Network, node: str, limits: _Range) -> _Part:
-    if node not in network.nodes():
-        raise ValueError(f"ranges.masses names {node!r}, which no spring reaches; nodes: {', '.join(network.nodes())}")
+    if node not in (*network.points, *network.nodes()):
+        names = network.points or network.nodes()
+        raise ValueError(f"ranges.masses names {node!r}, which no spring reaches; nodes: {', '.join(names)}")
     own = network.masses.get(node, 0.0)
     _require_inside(f"ranges.masses.{node}", limits, own, "kg")
     if limits[0] == limits[1]:
@@ -244,7 +246,7 @@ def _member(name: str, network: Network, parts: Sequence[_Part], values: Sequenc
         else:
             springs.append(value)
     labels = "; ".join(part.label(value) for part, value in zip(parts, values, strict=True))
-    return Member(f"{name} ({labels})", Network(network.contacts, tuple(springs), masses))
+    return Member(f"{name} ({labels})", Network(network.contacts, tuple(springs), masses, points=network.points))
 
 
 def _check_inside(field: str, uncertain: UncertainSpring, own: Spring) -> None:

@@ -17,12 +17,13 @@ Where delays vary, Theta is not in the block: its forces pass through a line tha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haptic_loop.controller.budget import NetFigures
 from haptic_loop.controller.delay import HeldLine, Ticks, packet_delays
@@ -33,6 +34,7 @@ from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen
 RunBlock = Callable[[int], None]  # so many ticks from row 0 on
 
 _PART = 128  # ticks of a block whose memory and views stay in the cache
+_ROUNDED = 1e-14  # relative: a force vector that was scaled to its limit is no shorter than this below it
 _CALM = 1 - 1e-9  # of the limiter's forces: above that they are being limited
 
 
@@ -64,6 +66,7 @@ class Process(ReadOnly):
     encoder_step: Array  # (m,) [m], 0 for an ideal encoder
     delays: Ticks | None = None  # (ticks, m, nsim or 1) of every packet [samples], in place of Theta; None: constant
     net: Callable[[int], Net] | None = None  # a fresh one for so many simulations; it takes delays
+    balls: tuple[slice, ...] = ()  # neighbouring channels with one limit, which bounds the length of their force vector
 
     def __post_init__(self) -> None:
         for name in ("force_limit", "encoder_step"):
@@ -120,7 +123,22 @@ class Process(ReadOnly):
     def applied(self, force: Array, out: Array | None = None) -> Array:
         """What the actuators make of forces (.., m, nsim) [N] that are asked of them."""
         high = self.force_limit[:, None]
+        for ball in self.balls:  # what clips a vector shortens it and keeps its direction
+            force = force if out is not None else force.copy()
+            vector = force[..., ball, :]
+            length = np.linalg.norm(vector, axis=-2, keepdims=True)
+            limit = high[ball.start]
+            np.multiply(vector, np.divide(limit, length, out=np.ones_like(length), where=length > limit), out=vector)
         return np.maximum(np.minimum(force, high, out=out), -high, out=out)
+
+
+def at_limit(force: Array, force_limit: Array, balls: Sequence[slice] = ()) -> NDArray[np.bool_]:
+    """Where forces (ticks, m, nsim) are at limits (m,) [N] of the actuators; in a ball all of its channels are."""
+    clipped = np.abs(force) >= force_limit[:, None]
+    for ball in balls:
+        length = np.linalg.norm(force[:, ball], axis=1, keepdims=True)
+        clipped[:, ball] = length >= force_limit[ball.start] * (1 - _ROUNDED)
+    return clipped
 
 
 class StepBuffer:
@@ -163,7 +181,10 @@ class StepBuffer:
         self._straight = nsim == 1 and not (self._quantised or process.walls or self._line or self.net)
         #: whether to try the next ticks by the linear law alone: nothing can bend it but limits that are far now
         self.calm = self._straight
-        bounds, most = process.ticked.bounds, process.force_limit.tolist()
+        bounds, most = process.ticked.bounds, process.force_limit.copy()
+        for ball in process.balls:  # within this box no vector is longer than the limit
+            most[ball] /= (ball.stop - ball.start) ** 0.5
+        most = most.tolist()
         within = bool(bounds) and self.net is None
         within &= all(limit <= largest for (_, limit), largest in zip(bounds, most, strict=False))
         #: whether a force may leave the tick that is more than the actuators have
@@ -261,8 +282,9 @@ class StepBuffer:
             within = low <= one[k] <= high and lowest <= other[k] <= highest
             if within and (not others or all(least <= asked[k] <= most for asked, least, most in others)):
                 return
-            if limited:
-                transition(seen[k], after[k])
+            if limited or process.balls:
+                if limited:
+                    transition(seen[k], after[k])
                 if clips:
                     process.applied(force[k], force[k])
                 return

@@ -197,7 +197,7 @@ class _EmulatedPlant:
         self._held = lru_cache(256)(self._hold)
         self.s = np.zeros(len(self._plant.A))
         self._w = np.zeros(self.scene.outside)
-        self._limit = np.array([device.force_limit for device in scenario.device])
+        self._limit = np.array([device.force_limit for device in scenario.axis_devices])
         self.still = False
         self.fastest = 0.0  # [m/s] of any motor, so far
         self._outside, self._first, self.tick = np.zeros((0, self.scene.outside)), 0, None
@@ -248,7 +248,7 @@ def nobody(scenario: Scenario, damping: float = 0.0) -> Scenario:
 
 def info_of(scenario: Scenario) -> Info:
     """The INFO of the emulated device: the scenario's devices, in the units of the wire."""
-    encoder = [round(1e12 * (device.encoder_step or _ENCODER_STEP)) for device in scenario.device]
+    encoder = [round(1e12 * (device.encoder_step or _ENCODER_STEP)) for device in scenario.axis_devices]
     return Info(
         version=PROTOCOL,
         firmware="emulator",
@@ -257,7 +257,7 @@ def info_of(scenario: Scenario) -> Info:
         osp_damping=tuple(round(1e6 * delta) for delta in scenario.delta),
         encoder_step=tuple(encoder),
         force_step=(_FORCE_STEP,) * scenario.channels,
-        hard_limit=tuple(min(0x7FFF, round(1e6 * d.force_limit / _FORCE_STEP)) for d in scenario.device),
+        hard_limit=tuple(min(0x7FFF, round(1e6 * d.force_limit / _FORCE_STEP)) for d in scenario.axis_devices),
         range=tuple(round(1e12 * _REACH / step) for step in encoder),
     )
 

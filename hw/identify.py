@@ -105,7 +105,7 @@ class Swing:
         w = speed / travel
         need = [
             min(device.force_limit, speed * abs(complex(device.damping, w * sum(device.bodies.values()))))
-            for device in scenario.device
+            for device in scenario.axis_devices
         ]
         return cls(tuple(need), w / (2 * np.pi))
 
@@ -325,7 +325,7 @@ def _more_damped(one: Estimate, least: Estimate) -> bool:
 def _declared(scenario: Scenario, session: Session) -> list[float]:
     """Damping of every axis [N s/m], the larger of the scenario's and INFO's."""
     guaranteed = [1e-6 * d for d in session.info.osp_damping] if session.info else [0.0] * scenario.channels
-    return [max(device.damping, said) for device, said in zip(scenario.device, guaranteed, strict=True)]
+    return [max(device.damping, said) for device, said in zip(scenario.axis_devices, guaranteed, strict=True)]
 
 
 def capped(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[Estimate]:
@@ -350,7 +350,7 @@ def estimate(
         raise ValueError(f"{missing} of {len(recorder)} ticks came without a STATE: take another record")
     applied = link["applied"]
     estimates = []
-    for i, device in enumerate(scenario.device):
+    for i, device in enumerate(scenario.axis_devices):
         progress(i, scenario.channels, f"estimating axis {i + 1}")
         x, force, step = link["x"][:, i], applied[:, i] * units.force_step[i], units.encoder_step[i]
         try:

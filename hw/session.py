@@ -385,12 +385,12 @@ def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: flo
 
 def _expected(scenario: Scenario) -> list[Expected]:
     """What the free handles of a scenario's devices are expected to do."""
-    return [Expected(device, scenario.T) for device in scenario.device]
+    return [Expected(device, scenario.T) for device in scenario.axis_devices]
 
 
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
     """A session that never asks for more than `cap` [N]. Raises InputError for impossible `more` limits, or T."""
-    caps = tuple(min(cap, device.force_limit) for device in scenario.device)
+    caps = tuple(min(cap, limit) for limit in scenario.box_limits)
     try:
         return Session(scenario, SafetyLimits(caps, watchdog_us=watchdog_for(scenario.T), **more), settings)
     except ValueError as error:

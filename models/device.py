@@ -1,4 +1,4 @@
-"""Force-feedback devices clamped to one axis, the damping that certificates rest on, and a catalogue of real ones."""
+"""Force-feedback devices with one to three axes, the damping that certificates rest on, and a catalogue of them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from numbers import Real
 from typing import Any, ClassVar
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 # ----------------------------------------------------------------------------------------------------
 # Physical quantities with their units and the range in which a value makes sense.
@@ -23,6 +25,36 @@ def require(field: str, value: float, low: float, high: float, unit: str) -> Non
 
 
 MOST_DAMPING = 1e4  # [N s/m]
+AXES = ("x", "y", "z")
+
+#: One number for every axis, one per axis, or (damping and delta only) a symmetric matrix.
+_PerAxis = float | tuple[float, ...]
+_Levels = float | tuple[float | tuple[float, ...], ...]
+_Matrix = NDArray[np.float64]
+
+
+def symmetric(field: str, value: Any, axes: int) -> _Matrix:
+    """Return a number, a list of one number per axis or a symmetric matrix as a matrix (axes, axes).
+
+    Raises:
+        ValueError: The list or matrix has the wrong shape, or the matrix is not symmetric.
+    """
+    if isinstance(value, Real):
+        return float(value) * np.eye(axes)
+    rows = [row if isinstance(row, Real) else tuple(row) for row in value]
+    if len(rows) == axes and all(isinstance(row, Real) for row in rows):
+        return np.diag(np.array(rows, dtype=float))
+    if len(rows) != axes or not all(isinstance(row, tuple) and len(row) == axes for row in rows):
+        shape = f"{axes} numbers or {axes} rows of {axes} numbers"
+        raise ValueError(f"{field} is {_listed(value)}, expected one number, {shape}")
+    matrix = np.array(rows, dtype=float)
+    if not (np.isfinite(matrix).all() and (matrix == matrix.T).all()):
+        raise ValueError(f"{field} is {_listed(value)}, expected a symmetric matrix")
+    return matrix
+
+
+def _listed(value: Any) -> Any:
+    return [_listed(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 class Guaranteed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -58,8 +90,48 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.damping if self.delta is None else self.delta
 
     def with_damping(self: Any, damping: float) -> Device:
-        """The same device with another motor damping, all of it guaranteed."""
+        """The same device with another motor damping, all of it guaranteed and equal on its axes."""
         return msgspec.structs.replace(self, damping=damping, delta=None)
+
+    @property
+    def free(self: Any) -> tuple[int, ...]:
+        """The axes that are not clamped, counted from 0: one channel each."""
+        return tuple(i for i, axis in enumerate(AXES[: self.axes]) if axis not in self.clamped)
+
+    @property
+    def axis_names(self: Any) -> tuple[str, ...]:
+        """What follows the names of joints and contacts: ".x" and so on, or nothing where there is one axis."""
+        return tuple(f".{AXES[i]}" for i in self.free) if self.axes > 1 else ("",)
+
+    def matrix(self: Any, field: str) -> _Matrix:
+        """`damping`, or the guaranteed one as `delta`, over the free axes [N s/m].
+
+        The clamped axes do not move, so that the form v' Delta v of the free ones is that of their own block.
+        """
+        value = self.passivity_level if field == "delta" else self.damping
+        return symmetric(field, value, self.axes)[np.ix_(self.free, self.free)]
+
+    @property
+    def ball(self: Any) -> bool:
+        """Whether `force_limit` bounds the length of the force vector, and not each axis."""
+        return isinstance(self.force_limit, Real) and len(self.free) > 1
+
+    def channels(self: Any) -> tuple[Device, ...]:
+        """The free axes as devices with one axis each; their dampings are the diagonals of the matrices."""
+        if self.axes == 1:
+            return (self,)
+        damping, level = np.diag(self.matrix("damping")), np.diag(self.matrix("delta"))
+        alone: dict[str, Any] = {"axes": 1, "clamped": ()}
+        made = []
+        for k, i in enumerate(self.free):
+            per_axis = {
+                name: value[i]
+                for name in ("force_limit", "encoder_step", "friction")
+                if isinstance(value := getattr(self, name), tuple)
+            }
+            delta = None if self.delta is None else float(level[k])
+            made.append(msgspec.structs.replace(self, **alone, **per_axis, damping=float(damping[k]), delta=delta))
+        return tuple(made)
 
 
 class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="compliant", tag_field="kind"):
@@ -70,19 +142,21 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
     """
 
     motor_mass: float = 0.06  # [kg] assumed, with handle_mass: 0.25 kg in total
-    damping: float = 1.37  # [N s/m] the paper's section 6, from a first-order model identified on an Omega
+    damping: _Levels = 1.37  # [N s/m] the paper's section 6, from a first-order model identified on an Omega
     handle_mass: float = 0.19  # [kg] assumed
     transmission_stiffness: float = 14500.0  # [N/m] assumed: puts the structural mode near 90 Hz
     transmission_damping: float = 0.0  # [N s/m] assumed
-    force_limit: float = 12.0  # [N] omega.3 in CHAI3D's device table
-    encoder_step: float = 0.0  # [m] assumed 0: an ideal encoder
-    friction: float = 0.0  # [N] Coulomb friction at the motor, assumed 0; only MuJoCo models it
+    force_limit: _PerAxis = 12.0  # [N] omega.3 in CHAI3D's device table; a number limits the vector, a list each axis
+    encoder_step: _PerAxis = 0.0  # [m] assumed 0: an ideal encoder
+    friction: _PerAxis = 0.0  # [N] Coulomb friction at the motor, assumed 0; only MuJoCo models it, axis by axis
     friction_max: float | None = None  # [N] an upper bound that is published: never simulated, and no proof uses it
-    delta: float | None = None  # [N s/m] guaranteed damping; `damping` unless an identification bounds it lower
+    delta: _Levels | None = None  # [N s/m] guaranteed damping; `damping` unless an identification bounds it lower
     credible_force: float | None = None  # [N] in the transmission: more is the model's alone, see `most_credible_force`
     credible_speed: float = 2.0  # [m/s] likewise; assumed: three times the 0.7 m/s that teleoperation masters exceed
     # in a fifth of the fast part of a tapping task (the abstract of such a study says so; not a figure of this device)
     guaranteed: Guaranteed | None = None  # bounds of motor and transmission that the known-device conditions rest on
+    axes: int = 1  # 1 to 3: x, y, z
+    clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
 
     file: ClassVar[str] = "compliant"  # .xml, its MJCF
 
@@ -103,7 +177,7 @@ class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="com
         The force at which a cable slips on its capstan is not published. Where a device declares none, it is three
         times what its motor can push, because a transmission that is made for a motor need not hold more.
         """
-        return 3.0 * self.force_limit if self.credible_force is None else self.credible_force
+        return 3.0 * float(np.max(self.force_limit)) if self.credible_force is None else self.credible_force
 
     def __post_init__(self) -> None:
         _check_common(self, ("motor_mass", "handle_mass"))
@@ -123,14 +197,16 @@ class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid",
     """Motor, encoder and handle as one body."""
 
     mass: float = 0.25  # [kg] assumed
-    damping: float = 1.37  # [N s/m] the paper's section 6
-    force_limit: float = 12.0  # [N] omega.3 in CHAI3D's device table
-    encoder_step: float = 0.0  # [m] assumed 0: an ideal encoder
-    friction: float = 0.0  # [N] Coulomb friction, assumed 0; only MuJoCo models it
+    damping: _Levels = 1.37  # [N s/m] the paper's section 6
+    force_limit: _PerAxis = 12.0  # [N] omega.3 in CHAI3D's device table; a number limits the vector, a list each axis
+    encoder_step: _PerAxis = 0.0  # [m] assumed 0: an ideal encoder
+    friction: _PerAxis = 0.0  # [N] Coulomb friction, assumed 0; only MuJoCo models it, axis by axis
     friction_max: float | None = None  # [N] an upper bound that is published: never simulated, and no proof uses it
-    delta: float | None = None  # [N s/m] guaranteed damping
+    delta: _Levels | None = None  # [N s/m] guaranteed damping
     credible_speed: float = 2.0  # [m/s] as of a compliant device
     guaranteed: Guaranteed | None = None  # refused: there is no transmission to guarantee
+    axes: int = 1  # 1 to 3: x, y, z
+    clamped: tuple[str, ...] = ()  # axes that are held; the others are the device's channels
 
     file: ClassVar[str] = "rigid"
     transmission: ClassVar[None] = None
@@ -153,15 +229,73 @@ Device = CompliantDevice | RigidDevice
 def _check_common(device: Device, masses: tuple[str, ...]) -> None:
     for name in masses:
         require(name, getattr(device, name), 1e-6, 1e3, "kg")
-    require("damping", device.damping, 0.0, MOST_DAMPING, "N s/m")
-    require("force_limit", device.force_limit, 1e-3, 1e6, "N")
-    require("encoder_step", device.encoder_step, 0.0, 1e-2, "m")
-    require("friction", device.friction, 0.0, 1e3, "N")
+    _check_axes(device)
+    limits = (("force_limit", 1e-3, 1e6, "N"), ("encoder_step", 0.0, 1e-2, "m"), ("friction", 0.0, 1e3, "N"))
+    for name, low, high, unit in limits:
+        for i, value in enumerate(_each(device, name), start=1):
+            many = isinstance(getattr(device, name), tuple)
+            require(f"{name} #{i}" if many else name, value, low, high, unit)
     if device.friction_max is not None:
-        require("friction_max", device.friction_max, device.friction, 1e3, "N")
+        require("friction_max", device.friction_max, max(_each(device, "friction")), 1e3, "N")
     require("credible_speed", device.credible_speed, 1e-3, 1e3, "m/s")
-    if device.delta is not None and not 0 < device.delta <= device.damping:
-        raise ValueError(f"delta is {device.delta:g} N s/m, allowed are values in (0, damping = {device.damping:g}]")
+    _check_damping(device)
+
+
+def _each(self: Any, name: str) -> tuple[float, ...]:
+    """One number per axis, or the one number. Raises ValueError for a list of the wrong length."""
+    value = getattr(self, name)
+    if not isinstance(value, tuple):
+        return (value,)
+    if len(value) != self.axes or self.axes == 1:
+        expected = "one number" if self.axes == 1 else f"one number or {self.axes}"
+        raise ValueError(f"{name} is {list(value)}, expected {expected}: the device has axes = {self.axes}")
+    return value
+
+
+def _check_axes(self: Any) -> None:
+    if not 1 <= self.axes <= len(AXES):
+        raise ValueError(f"axes is {self.axes}, allowed are 1 to {len(AXES)}")
+    names = AXES[: self.axes]
+    for axis in self.clamped:
+        if axis not in names:
+            raise ValueError(
+                f"clamped names {axis!r}, allowed are {', '.join(names)}: the device has axes = {self.axes}"
+            )
+    if len(set(self.clamped)) == self.axes:
+        raise ValueError(f"clamped is {list(self.clamped)}, which leaves no axis of {', '.join(names)}")
+
+
+def _check_damping(self: Any) -> None:
+    """Raise ValueError unless 0 <= damping and 0 < delta <= damping, as matrices where there are several axes."""
+    if self.axes == 1:
+        for name in ("damping", "delta"):
+            if isinstance(getattr(self, name), tuple):
+                raise ValueError(
+                    f"{name} is {_listed(getattr(self, name))}, expected one number: the device has one axis"
+                )
+        require("damping", self.damping, 0.0, MOST_DAMPING, "N s/m")
+        if self.delta is not None and not 0 < self.delta <= self.damping:
+            raise ValueError(f"delta is {self.delta:g} N s/m, allowed are values in (0, damping = {self.damping:g}]")
+        return
+    damping = symmetric("damping", self.damping, self.axes)
+    least, most = np.linalg.eigvalsh(damping)[[0, -1]]
+    if not (least > 0 and most <= MOST_DAMPING):
+        range_ = f"eigenvalues in (0, {MOST_DAMPING:g}] N s/m"
+        raise ValueError(
+            f"damping is {_listed(self.damping)} with eigenvalues {least:g} to {most:g}, allowed are {range_}"
+        )
+    if self.delta is None:
+        return
+    delta = symmetric("delta", self.delta, self.axes)
+    if not (lowest := np.linalg.eigvalsh(delta)[0]) > 0:
+        raise ValueError(
+            f"delta is {_listed(self.delta)} with the eigenvalue {lowest:g}, expected a positive definite one"
+        )
+    # eigvalsh is exact to a few units in the last place of the largest entry
+    if (left := np.linalg.eigvalsh(damping - delta)[0]) < -1e-12 * most:
+        raise ValueError(
+            f"delta is {_listed(self.delta)}, allowed is delta <= damping as matrices: damping - delta has {left:g}"
+        )
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -3,6 +3,8 @@
 Any object with the two methods of `Hand` can hold a device. Its `port()` describes the mechanics that the handle
 feels: masses, spring-dampers, and optionally an impedance (A, B, C, D). A `Port` checks that it is passive when it is
 built, so every human in a simulation is passive.
+
+On a device with several axes a port of one axis acts alike in every direction: `Port.in_space`.
 """
 
 from __future__ import annotations
@@ -17,10 +19,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from haptic_loop.models.device import require
+from haptic_loop.models.device import AXES, require, symmetric
 
 _Array = NDArray[np.floating[Any]]
 _Range = tuple[float, float]
+_Amount = float | tuple[float | tuple[float, ...], ...]
 
 _ROUNDING = 1e-9  # relative to |Z|: bound on the rounding error of Re Z of a lossless impedance
 
@@ -95,6 +98,7 @@ class Port:
     The points are the handles (one, or several of a person), then the human's own masses, then the base, which is
     ground or the body of the person to whom this arm belongs. Row i of `across` holds the derivatives of the length of
     spring-damper i with respect to the points and the base: -1 and 1 between two points, other numbers for a lever.
+    In space every point and the base have `axes` coordinates, which are neighbouring columns of `across`.
     The port is passive because no parameter is negative and the impedance is passive. Arrays with a leading axis hold
     many humans of the same structure.
 
@@ -103,18 +107,19 @@ class Port:
     """
 
     mass: _Array  # (..., points) [kg]; 0 is allowed at the handles only
-    across: _Array  # (springs, points + 1)
+    across: _Array  # (springs, (points + 1) axes)
     damping: _Array  # (..., springs) [N s/m]
     stiffness: _Array  # (..., springs) [N/m]
-    impedance: Impedance | None = None  # between the (only) handle and the base
+    impedance: Impedance | None = None  # between the (only) handle and the base, on every axis
     handles: int = 1
-    pull: int = -1  # the spring-damper that the voluntary force contracts
+    pull: int = -1  # the spring-damper that the voluntary force contracts; in space the group of `axes` of them
+    axes: int = 1
 
     def __post_init__(self) -> None:
         for name in ("mass", "across", "damping", "stiffness"):
             _freeze(self, name, getattr(self, name))
         *many, points = self.mass.shape
-        shapes = {"across": (len(self.across), points + 1)}
+        shapes = {"across": (len(self.across), (points + 1) * self.axes)}
         shapes |= {name: (*many, len(self.across)) for name in ("damping", "stiffness")}
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
@@ -124,7 +129,8 @@ class Port:
                 raise ValueError(f"port: {name} has a negative or infinite entry: such a human is not passive")
         if not 1 <= self.handles <= points or not (self.mass[..., self.handles :] > 0).all():
             raise ValueError("port: a point that is no handle has no mass")
-        if not self.across[:, :-1].any(axis=1).all() or not -len(self.across) <= self.pull < len(self.across):
+        groups = len(self.across) // self.axes
+        if not self.across[:, : -self.axes].any(axis=1).all() or not -groups <= self.pull < groups:
             raise ValueError("port: expected spring-dampers that touch a point each, and `pull` one of them")
         if self.impedance and (self.handles > 1 or self.impedance.A.shape[:-2] != tuple(many)):
             raise ValueError("port: an impedance belongs to one handle, and to each of many humans")
@@ -135,6 +141,42 @@ class Port:
         n = links.shape[-2]
         across = np.eye(n, n + 1, 1) - np.eye(n, n + 1)
         return cls(links[..., 0], across, links[..., 1], links[..., 2])
+
+    @classmethod
+    def chain_in_space(cls, links: _Array, axes: int) -> Self:
+        """Return a chain of links (..., n, 1 + 2 axes^2): mass, then damping and stiffness along each of `directions`.
+
+        The springs along the axes are the last ones of a link, which a voluntary force contracts.
+        """
+        n, count = links.shape[-2], axes**2
+        between = np.eye(n, n + 1, 1) - np.eye(n, n + 1)
+        damping, stiffness = (links[..., 1 + k * count : 1 + (k + 1) * count] for k in range(2))
+        flat = (*links.shape[:-2], n * count)
+        across = np.kron(between, directions(axes))
+        return cls(links[..., 0], across, damping.reshape(flat), stiffness.reshape(flat), axes=axes)
+
+    def in_space(self, axes: int) -> Self:
+        """Return this port on a device with so many axes: itself if it has them, or one of one axis, alike on all.
+
+        Raises:
+            ValueError: It has another number of axes.
+        """
+        if self.axes == axes:
+            return self
+        if self.axes > 1:
+            raise ValueError(f"the human moves along {self.axes} axes, the device along {axes}")
+        groups = len(self.across)
+        pull = self.pull % groups
+        return type(self)(
+            self.mass,
+            np.kron(self.across, np.eye(axes)),
+            np.repeat(self.damping, axes, axis=-1),
+            np.repeat(self.stiffness, axes, axis=-1),
+            self.impedance,
+            self.handles,
+            pull,
+            axes,
+        )
 
     @classmethod
     def body(cls, hands: int, values: _Array) -> Self:
@@ -162,19 +204,41 @@ class Port:
         mass, damping, stiffness = (np.stack([getattr(p, n) for p in ports]) for n in ("mass", "damping", "stiffness"))
         some = [port.impedance for port in ports if port.impedance]
         impedance = Impedance(*(np.stack([getattr(z, name) for z in some]) for name in "ABCD")) if some else None
-        return cls(mass, first.across, damping, stiffness, impedance, first.handles, first.pull)
+        return cls(mass, first.across, damping, stiffness, impedance, first.handles, first.pull, first.axes)
 
     def of(self, i: int) -> Self:
         """Return port i of a stack."""
         impedance = self.impedance and self.impedance.changed(lambda part: part[i])
         one = self.mass[i], self.across, self.damping[i], self.stiffness[i]
-        return type(self)(*one, impedance, self.handles, self.pull)
+        return type(self)(*one, impedance, self.handles, self.pull, self.axes)
 
     @property
     def layout(self) -> tuple[Any, ...]:
         """The structure of the port without its parameters. Humans of equal layout can be stacked."""
         order = self.impedance.order if self.impedance else None
-        return self.across.shape, self.across.tobytes(), order, self.handles, self.pull
+        return self.across.shape, self.across.tobytes(), order, self.handles, self.pull, self.axes
+
+
+def directions(axes: int) -> _Array:
+    """The directions of springs whose sums are all diagonally dominant matrices, (axes^2, axes).
+
+    These are e_i + e_j and e_i - e_j for every two axes, then the axes themselves.
+    """
+    unit = np.eye(axes)
+    skew = [unit[i] + sign * unit[j] for i in range(axes) for j in range(i + 1, axes) for sign in (1, -1)]
+    return np.array([*skew, *unit])
+
+
+def _amounts_along(field: str, value: Any, axes: int) -> _Array:
+    """Return a number, a list or a matrix as amounts along `directions`, (axes^2,). Raises ValueError for others."""
+    matrix = symmetric(field, value, axes)
+    pairs = [matrix[i, j] for i in range(axes) for j in range(i + 1, axes)]
+    skew = [max(0.0, sign * each) for each in pairs for sign in (1, -1)]
+    own = 2 * np.diag(matrix) - np.abs(matrix).sum(axis=1)
+    if not (own >= -1e-12 * np.abs(matrix).max()).all():  # rounding of a matrix that was made of amounts
+        expected = "no row whose diagonal entry is below the sum of the others' magnitudes"
+        raise ValueError(f"{field} is {matrix.tolist()}, expected {expected}")
+    return np.array([*skew, *np.maximum(own, 0.0)])
 
 
 def state_space(A: Any, B: Any, C: Any, D: Any, mass: float = 0.0) -> Port:
@@ -210,7 +274,10 @@ class Hand(Protocol):
         ...
 
     def voluntary_force(self, t: _Array) -> _Array:
-        """Return the force [N] at the times t [s] that contracts the spring-damper `pull` of the port."""
+        """Return the force [N] at the times t [s] that contracts the spring-damper `pull` of the port.
+
+        Its shape is that of t, or (N, axes) on a device with several axes, where (N,) acts on the first one.
+        """
         ...
 
 
@@ -226,16 +293,33 @@ def _freeze(record: object, name: str, values: Any) -> None:
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A mass and the spring-damper behind it, which ends at the next mass or at the moving equilibrium."""
+    """A mass and the spring-damper behind it, which ends at the next mass or at the moving equilibrium.
+
+    In space damping and stiffness are numbers, the same in every direction, one number per axis, or symmetric matrices.
+    """
 
     mass: float  # [kg]
-    damping: float  # [N s/m]
-    stiffness: float  # [N/m]
+    damping: _Amount  # [N s/m]
+    stiffness: _Amount  # [N/m]
 
     def __post_init__(self) -> None:
         require("mass", self.mass, 0.0, 1e3, "kg")
-        require("damping", self.damping, 0.0, 1e6, "N s/m")
-        require("stiffness", self.stiffness, 0.0, 1e9, "N/m")
+        for name, most, unit in (("damping", 1e6, "N s/m"), ("stiffness", 1e9, "N/m")):
+            value = getattr(self, name)
+            if not isinstance(value, tuple):
+                require(name, value, 0.0, most, unit)
+                continue
+            if not 1 < len(value) <= len(AXES):
+                raise ValueError(
+                    f"{name} has {len(value)} entries, expected one number, or one for each of 2 or 3 axes"
+                )
+            for amount in _amounts_along(name, value, len(value)):
+                require(name, float(amount), 0.0, most, unit)
+
+    @property
+    def axes(self) -> int:
+        """How many axes a device must have; 1 where the link is alike in every direction."""
+        return max(len(value) if isinstance(value, tuple) else 1 for value in (self.damping, self.stiffness))
 
 
 class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -245,8 +329,11 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     frequency: float  # [Hz]
     phase: float = 0.0  # [rad]
     ease: float = 1.0  # [s]
+    along: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # the direction; the first axis unless given
 
     def __post_init__(self) -> None:
+        if self.along and not 1e-9 < float(np.linalg.norm(self.along)) < np.inf:
+            raise ValueError(f"along is {list(self.along)}, expected a direction whose entries are not all 0")
         require("amplitude", self.amplitude, 0.0, 1.0, "m")
         require("frequency", self.frequency, 0.0, 100.0, "Hz")
         require("phase", self.phase, -100.0, 100.0, "rad")
@@ -283,16 +370,40 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for i, link in enumerate(self.links[1:], start=2):
             if link.mass == 0:
                 raise ValueError(f"links #{i}.mass is 0: only the mass at the handle may be missing")
+        if len(several := {link.axes for link in self.links} - {1}) > 1:
+            raise ValueError(f"links have {' and '.join(map(str, sorted(several)))} axes, expected the same number")
+        along = self.voluntary and self.voluntary.along
+        if several and along and {len(along)} != several:
+            raise ValueError(f"voluntary.along is {list(along)}, expected {max(several)} numbers as the links have")
 
     def port(self) -> Port:
         """Return the mechanics that the handle feels."""
-        return Port.chain(np.array([(link.mass, link.damping, link.stiffness) for link in self.links]))
+        axes = max(link.axes for link in self.links)
+        if axes == 1:
+            return Port.chain(np.array([(link.mass, link.damping, link.stiffness) for link in self.links]))
+        rows = [
+            [
+                link.mass,
+                *_amounts_along("damping", link.damping, axes),
+                *_amounts_along("stiffness", link.stiffness, axes),
+            ]
+            for link in self.links
+        ]
+        return Port.chain_in_space(np.array(rows), axes)
 
     def voluntary_force(self, t: _Array) -> _Array:
         """Return the force k x_eq + b x_eq' [N] on the last mass at the times t [s]."""
         if self.voluntary is None:
             return np.zeros_like(t)
-        return self.voluntary.force(t, self.links[-1].stiffness, self.links[-1].damping)
+        last, along = self.links[-1], self.voluntary.along
+        if not along and last.axes == 1:
+            return self.voluntary.force(t, last.stiffness, last.damping)  # type: ignore[arg-type]
+        axes = len(along) if along else last.axes
+        way = np.array(along if along else np.eye(axes)[0], dtype=float)
+        way /= np.linalg.norm(way)
+        # The force of a spring-damper whose end moves along `way` is K way x + B way x'.
+        K, B = (symmetric(name, getattr(last, name), axes) @ way for name in ("stiffness", "damping"))
+        return np.stack([self.voluntary.force(t, k, b) for k, b in zip(K, B, strict=True)], axis=1)
 
 
 class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -334,11 +445,11 @@ class Cross(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A person who holds several devices: a passive mechanical multi-port.
 
-    The arms of these channels end on the person's body instead of on ground. The body is a mass with a spring-damper
+    The arms at these devices end on the person's body instead of on ground. The body is a mass with a spring-damper
     to ground. The spring-damper `cross` joins each hand to the next, in the order of `holds`.
     """
 
-    holds: tuple[int, ...]  # channels, counted from 1
+    holds: tuple[int, ...]  # devices, counted from 1
     mass: float  # [kg] of the body
     damping: float  # [N s/m] between body and ground
     stiffness: float  # [N/m]

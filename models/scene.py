@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from haptic_loop.models.device import Device
+from haptic_loop.models.device import AXES, Device
 from haptic_loop.models.human import (
     Cross,
     Hand,
@@ -24,6 +24,7 @@ from haptic_loop.models.human import (
     Population,
     Port,
     check_holds,
+    directions,
 )
 
 if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions import it when they need it
@@ -32,7 +33,8 @@ if TYPE_CHECKING:  # MuJoCo takes a third of a second to import; functions impor
 # ----------------------------------------------------------------------------------------------------
 # Devices and humans as one MuJoCo model, and the same plant as matrices, read from that model.
 #
-# Only this file knows the names of joints. Every body slides along x. The order of the joints is motors, handles of
+# Only this file knows the names of joints. Every body slides along x, or along the axes of its device that are not
+# clamped; then its joints are called motor.x, motor.y and so on. The order of the joints is motors, handles of
 # compliant devices, further masses of the humans, bodies of persons. So the first m positions are the encoders':
 #
 #     actuator (-f) -> motor ==transmission== handle (with the human's first mass) ==link== human_i_2 == ...
@@ -62,6 +64,7 @@ APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] between devices, between the bodi
 DRAWN = "drawn transmission"
 _SKY: dict[str, Any] = {"name": "sky", "width": 32, "height": 192, "rgb1": [0.93] * 3, "rgb2": [0.93] * 3}
 _EMPTY_CLASSES = re.compile(r" *<default>\s*(<default class=\"[^\"]*\"/>\s*)*</default>\s*\n")  # of attached files
+_FORCE = "/force"  # in the names of the devices' motors
 _IMPEDANCE = "impedance_"  # custom numbers: joint of the handle, joint of the base or -1, then [[A, B], [C, D]] by rows
 
 
@@ -71,10 +74,11 @@ class Scene:
 
     model: mujoco.MjModel
     xml: str
-    handles: tuple[int, ...]  # (m,) joint of each handle
+    handles: tuple[int, ...]  # (m,) joint of each handle, on each of its axes
     pushed: tuple[int, ...]  # (m,) external input that acts on the end of each human (voluntary force)
     tapped: tuple[int, ...]  # (m,) external input that acts on each handle
-    points: tuple[tuple[int, ...], ...]  # (m + persons,) joints of the points of each port, handles first
+    points: tuple[tuple[int, ...], ...]  # (devices + persons,) joints of the points of each port, handles first
+    devices: tuple[int, ...]  # (m,) the device of each channel, counted from 0
 
     @property
     def channels(self) -> int:
@@ -281,52 +285,76 @@ def _only_what_the_loop_needs(spec: mujoco.MjSpec, friction: bool) -> None:
     spec.option.disableflags = sum(int(flag) for flag in disabled)
 
 
-def _handle(i: int, device: Device) -> str:
-    return f"device_{i}/{list(device.bodies)[-1]}"
+def _joints(body: str, device: Device) -> tuple[str, ...]:
+    """Return the joints of a body on the axes of a device; a joint of a device with one axis is called as its body."""
+    return tuple(body + axis for axis in device.axis_names)
+
+
+def _body(joint: str) -> str:
+    return joint.partition(".")[0]
+
+
+def _handle(i: int, device: Device) -> tuple[str, ...]:
+    return _joints(f"device_{i}/{list(device.bodies)[-1]}", device)
 
 
 class _Placed(NamedTuple):
     """A port and the joints and tendons that represent it in the scene."""
 
     port: Port
-    joints: tuple[str, ...]  # joint of each point
-    base: str | None  # joint of the body that it ends on; None for ground
+    joints: tuple[str, ...]  # joint of each coordinate of the points
+    base: tuple[str, ...]  # joints of the body that it ends on; none for ground
     springs: tuple[str, ...]  # the tendon or joint that carries each spring-damper
+
+    @property
+    def handles(self) -> int:
+        """Number of joints of the handles: the first ones."""
+        return self.port.handles * self.port.axes
 
 
 def _placed(
     devices: Sequence[Device], ports: Sequence[Port], held: Sequence[tuple[tuple[int, ...], Port]]
 ) -> tuple[_Placed, ...]:
-    """Return the placed ports of all channels, then those of the persons who hold several devices.
+    """Return the placed ports of all devices, then those of the persons who hold several devices.
 
-    Raises ValueError if the numbers of devices and humans differ, or if a device is held twice.
+    Raises ValueError if the numbers of devices and humans differ, if a device is held twice, or if the axes of humans
+    and devices differ.
     """
     if len(devices) != len(ports) or not devices:
         raise ValueError(f"{len(devices)} devices and {len(ports)} humans: each device needs one human")
     check_holds([holds for holds, _ in held], len(devices))
     handles = [_handle(i, device) for i, device in enumerate(devices, start=1)]
-    body = {channel: f"body_{p}" for p, (holds, _) in enumerate(held, start=1) for channel in holds}
+    body = {device: f"body_{p}" for p, (holds, _) in enumerate(held, start=1) for device in holds}
     placed = []
-    for i, port in enumerate(ports, start=1):
+    for i, (port, device) in enumerate(zip(ports, devices, strict=True), start=1):
+        try:
+            port = port.in_space(len(device.free))
+        except ValueError as error:
+            raise ValueError(f"human #{i}: {error}") from None
         if port.handles > 1:
             raise ValueError(f"human #{i} has {port.handles} handles, expected one: a person holds several")
-        own = (f"human_{i}_{j}" for j in range(2, port.mass.shape[-1] + 1))
-        placed.append(_place(port, (handles[i - 1], *own), body.get(i), f"link_{i}"))
+        own = (joint for j in range(2, port.mass.shape[-1] + 1) for joint in _joints(f"human_{i}_{j}", device))
+        base = _joints(body[i], device) if i in body else ()
+        placed.append(_place(port, (*handles[i - 1], *own), base, f"link_{i}"))
     for p, (holds, port) in enumerate(held, start=1):
         extra = port.mass.shape[-1] - len(holds)
         if port.handles != len(holds) or extra < 1:
             raise ValueError(f"person #{p} has {port.handles} handles and {extra} bodies, expected {len(holds)}, 1")
-        own = (f"body_{p}_{j}" for j in range(1, extra))
-        hands = (handles[channel - 1] for channel in holds)
-        placed.append(_place(port, (*hands, *own, f"body_{p}"), None, f"cross_{p}"))
+        first = devices[holds[0] - 1]
+        if any(devices[i - 1].axis_names != first.axis_names for i in holds):
+            raise ValueError(f"person #{p}.holds is {list(holds)}: expected devices with the same free axes")
+        port = port.in_space(len(first.free))
+        own = (joint for j in range(1, extra) for joint in _joints(f"body_{p}_{j}", first))
+        hands = (joint for i in holds for joint in handles[i - 1])
+        placed.append(_place(port, (*hands, *own, *_joints(f"body_{p}", first)), (), f"cross_{p}"))
     return tuple(placed)
 
 
-def _place(port: Port, joints: tuple[str, ...], base: str | None, name: str) -> _Placed:
-    ends = (*joints, base) if base else joints
+def _place(port: Port, joints: tuple[str, ...], base: tuple[str, ...], name: str) -> _Placed:
+    ends = (*joints, *base)  # ground has no joint
     springs = []
     for j, row in enumerate(port.across, start=1):
-        between = [joint for joint, c in zip(ends, row, strict=False) if c]  # ground has no joint
+        between = [joint for joint, c in zip(ends, row, strict=False) if c]
         springs.append(between[0] if len(between) == 1 and between[0] in joints else f"{name}_{j}")
     return _Placed(port, joints, base, tuple(springs))
 
@@ -345,21 +373,38 @@ def _amounts(devices: Sequence[Device], placed: Sequence[_Placed]) -> _Amounts:
     damping: dict[str, Any] = {}
     stiffness: dict[str, Any] = {}
     for i, device in enumerate(devices, start=1):
-        motor = f"device_{i}/motor"
-        mass[motor], damping[motor], stiffness[motor] = device.bodies["motor"], device.damping, 0.0
+        own, _ = _dampers(device)
+        for motor, amount in zip(_joints(f"device_{i}/motor", device), own, strict=True):
+            mass[motor], damping[motor], stiffness[motor] = device.bodies["motor"], amount, 0.0
     for i, device in enumerate(devices, start=1):
-        mass |= {f"device_{i}/{name}": amount for name, amount in device.bodies.items()}
+        for name, amount in device.bodies.items():
+            mass |= dict.fromkeys(_joints(f"device_{i}/{name}", device), amount)
         if device.transmission:
-            between = f"device_{i}/transmission"
-            damping[between], stiffness[between] = device.transmission
+            for between in _joints(f"device_{i}/transmission", device):
+                damping[between], stiffness[between] = device.transmission
     for port, joints, _, springs in placed:
         for k, joint in enumerate(joints):
-            mass[joint] = mass.get(joint, 0.0) + port.mass[..., k]
+            mass[joint] = mass.get(joint, 0.0) + port.mass[..., k // port.axes]
         for r, name in enumerate(springs):
             lever = float(port.across[r, joints.index(name)]) ** 2 if name in joints else 1.0
             damping[name] = damping.get(name, 0.0) + lever * port.damping[..., r]
             stiffness[name] = stiffness.get(name, 0.0) + lever * port.stiffness[..., r]
     return _Amounts(mass, damping, stiffness)
+
+
+def _dampers(device: Device) -> tuple[list[float], list[tuple[float, list[float]]]]:
+    """Return a device's damping on each joint, and the dampers between its axes: amounts [N s/m] with directions."""
+    if device.axes == 1:
+        return [device.damping], []  # type: ignore[list-item]
+    matrix = device.matrix("damping")
+    if (matrix == np.diag(np.diag(matrix))).all():
+        return np.diag(matrix).tolist(), []
+    amounts, directions = np.linalg.eigh(matrix)
+    return [0.0] * len(matrix), list(zip(amounts.tolist(), directions.T.tolist(), strict=True))
+
+
+def _per_channel(device: Device, name: str) -> list[float]:
+    return [getattr(channel, name) for channel in device.channels()]
 
 
 def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
@@ -369,46 +414,56 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
     spec.modelname = "haptic loop"
     spec.add_texture(type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT, **_SKY)
     spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
-    _only_what_the_loop_needs(spec, friction=any(device.friction for device in devices))
+    _only_what_the_loop_needs(spec, friction=any(np.any(device.friction) for device in devices))
     mass, damping, stiffness = _amounts(devices, placed)
-    own = [joint for part in placed for joint in part.joints[part.port.handles :]]
+    own = [joint for part in placed for joint in part.joints[part.handles :]]
     order = [name for name in mass if name not in own] + own
     _attach_devices(spec, devices)
     row = {joint: -APART * min(i, len(devices) - 1) for i, part in enumerate(placed) for joint in part.joints}
-    for step, name in enumerate(own, start=1):
-        body = spec.worldbody.add_body(name=name, pos=[STEP * (1 + step), row[name], _HEIGHT])
+    for step, name in enumerate(dict.fromkeys(map(_body, own)), start=1):
+        joints = [joint for joint in own if _body(joint) == name]
+        body = spec.worldbody.add_body(name=name, pos=[STEP * (1 + step), row[joints[0]], _HEIGHT])
         body.ipos, body.inertia, body.explicitinertial = [0, 0, 0], [1e-3] * 3, True
-        body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
+        for joint in joints:
+            body.add_joint(name=joint, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=_axis(joint))
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02] * 3, mass=0, contype=0, conaffinity=0)
     for name in order:
-        spec.body(name).mass, joint = float(mass[name]), spec.joint(name)
+        spec.body(_body(name)).mass, joint = float(mass[name]), spec.joint(name)
         joint.damping[0], joint.stiffness[0] = float(damping.get(name, 0.0)), float(stiffness.get(name, 0.0))
     for i, device in enumerate(devices, start=1):
-        if device.friction:
-            joint = spec.joint(f"device_{i}/motor")
-            joint.frictionloss = device.friction
-            joint.solref_friction, joint.solimp_friction = _STICK, _HARD
+        motors = _joints(f"device_{i}/motor", device)
+        for name, friction in zip(motors, _per_channel(device, "friction"), strict=True):
+            if friction:
+                joint = spec.joint(name)
+                joint.frictionloss = friction
+                joint.solref_friction, joint.solimp_friction = _STICK, _HARD
         if device.transmission:
-            tendon = spec.tendon(f"device_{i}/transmission")
-            tendon.damping[0], tendon.stiffness[0] = device.transmission
+            for name in _joints(f"device_{i}/transmission", device):
+                tendon = spec.tendon(name)
+                tendon.damping[0], tendon.stiffness[0] = device.transmission
+        for k, (amount, direction) in enumerate(_dampers(device)[1], start=1):
+            ends = {joint: c for joint, c in zip(motors, direction, strict=True) if c}
+            _add_spring(spec, f"device_{i}/damper_{k}", ends, 0.0, amount)
         _add_springs(spec, placed[i - 1], damping, stiffness)
     for part in placed[len(devices) :]:
         _add_springs(spec, part, damping, stiffness)
 
     channels = placed[: len(devices)]
-    handles = [part.joints[0] for part in channels]
-    ends = [_pulled(part) for part in channels]
+    handles = [joint for part in channels for joint in part.joints[: part.handles]]
+    ends = [end for part in channels for end in _pulled(part)]
     reached = list(dict.fromkeys([*((name, 1.0) for name in handles), *ends]))
     for name, gear in reached:
         _add_motor(spec, f"push_{name}", name, gear, joint=name in mass)
     for i, device in enumerate(devices, start=1):
-        _add_motor(spec, f"device_{i}/force", f"device_{i}/motor", gear=-1.0, limit=device.force_limit)
+        for axis, limit in zip(device.axis_names, _per_channel(device, "force_limit"), strict=True):
+            _add_motor(spec, f"device_{i}{_FORCE}{axis}", f"device_{i}/motor{axis}", gear=-1.0, limit=limit)
     number = {name: j for j, name in enumerate(order)}
     for i, (port, joints, base, _) in enumerate(channels, start=1):
         if z := port.impedance:
             numbers = np.block([[z.A, z.B], [z.C, z.D]]).ravel()
-            places = [number[joints[0]], number[base] if base else -1]
-            spec.add_numeric(name=f"{_IMPEDANCE}{i}", data=[*places, *numbers], size=len(numbers) + 2)
+            for k, axis in enumerate(devices[i - 1].axis_names):
+                places = [number[joints[k]], number[base[k]] if base else -1]
+                spec.add_numeric(name=f"{_IMPEDANCE}{i}{axis}", data=[*places, *numbers], size=len(numbers) + 2)
     spec.compile()
     xml = _EMPTY_CLASSES.sub("", spec.to_xml())
     for part in [*(tendon for tendon in spec.tendons if tendon.name.endswith(DRAWN)), *spec.sites]:
@@ -422,7 +477,14 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
         pushed=tuple(reached.index(end) for end in ends),
         tapped=tuple(reached.index((name, 1.0)) for name in handles),
         points=tuple(tuple(model.joint(name).id for name in part.joints) for part in placed),
+        devices=tuple(i for i, part in enumerate(channels) for _ in range(part.handles)),
     )
+
+
+def _axis(joint: str) -> list[float]:
+    """Return the direction in which a joint slides: x, unless its name says otherwise."""
+    _, _, axis = joint.partition(".")
+    return [float(name == (axis or "x")) for name in AXES]
 
 
 def _attach_devices(spec: mujoco.MjSpec, devices: Sequence[Device]) -> None:
@@ -433,6 +495,26 @@ def _attach_devices(spec: mujoco.MjSpec, devices: Sequence[Device]) -> None:
             if part.body(name):
                 frame = spec.worldbody.add_frame(pos=[0.0, -APART * (i - 1), 0.0])
                 frame.attach_body(part.body(name), prefix=f"device_{i}/")
+    for i, device in enumerate(devices, start=1):
+        if device.axes > 1:
+            _free_axes(spec, i, device)
+
+
+def _free_axes(spec: mujoco.MjSpec, i: int, device: Device) -> None:
+    """Replace the slides of device i along x, and its transmission, by one for each free axis."""
+    import mujoco
+
+    for name in device.bodies:
+        body = spec.body(f"device_{i}/{name}")
+        spec.delete(spec.joint(body.name))
+        for joint in _joints(body.name, device):
+            body.add_joint(name=joint, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=_axis(joint))
+    if device.transmission:
+        spec.delete(spec.tendon(f"device_{i}/transmission"))
+        damping, stiffness = device.transmission
+        for axis in device.axis_names:
+            ends = {f"device_{i}/handle{axis}": 1.0, f"device_{i}/motor{axis}": -1.0}
+            _add_spring(spec, f"device_{i}/transmission{axis}", ends, stiffness, damping)
 
 
 @cache
@@ -446,19 +528,22 @@ def _file(name: str) -> mujoco.MjSpec:
     return spec
 
 
-def _pulled(part: _Placed) -> tuple[str, float]:
-    """Return the joint or tendon on which the voluntary force of a human acts, and its gear."""
-    name = part.springs[part.port.pull]
-    if name not in part.joints:
-        return name, -1.0
-    return name, -float(part.port.across[part.port.pull, part.joints.index(name)])
+def _pulled(part: _Placed) -> list[tuple[str, float]]:
+    """Return the joints or tendons on which the voluntary force of a human acts, one per axis, and their gears."""
+    pulled, port = [], part.port
+    first = port.pull % (len(port.across) // port.axes) * port.axes
+    for row in range(first, first + port.axes):
+        name = part.springs[row]
+        gear = -float(port.across[row, part.joints.index(name)]) if name in part.joints else -1.0
+        pulled.append((name, gear))
+    return pulled
 
 
 def _add_springs(spec: mujoco.MjSpec, part: _Placed, damping: Mapping[str, Any], stiffness: Mapping[str, Any]) -> None:
     """Add the spring-dampers of a port that lie between joints, as fixed tendons."""
     for name, row in zip(part.springs, part.port.across, strict=True):
         if name not in part.joints:
-            joints = (*part.joints, part.base) if part.base else part.joints
+            joints = (*part.joints, *part.base)
             ends = {joint: float(c) for joint, c in zip(joints, row, strict=False) if c}
             _add_spring(spec, name, ends, float(stiffness[name]), float(damping[name]))
 
@@ -487,25 +572,29 @@ def _add_motor(
 
 
 def _motors(model: mujoco.MjModel) -> int:
-    return sum(model.actuator(a).name.endswith("force") for a in range(model.nu))
+    return sum(_FORCE in model.actuator(a).name for a in range(model.nu))
 
 
 @dataclass(frozen=True, eq=False)
 class Crowd:
     """Sets of humans, one per device, all with the same number of links and without voluntary motion.
 
-    `holds` lists the channels of each person with several devices. Their bodies and cross springs are in `bodies`.
+    `holds` lists the devices of each person with several. Their bodies and cross springs are in `bodies`. A link with
+    three numbers is alike in every direction. On devices with several axes it may have an amount of damping and one of
+    stiffness along each of `models.human.directions`.
     """
 
-    links: _Array  # (nsim, m, links, 3): mass [kg], damping [N s/m], stiffness [N/m]
-    holds: tuple[tuple[int, ...], ...] = ()  # (persons,) channels, counted from 1
+    links: _Array  # (nsim, devices, links, 3 or more): mass [kg], dampings [N s/m], stiffnesses [N/m]
+    holds: tuple[tuple[int, ...], ...] = ()  # (persons,) devices, counted from 1
     bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
+    axes: tuple[int, ...] = ()  # (devices,) of links with amounts along directions; a link has 1 + 2 axes^2 numbers
 
     def __post_init__(self) -> None:
         links = np.array(self.links, dtype=float)
-        if links.ndim != 4 or links.shape[-1] != 3 or 0 in links.shape[1:]:
-            raise ValueError(f"links has the shape {links.shape}, expected (sets, devices, links, 3)")
+        count = 1 + 2 * max(self.axes, default=1) ** 2
+        if links.ndim != 4 or links.shape[-1] != count or 0 in links.shape[1:]:
+            raise ValueError(f"links has the shape {links.shape}, expected (sets, devices, links, {count})")
         if not ((links >= 0) & (links < np.inf)).all():
             raise ValueError("links has a negative or infinite entry: such a human is not passive")
         bodies = np.array(self.bodies, dtype=float) if self.holds else np.zeros((len(links), 0, 5))
@@ -523,7 +612,9 @@ class Crowd:
     @property
     def ports(self) -> tuple[Port, ...]:
         """One port per device, each with a leading axis over the sets."""
-        return tuple(Port.chain(self.links[:, i]) for i in range(self.links.shape[1]))
+        if not self.axes:
+            return tuple(Port.chain(self.links[:, i]) for i in range(self.links.shape[1]))
+        return tuple(Port.chain_in_space(self.links[:, i, :, : 1 + 2 * k**2], k) for i, k in enumerate(self.axes))
 
     @property
     def held(self) -> tuple[tuple[tuple[int, ...], Port], ...]:
@@ -532,7 +623,8 @@ class Crowd:
 
     def humans(self, i: int) -> tuple[Human, ...]:
         """The humans of set i, one per device."""
-        return tuple(Human(tuple(Link(*link) for link in human)) for human in self.links[i].tolist())
+        axes = self.axes or (1,) * self.links.shape[1]
+        return tuple(Human(tuple(_link(row, k) for row in human)) for human, k in zip(self.links[i], axes, strict=True))
 
     def persons(self, i: int) -> tuple[Person, ...]:
         """The persons of set i who hold several devices."""
@@ -540,37 +632,59 @@ class Crowd:
         return tuple(Person(holds, m, b, k, Cross(*cross)) for holds, (m, b, k, *cross) in pairs)
 
 
+def _link(row: _Array, axes: int) -> Link:
+    """Return a link from its row in Crowd, on a device with so many axes."""
+    if axes == 1:
+        return Link(*row[:3].tolist())
+    along, count = directions(axes), axes**2
+    amounts = row[1 : 1 + count], row[1 + count : 1 + 2 * count]
+    damping, stiffness = ((along.T * amount @ along).tolist() for amount in amounts)
+    return Link(float(row[0]), tuple(map(tuple, damping)), tuple(map(tuple, stiffness)))
+
+
 MIXED = 0  # a number of links: half of the humans have one link and half have two
 
 
-def draw(population: Population, channels: int, seed: int, index: int, links: int) -> _Array:
-    """Draw the links (channels, links, 3) of the humans with this index, one per channel, as in Crowd.
+def draw(population: Population, devices: int, seed: int, index: int, links: int, axes: tuple[int, ...] = ()) -> _Array:
+    """Draw the links (devices, links, 3) of the humans with this index, one per device, as in Crowd.
 
-    They depend on (seed, index) and the population only. With `links` = MIXED the number of links is 1 or 2.
+    They depend on (seed, index) and the population only. With `links` = MIXED the number of links is 1 or 2. With
+    `axes` the damping and the stiffness of a link are sums over `directions`, each within the population's range when
+    all have the same number, so that no direction has more than the range's upper end or less than its lower one.
     """
     rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
     count = int(rng.integers(1, 3)) if links == MIXED else links
     low, high = np.log([population.mass, population.damping, population.stiffness]).T
-    return np.exp(rng.uniform(low, high, size=(channels, count, 3)))
+    if not axes:
+        return np.exp(rng.uniform(low, high, size=(devices, count, 3)))
+    drawn = np.zeros((devices, count, 1 + 2 * max(axes) ** 2))
+    for i, k in enumerate(axes):
+        # The sum of w d d' over all directions d is I: e_i + e_j and e_i - e_j together give 2 (e_i e_i' + e_j e_j').
+        weights = np.concatenate([[1.0], *[np.repeat([0.5 / k, 1.0 / k], [k * k - k, k])] * 2])
+        which = np.repeat([0, 1, 2], [1, k * k, k * k])
+        amounts = np.exp(rng.uniform(low[which], high[which], size=(count, which.size)))
+        drawn[i, :, : which.size] = weights * amounts
+    return drawn
 
 
 def crowds(
     population: Population,
-    channels: int,
+    devices: int,
     seed: int,
     indices: Iterable[int],
     links: int,
     holds: tuple[tuple[int, ...], ...] = (),
+    axes: tuple[int, ...] = (),
 ) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
     """Yield the humans of these indices, grouped by their number of links, as (indices of the group, crowd).
 
-    `holds` lists the channels of each person with several devices, as in Crowd.
+    `holds` lists the devices of each person with several, and `axes` their numbers of axes, as in Crowd.
     """
-    drawn = {i: draw(population, channels, seed, i, links) for i in indices}
+    drawn = {i: draw(population, devices, seed, i, links, axes) for i in indices}
     for count in sorted({values.shape[1] for values in drawn.values()}):
         group = [i for i, values in drawn.items() if values.shape[1] == count]
         bodies = np.stack([_draw_bodies(population, len(holds), seed, i) for i in group])
-        yield np.array(group), Crowd(np.stack([drawn[i] for i in group]), holds, bodies)
+        yield np.array(group), Crowd(np.stack([drawn[i] for i in group]), holds, bodies, axes)
 
 
 def _draw_bodies(population: Population, persons: int, seed: int, index: int) -> _Array:
@@ -663,12 +777,12 @@ def variants(devices: Sequence[Device], crowd: Crowd | HumanSets) -> Variants:
     fields = {name: np.tile(getattr(model, name).astype(float), (len(crowd), 1)) for name in names}
     mass, damping, stiffness = _amounts(devices, placed)
     for name, amount in mass.items():
-        fields["body_mass"][:, model.body(name).id] = amount
+        fields["body_mass"][:, model.body(_body(name)).id] = amount
     for name, amount in damping.items():
         joint = name in mass
         at = model.joint(name).id if joint else model.tendon(name).id
         fields["dof_damping" if joint else "tendon_damping"][:, at] = amount
         fields["jnt_stiffness" if joint else "tendon_stiffness"][:, at] = stiffness[name]
     rows = (row for row, _ in _impedances(model))
-    stacked = (part.port.impedance for part in placed if part.port.impedance)
+    stacked = (part.port.impedance for part in placed if part.port.impedance for _ in range(part.port.axes))
     return Variants(scene, fields, tuple(_Felt(row, z) for row, z in zip(rows, stacked, strict=True)))

@@ -51,9 +51,9 @@ def position_error(
     """
     if exact is None:
         return PositionError(reason="the exact engine is linear and has no Coulomb friction to compare with")
-    limit, m = simulation.process.force_limit, simulation.process.channels
+    limits, m = (simulation.process.force_limit, simulation.process.balls), simulation.process.channels
     n = min(trace.t.size, exact.t.size)
-    clipped = exact.clipped(limit)[:n] | trace.clipped(limit)[:n]
+    clipped = exact.clipped(*limits)[:n] | trace.clipped(*limits)[:n]
     if grows is None:
         grows = worst_mode(simulation).verdict == "unstable"
     linear = int(np.argmax(clipped)) if grows and clipped.any() else n
@@ -242,7 +242,7 @@ def credible(simulation: Simulation, trace: Trace) -> Credible:
     `until_s` is the first time at which a transmission carries more than `credible_force`, or a motor moves faster than
     `credible_speed`; None where that never happens.
     """
-    n, devices = simulation.scene.model.nq, simulation.scenario.device
+    n, devices = simulation.scene.model.nq, simulation.scenario.axis_devices
     forces: list[float | None] = []
     speeds, outside = [], np.zeros(trace.t.size, bool)
     for i, (device, handle) in enumerate(zip(devices, simulation.scene.handles, strict=True)):

@@ -75,7 +75,7 @@ def search(
     """
     from scipy.optimize import differential_evolution  # slow to load, and seldom needed
 
-    m, done = scenario.channels, 0
+    m, done = len(scenario.device), 0
     passes = [p for p in _PASSES if m > 1 or not p.held]
 
     def stop(intermediate_result: OptimizeResult) -> bool:
@@ -124,7 +124,7 @@ def search_population(
     Every generation half of the sets are new draws; the others take each device's hand from one of the worst sets so
     far, or from a new draw. So each hand is one that the population drew, and no assumption is made of what it is.
     """
-    rng, m = np.random.default_rng(np.random.SeedSequence((seed, len(_PASSES)))), scenario.channels
+    rng, m = np.random.default_rng(np.random.SeedSequence((seed, len(_PASSES)))), len(scenario.device)
     elite: list[tuple[float, tuple[Hand, ...]]] = []
     for generation in range(generations):
         sets: list[tuple[Hand, ...]] = [tuple(scenario.population.draw(rng, m)) for _ in range(_CANDIDATES)]
@@ -150,19 +150,19 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
     return ranked
 
 
-def _ladders(x: Array, channels: int, kind: _Pass) -> Crowd:
-    """Logs of masses and stiffnesses, (2 channels links, nsim), as lossless humans.
+def _ladders(x: Array, devices: int, kind: _Pass) -> Crowd:
+    """Logs of masses and stiffnesses, (2 devices links, nsim), as lossless humans.
 
     Where one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness.
     """
-    arms = 2 * channels * kind.links
-    values = np.exp(x[:arms].T).reshape(-1, channels, kind.links, 2)
+    arms = 2 * devices * kind.links
+    values = np.exp(x[:arms].T).reshape(-1, devices, kind.links, 2)
     links = np.stack([values[..., 0], np.zeros_like(values[..., 0]), values[..., 1]], axis=-1)
     if not kind.held:
         return Crowd(links)
     mass, stiffness, cross = np.exp(x[arms:])
     bodies = np.stack([mass, 0 * mass, stiffness, 0 * mass, cross], axis=-1)[:, None]
-    return Crowd(links, (tuple(range(1, channels + 1)),), bodies)
+    return Crowd(links, (tuple(range(1, devices + 1)),), bodies)
 
 
 def _loops(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets) -> ClosedLoop:
@@ -173,7 +173,7 @@ def _loops(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets) -> ClosedLoop:
 
 def _losses(x: Array, scenario: Scenario, F: Lti, kind: _Pass) -> Array:
     """Minus the largest growth [1/s] among the modes looked at, for every column of x."""
-    loops = _loops(scenario, F, _ladders(x.reshape(x.shape[0], -1), scenario.channels, kind))
+    loops = _loops(scenario, F, _ladders(x.reshape(x.shape[0], -1), len(scenario.device), kind))
     (growth,) = loops.growths(kind.min_frequency_hz)
     return -growth
 

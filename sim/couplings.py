@@ -230,12 +230,12 @@ def assessed(
         ranges_seed=seed,
         limiter=limiter,
         limiter_proof=chosen.limiter,
-        force_limit=tuple(device.force_limit for device in scenario.device),
+        force_limit=tuple(device.force_limit for device in scenario.axis_devices),
         band_hz=band_hz,
         progress=progress,
     )
     plugged = shelled(environment or scenario.environment)
-    if plugged and assessment.guarantee and any(device.encoder_step for device in scenario.device):
+    if plugged and assessment.guarantee and any(device.encoder_step for device in scenario.axis_devices):
         return assessment.without_guarantee("the devices have encoder steps, and the account needs exact positions")
     budgeted = energy_budget is not None and not plugged
     if scenario.loses_packets and assessment.guarantee and not budgeted:

@@ -77,7 +77,7 @@ def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterat
     drawn, layouts = {}, {}
     for i in indices:
         rng = np.random.default_rng(np.random.SeedSequence((seed, i)))
-        drawn[i] = tuple(scenario.population.draw(rng, scenario.channels))
+        drawn[i] = tuple(scenario.population.draw(rng, len(scenario.device)))
         layouts[i] = tuple(human.port().layout for human in drawn[i])
     for layout in dict.fromkeys(layouts.values()):
         group = [i for i in drawn if layouts[i] == layout]
@@ -140,7 +140,9 @@ class Validation:
         if not isinstance(scenario.population, Population):
             return _own_crowds(scenario, self.seed, indices)
         holds = tuple(person.holds for person in scenario.person)
-        return crowds(scenario.population, scenario.channels, self.seed, indices, self.links, holds)
+        counts = tuple(len(device.free) for device in scenario.device)
+        axes = counts if max(counts) > 1 else ()
+        return crowds(scenario.population, len(counts), self.seed, indices, self.links, holds, axes)
 
     def crowd(self, index: int) -> Crowd | HumanSets:
         """The one set of humans with this index."""

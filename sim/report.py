@@ -30,11 +30,18 @@ from haptic_loop.sim.trace import Trace
 def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> EncoderSteps | None:
     """Whether the devices' friction pays for their encoders' steps."""
     fields = ("encoder_step", "friction", "friction_max")
-    steps, friction, most = ([getattr(device, field) for device in scenario.device] for field in fields)
+    steps, friction, most = ([getattr(device, field) for device in scenario.axis_devices] for field in fields)
+    friction = [f / n for f, n in zip(friction, _shared(scenario), strict=True)]
     try:
         return EncoderSteps.of(scenario.loop(case), coupling, steps, friction, most)
     except ValueError:  # no solution of the algebraic loop, which the conditions have said
         return None
+
+
+def _shared(scenario: Scenario) -> list[float]:
+    """What a friction force is divided by on each channel: sqrt(n) where one number is that of n axes together."""
+    counts = [1 if isinstance(d.friction, tuple) else len(d.free) for d in scenario.device]
+    return [count**0.5 for d, count in zip(scenario.device, counts, strict=True) for _ in d.free]
 
 
 def friction_left_out(devices: Sequence[Device]) -> list[str]:
@@ -42,7 +49,7 @@ def friction_left_out(devices: Sequence[Device]) -> list[str]:
     return [
         f"Friction of device #{i}: at most {device.friction_max:g} N (published), not simulated and not relied upon."
         for i, device in enumerate(devices, start=1)
-        if device.friction_max is not None and not device.friction
+        if device.friction_max is not None and not np.any(device.friction)
     ]
 
 
@@ -255,7 +262,7 @@ def switched_stability(simulation: Simulation, trace: Trace, delays: VaryingDela
     return Stability(
         **vars(constant),
         verdict="unstable" if grows else "stable",
-        clipped_ticks=int(trace.clipped(simulation.process.force_limit).sum()),
+        clipped_ticks=int(trace.clipped(simulation.process.force_limit, simulation.process.balls).sum()),
         growth_rate_per_s=finite(met.worst.growth_rate_per_s),
         frequency_hz=trace.dominant_frequency_hz(),
         reason=f"{met.how}; the eigenvalues are those of the constant delay theta = {theta}",

@@ -103,7 +103,7 @@ class Simulation:
     @property
     def friction(self) -> bool:
         """Whether a device has Coulomb friction: the scene has it then, `plant` has not."""
-        return any(device.friction for device in self.scenario.device)
+        return any(np.any(device.friction) for device in self.scenario.device)
 
     @property
     def smooth(self) -> Simulation:
@@ -144,12 +144,13 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
     """
     if scenario.environment.walls and coupling.holds_model:
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
-    limits, steps = (np.array([getattr(d, of) for d in scenario.device]) for of in ("force_limit", "encoder_step"))
+    axes = scenario.axis_devices
+    limits, steps = (np.array([getattr(axis, of) for axis in axes]) for of in ("force_limit", "encoder_step"))
     if scenario.environment.world:  # the scene's forces come from a net (sim.world), and no linear law is known
         law = Law(Lti.constant(np.zeros((scenario.channels,) * 2), scenario.T), scenario.theta)
     else:
-        law = scenario.loop("I").law(coupling, limits, lag)
-    process = Process(law, limits, steps)
+        law = scenario.loop("I").law(coupling, scenario.box_limits, lag)
+    process = Process(law, limits, steps, balls=scenario.balls)
     scene = build(scenario.device, scenario.human, scenario.person)
     plant = hold(scene.plant, scenario.T, scenario.usual_latency)
     return Simulation(scenario, coupling, process, scene, plant, scenario.timing(seed, scenario.samples))
@@ -212,6 +213,7 @@ def run(
         diverged=diverged,
         interrupted=interrupted,
         net=net,
+        names=scenario.channel_names,
     )
 
 
@@ -311,16 +313,20 @@ def outside_forces(
     t = beginnings(scenario.T, timing, first, ticks)
     w = np.zeros((ticks, scene.outside))
     if voluntary:
-        for i, (human, column) in enumerate(zip(scenario.human, scene.pushed, strict=True), start=1):
+        for i, (human, device) in enumerate(zip(scenario.human, scenario.device, strict=True), start=1):
             force = np.asarray(human.voluntary_force(t))
-            if force.shape != t.shape:
+            columns = [column for column, of in zip(scene.pushed, scene.devices, strict=True) if of == i - 1]
+            rows = force[:, None] if force.ndim == 1 else force
+            if rows.shape == (t.size, device.axes):
+                rows = rows[:, list(device.free)]
+            if len(rows) != t.size or rows.ndim != 2 or rows.shape[1] not in (1, len(columns)):
                 raise InputError(f"human #{i}.voluntary_force(t) has the shape {force.shape} for {t.size} times")
-            if not (finite := np.isfinite(force)).all():
+            if not (finite := np.isfinite(rows).all(axis=1)).all():
                 k = int(np.argmin(finite))
                 raise InputError(
                     f"human #{i}.voluntary_force(t) is {force[k]} at {t[k]:g} s, expected a finite force in N"
                 )
-            w[:, column] += force
+            w[:, columns[: rows.shape[1]]] += rows
     if tap := scenario.tap:
         places = np.round(t / scenario.T, 9) if timing else range(first, first + ticks)
         ends = [bisect_left(places, round(time / scenario.T, 9)) for time in (tap.start, tap.start + tap.duration)]

@@ -175,6 +175,6 @@ def _ran(run: ScenarioRun, lam: tuple[int, ...], environment: str, check: bool) 
         interrupted=trace.interrupted,
         scenario_digest=scenario.digest,
         encoder_step_m=process.encoder_step,
-        steady_ticks=[[0, trace.ticks_before_clipping(process.force_limit)]],
+        steady_ticks=[[0, trace.ticks_before_clipping(process.force_limit, process.balls)]],
         environment=environment,
     )

@@ -19,6 +19,7 @@ import numpy as np
 
 from haptic_loop.controller.delay import LOST, Periods, Timing, VaryingDelay, drawn
 from haptic_loop.controller.environment import (
+    GROUND,
     RIGID_WALL,
     Block,
     Environment,
@@ -31,7 +32,7 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.design.files import InputError, counted, read_text, toml, write
 from haptic_loop.design.own import called, named, place_of
-from haptic_loop.models.device import MOST_DAMPING, Device, fields_of, require
+from haptic_loop.models.device import AXES, MOST_DAMPING, Device, fields_of, require, symmetric
 from haptic_loop.models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
 CASES = ("none", "I", "II")
@@ -50,7 +51,7 @@ _UNSAID: Any = None  # until the number of channels is known; no file can say it
 class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A short constant force on one handle."""
 
-    channel: int  # counted from 1
+    channel: int  # counted from 1, over the axes of all devices
     force: float  # [N]
     start: float  # [s]
     duration: float  # [s]
@@ -67,7 +68,10 @@ def _usual_hand(i: int) -> Human:
 
 
 class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Devices, humans, environment, delays and timing of one loop; every list has one entry per channel."""
+    """Devices, humans, environment, delays and timing of one loop; every list has one entry per device.
+
+    A channel is an axis of a device. Delays and latencies are given per device and kept per channel.
+    """
 
     name: str
     T: float  # sampling period [s]
@@ -91,6 +95,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def __post_init__(self) -> None:
         if len(self.name) > _LONGEST_NAME:
             raise ValueError(f"name has {len(self.name)} characters, allowed are {_LONGEST_NAME}")
+        self._per_channel()
         if self.channels > _MOST_CHANNELS:
             raise ValueError(f"environment.contacts has {self.channels} entries, allowed are 1 to {_MOST_CHANNELS}")
         require("T", self.T, 1e-6, 0.1, "s")
@@ -98,10 +103,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         if self.psi is _UNSAID:
             msgspec.structs.force_setattr(self, "psi", (0,) * self.channels)
         if self.human is _UNSAID:
-            msgspec.structs.force_setattr(self, "human", tuple(map(_usual_hand, range(self.channels))))
+            msgspec.structs.force_setattr(self, "human", tuple(map(_usual_hand, range(len(self.device)))))
         for name in ("theta", "psi", "device", "human", "lam"):
             value = getattr(self, name)
-            if value is not None and len(value) != self.channels:
+            expected = len(self.device) if name == "human" else self.channels
+            there = len(self.axis_devices) if name == "device" else len(value or ())
+            if value is not None and there != expected:
                 contacts = f"the environment has {self.channels} contacts ({', '.join(self.environment.contacts)})"
                 raise ValueError(f"{name} has {len(value)} entries, but {contacts}")
             for i, n in enumerate(value if name in ("theta", "psi", "lam") and value else (), start=1):
@@ -114,7 +121,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             if lam > self.theta[i] + self.psi[i]:
                 total = self.theta[i] + self.psi[i]
                 raise ValueError(f"lam #{i + 1} is {lam}, allowed are 0 to theta + psi = {total} samples")
-        check_holds([person.holds for person in self.person], self.channels)
+        check_holds([person.holds for person in self.person], len(self.device))
         if self.varying_delay:
             self._check_varying_delay(self.varying_delay)
         if self.ranges and self.environment.walls:
@@ -123,6 +130,63 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         self.loop("I")  # raises ValueError where the ranges do not fit the environment
         if self.tap and not 1 <= self.tap.channel <= self.channels:
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
+
+    def _per_channel(self) -> None:
+        """Repeat what is given per device for each of its axes. Raises ValueError where axes of a device differ."""
+        counts = [len(device.free) for device in self.device]
+        if max(counts, default=1) == 1:
+            return
+
+        def each(name: str, values: Any) -> Any:
+            if values is None or values is _UNSAID or len(values) not in (len(counts), sum(counts)):
+                if values is None or values is _UNSAID:
+                    return values
+                raise ValueError(f"{name} has {len(values)} entries, expected {len(counts)}, one for each device")
+            if len(values) == len(counts):
+                return tuple(value for value, count in zip(values, counts, strict=True) for _ in range(count))
+            if any(value != values[first] for value, first in zip(values, self.lead, strict=True)):
+                raise ValueError(f"{name} is {list(values)}, expected one value for all axes of a device")
+            return tuple(values)
+
+        for name in ("theta", "psi", "lam", "latency"):
+            msgspec.structs.force_setattr(self, name, each(name, getattr(self, name)))
+        if varying := self.varying_delay:
+            rows = {name: each(f"varying_delay.{name}", getattr(varying, name)) for name in ("lo", "hi")}
+            recorded = tuple(each("varying_delay.recorded", row) for row in varying.recorded)
+            varying = msgspec.structs.replace(varying, **rows, recorded=recorded)
+            msgspec.structs.force_setattr(self, "varying_delay", varying)
+
+    @property
+    def axis_devices(self) -> tuple[Any, ...]:
+        """Every channel as a Device whose fields are numbers; `device` itself where all devices have one axis."""
+        if all(device.axes == 1 for device in self.device):
+            return self.device
+        return tuple(axis for device in self.device for axis in device.channels())
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """(m,) "left.x" and so on where devices have several axes, else nothing: channels are called by numbers."""
+        return () if self.axis_devices is self.device else self.environment.contacts
+
+    @property
+    def balls(self) -> tuple[slice, ...]:
+        """The channels of each device whose `force_limit` bounds the length of its force vector."""
+        ends = np.cumsum([0, *(len(device.free) for device in self.device)]).tolist()
+        return tuple(slice(a, b) for device, a, b in zip(self.device, ends, ends[1:], strict=False) if device.ball)
+
+    @property
+    def box_limits(self) -> tuple[float, ...]:
+        """(m,) [N] limits of single channels that keep every force vector within its device's limit."""
+        limits = [device.force_limit for device in self.axis_devices]
+        for ball in self.balls:
+            limits[ball] = [limit / (ball.stop - ball.start) ** 0.5 for limit in limits[ball]]
+        return tuple(limits)
+
+    @property
+    def lead(self) -> list[int]:
+        """(m,) the first channel of each channel's device: all axes of a device share what is drawn for it."""
+        counts = [len(device.free) for device in self.device]
+        return np.repeat(np.cumsum([0, *counts[:-1]]), counts).tolist()
 
     def _check_timing(self) -> None:
         if self.period and self.T_max is not None and self.period.longest > self.T_max:
@@ -174,8 +238,19 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def delta(self) -> tuple[float, ...]:
-        """The guaranteed damping of each device [N s/m]: all that certificates know of it."""
-        return tuple(device.passivity_level for device in self.device)
+        """The guaranteed damping on each channel [N s/m], the diagonal of a matrix: see `levels`."""
+        return tuple(device.passivity_level for device in self.axis_devices)
+
+    @property
+    def _axes(self) -> dict[str, Any]:
+        """The fields of a loop on devices with several axes; none where all have one: such a loop keeps its digest."""
+        counts = tuple(len(device.free) for device in self.device)
+        if max(counts) == 1:
+            return {}
+        matrices = [device.matrix("delta") for device in self.device]
+        skew = any((matrix != np.diag(np.diag(matrix))).any() for matrix in matrices)
+        levels = tuple(tuple(map(tuple, matrix.tolist())) for matrix in matrices)
+        return {"axes": counts, "levels": levels} if skew else {"axes": counts}
 
     @property
     def samples(self) -> int:
@@ -198,7 +273,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     @property
     def known_devices(self) -> tuple[DeviceBounds, ...] | None:
         """The guaranteed bounds of every device, None unless all devices have some."""
-        known = [device.guaranteed for device in self.device]
+        known = [device.guaranteed for device in self.axis_devices]
         return None if None in known else tuple(DeviceBounds(**msgspec.structs.asdict(each)) for each in known if each)
 
     @property
@@ -214,7 +289,10 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def timing(self, seed: int, ticks: int) -> Timing | None:
         """When the ticks of a run begin and its forces latch, of the seed only; None where both are at k T."""
         rng = np.random.default_rng(np.random.SeedSequence((seed, _TIMING_STREAM)))
-        return drawn(self.T, self.period, self.latency, ticks, rng)
+        timing = drawn(self.T, self.period, self.latency, ticks, rng)
+        if timing is None or timing.late is None or self.axis_devices is self.device:
+            return timing
+        return Timing(timing.period, timing.late[:, self.lead])
 
     @property
     def digest(self) -> str:
@@ -257,7 +335,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         varying = span if self.switches and span.lo != span.hi else None
         delays = (self.theta, self.psi, self.reference_delays(case))
         rest = (self.delta, _nowhere(self.environment), self.ranges, varying)
-        return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency, **self._known())
+        more = {**self._known(), **self._axes}
+        return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency, **more)
 
     def _known(self, channels: int | None = None) -> dict[str, Any]:
         """The fields of a loop on known devices, those of its first channels; none where a device is not known.
@@ -268,10 +347,16 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return {"known_devices": known[:channels], "T_min": self.shortest_period} if known else {}
 
     def before_a_rigid_wall(self, psi: tuple[int, ...] = (0,)) -> Loop:
-        """The loop of the first channel alone, a rigid wall in the place of the environment. Raises ValueError."""
-        theta, late = self.theta[:1], self.latency and self.latency[:1]
+        """The loop of the first device alone, a rigid wall in the place of the environment. Raises ValueError.
+
+        Of a device with several axes the wall may face any direction, so that the least damping of all counts.
+        """
+        theta, late, delta = self.theta[:1], self.latency and self.latency[:1], self.delta[:1]
+        if self.device[0].axes > 1:
+            least = np.linalg.eigvalsh(self.device[0].matrix("delta"))[0]
+            delta = (min(float(least) * (1 - 1e-12), *self.delta[: len(self.device[0].free)]),)  # rounding of eigvalsh
         rest: dict[str, Any] = {"T_max": self.longest_period, **self._known(1)}
-        return Loop(self.T, theta, psi, theta, self.delta[:1], RIGID_WALL, latency=late, **rest)
+        return Loop(self.T, theta, psi, theta, delta, RIGID_WALL, latency=late, **rest)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping [N s/m].
@@ -286,8 +371,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         try:
             if delta is not None:
                 damping = _strictly({"delta": delta}, _Damping).delta
-                if len(damping) != self.channels:
-                    raise InputError(f"delta has {len(damping)} entries for {self.channels} channels")
+                if len(damping) != len(self.device):
+                    raise InputError(f"delta has {len(damping)} entries for {len(self.device)} devices")
                 fields["device"] = tuple(d.with_damping(b) for d, b in zip(self.device, damping, strict=True))
             if not isinstance(fields["environment"], Network | dict):
                 fields["environment"] = _network(fields["environment"], fields["T"])
@@ -358,9 +443,10 @@ def require_no_world(scenario: Scenario, what: str) -> None:
 def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
     """Raises InputError where a loop has Coulomb friction or, unless `walls` are decided too, walls."""
     for i, device in enumerate(scenario.device, start=1):
-        if device.friction:
+        if np.any(device.friction):
+            friction = list(device.friction) if isinstance(device.friction, tuple) else f"{device.friction:g}"
             instead = "sim.run and sim.zwidth simulate it"
-            raise InputError(f"device #{i}.friction is {device.friction:g} N: {what} decides linear loops; {instead}")
+            raise InputError(f"device #{i}.friction is {friction} N: {what} decides linear loops; {instead}")
     if scenario.environment.walls and not walls:
         raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
 
@@ -392,25 +478,25 @@ class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def held_by(scenario: Scenario, text: str) -> Scenario:
     """The scenario with the hands, or the population, of a TOML file or of FILE.py:NAME. Raises InputError."""
-    people = _load_humans(text, scenario.channels)
+    people = _load_humans(text, len(scenario.device))
     who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
     if people.population is not None:
         who["population"] = people.population
     return scenario.replace(**who)
 
 
-def _load_humans(text: str, channels: int) -> _HumanFile:
-    """The humans of a TOML file or of FILE.py:NAME, one per channel, and who holds several devices.
+def _load_humans(text: str, devices: int) -> _HumanFile:
+    """The humans of a TOML file or of FILE.py:NAME, one per device, and who holds several devices.
 
     Raises InputError with one line that names the file and the field.
     """
     own = ".py" in text
     try:
         people = _own_humans(text) if own else _humans_of(read_text(text, f"--human {text}"), f"--human {text}")
-        if len(people.human) != channels and not people.population:
+        if len(people.human) != devices and not people.population:
             what = "hands" if own else "[[human]] tables"
-            raise InputError(f"--human {text} has {len(people.human)} {what}, expected {channels} (one per channel)")
-        check_holds([person.holds for person in people.person], channels)
+            raise InputError(f"--human {text} has {len(people.human)} {what}, expected {devices} (one per device)")
+        check_holds([person.holds for person in people.person], devices)
     except InputError:
         raise
     except ValueError as error:
@@ -456,6 +542,11 @@ def _own_humans(text: str) -> _HumanFile:
     return _HumanFile(_kept(tuple(hand for hand in made if not isinstance(hand, Person))), persons)
 
 
+def _toml(value: Any) -> str:
+    """A number, or a list or a matrix of numbers, as TOML has it."""
+    return f"[{', '.join(map(_toml, value))}]" if isinstance(value, tuple) else repr(value)
+
+
 def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
     """Write humans and persons without voluntary motion so that reading gives the same numbers.
 
@@ -464,7 +555,8 @@ def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple
     lines = [f"# {line}" for line in remark.splitlines()]
     for human in humans:
         rows = (
-            f"    {{ mass = {x.mass!r}, damping = {x.damping!r}, stiffness = {x.stiffness!r} }}," for x in human.links
+            f"    {{ mass = {x.mass!r}, damping = {_toml(x.damping)}, stiffness = {_toml(x.stiffness)} }},"
+            for x in human.links
         )
         lines += ["", "[[human]]", "links = [", *rows, "]"]
     for person in persons:
@@ -485,7 +577,7 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
     raw = toml(text, source)
     try:
         raw = _whole(raw) if kind is Scenario else raw
-        return msgspec.convert(_with_world(_with_catalogue(raw), folder), kind)
+        return msgspec.convert(_with_world(_in_space(_with_catalogue(raw)), folder), kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
     except ValueError as error:
@@ -520,6 +612,75 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
                 raise InputError(f"device #{i}: {error}") from None
         made.append(given)
     return raw | {"device": made}
+
+
+def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
+    """The file with the points of its environment in space, where its devices have several axes. Raises ValueError."""
+    devices, given = raw.get("device"), raw.get("environment")
+    tables = [one for one in devices if isinstance(one, dict)] if isinstance(devices, list) else []
+    counts = [one.get("axes", 1) for one in tables]
+    if all(n == 1 for n in counts) or not all(type(n) is int and 1 <= n <= len(AXES) for n in counts):
+        return raw  # one axis, or what the fields' own checks refuse
+    if not isinstance(given, dict) or "world" in given or given.get("points"):
+        return raw
+    for i, n in enumerate(counts, start=1):
+        if n != counts[0]:
+            raise ValueError(f"device #{i}.axes is {n}, expected {counts[0]} as of device #1: clamp axes of it instead")
+    names = AXES[: counts[0]]
+    held = [one.get("clamped", []) for one in tables]
+    contacts, walls = given.get("contacts", []), given.get("walls", [])
+    springs = [part for i, one in enumerate(given.get("springs", []), 1) for part in _along_axes(i, one, len(names))]
+    parts = [*springs, *(walls if isinstance(walls, list) else [])]
+    if not isinstance(contacts, list) or not all(isinstance(name, str) for name in contacts):
+        return raw
+    if len(contacts) != len(tables):
+        raise ValueError(
+            f"environment.contacts has {len(contacts)} points, expected {len(tables)}, one for each device"
+        )
+    ends = [end for part in parts if isinstance(part, dict) for end in _listed(part.get("between")) if end != GROUND]
+    masses = given.get("masses", {})
+    points = {name: [f"{name}.{axis}" for axis in names] for name in (*contacts, *ends, *masses)}
+    for name, clamped in zip(contacts, held, strict=True):
+        free = [axis for axis in names if axis not in _listed(clamped)]
+        points[name] = [f"{name}.{axis}" if axis in free else GROUND for axis in names]
+    flat = [node for name in contacts for node in points[name] if node != GROUND]
+    return raw | {"environment": {**given, "contacts": flat, "springs": springs, "points": points}}
+
+
+def _listed(value: Any) -> list[str]:
+    return [part for part in value if isinstance(part, str)] if isinstance(value, list | tuple) else []
+
+
+def _along_axes(number: int, spring: Any, axes: int) -> list[Any]:
+    """Return a spring whose stiffness or damping is a list or a matrix as springs along its principal directions.
+
+    Raises ValueError for a matrix that is not symmetric and positive semidefinite.
+    """
+    fields = ("stiffness", "damping")
+    several = [f for f in fields if isinstance(spring, dict) and isinstance(spring.get(f), list)]
+    if not several:
+        return [spring]
+    if "along" in spring:
+        raise ValueError(f"environment.springs #{number}: along with a list of {several[0]}: give one of them")
+    rest = {key: value for key, value in spring.items() if key not in several}
+    found: dict[tuple[float, ...], dict[str, float]] = {}
+    for name in several:
+        field = f"environment.springs #{number}.{name}"
+        value = spring[name]
+        if not all(type(c) in (int, float) for row in value for c in (row if isinstance(row, list) else [row])):
+            raise ValueError(f"{field} is {value!r}, expected numbers")
+        matrix = symmetric(field, value, axes)
+        diagonal = (matrix == np.diag(np.diag(matrix))).all()
+        amounts, directions = (np.diag(matrix), np.eye(axes)) if diagonal else np.linalg.eigh(matrix)
+        most = float(np.abs(amounts).max())
+        if amounts.min() < -1e-12 * most:  # what rounding of eigh may add
+            raise ValueError(f"{field} is {value!r} with the eigenvalue {amounts.min():g}, expected none below 0")
+        for amount, direction in zip(amounts.tolist(), directions.T.tolist(), strict=True):
+            if amount > 1e-12 * most:
+                found.setdefault(tuple(direction), {})[name] = amount
+    plain = [rest | {"stiffness": rest.get("stiffness", 0.0)}] if set(rest) - {"between"} else []
+    directed = [{"stiffness": 0.0} | rest_of | {"along": list(n)} for n, rest_of in found.items()]
+    return [*plain, *({"between": spring.get("between")} | one for one in directed)]
 
 
 _ALONG = [1.0, 0.0, 0.0]  # x, unless a scenario says otherwise
@@ -608,7 +769,7 @@ def _strictly(fields: dict[str, Any], kind: Any) -> Any:
     """The fields as `kind`, by the rules of a file. Raises InputError."""
     raw = {name: _plain(name, value) for name, value in fields.items()}
     try:
-        return msgspec.convert(_with_catalogue(raw), kind)
+        return msgspec.convert(_in_space(_with_catalogue(raw)), kind)
     except msgspec.ValidationError as error:
         raise InputError(_located(str(error), raw)) from None
 
@@ -659,8 +820,8 @@ def _kept(value: Any) -> Any:
 def _given_fields(device: Device) -> dict[str, Any]:
     """Return the fields of a device without newer ones that are not given: such devices keep their digest."""
     fields = msgspec.to_builtins(device)
-    for name in ("guaranteed", "friction_max"):
-        if fields.get(name) is None:
+    for name, default in (("guaranteed", None), ("friction_max", None), ("axes", 1), ("clamped", ())):
+        if fields.get(name) == default:
             fields.pop(name, None)
     return fields
 

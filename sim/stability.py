@@ -17,7 +17,7 @@ from haptic_loop.controller.delay import Timing
 from haptic_loop.controller.law import State
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
-from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.controller.tick import Process, StepBuffer, at_limit
 from haptic_loop.design.files import off_table
 from haptic_loop.models.hold import HeldPlant, at_the_latch, hold
 from haptic_loop.models.scene import Scene, Variants
@@ -190,7 +190,7 @@ _AT_ONCE = 1 << 16  # ticks that are projected at a time, because the states of 
 
 
 def _measured_growth(
-    loop: ClosedLoop, trace: Trace, force_limit: Array, ahead: int = 0
+    loop: ClosedLoop, trace: Trace, force_limit: Array, ahead: int = 0, balls: Sequence[slice] = ()
 ) -> tuple[float | None, str | None]:
     """Return the growth rate [1/s] of the loop's dominant mode in a trace, or None and the reason.
 
@@ -198,7 +198,7 @@ def _measured_growth(
     y[k+1] - left* B w[k] = lambda y[k], and lambda is the least-squares fit over the ticks before the first clipped
     one, less `ahead` ticks, by which a limiter acts before its force arrives.
     """
-    clipped = trace.clipped(force_limit)
+    clipped = trace.clipped(force_limit, balls)
     usable = max(int(np.argmax(clipped)) - ahead, 0) if clipped.any() else clipped.size - 1 - ahead
     if usable < _SHORTEST_TRACE:
         which = "ticks before the first clipped one" if clipped.any() else "ticks"
@@ -290,7 +290,7 @@ def stability_of(simulation: Simulation, trace: Trace) -> Stability:
     else:
         loop = close(simulation.plant, simulation.F)
         ahead = max(simulation.scenario.theta) if simulation.process.law.bounds else 0
-        growth, reason = _measured_growth(loop, trace, simulation.process.force_limit, ahead)
+        growth, reason = _measured_growth(loop, trace, simulation.process.force_limit, ahead, simulation.process.balls)
     if trace.diverged:
         reason = "the simulation left the range of finite numbers: reported as unstable"
     exact = eigenvalues(worst_mode(simulation))
@@ -302,7 +302,7 @@ def stability_of(simulation: Simulation, trace: Trace) -> Stability:
     return Stability(
         **vars(exact),
         verdict=exact.exact_verdict if reason == _NOT_EXCITED else found,
-        clipped_ticks=int(trace.clipped(simulation.process.force_limit).sum()),
+        clipped_ticks=int(trace.clipped(simulation.process.force_limit, simulation.process.balls).sum()),
         growth_rate_per_s=growth,
         frequency_hz=trace.dominant_frequency_hz(),
         contact=contact,
@@ -361,22 +361,29 @@ class Balance:
     """The energy of each tick where forces act at ticks: the work of the forces and the least dissipation."""
 
     damping: Array  # (m, 1) [N/m] delta/T
+    Delta: Array | None  # (m, m) [N s/m] where a device has a matrix, whose diagonal is delta
 
     @staticmethod
     def of(variants: Variants, loop: Loop, late: Sequence[float] | None) -> Balance:
         """Return the balance of devices held by `variants`; forces latch `late` (m,) [s] after ticks, or at ticks."""
-        delta = np.array(loop.delta)[:, None]
+        delta, Delta = np.array(loop.delta)[:, None], loop.Delta() if loop.levels else None
         if late is None:
-            return Balance(delta / loop.T)
+            return Balance(delta / loop.T, Delta)
         spans = np.array(loop.latency)[:, :, None]
         before = np.divide(delta, spans[:, 1], out=np.zeros_like(delta), where=spans[:, 1] > 0)  # 0: no step before
         after = delta / ((loop.T_max or loop.T) - spans[:, 0])
-        return _LateBalance(after, before, at_the_latch(variants.plants(), late))
+        return _LateBalance(after, Delta, before, at_the_latch(variants.plants(), late))
 
     def terms(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
         """Return the work of the forces and the least dissipation, for each tick and channel, (count, m, nsim)."""
         moved = np.diff(buffer.x[: count + 1], axis=0)
-        return buffer.f[:count] * moved, self.damping * moved**2
+        return buffer.f[:count] * moved, self._spent(self.damping, moved)
+
+    def _spent(self, damping: Array, moved: Array) -> Array:
+        """The least that is dissipated over steps (count, m, nsim), `damping` (m, 1) of them; a matrix is scaled."""
+        if self.Delta is None:
+            return damping * moved**2
+        return damping * moved * np.einsum("ij,kjn->kin", self.Delta / np.diag(self.Delta)[:, None], moved)
 
 
 @dataclass(frozen=True, eq=False)
@@ -390,7 +397,7 @@ class _LateBalance(Balance):
         x, s, f = buffer.x[: count + 1], buffer.s[:count], buffer.f[:count]
         middle = np.einsum("nme,ken->kmn", self.seen, np.concatenate([s, buffer.w[:count], f], axis=1), optimize=True)
         first, then = middle - x[:-1], x[1:] - middle
-        spent = self.before * first**2 + self.damping * then**2
+        spent = self._spent(self.before, first) + self._spent(self.damping, then)
         return s[:, s.shape[1] - f.shape[1] :] * first + f * then, spent
 
 
@@ -437,11 +444,11 @@ def impulse_growth(
     the second: inf where numbers overflow, -inf at exact rest. Without force limits it does not depend on the size of
     the impulse.
     """
-    T, quarter, limit = process.F.T, ticks // 4, process.force_limit[:, None]
+    T, quarter = process.F.T, ticks // 4
     speeds, clipped = _Speeds(scene, nsim, (quarter, 2 * quarter), (ticks - quarter, ticks)), np.zeros(nsim, dtype=bool)
 
     def each_block(buffer: StepBuffer, first: int, count: int) -> None:
-        clipped[...] |= (np.abs(buffer.f[:count]) >= limit).any(axis=(0, 1))
+        clipped[...] |= at_limit(buffer.f[:count], process.force_limit, process.balls).any(axis=(0, 1))
         speeds.see(buffer, first, count)
 
     run_blocks(process, engine, partial(impulse_forces, scene, T), ticks, np.zeros((states, nsim)), each_block)
@@ -487,7 +494,7 @@ class _Audit:
 
     def __init__(self, process: Process, scene: Scene, loops: ClosedLoop, balance: Balance, ticks: int) -> None:
         nsim, self._balance = loops.A.shape[0], balance
-        self._limit, self._law = process.force_limit[:, None], process.ticked
+        self._process, self._law = process, process.ticked
         self._made, self._touching = np.zeros(nsim, dtype=int), np.zeros((len(process.walls), nsim), dtype=bool)
         self._B, self._T = loops.B, loops.T
         self._left = _left_eigenvector(loops)  # (nsim, n)
@@ -502,7 +509,10 @@ class _Audit:
         """Take in the first `count` rows of the buffer; row 0 is tick `first`."""
         z, s, w, f = (rows[: count + 1] for rows in (buffer.z, buffer.s, buffer.w, buffer.f))
         law = self._law
-        clipped = law.limited(z, f[:count], self._limit).any(axis=1)  # (ticks, nsim)
+        limit, balls = self._process.force_limit, self._process.balls
+        slipped = law.bounds or not balls
+        where = law.limited(z, f[:count], limit[:, None]) if slipped else at_limit(f[:count], limit, balls)
+        clipped = where.any(axis=1)  # (ticks, nsim)
         if law.walls:
             touching = np.concatenate([self._touching[None], law.depths(z) > 0])
             self._made += (touching[1:] & ~touching[:-1]).sum(axis=(0, 1))

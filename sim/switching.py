@@ -80,7 +80,8 @@ def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: T
     assert scenario.varying_delay is not None
     rows = np.array([scenario.theta]) if scenario.varying_delay.pattern == "constant" else given
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, _STREAM)))
-    return scenario.varying_delay.draw(rng, ticks, rows)
+    delays = scenario.varying_delay.draw(rng, ticks, rows)
+    return delays if scenario.axis_devices is scenario.device else delays[:, scenario.lead]
 
 
 # ---- the worst delays

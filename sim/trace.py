@@ -22,7 +22,7 @@ if __name__ == "__main__":  # before the imports, which --help does without
     door("trace")
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array, ReadOnly, frozen
-from haptic_loop.controller.tick import Net
+from haptic_loop.controller.tick import Net, at_limit
 from haptic_loop.design.files import InputError, read_arrays, write
 
 _MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep
@@ -71,6 +71,7 @@ class Trace(ReadOnly):
         diverged: Whether the engine gave up, or a number stopped being finite, soon after the last tick.
         interrupted: Whether the run was stopped from the keyboard.
         net: The passivity layer that stood under the controller, as the run left it; None without one.
+        names: (m,) names of the channels where devices have several axes; empty where they are called by numbers.
     """
 
     t: Array
@@ -85,6 +86,7 @@ class Trace(ReadOnly):
     diverged: bool = False
     interrupted: bool = False
     net: Net | None = None
+    names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name, ndim in (_MEASURED | _STATES).items():
@@ -105,13 +107,13 @@ class Trace(ReadOnly):
         verdict = f", {stability['verdict']}" if isinstance(stability, dict) and stability.get("verdict") else ""
         return f"Trace({n} samples of {m} channels{f', {self.t[-1]:.4g} s' if n else ''}{sizes}{verdict})"
 
-    def clipped(self, force_limit: Array) -> NDArray[np.bool_]:
-        """Return (N,) whether any force was at its limit, (m,) [N], at each tick."""
-        return np.any(np.abs(self.f) >= force_limit, axis=1)
+    def clipped(self, force_limit: Array, balls: Sequence[slice] = ()) -> NDArray[np.bool_]:
+        """Return (N,) whether any force was at its limit, (m,) [N], at each tick; `balls` as in Process."""
+        return np.any(at_limit(self.f[:, :, None], force_limit, balls)[:, :, 0], axis=1)
 
-    def ticks_before_clipping(self, force_limit: Array) -> int:
+    def ticks_before_clipping(self, force_limit: Array, balls: Sequence[slice] = ()) -> int:
         """Return the number of ticks before the first clipped one, or of all ticks."""
-        clipped = self.clipped(force_limit)
+        clipped = self.clipped(force_limit, balls)
         return int(np.argmax(clipped)) if clipped.any() else clipped.size
 
     def dominant_frequency_hz(self) -> float | None:
@@ -138,7 +140,7 @@ class Trace(ReadOnly):
         columns = {
             f"{name}{i} [{unit}]": column
             for name, unit in _UNITS.items()
-            for i, column in enumerate(getattr(self, name).T, start=1)
+            for i, column in zip(self._channels, getattr(self, name).T, strict=True)
         }
         return pandas.DataFrame(columns, index=pandas.Index(self.t, name="t [s]"))
 
@@ -190,9 +192,14 @@ class Trace(ReadOnly):
         except (KeyError, ValueError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: not a trace of this program ({error})") from None
 
+    @property
+    def _channels(self) -> list[str]:
+        """What follows a quantity in a header: the channel's number, or its name."""
+        return [f" {name}" for name in self.names] or [str(i) for i in range(1, self.x.shape[1] + 1)]
+
     def save_csv(self, path: Path) -> Path:
         """Write time, displacements and forces, one line per sample, with SI units in the header."""
-        channels = range(1, self.x.shape[1] + 1)
+        channels = self._channels
         names = ["t [s]", *(f"x{i} [m]" for i in channels), *(f"f{i} [N]" for i in channels)]
         table = np.column_stack([self.t, self.x, self.f])
 

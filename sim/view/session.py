@@ -24,7 +24,7 @@ import numpy as np
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.lti import Array
-from haptic_loop.controller.tick import StepBuffer
+from haptic_loop.controller.tick import StepBuffer, at_limit
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.designs import KINDS, name_and_own
@@ -269,26 +269,32 @@ class _Pace:
 class Grip:
     """Which handle is held, and where it is drawn to."""
 
-    channel: int  # counted from 0
-    target: float  # [m] displacement of the handle
+    channel: int  # the first one of the device, counted from 0
+    target: tuple[float, ...]  # [m] displacement of the handle on each axis of the device
 
     @property
-    def pull(self) -> float:
-        """Force [N] of the hand on a handle that rests at 0."""
-        return _STIFFNESS * self.target
+    def channels(self) -> range:
+        return range(self.channel, self.channel + len(self.target))
 
-    def force(self, scene: Scene, s: Array) -> float:
-        """Force [N] of the hand on the handle in the plant state s, positions and velocities."""
-        joint, n = scene.handles[self.channel], scene.model.nq
-        return self.pull - _STIFFNESS * float(s[joint]) - _DAMPING * float(s[n + joint])
+    @property
+    def pull(self) -> Array:
+        """Force [N] of the hand on a handle that rests at 0, on each axis."""
+        return _STIFFNESS * np.array(self.target)
+
+    def force(self, scene: Scene, s: Array) -> Array:
+        """Force [N] of the hand on the handle in the plant state s, positions and velocities, on each axis."""
+        joints, n = np.array(scene.handles)[list(self.channels)], scene.model.nq
+        return self.pull - _STIFFNESS * s[joints] - _DAMPING * s[n + joints]
 
 
-def _gripped(scene: Scene, channel: int, T: float) -> HeldPlant:
+def _gripped(scene: Scene, channels: range, T: float) -> HeldPlant:
     """The plant with the hand's spring and damper on a handle, its end at rest."""
-    free, joint, n = scene.plant, scene.handles[channel], scene.model.nq
-    A, at_handle = free.A.copy(), free.B[:, scene.tapped[channel]]
-    A[:, joint] -= _STIFFNESS * at_handle
-    A[:, n + joint] -= _DAMPING * at_handle
+    free, n = scene.plant, scene.model.nq
+    A = free.A.copy()
+    for channel in channels:
+        joint, at_handle = scene.handles[channel], free.B[:, scene.tapped[channel]]
+        A[:, joint] -= _STIFFNESS * at_handle
+        A[:, n + joint] -= _DAMPING * at_handle
     return hold(Plant(A, free.B, free.C), T)
 
 
@@ -362,7 +368,7 @@ class LiveLoop:
         self._run(self.pace.due(now))
         push = self._pushed.copy()
         if grip:
-            push[grip.channel] += grip.force(self.prepared.simulation.scene, self.state)
+            push[list(grip.channels)] += grip.force(self.prepared.simulation.scene, self.state)
         made = self._history[-min(self._tick - first, len(self._history)) :] if self._tick > first else None
         recent = self._history[-1:] if made is None else made
         shown = self._history[-max(1, min(self._tick, len(self._history))) :]
@@ -434,7 +440,7 @@ class LiveLoop:
         for column, force in zip(scene.tapped, self._pushed, strict=True):
             w[:, column] += force
         if self._grip:
-            w[:, scene.tapped[self._grip.channel]] += self._grip.pull
+            w[:, [scene.tapped[channel] for channel in self._grip.channels]] += self._grip.pull
         buffer.w[:count] = w[:, :, None]
         with np.errstate(over="ignore", invalid="ignore"):  # a process that runs away is noticed below
             run_block(buffer, self._engine, count)
@@ -444,7 +450,8 @@ class LiveLoop:
             self._note = "the process itself ran away, beyond all numbers: restarted from rest"
             return
         f = buffer.f[:count, :, 0]
-        self.clipped += int((np.abs(f) >= buffer.process.force_limit).any(axis=1).sum())
+        limits = buffer.process.force_limit, buffer.process.balls
+        self.clipped += int(at_limit(buffer.f[:count], *limits).any(axis=(1, 2)).sum())
         self._history = np.concatenate([self._history[count:], f])[-len(self._history) :]
         buffer.rewind(count)
 
@@ -486,7 +493,7 @@ class LiveLoop:
     def _start_engine(self) -> None:
         """The engine of the plant, with the mouse's hand where there is one, on the present buffer."""
         simulation, held = self.prepared.simulation, self._grip
-        plant = _gripped(simulation.scene, held.channel, simulation.scenario.T) if held else simulation.plant
+        plant = _gripped(simulation.scene, held.channels, simulation.scenario.T) if held else simulation.plant
         self._engine = ExactEngine(plant)
         self._engine.start(self._buffer)
 

@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Iterable
 from functools import partial
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -73,12 +74,21 @@ def _colour(channel: int) -> _Colour:
     return _PALETTE[channel % len(_PALETTE)]
 
 
-def _channels(scene: Scene) -> tuple[int, ...]:
-    """The channel (from 0) that each joint belongs to; of a person's body, the first that the person holds."""
-    owner = {motor: motor for motor in range(scene.channels)}
-    for i, (_, *own) in enumerate(scene.points[: scene.channels]):
-        owner |= dict.fromkeys((scene.handles[i], *own), i)
-    for points in scene.points[scene.channels :]:
+def _devices(scene: Scene) -> int:
+    return 1 + max(scene.devices)
+
+
+def _own(scene: Scene, device: int) -> list[int]:
+    """The channels of a device."""
+    return [channel for channel, of in enumerate(scene.devices) if of == device]
+
+
+def _owners(scene: Scene) -> tuple[int, ...]:
+    """The device (from 0) that each joint belongs to; of a person's body, the first that the person holds."""
+    owner = dict(enumerate(scene.devices))
+    for i, points in enumerate(scene.points[: _devices(scene)]):
+        owner |= dict.fromkeys(points, i)
+    for points in scene.points[_devices(scene) :]:
         owner |= {joint: owner[points[0]] for joint in points if joint not in owner}
     return tuple(owner[joint] for joint in range(scene.model.njnt))
 
@@ -86,8 +96,8 @@ def _channels(scene: Scene) -> tuple[int, ...]:
 def _places(scene: Scene) -> tuple[int, ...]:
     """How many steps behind its handle each joint's body stands: 0 the handle, -1 a motor, 1.. a human's arm."""
     place = dict.fromkeys(range(scene.channels), -1)
-    for points in scene.points[: scene.channels]:
-        place |= {joint: step for step, joint in enumerate(points)}
+    for i, points in enumerate(scene.points[: _devices(scene)]):
+        place |= {joint: k // len(_own(scene, i)) for k, joint in enumerate(points)}
     behind = 1 + max(place.values())
     return tuple(place.get(joint, behind) for joint in range(scene.model.njnt))
 
@@ -180,7 +190,8 @@ class ShownScene:
         self.scene, self.force_limit = scene, force_limit
         self.model = _dressed(scene, size)
         self.data = mujoco.MjData(self.model)
-        self.channel = _channels(scene)  # joint -> channel; bodies and joints have the same order
+        self.device = _owners(scene)  # joint -> device
+        self._channels = [_own(scene, device) for device in range(_devices(scene))]
 
     def show(self, frame: Frame) -> None:
         """Put the joints where they are in a frame."""
@@ -193,35 +204,41 @@ class ShownScene:
         joint = int(self.model.body_jntadr[perturb.select]) if perturb.select > 0 else -1
         if joint < 0 or not (perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE):
             return None
-        channel = self.channel[joint]
+        channels = _own(self.scene, self.device[joint])
+        handles = np.array(self.scene.handles)[channels]
         turn = self.data.xmat[perturb.select].reshape(3, 3)
         taken = self.data.xpos[perturb.select] + turn @ perturb.localpos
-        drawn = float(perturb.refselpos[0] - taken[0])
-        return Grip(channel, float(self.data.qpos[self.scene.handles[channel]]) + drawn)
+        drawn = self.model.jnt_axis[handles] @ (perturb.refselpos - taken)
+        return Grip(channels[0], tuple((self.data.qpos[handles] + drawn).tolist()))
 
     def draw(self, drawn: mujoco.MjvScene, frame: Frame) -> None:
         """Arrows: the mean force on each device, the range it has had since the last frame, and what pushes."""
-        for i, handle in enumerate(self.scene.handles):
-            own, reach = _colour(i), _LONGEST / self.force_limit[i]
-            at = self.data.xpos[self.model.jnt_bodyid[handle]] + np.array([0, 0, 0.045])
-            clipped = max(-frame.low[i], frame.high[i]) >= self.force_limit[i]
-            band = (*_ALARM, 0.6) if clipped else (*own, 0.35)
+        for device in range(_devices(self.scene)):
+            channels, own = _own(self.scene, device), _colour(device)
+            handles = np.array(self.scene.handles)[channels]
+            axes, reach = self.model.jnt_axis[handles], _LONGEST / self.force_limit[channels]
+            at = self.data.xpos[self.model.jnt_bodyid[handles[0]]] + np.array([0, 0, 0.045])
+            clipped = np.maximum(-frame.low, frame.high)[channels] >= self.force_limit[channels]
             # the device feels -f
-            left, right = (np.array([-f * reach, 0, 0]) for f in (frame.high[i], frame.low[i]))
-            _connect(drawn, _BAR, 0.010, at + left, at + right, band)
-            _arrow(drawn, at, -frame.mean[i] * reach, (*own, 1.0))
-            pushed = float(np.clip(frame.push[i] * reach, -_LONGEST, _LONGEST))
+            for axis, low, high, each, over in zip(
+                axes, frame.low[channels], frame.high[channels], reach, clipped, strict=True
+            ):
+                band = (*_ALARM, 0.6) if over else (*own, 0.35)
+                _connect(drawn, _BAR, 0.010, at - high * each * axis, at - low * each * axis, band)
+            _arrow(drawn, at, -(frame.mean[channels] * reach) @ axes, (*own, 1.0))
+            pushed = np.clip(frame.push[channels] * reach, -_LONGEST, _LONGEST) @ axes
             _arrow(drawn, at + np.array([0, 0, 0.03]), pushed, (0.1, 0.1, 0.1, 1.0))
 
     def figures(self, frame: Frame, picture: mujoco.MjrRect) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
         """The forces of the last seconds, side by side at the bottom of a picture."""
-        m = frame.history.shape[1]
+        m = len(self._channels)
         width, height = picture.width // m, round(_PLOT * picture.height)
         low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
         top, drawn = _scale(frame.history), []
         for i in range(m):
             place = mujoco.MjrRect(picture.left + i * width, picture.bottom, width, height)
-            drawn.append((place, _figure(i, low[:, i], high[:, i], top)))
+            own = self._channels[i]
+            drawn.append((place, _figure(i, low[:, own], high[:, own], top)))
         return drawn
 
     def aim(self, camera: mujoco.MjvCamera) -> None:
@@ -244,6 +261,8 @@ class ShownWorld(ShownScene):
         self._rest = [self.data.xpos[body].copy() for body in self._bodies]
         self._along = [np.array(contact.along) for contact in world.contacts]  # (axes, 3) each
         self._x = [np.zeros(len(along)) for along in self._along]
+        ends = np.cumsum([0, *map(len, self._along)]).tolist()
+        self._channels = [list(range(first, last)) for first, last in pairwise(ends)]
         self.model.vis.headlight.ambient[:], self.model.vis.headlight.diffuse[:] = 0.45, 0.5
         away = [rest - self.model.stat.center + (0.0, 0.0, 0.2 * self.model.stat.extent) for rest in self._rest]
         length = 0.45 * self.model.stat.extent
@@ -262,13 +281,13 @@ class ShownWorld(ShownScene):
         return np.split(values[: sum(map(len, self._along))], np.cumsum([len(a) for a in self._along])[:-1])
 
     def grip(self, perturb: mujoco.MjvPerturb) -> Grip | None:
-        """What the mouse holds: a contact, with its first direction."""
+        """What the mouse holds: a contact, in the directions in which it slides."""
         held = int(perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
         if perturb.select not in self._bodies or not held:
             return None
         i = self._bodies.index(perturb.select)
         drawn = np.array(perturb.refselpos) - self._rest[i]
-        return Grip(sum(map(len, self._along[:i])), float(self._along[i][0] @ drawn))
+        return Grip(self._channels[i][0], tuple((self._along[i] @ drawn).tolist()))
 
     def draw(self, drawn: mujoco.MjvScene, frame: Frame) -> None:
         """A stylus for each device, and arrows at its handle for the force on it and what pushes it."""
@@ -306,20 +325,28 @@ def _dressed(scene: Scene, size: tuple[int, int] = _SIZE) -> mujoco.MjModel:
     spec.visual.global_.offwidth, spec.visual.global_.offheight = size
     spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
     where = _places(scene)
-    for joint, (place, channel) in enumerate(zip(where, _channels(scene), strict=True)):
-        body = spec.body(scene.model.joint(joint).name)
-        body.pos = [place * STEP, channel * -APART, 0.03]
+    seen = set[int]()
+    for joint, (place, device) in enumerate(zip(where, _owners(scene), strict=True)):
+        number = int(scene.model.jnt_bodyid[joint])
+        if number in seen:  # by another of its joints
+            continue
+        seen.add(number)
+        body = spec.body(scene.model.body(number).name)
+        body.pos = [place * STEP, device * -APART, 0.03]
         if place == 0:
-            body.add_geom(type=_SPHERE, size=[0.024] * 3, rgba=(*_colour(channel), 1.0), **_MASSLESS)
+            body.add_geom(type=_SPHERE, size=[0.024] * 3, rgba=(*_colour(device), 1.0), **_MASSLESS)
         else:
             body.add_geom(type=_BOX, size=[0.022, 0.026, 0.022], rgba=(*_GREY, 1.0), **_MASSLESS)
     deepest = max(1, *where)
-    middle = [(deepest - 1) * STEP / 2, -APART * (scene.channels - 1) / 2, 0.03]
-    for channel in range(scene.channels):
-        at, rail = [middle[0], -APART * channel, 0.0], [0.5 * STEP * (deepest + 1) + 0.06, 0.012, 0.004]
+    devices = _devices(scene)
+    middle = [(deepest - 1) * STEP / 2, -APART * (devices - 1) / 2, 0.03]
+    for device in range(devices):
+        if len(_own(scene, device)) > 1:  # it moves in space and needs no rail
+            continue
+        at, rail = [middle[0], -APART * device, 0.0], [0.5 * STEP * (deepest + 1) + 0.06, 0.012, 0.004]
         spec.worldbody.add_geom(type=_BOX, pos=at, size=rail, rgba=[0.8, 0.8, 0.8, 1], **_MASSLESS)
     spec.stat.center = middle
-    spec.stat.extent = 0.24 + 0.5 * STEP * deepest + 0.5 * APART * (scene.channels - 1)
+    spec.stat.extent = 0.24 + 0.5 * STEP * deepest + 0.5 * APART * (devices - 1)
     return spec.compile()
 
 
@@ -330,11 +357,11 @@ def _undress(spec: mujoco.MjSpec) -> None:
         spec.delete(part)
 
 
-def _figure(channel: int, low: Array, high: Array, top: float) -> mujoco.MjvFigure:
-    """One device's forces [N], drawn from least to largest in every span."""
+def _figure(device: int, low: Array, high: Array, top: float) -> mujoco.MjvFigure:
+    """One device's forces [N], (spans, axes), each drawn from least to largest in every span."""
     figure = mujoco.MjvFigure()
     mujoco.mjv_defaultFigure(figure)
-    figure.title, figure.xlabel = f"force on device {channel + 1} [N]", "time [s]"
+    figure.title, figure.xlabel = f"force on device {device + 1} [N]", "time [s]"
     figure.flg_extend, figure.flg_legend = 0, 0
     figure.gridsize = [5, 5]
     figure.figurergba[:] = (1, 1, 1, 1)
@@ -342,17 +369,24 @@ def _figure(channel: int, low: Array, high: Array, top: float) -> mujoco.MjvFigu
     figure.textrgb[:] = (0, 0, 0)
     figure.gridrgb[:] = (0.75, 0.75, 0.75)
     figure.range[:] = ((-HISTORY, 0.0), (-top, top))
-    t, seen = np.linspace(-HISTORY, 0.0, low.size), np.isfinite(low)
-    points = np.stack([t, low, t, high], axis=1)[seen].reshape(-1)
-    figure.linedata[0, : points.size] = points
-    figure.linepnt[0] = points.size // 2
-    figure.linergb[0] = _colour(channel)
+    t = np.linspace(-HISTORY, 0.0, len(low))
+    for k, (least, most) in enumerate(zip(low.T, high.T, strict=True)):
+        points = np.stack([t, least, t, most], axis=1)[np.isfinite(least)].reshape(-1)
+        figure.linedata[k, : points.size] = points
+        figure.linepnt[k] = points.size // 2
+        figure.linergb[k] = _shade(device, k)
     return figure
 
 
-def _arrow(drawn: mujoco.MjvScene, at: Array, length: float, rgba: tuple[float, ...]) -> None:
-    if abs(length) > 1e-4:
-        _connect(drawn, _ARROW, 0.005, at, at + np.array([length, 0, 0]), rgba)
+def _shade(device: int, axis: int) -> _Colour:
+    """The colour of an axis of a device: darker from one to the next."""
+    red, green, blue = _colour(device)
+    return red * 0.6**axis, green * 0.6**axis, blue * 0.6**axis
+
+
+def _arrow(drawn: mujoco.MjvScene, at: Array, way: Array, rgba: tuple[float, ...]) -> None:
+    if np.abs(way).max() > 1e-4:
+        _connect(drawn, _ARROW, 0.005, at, at + way, rgba)
 
 
 def _sphere(drawn: mujoco.MjvScene, at: Array, radius: float, rgba: tuple[float, ...]) -> None:
@@ -481,12 +515,19 @@ _BLACK, _LIGHT = (0, 0, 0), (205, 205, 205)
 
 
 class FlatPictures:
-    """Frames of a scene as shapes on their rails, seen from above, and the forces, by Pillow: pictures of a film."""
+    """Frames of a scene as shapes, seen from above, and the forces, by Pillow: pictures of a film.
+
+    A body that moves along z becomes larger when it comes nearer.
+    """
 
     def __init__(self, scene: Scene, force_limit: Array) -> None:
         self.scene, self.force_limit = scene, force_limit
         self._font = ImageFont.load_default(12)
-        self._places, self._channels = _places(scene), _channels(scene)
+        places, owners, first = _places(scene), _owners(scene), dict[int, int]()
+        for joint, body in enumerate(scene.model.jnt_bodyid.tolist()):
+            first.setdefault(body, joint)
+        #: number, place and device of each body, in the order of its first joint
+        self._shapes = [(body, places[joint], owners[joint]) for body, joint in first.items()]
 
     def picture(self, frame: Frame) -> Picture:
         """(height, width, 3): what is said of the loop, the bodies, the forces, from top to bottom."""
@@ -510,15 +551,19 @@ class FlatPictures:
         self._bodies(ImageDraw.Draw(image), frame, max(top, round(_WORDS * image.height)), bottom)
 
     def _bodies(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
-        steps = max(self._places) + 2
+        steps = max(place for _, place, _ in self._shapes) + 2
         per_metre = (_SIZE[0] - 120) / (steps * STEP + 2 * _LONGEST)
-        origin, row = 60 + (_LONGEST + STEP) * per_metre, (bottom - top) / self.scene.channels
-        size = min(14.0, 0.3 * row)
-        for i in range(self.scene.channels):
+        origin, row = 60 + (_LONGEST + STEP) * per_metre, (bottom - top) / _devices(self.scene)
+        usual = min(14.0, 0.3 * row)
+        for i in range(_devices(self.scene)):
             y = top + (i + 0.5) * row
-            pen.line((30, y, _SIZE[0] - 30, y), _LIGHT, 2)
-        for place, i, q in zip(self._places, self._channels, frame.q, strict=True):
-            x, y = origin + (place * STEP + q) * per_metre, top + (i + 0.5) * row
+            if len(_own(self.scene, i)) == 1:
+                pen.line((30, y, _SIZE[0] - 30, y), _LIGHT, 2)
+        model = self.scene.model
+        for body, place, i in self._shapes:
+            moved = frame.q[model.jnt_bodyid == body] @ model.jnt_axis[model.jnt_bodyid == body]
+            x, y = origin + (place * STEP + moved[0]) * per_metre, top + (i + 0.5) * row - moved[1] * per_metre
+            size = usual * min(2.0, max(0.5, 1 + moved[2] / STEP))
             corners = (x - size, y - size, x + size, y + size)
             if place == 0:
                 pen.ellipse(corners, _rgb(_colour(i)))
@@ -526,19 +571,27 @@ class FlatPictures:
             else:
                 pen.rectangle(corners, _rgb(_GREY))
 
-    def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, i: int, x: float, y: float, per_metre: float) -> None:
-        """The range of the force since the last frame, and its mean; the device feels -f."""
+    def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, device: int, x: float, y: float, per_metre: float) -> None:
+        """The range of the force since the last frame, and its mean; the device feels -f. In space only the mean."""
+        channels = _own(self.scene, device)
+        if len(channels) > 1:
+            joints = np.array(self.scene.handles)[channels]
+            reach = per_metre * _LONGEST / self.force_limit[channels]
+            dx, dy, _ = -(frame.mean[channels] * reach) @ self.scene.model.jnt_axis[joints]
+            pen.line((x, y, x + dx, y - dy), _rgb(_colour(device)), 4)
+            return
+        (i,) = channels
         reach = per_metre * _LONGEST / self.force_limit[i]
         clipped = max(-frame.low[i], frame.high[i]) >= self.force_limit[i]
-        shade = _ALARM if clipped else _colour(i)
+        shade = _ALARM if clipped else _colour(device)
         pen.line((x - frame.high[i] * reach, y, x - frame.low[i] * reach, y), _rgb(shade), 3)
-        pen.line((x, y + 4, x - frame.mean[i] * reach, y + 4), _rgb(_colour(i)), 4)
+        pen.line((x, y + 4, x - frame.mean[i] * reach, y + 4), _rgb(_colour(device)), 4)
         if frame.push[i]:
             pen.line((x, y + 9, x + frame.push[i] * reach, y + 9), _BLACK, 4)
 
     def _forces(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
         """One plot per device, side by side."""
-        m, most, middle = self.scene.channels, _scale(frame.history), (top + bottom) / 2
+        m, most, middle = _devices(self.scene), _scale(frame.history), (top + bottom) / 2
         low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
         width = (_SIZE[0] - 20) / m
         for i in range(m):
@@ -549,9 +602,10 @@ class FlatPictures:
                 pen.text((left - 40, y - 7), f"{value:+g}" if value else "0", _BLACK, self._font)
             pen.text((left, bottom + 2), f"force on device {i + 1} [N], last {HISTORY:g} s", _BLACK, self._font)
             x = np.linspace(left, right, _COLUMNS)
-            for j in np.flatnonzero(np.isfinite(low[:, i])):
-                ends = middle - np.array([low[j, i], high[j, i]]) / most * (bottom - top) / 2
-                pen.line((x[j], ends[0], x[j], ends[1] - 1), _rgb(_colour(i)), 2)
+            for axis, channel in enumerate(_own(self.scene, i)):
+                for j in np.flatnonzero(np.isfinite(low[:, channel])):
+                    ends = middle - np.array([low[j, channel], high[j, channel]]) / most * (bottom - top) / 2
+                    pen.line((x[j], ends[0], x[j], ends[1] - 1), _rgb(_shade(i, axis)), 2)
 
 
 class WorldPictures(FlatPictures):

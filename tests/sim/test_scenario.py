@@ -120,7 +120,7 @@ def test_replacing_checks_again():
     for change, message in [
         ({"theta": (1, 2, 3)}, "theta has 3 entries"),
         ({"delta": (1.0, -1.0)}, r"delta #2 is -1, allowed are 0 to 10000 N s/m"),
-        ({"delta": (1.0,)}, "delta has 1 entries for 2 channels"),
+        ({"delta": (1.0,)}, "delta has 1 entries for 2 devices"),
     ]:
         with pytest.raises(InputError, match=message):
             scenario.replace(**change)

@@ -50,11 +50,11 @@ from haptic_loop.sim.view.stage import (
     FlatPictures,
     ShownScene,
     _apart,
-    _channels,
     _dressed,
     _envelope,
     _loop,
     _overlay,
+    _owners,
     _places,
     _scale,
     _typed,
@@ -274,7 +274,7 @@ def test_the_mouse_is_one_more_passive_hand(none):
     human = SCENARIO.human[0].links[0]
     firmer = Human((Link(human.mass, human.damping + _DAMPING, human.stiffness + _STIFFNESS),))
     scene = build(SCENARIO.device, (firmer, SCENARIO.human[1]))
-    expected, held = hold(plant(scene.model), SCENARIO.T), _gripped(none.simulation.scene, 0, SCENARIO.T)
+    expected, held = hold(plant(scene.model), SCENARIO.T), _gripped(none.simulation.scene, range(1), SCENARIO.T)
     # both are one matrix exponential of the same matrix, whose entries reach 1e5
     assert np.allclose(held.A, expected.A, rtol=0, atol=1e-10)
     assert np.allclose(held.B, expected.B, rtol=0, atol=1e-12)
@@ -282,14 +282,14 @@ def test_the_mouse_is_one_more_passive_hand(none):
 
 def test_the_mouse_draws_and_releases_handles():
     soft = replace_theta(first_loop(Menu("I"), SCENARIO, "published"), (0, 0))
-    assert dominant_mode(close(_gripped(soft.simulation.scene, 1, SCENARIO.T), soft.simulation.F)).growth < 0
+    assert dominant_mode(close(_gripped(soft.simulation.scene, range(1, 2), SCENARIO.T), soft.simulation.F)).growth < 0
     running, quiet = session(soft), session(soft)
     handle = soft.simulation.scene.handles[1]
     for k in range(1, 30):
-        drawn = running.frame(k / 20, Grip(1, 0.03))
+        drawn = running.frame(k / 20, Grip(1, (0.03,)))
         still = quiet.frame(k / 20)
     assert drawn.q[handle] > still.q[handle] + 0.005
-    assert drawn.push[1] == pytest.approx(Grip(1, 0.03).force(soft.simulation.scene, running.state))
+    assert drawn.push[1] == pytest.approx(Grip(1, (0.03,)).force(soft.simulation.scene, running.state)[0])
     assert not running.frame(1.5).push.any()
 
 
@@ -302,7 +302,7 @@ def test_the_viewer_s_selection_is_a_grip(none):
     motor, handle = stage.model.body("device_2/motor").id, none.simulation.scene.handles[1]
     perturb.select, perturb.active = motor, int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
     perturb.refselpos[:] = stage.data.xpos[motor] + (0.02, 0.5, 0.1)  # dragged 20 mm along the device
-    assert stage.grip(perturb) == Grip(1, pytest.approx(q[handle] + 0.02))
+    assert stage.grip(perturb) == Grip(1, (pytest.approx(q[handle] + 0.02),))
     perturb.active = int(mujoco.mjtPertBit.mjPERT_ROTATE)
     assert stage.grip(perturb) is None
 
@@ -329,7 +329,7 @@ def test_shapes_change_nothing_that_moves(name):
 def test_every_body_has_its_place():
     scene = build(SCENARIO.device, [Human((Link(0.3, 3, 200), Link(1, 2, 300))), SCENARIO.human[1]])
     names = [scene.model.joint(j).name for j in range(scene.model.njnt)]
-    found = dict(zip(names, zip(_channels(scene), _places(scene), strict=True), strict=True))
+    found = dict(zip(names, zip(_owners(scene), _places(scene), strict=True), strict=True))
     assert found == {
         "device_1/motor": (0, -1),
         "device_2/motor": (1, -1),
@@ -343,7 +343,7 @@ def test_a_person_s_body_stands_behind_both_arms():
     arm = Human((Link(0.3, 3, 200), Link(1, 2, 300)))
     scene = build(SCENARIO.device, [arm, SCENARIO.human[1]], [Person((1, 2), 30.0, 80.0, 900.0)])
     body = scene.model.joint("body_1").id
-    assert (_channels(scene)[body], _places(scene)[body]) == (0, 2)
+    assert (_owners(scene)[body], _places(scene)[body]) == (0, 2)
     assert np.array_equal(plant(_dressed(scene)).A, plant(scene.model).A)
 
 
@@ -643,7 +643,7 @@ def test_the_window_shows_scene_and_devices(ball):
     assert "push" in words
     assert window.user_scn.ngeom >= 4  # two styluses of two shapes
     np.testing.assert_array_equal(stage.data.qpos, running.frame(0).pose)
-    assert stage.grip(window.perturb) == Grip(1, pytest.approx(0.03))
+    assert stage.grip(window.perturb) == Grip(1, (pytest.approx(0.03),))
 
 
 def test_a_film_of_a_world_shows_the_scene(ball, tmp_path, capsys):
