@@ -100,6 +100,8 @@ def main(argv: list[str]) -> int:
         time.perf_counter() - begin,
     )
     said = verdicts.verdict(found.assessment, encoder=report.encoder)
+    if args.rigid and isinstance(coupling, SpringDamper):
+        said = f"{said} {_stiffest_wall(found, coupling)}"
     caveats = [found.not_covered, *([found.switching.not_covered or ""] if found.switching else [])]
     render.publish(args, report, _tables(found), _remarks(report), out, verdict=said, details=caveats)
     return options.exit_code(found.assessment.holds)
@@ -255,6 +257,15 @@ def _tables(found: Audit) -> list[render.Table]:
         return [table]
     rows = verdicts.range_rows(assessment.ranges)
     return [table, render.facts("the ranges around the environment", rows, left=True)]
+
+
+def _stiffest_wall(found: Audit, coupling: SpringDamper) -> str:
+    """Answer which wall may be used with the damper of the coupling."""
+    condition, damper = found.assessment.condition, f"B = {listed(coupling.B)} N s/m"
+    margin = found.margins[condition].stiffest
+    if None in margin.K:
+        return f"No wall with {damper} was found to be certified: {margin.reason}."
+    return f"The stiffest wall with {damper}: {_stiffest(margin.K)} ({condition})."
 
 
 def _percent(error: float | None) -> str:

@@ -305,9 +305,9 @@ def _check_damping(self: Any) -> None:
 
 @dataclass(frozen=True)
 class _Known:
-    """A published number with its source."""
+    """A published number, or the kind of a model, with its source."""
 
-    value: float
+    value: float | str
     source: str
 
 
@@ -324,6 +324,7 @@ class Listed:
     """A real device along one axis; None stands for a number without a published source."""
 
     title: str
+    kind: _Known | None = None  # of the model that the source identified; a scenario assumes "rigid" unless it says so
     damping: _Known | None = None  # [N s/m]
     mass: _Known | None = None  # [kg] felt at the handle
     force_limit: _Known | None = None  # [N]
@@ -335,27 +336,29 @@ class Listed:
     @property
     def known(self) -> dict[str, _Known]:
         """The published fields of a RigidDevice. Of friction an upper bound is published, which is no `friction`."""
-        fields = ("damping", "mass", "force_limit", "encoder_step")
+        fields = ("kind", "damping", "mass", "force_limit", "encoder_step")
         facts = {name: fact for name in fields if (fact := getattr(self, name))}
         return facts | ({"friction_max": self.friction} if self.friction else {})
 
 
-_IDENTIFIED = _Known(1.37, "section 6 of the paper: a first-order model identified on an Omega")
+_IDENTIFIED = "section 6 of the paper: a first-order model identified on an Omega 3"
+
+
+def _force_dimension(title: str, force: float, stiffness: float = 5000.0, **more: _Known) -> Listed:
+    """Return the translation of a device in CHAI3D's table, whose wrist and gripper are left out."""
+    limits = {"force_limit": force, "stiffness": stiffness, "framework_damping": 30.0}
+    return Listed(f"Force Dimension {title}", **{name: _Known(value, _DELTA) for name, value in limits.items()}, **more)
+
 
 CATALOGUE: Mapping[str, Listed] = {
-    "omega.3": Listed(
-        "Force Dimension omega.3",
-        damping=_IDENTIFIED,
-        force_limit=_Known(12.0, _DELTA),
-        stiffness=_Known(5000.0, _DELTA),
-        framework_damping=_Known(30.0, _DELTA),
+    "omega.3": _force_dimension(
+        "omega.3", 12.0, kind=_Known("rigid", _IDENTIFIED), damping=_Known(1.37, _IDENTIFIED)
     ),
-    "delta.3": Listed(
-        "Force Dimension delta.3",
-        force_limit=_Known(20.0, _DELTA),
-        stiffness=_Known(5000.0, _DELTA),
-        framework_damping=_Known(30.0, _DELTA),
-    ),
+    "omega.6": _force_dimension("omega.6, translation", 12.0),
+    "omega.7": _force_dimension("omega.7, translation", 12.0),
+    "delta.3": _force_dimension("delta.3", 20.0),
+    "delta.6": _force_dimension("delta.6, translation", 20.0),
+    "sigma.7": _force_dimension("sigma.7, translation", 12.0, stiffness=4000.0),
     "falcon": Listed(
         "Novint Falcon",
         force_limit=_Known(8.0, _FALCON),

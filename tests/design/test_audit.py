@@ -317,7 +317,7 @@ BAD = [
     ("--rigid --coupling gains.json", "gains.json couples 2 channels, the loop has 1"),
     ("--rigid --case none", "--rigid with --case none"),
     ("--case none --K 1 --B 1", "--K with --case none"),
-    ("--device falkon --delta 1", "--device is 'falkon' (did you mean falcon?), the catalogue has omega.3, delta.3"),
+    ("--device falkon --delta 1", "--device is 'falkon' (did you mean falcon?), the catalogue has omega.3, omega.6"),
     ("--device falcon", "--device falcon: nobody publishes its damping: give --delta"),
     ("--device hapkit --delta 1", "nothing to audit"),
     ("--coupling gains.json --K 1", "--K with --coupling"),
