@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_con
 from haptic_loop.design.files import out_file
 from haptic_loop.design.gain_search import SOFTEST, STIFFEST
 from haptic_loop.design.program import DEFAULT, OBJECTIVES, Options
-from haptic_loop.design.result import Design, finite, listed
+from haptic_loop.design.result import Design, DesignFailed, finite, listed
 from haptic_loop.design.robustness import Nearby, ranges_around
 from haptic_loop.design.transparency import BAND_HZ
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from haptic_loop.design import coverage
     from haptic_loop.design.api import Filed
     from haptic_loop.design.bound import BoundBeside
+    from haptic_loop.sim.stability import Ringing
 
 
 def main(argv: list[str]) -> int:
@@ -40,6 +41,8 @@ def main(argv: list[str]) -> int:
     out = out_file(args.out, f"out/design-{options.place(args)}.json", "the file of the coupling")
     scenario = options.scenario_from(args)
     args.coupling = args.coupling or ("moving-average" if is_world(scenario) else "spring-damper")
+    if args.decay is not None and (is_world(scenario) or scenario.switches or args.varying_delay):
+        raise InputError("--decay: a damping ratio is of a linear loop with constant delays, and this is none")
     if is_world(scenario):
         from haptic_loop.cli import world
 
@@ -47,10 +50,10 @@ def main(argv: list[str]) -> int:
     loop = _loop(args, scenario)
     if args.samples is not None and loop.ranges is None:
         raise InputError("--samples is only with ranges: give --ranges, or a scenario with [ranges]")
-    design = _design(args, loop)
+    design, dies_away = _design(args, loop, scenario)
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
-    report = _reported(args, loop, design, assessment, stored)
+    report = replace(_reported(args, loop, design, assessment, stored), ringing=dies_away)
     said = verdicts.verdict(assessment, report.nearby)
     if _is_useless(assessment):
         said += " [red]Useless[/]: the coupling renders next to nothing."
@@ -73,6 +76,8 @@ def _parser() -> options.Parser:
     around = "certify for every stiffness and mass this much more or less, as [ranges] of a scenario does"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
     parser.add_condition("what to certify")
+    ratio = "softer, until every mode of the loop with the scenario's hands has at least this damping ratio"
+    parser.add_argument("--decay", type=options.number(1e-6, 0.9), metavar="RATIO", help=ratio)
     varying = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
     parser.add_varying_delay(varying)
     limiter = "for this-environment: proved also while forces are limited, or not made (spring-damper: if it can)"
@@ -153,15 +158,74 @@ def _asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     return given
 
 
-def _design(args: argparse.Namespace, loop: Loop) -> Design:
-    """Design and prove. Raises InputError for options that contradict each other, DesignFailed without a coupling."""
+def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[Design, Ringing | None]:
+    """Design and prove. Raises InputError for options that contradict each other, DesignFailed without a coupling.
+
+    The second part says how a knock dies away, with --decay.
+    """
     from haptic_loop.design.api import proved
 
     asked = _asked_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
         asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
     with options.refused(args=args), render.designing(loop, args.coupling, args.condition) as progress:
-        return proved(loop, design_by_kind(loop, args.coupling, args.condition, progress, **asked))
+        made = partial(design_by_kind, kind=args.coupling, condition=args.condition, progress=progress, **asked)
+        if args.decay is None:
+            return proved(loop, made(loop)), None
+        if not kind_of(args.coupling).softened:
+            able = " or ".join(name for name, kind in KINDS.items() if kind.softened)
+            raise InputError(f"--decay is for --coupling {able}, not {args.coupling}")
+    with render.progress("designing softer and softer couplings"):  # whose failure names no other coupling
+        design, dies_away = _that_decays(scenario, loop, made, args.decay)
+        return proved(loop, design), dies_away
+
+
+#: Shares of the damping for which designs are made in search of a damping ratio; and bisections between two of them.
+_SHARES, _BISECTIONS = (1.0, 0.75, 0.5, 0.35, 0.2, 0.1), 4
+
+
+def _that_decays(
+    scenario: Scenario, loop: Loop, made: Callable[[Loop], Design], ratio: float
+) -> tuple[Design, Ringing | None]:
+    """Design for less damping, which gives a softer coupling, until every mode has this damping ratio.
+
+    What is certified for less damping is certified for the damping that there is.
+    """
+    from haptic_loop.sim.run import assemble
+    from haptic_loop.sim.stability import ringing
+
+    def attempt(share: float) -> tuple[Design, Ringing]:
+        part = msgspec.structs.replace(loop, delta=tuple(share * delta for delta in loop.delta))
+        design = made(part)
+        if share < 1:
+            needs = named(design.asked).judge(loop.at(loop.environment), design.coupling)
+            design = replace(design, requirement=needs, certificate=None)
+        dies_away = ringing(assemble(scenario, design.coupling))
+        assert dies_away  # no world
+        return design, dies_away
+
+    tried: list[Ringing] = []
+    outside = 1.0
+    for share in _SHARES:
+        found = attempt(share)
+        tried.append(found[1])
+        if found[1].least_damping_ratio >= ratio:
+            inside = share
+            for _ in range(_BISECTIONS if share < 1 else 0):
+                between = attempt((inside + outside) / 2)
+                if between[1].least_damping_ratio >= ratio:
+                    inside, found = (inside + outside) / 2, between
+                else:
+                    outside = (inside + outside) / 2
+            return found
+        outside = share
+    best = max(tried, key=lambda each: each.least_damping_ratio)
+    reached = (
+        f"the best of {len(tried)} couplings has {best.least_damping_ratio:.4f} at {best.least_frequency_hz:.1f} Hz"
+    )
+    raise DesignFailed(
+        None, (), f"--decay {ratio:g}: no certified coupling gives every mode this damping ratio; {reached}"
+    )
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -310,6 +374,7 @@ class _Report:
     delays: str | None = render.figure("guarantee, delays", json="left out")
     objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
     nearby: Nearby = render.several(render.robustness_rows, "inlined")
+    ringing: Ringing | None = render.figure("slowest mode decays", "{.words}", default=None, json="if given")
     best: _Best | None = render.several(_Best.rows, "inlined")
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
     stored: Filed = render.several(_stored_rows)

@@ -25,7 +25,7 @@ from haptic_loop.sim.report import (
 )
 from haptic_loop.sim.run import beginnings, engine_name
 from haptic_loop.sim.scenario import Scenario
-from haptic_loop.sim.stability import Stability, stability_of
+from haptic_loop.sim.stability import Ringing, Stability, ringing, stability_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +65,7 @@ class RunReport:
     assessment: Assessment
     encoder: EncoderSteps | None
     stability: Stability
+    ringing: Ringing | None
     varying_delay: VaryingDelays | None = off_table()
     run: Ran
     error: accuracy.PositionError
@@ -141,6 +142,7 @@ def run_report(
         assessment=assessment,
         encoder=encoder_steps(scenario, case, chosen.coupling),
         stability=stability,
+        ringing=None if grows is not None else ringing(simulation),
         varying_delay=delays,
         run=_ran(run, loop.lam, environment, check),
         error=accuracy.position_error(trace, run.exact, simulation, grows),

@@ -178,6 +178,54 @@ def worst_mode(simulation: Simulation) -> Mode:
     return max(_frozen_modes(simulation).values(), key=lambda mode: float(mode.spectral_radius))
 
 
+@dataclass(frozen=True)
+class Ringing:
+    """How a knock dies away in the exact loop with the scenario's own hands, at constant delays and without friction.
+
+    A mode is s = ln(eigenvalue) / T with the damping ratio -Re s / |s|, which is 1 where it does not oscillate.
+
+    Attributes:
+        decay_per_s: How fast the slowest mode decays [1/s]; negative where it grows.
+        frequency_hz: The frequency of that mode [Hz].
+        damping_ratio: The damping ratio of that mode.
+        least_damping_ratio: The least damping ratio of all modes.
+        least_frequency_hz: The frequency of the mode that has it [Hz].
+    """
+
+    decay_per_s: float
+    frequency_hz: float
+    damping_ratio: float
+    least_damping_ratio: float
+    least_frequency_hz: float
+
+    @property
+    def words(self) -> str:
+        """One row of a report."""
+        slowest = f"{self.decay_per_s:.4g} 1/s at {self.frequency_hz:.2f} Hz, damping ratio {self.damping_ratio:.4f}"
+        if self.least_damping_ratio == self.damping_ratio:
+            return slowest
+        return f"{slowest}; least ratio {self.least_damping_ratio:.4f} at {self.least_frequency_hz:.2f} Hz"
+
+
+_FADED = 1e-6  # of modulus: a delay line's poles at zero, as rounding spreads them, are gone after a tick
+
+
+def ringing(simulation: Simulation) -> Ringing | None:
+    """Return how a knock dies away, in the worst set of walls that touch; None in a world, which has no eigenvalues."""
+    if simulation.scenario.environment.world:
+        return None
+    loops = [close(simulation.plant, F) for F in simulation.process.law.frozen().values()]
+    values = np.concatenate([np.linalg.eigvals(loop.A) for loop in loops]).astype(complex)
+    modes = np.log(values[np.abs(values) > _FADED]) / simulation.plant.T
+    modes = modes[np.abs(modes) > _CLEAR]  # what drifts freely neither rings nor decays
+    ratios, hz = -modes.real / np.abs(modes), np.abs(modes.imag) / (2 * np.pi)
+    slowest, least = int(np.argmax(modes.real)), int(np.argmin(ratios))
+    if np.isclose(ratios[slowest], ratios[least], rtol=1e-9):  # the two of a pair
+        least = slowest
+    shown = (-modes.real[slowest], hz[slowest], ratios[slowest], ratios[least], hz[least])
+    return Ringing(*map(float, shown))
+
+
 def exact_growth(simulation: Simulation) -> float:
     """Return the growth rate [1/s] of the exact loop, or of its worst frozen contact state."""
     return float(worst_mode(simulation).growth)

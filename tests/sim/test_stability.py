@@ -1,11 +1,18 @@
 """Growth rates: the agreed figures, and what a trace may be asked."""
 
+import json
+
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
+from haptic_loop.cli.design import main as design_command
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
+from haptic_loop.design.result import DesignFailed
+from haptic_loop.models.scene import HumanSets, variants
+from haptic_loop.sim.couplings import read_coupling
 from haptic_loop.sim.run import assemble, run
-from haptic_loop.sim.scenario import load
+from haptic_loop.sim.scenario import InputError, load, parse
 from haptic_loop.sim.stability import (
     _NOT_EXCITED,
     Mode,
@@ -13,6 +20,8 @@ from haptic_loop.sim.stability import (
     _measured_growth,
     close,
     dominant_mode,
+    mujoco_loops,
+    ringing,
     verdict,
 )
 
@@ -65,3 +74,58 @@ def test_verdicts():
     assert verdict(Mode(np.array(1.0), 1e-3).growth) == "stable"
     assert verdict(Mode(np.array(1.001), 1e-3).growth) == "unstable"
     assert Mode(np.array(0.0), 1e-3).growth == -np.inf
+
+
+def test_how_a_knock_dies_away_is_that_of_the_held_plant():
+    """One body of device and hand before a spring: the exponential of its own matrices, without the program's."""
+    T, K = 2e-3, 900.0
+    text = """
+name = "knock"
+T = 2e-3
+theta = [1]
+device = [{ kind = "rigid", mass = 0.2, damping = 1.5 }]
+human = [{ links = [{ mass = 0.3, damping = 2.0, stiffness = 150.0 }] }]
+[environment]
+contacts = ["a"]
+springs = [{ between = ["a", "ground"], stiffness = 900.0 }]
+"""
+    mass, damping, stiffness = 0.2 + 0.3, 1.5 + 2.0, 150.0
+    plant = np.array([[0, 1, 0], [-stiffness / mass, -damping / mass, -1 / mass], [0, 0, 0]])
+    held = expm(plant * T)
+    loop = np.array([[*held[0, :2], held[0, 2]], [*held[1, :2], held[1, 2]], [K, 0, 0]])  # the force is a tick late
+    poles = np.log(np.linalg.eigvals(loop).astype(complex)) / T
+    pair = poles[np.argmax(poles.real)]
+    said = ringing(assemble(parse(text), NoCoupling()))
+    assert said.decay_per_s == pytest.approx(-pair.real, rel=1e-9)
+    assert said.frequency_hz == pytest.approx(abs(pair.imag) / (2 * np.pi), rel=1e-9)
+    assert said.damping_ratio == said.least_damping_ratio == pytest.approx(-pair.real / abs(pair), rel=1e-9)
+
+
+def test_a_design_for_a_damping_ratio_has_it_in_both_engines(tmp_path, capsys):
+    path = tmp_path / "soft.json"
+    assert design_command(["--decay", "0.01", "--out", str(path), "--json", str(tmp_path / "r.json")]) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["assessment"]["guarantee"]["proof"] == "rational"
+    scenario = load()
+    simulation = assemble(scenario, read_coupling(path).built())
+    crowd = HumanSets((scenario.human,), scenario.person)
+    loops = mujoco_loops(variants(scenario.device, crowd), simulation.process, "exponential", 1)
+    values = np.linalg.eigvals(loops.A[0]).astype(complex)
+    poles = np.log(values[np.abs(values) > 1e-6]) / scenario.T
+    ratio = (-poles.real / np.abs(poles)).min()
+    assert 0.01 <= report["ringing"]["least_damping_ratio"] == pytest.approx(ratio, rel=1e-4)
+    capsys.readouterr()
+    with pytest.raises(DesignFailed, match=r"^--decay 0.05: no certified coupling .* has 0\.0\d+ at 8\d\.\d Hz$"):
+        design_command(["--decay", "0.05", "--out", str(path)])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--coupling", "optimal"], "--decay is for --coupling spring-damper or moving-average, not optimal"),
+        (["--scenario", "world-cube"], "--decay: a damping ratio is of a linear loop with constant delays"),
+    ],
+)
+def test_a_damping_ratio_is_refused_where_there_is_none(options, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        design_command([*options, "--decay", "0.01", "--out", str(tmp_path / "c.json")])
