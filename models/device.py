@@ -351,9 +351,7 @@ def _force_dimension(title: str, force: float, stiffness: float = 5000.0, **more
 
 
 CATALOGUE: Mapping[str, Listed] = {
-    "omega.3": _force_dimension(
-        "omega.3", 12.0, kind=_Known("rigid", _IDENTIFIED), damping=_Known(1.37, _IDENTIFIED)
-    ),
+    "omega.3": _force_dimension("omega.3", 12.0, kind=_Known("rigid", _IDENTIFIED), damping=_Known(1.37, _IDENTIFIED)),
     "omega.6": _force_dimension("omega.6, translation", 12.0),
     "omega.7": _force_dimension("omega.7, translation", 12.0),
     "delta.3": _force_dimension("delta.3", 20.0),
