@@ -15,6 +15,7 @@ _REACH = 0.5  # an interval is bounded only if its half-width is at most this pa
 _UNIT = 2.0**-53
 _NOISE = 1e-4  # in every state, beside the noise at the inputs
 _INFLATED = 1.001  # covers the rounding of norms
+_TOGETHER = 2**18  # entries of resolvents that are held at once
 
 
 def hermitian_floor(G: Lti, enough: float, unwanted: float) -> tuple[float, float, float]:
@@ -135,6 +136,43 @@ def _bounded(
     if lost:  # |R| grows at most twofold on an interval
         lower = np.minimum(lower, 0) - 2 * (_size(CR) * lost[0] + _size(RB) * lost[1]) - lost[2]
     return lower, here
+
+
+def sizes_around(G: Lti, w: Array, radius: Array) -> tuple[Array, Array]:
+    """Bound |G(e^jv)| over the complex v with |v - w| <= radius, and the rounding error of its value at real ones.
+
+    With R0 at the middle and |z - z0| <= e^radius - 1 = d, R = (I + (z - z0) R0)^-1 R0 has |R| <= |R0|/(1 - d |R0|).
+
+    Args:
+        G: A stable block of floats.
+        w: (k,) middles [rad/sample].
+        radius: (k,) radii, up to which nothing is near a pole for the bounds to be finite.
+
+    Returns:
+        (the bounds, the rounding errors), (k,) each, Frobenius norms; inf where half of 1/|R0| is exceeded.
+    """
+    G = _balanced(G)
+    n, m = G.B.shape
+    if not n:
+        size = np.full(w.shape, np.linalg.norm(G.D))
+        return size, 8 * m * _UNIT * size
+    norms, parts = _norms(G), max(1, _TOGETHER // n**2)
+    found = np.full((2, w.size), np.inf)
+    for first in range(0, w.size, parts):
+        here = slice(first, first + parts)
+        R = np.linalg.inv(np.exp(1j * w[here])[:, None, None] * np.eye(n) - G.A)
+        CR, RB, away = G.C @ R, R @ G.B, np.expm1(radius[here])
+        size = _size(CR @ G.B + G.D)
+        for L, back in norms:
+            left, right = _INFLATED * _size(CR @ L), _INFLATED * _size(back @ RB)
+            near = _INFLATED * away * _size(back @ R @ L) <= _REACH
+            bound = _INFLATED * size + away * left * right / (1 - _REACH)
+            found[0, here] = np.minimum(found[0, here], np.where(near, bound, np.inf))
+            error = (
+                16 * (n + m) * _UNIT * ((1 + np.linalg.norm(G.A)) * _size(CR) * _size(RB) / (1 - _REACH) ** 2 + size)
+            )
+            found[1, here] = np.minimum(found[1, here], np.where(near, error, np.inf))
+    return found[0], found[1]
 
 
 def _size(M: NDArray[np.inexact[Any]]) -> Array:

@@ -15,14 +15,15 @@ the mean over log frequency in the band. H is piecewise linear, so that its sums
 D is bounded from below between any two frequencies (`dual_matrix`). What it lacks is added to C_0, which is charged:
 the bound that remains is one of every linear coupling.
 Where nothing remains, or where unequal psi make the forbidden sums known up to rounding only, there is an estimate: of
-a D that is positive at the frequencies of a sweep. The integrals over the band are by Gauss's rule; _QUADRATURE and the
-difference to the same rule in half the intervals are charged.
+a D that is positive at the frequencies of a sweep. The integrals over the band are by Gauss's rule, whose error is
+bounded (`_Dual.objective_again`) and charged, and _QUADRATURE beside it.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import cached_property
 
 import msgspec
 import numpy as np
@@ -30,6 +31,7 @@ import numpy as np
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Complex, Lti
+from haptic_loop.controller.passivity import sizes_around
 from haptic_loop.design.barrier import EntryInequality, Program, centre, packed, towards
 from haptic_loop.design.conditions import even_damping
 from haptic_loop.design.dual_matrix import DualMatrix, dilogarithm
@@ -58,7 +60,11 @@ _GAP = 0.004  # of the bound, relatively, that the barrier leaves
 _LEAST = 1e-9  # mean square below which a bound says nothing
 _SWEEPS = 6
 _WANTED = 1e-3  # of the bound: what may be charged for the error of the bounds of D between frequencies
-_QUADRATURE = 1e-8  # of the mean square: what Gauss's rule may differ from the integral
+_QUADRATURE = 1e-8  # of the mean square, charged in any case: the estimate's rule has no bound of its error
+_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # in each interval, for the bound that remains
+_DISK = 4.0  # half-widths of an interval: the disk in which the integrand is bounded, away from the poles
+_MOST_INTERVALS = 20_000
+_UNIT = 2.0**-53
 _LARGEST_CHARGE = 0.005  # of the bound, for what D lacks between the frequencies where it is imposed
 
 
@@ -201,17 +207,54 @@ class _Dual:
         parts = x[: 2 * m * m * inner].reshape(m * m, 2 * inner)
         return (self.heights @ (parts[:, :inner] + 1j * parts[:, inner:]).T).reshape(-1, m, m)
 
-    def objective_again(self, x: Array) -> float:
-        """The bound of a point by Gauss's rule in halves of the intervals, from H itself."""
+    @cached_property
+    def _nodes(self) -> tuple[Array, Array, Complex, Array]:
+        """The middles and half-widths (k,) of intervals, Lambda E at Gauss's points (k, points, m, m), and (2, k):
+
+        bounds of |Lambda E| in the disk of _DISK half-widths around the middle, and of its rounding.
+        """
+        E, half = self.loop.E(), np.diff(self.grid) / 2
+        middle, found = self.grid[:-1] + half, []
+        while middle.size:
+            bounds = np.stack(sizes_around(E, middle, _DISK * half))
+            done = np.isfinite(bounds[0]) | (sum(part[0].size for part in found) + 2 * middle.size > _MOST_INTERVALS)
+            found.append((middle[done], half[done], bounds[:, done]))
+            half = np.repeat(half[~done] / 2, 2)
+            middle = np.repeat(middle[~done], 2) + half * np.tile([-1.0, 1.0], half.size // 2)
+        middle, half, bounds = (np.concatenate([part[i] for part in found], axis=-1) for i in range(3))
+        longest, m = max(self.loop.lam), self.loop.channels
+        w = (middle[:, None] + half[:, None] * _POINTS).ravel()
+        late = on_circle(w)[:, None] ** -np.asarray(self.loop.lam)
+        response = (late[:, :, None] * E.at(on_circle(w))).reshape(middle.size, -1, m, m)
+        bounds[1] += 7 * (longest + 2) * _UNIT * bounds[0]
+        bounds[0] *= np.exp(longest * _DISK * half)
+        return middle, half, response, bounds
+
+    def objective_again(self, x: Array) -> tuple[float, float]:
+        """The bound of a point by Gauss's rule, from H itself; and how far it is off at most.
+
+        In an interval the integrand g = (2/pi) Re tr H* Lambda E + (span/pi^2) w |H|^2 |E|^2 is analytic, since H is
+        linear there. Gauss's rule of N points is exact for polynomials up to the degree 2N - 1, and its weights are
+        positive: it is off by at most twice the length times the distance of g from such a polynomial. For that of
+        Taylor around the middle the distance is at most max |g| q^2N/(1 - q), over the disk of radius half-width/q.
+        """
+        middle, half, response, (size, error) = self._nodes
         low, high = self.band
-        grid = np.union1d(self.grid, (self.grid[1:] + self.grid[:-1]) / 2)
-        w, weight, _ = _gauss(grid)
-        H = self.h(x).reshape(self.grid.size, -1)
-        H = np.stack([np.interp(w, self.grid, column) for column in H.T], axis=1)
-        size, target = _late(self.loop, self.loop.E(), w)
-        h = (np.log(high / low) / np.pi * w * size)[:, None] * H
-        mean = weight / (w * np.log(high / low)) @ (2 * (np.conj(h) * target.reshape(h.shape)).real + np.abs(h) ** 2)
-        return float(-mean.sum() - self.start @ x)
+        span, H = np.log(high / low), self.h(x).reshape(self.grid.size, -1)
+        at = lambda w: np.stack([np.interp(w, self.grid, column) for column in H.T], axis=-1)  # noqa: E731
+        w, weight = middle[:, None] + half[:, None] * _POINTS, half[:, None] * _WEIGHTS
+        inside, G = at(w), response.reshape(*w.shape, -1)
+        h, g = np.linalg.norm(inside, axis=2), np.linalg.norm(G, axis=2)
+        squares = span / np.pi**2 * w * h**2
+        value = float((weight * (2 / np.pi * (np.conj(inside) * G).real.sum(axis=2) + squares * g**2)).sum())
+
+        rise = _DISK * np.linalg.norm(at(middle + half) - at(middle - half), axis=1) / 2
+        highest = np.linalg.norm(at(middle), axis=1) + rise
+        most = 2 / np.pi * highest * size + span / np.pi**2 * (middle + _DISK * half) * (highest * size) ** 2
+        missed = 4 * half * most * _DISK ** (-2.0 * _POINTS.size) / (1 - 1 / _DISK)
+        of_sum = (w.size + 40) * _UNIT * (weight * (2 / np.pi * h * g + squares * g**2))
+        of_values = weight * (2 / np.pi * h + squares * (2 * g + error[:, None])) * error[:, None]
+        return -value - float(self.start @ x), float(missed.sum() + (of_sum + of_values).sum())
 
     def charged(self, x: Array, value: float, swept: Array) -> tuple[float, Array, Array]:
         """The bound of a point after what D lacks anywhere is charged; where D was evaluated, and its eigenvalues.
@@ -220,9 +263,9 @@ class _Dual:
         """
         if not self.exact:
             return 0.0, swept, np.zeros(swept.size)
-        m, again = self.loop.channels, self.objective_again(x)
+        m, (again, error) = self.loop.channels, self.objective_again(x)
         lower, where, least = self.matrix(x).lower(swept, _WANTED * max(value, _LEAST) / m)
-        return min(value, again) - abs(value - again) + m * min(lower, 0.0), where, least
+        return again - error + m * min(lower, 0.0), where, least
 
     def best(self) -> tuple[float, float]:
         """Two bounds on the mean square: with D at samples, and what remains after D is charged on the whole circle.

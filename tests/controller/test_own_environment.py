@@ -10,7 +10,7 @@ from haptic_loop import load
 from haptic_loop.controller.arithmetic import rational
 from haptic_loop.controller.environment import Block, Network, Spring, Wall, environment, parts_of
 from haptic_loop.controller.lti import Lti
-from haptic_loop.controller.passivity import hermitian_floor
+from haptic_loop.controller.passivity import hermitian_floor, sizes_around
 from haptic_loop.design.exact import Matrix, definiteness
 from haptic_loop.sim.scenario import InputError
 
@@ -147,6 +147,27 @@ def test_the_bound_is_below_every_sample():
         assert floor <= sampled + 1e-9 * abs(sampled)
         assert floor <= least
         assert floor >= sampled - 2e-3 * abs(sampled)
+
+
+def test_a_block_is_bounded_away_from_its_poles():
+    """Random stable blocks with sharp resonances: the values at complex frequencies, by solving."""
+    rng = np.random.default_rng(12)
+    for _ in range(20):
+        n, m = int(rng.integers(1, 7)), int(rng.integers(1, 4))
+        A = rng.normal(size=(n, n))
+        A *= (1 - 10 ** rng.uniform(-6, -0.5)) / np.abs(np.linalg.eigvals(A)).max()
+        G = Lti(A, rng.normal(size=(n, m)), rng.normal(size=(m, n)), rng.normal(size=(m, m)), T)
+        poles = np.linalg.eigvals(A)
+        w, radius = rng.uniform(0, np.pi, 40), 10 ** rng.uniform(-6, -0.5, 40)
+        w[: n // 2] = np.abs(np.angle(poles))[: n // 2]
+        bounds, errors = sizes_around(G, w, radius)
+        for middle, r, bound, error in zip(w, radius, bounds, errors, strict=True):
+            z = np.exp(1j * (middle + r * np.exp(2j * np.pi * np.arange(24) / 24)))
+            sizes = np.linalg.norm([G.C @ np.linalg.solve(v * np.eye(n) - A, G.B) + G.D for v in z], axis=(1, 2))
+            assert (sizes <= bound).all()
+            assert np.isinf(bound) or np.abs(poles - np.exp(1j * middle)).min() > np.expm1(r)
+            assert 0 < error < 1e-6 * bound or np.isinf(bound)
+        assert np.isfinite(bounds).any()
 
 
 def test_blocks_of_barely_passive_networks_are_accepted():

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.integrate
 
 import haptic_loop
 from haptic_loop.design import bound as module
@@ -87,6 +88,30 @@ def test_a_charged_bound_is_never_above_the_estimate(name):
     found, (_, _, value, charged) = judged(name)
     assert charged <= value
     assert 0 < found.rms <= found.sampled_rms
+
+
+@pytest.mark.parametrize("name", ["n1-omega-II", "o12-free-mass-late"])
+def test_the_integral_errs_by_less_than_its_bound(name):
+    """-tr C_0 - 2 <H, Lambda E> - <H, H/w> by Simpson's rule with 400 steps in each interval, E from its states."""
+    loop = loop_of(name)
+    dual = module._Dual.of(loop, (1.0, 100.0), 16)
+    x = dual.start + 0.1 * np.random.default_rng(0).normal(size=dual.start.size)
+    found, error = dual.objective_again(x)
+    E, H, span = loop.E(), dual.h(x), np.log(dual.band[1] / dual.band[0])
+    total, wrong = 0.0, 0.0
+    for a, b, left, right in zip(dual.grid[:-1], dual.grid[1:], H[:-1], H[1:], strict=True):
+        share = np.linspace(0, 1, 401)[:, None, None]
+        z = np.exp(1j * (a + (b - a) * share))
+        late = z ** -np.array(loop.lam)[:, None] * (E.C @ np.linalg.solve(z * np.eye(E.order) - E.A, E.B) + E.D)
+        between = left + (right - left) * share
+        g = 2 / np.pi * (np.conj(between) * late).real.sum(axis=(1, 2))
+        size = np.linalg.norm(between, axis=(1, 2)) * np.linalg.norm(late, axis=(1, 2))
+        g += span / np.pi**2 * (a + (b - a) * share[:, 0, 0]) * size**2
+        fine, coarse = (scipy.integrate.simpson(g[::step], dx=step * (b - a) / 400) for step in (1, 2))
+        total, wrong = total + fine, wrong + abs(fine - coarse)
+    assert wrong < 1e-7 * abs(total)
+    assert abs(-total - float(dual.start @ x) - found) <= error + wrong
+    assert error < 1e-8 * abs(total)
 
 
 def test_what_is_negative_only_between_samples_is_found():
