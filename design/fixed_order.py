@@ -28,9 +28,9 @@ from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.frequency import on_circle
 from haptic_loop.design.result import Design, DesignFailed, Requirement
 
-#: How such a coupling may be sought.
+#: The methods of the search.
 _METHODS = ("complementarity", "inner", "fixed-poles")
-#: States per channel: each adds a row and a column to every cone; poles of those that a spring-damper does not have.
+#: States per channel, each of which adds a row and a column to every cone; poles of the further states at the start.
 _MOST_STATES, _SPARE_POLE = 10, 0.5
 
 
@@ -50,7 +50,7 @@ class _Units:
         return Lti(V.A, V.B * root, self.T * root[:, None] * V.C, self.T * root[:, None] * V.D * root, self.T)
 
     def block(self, V: Lti) -> Lti:
-        """What Theorem 4 asks to be positive real, linear in what V puts out; rows of a multiplier have unit size."""
+        """Return the block of Theorem 4, which is linear in the output of V; rows of a multiplier have unit size."""
         demand = any_environment_demand(V, self.loop, self.phi)
         block, one = demand.gain + demand.free, np.ones(V.inputs)
         scale = np.diag(np.append(one, 1 / np.sqrt(np.diag(block.D)[V.inputs :])))
@@ -98,7 +98,7 @@ class FixedOrder:
         return self.units.si(self.unit_coupling(p))
 
     def start(self, gains: SpringDamper) -> Array:
-        """p of a spring-damper; each further state is driven by the one before, and nothing reads it yet.
+        """Return p of a spring-damper. Each further state is driven by the one before, and no output reads it.
 
         All states are reachable, so the storage of the weighted loop is well conditioned. A state that is read but not
         driven makes it singular, and rounding then decides whether the solver finishes the first step.
@@ -114,28 +114,28 @@ class FixedOrder:
         return np.concatenate([M[free] for M, free in zip(parts, self._free, strict=True)])
 
     def block(self, p: Array) -> Lti:
-        """What must be positive real, affine in p."""
+        """Return the block of the condition, affine in p."""
         return self.units.block(self.unit_coupling(p))
 
     def weighted_loop(self, p: Array) -> Lti:
-        """W1 L W2, affine in p."""
+        """Return W1 L W2, affine in p."""
         shaping = self.shaping
         return shaping.W1 @ (shaping.late + shaping.environment @ self.coupling(p)) @ shaping.W2
 
 
 # ----------------------------------------------------------------------------------------------------
-# Storage matrices of a given coupling: what makes the inequalities of a fixed-order design hold at a start.
+# Storage matrices of a given coupling, with which the inequalities of a fixed-order design hold at the start.
 
 
 def _passivity_storage(family: FixedOrder, p: Array) -> Array:
-    """P > 0 of the remedied (2) for the coupling p, with the most room; the coupling must satisfy it strictly."""
+    """Return P > 0 of the remedied (2) for the coupling p, as deep inside as possible. p must be strictly feasible."""
     G = family.block(p)
     zero = np.zeros_like(G.D)
     return _roomiest(lambda P: lmi.lemma1(lmi.Ports.same(G), P, zero, zero), G.order, "the storage of V-hat")
 
 
 def _gain_storage(family: FixedOrder, p: Array, mu: float) -> Array:
-    """U = X^-1 > 0 of Lemma 3, ||W1 L W2||_inf < mu, with the most room in coordinates of unit reachability."""
+    """Return U = X^-1 > 0 of Lemma 3, ||W1 L W2||_inf < mu, as deep inside as possible."""
     G = family.weighted_loop(p) * (1 / mu)
     S = lmi.reachability_scaled(G)
     n, m = S.shape[0], G.inputs
@@ -146,7 +146,7 @@ def _gain_storage(family: FixedOrder, p: Array, mu: float) -> Array:
 
 
 def _roomiest(inequality: Callable[[Array], Array], n: int, what: str) -> Array:
-    """The P that maximises s <= 1 with inequality(P) >= s I and P >= s I."""
+    """Return the P that maximises s <= 1 with inequality(P) >= s I and P >= s I."""
     every = range(lmi.packed(n) + 1)  # P and s
 
     def roomy(of: Callable[[Array], Array]) -> Inequality:
@@ -170,7 +170,7 @@ class _Lemmas:
         self._loop = _affine(lambda p: family.weighted_loop(p) * (1 / norm), at, self.LU)
 
     def inequalities(self, parts: Callable[[Array], Sequence[Any]], every: range) -> list[Inequality]:
-        """Of unknowns with `parts` p - at, Q, Q^-1, U, U^-1 and mu^2."""
+        """Return the inequalities in unknowns with `parts` p - at, Q, Q^-1, U, U^-1 and mu^2."""
 
         def passivity(v: Array) -> Array:
             p, Q, Y, *_ = parts(v)
@@ -188,7 +188,7 @@ _System = tuple[Array, Array, Array, Array]  # A, B, C, D
 
 
 def _affine(system: Callable[[Array], Lti], at: Array, L: Array) -> Callable[[Array], _System]:
-    """p - at -> A, B, C, D of a system that is affine in p, with the states L^-1 x."""
+    """Return p - at -> A, B, C, D of a system that is affine in p, with the states L^-1 x."""
     n = L.shape[0]
 
     def whole(p: Array) -> Array:
@@ -224,9 +224,9 @@ _LEAST, _MOST = 0.1, 1.99
 
 
 def descend(family: FixedOrder, p: Array, norm: float) -> Iterator[Array]:
-    """The couplings p of successive steps from one that is strictly feasible and has the given norm.
+    """Yield the couplings p of successive steps from a strictly feasible one with the given norm.
 
-    Ends where a certificate is singular to rounding: the coupling then stands on the boundary.
+    The descent ends where a certificate is singular to rounding: the coupling is then on the boundary.
     """
     Q = np.linalg.inv(_passivity_storage(family, p))
     U = _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
@@ -242,7 +242,7 @@ def _descended(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget:
         try:
             trial = next(steps, None)
         except DesignFailed:
-            break  # the solver's accuracy is exhausted: what the steps before reached stands
+            break  # the solver's accuracy is exhausted: the last good step is kept
         if trial is None or not holds(trial, norm):
             break
         before, norm, p = norm, family.shaping.norm(family.coupling(trial))[0], trial
@@ -253,7 +253,7 @@ def _descended(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget:
 
 
 def _step(lemmas: _Lemmas) -> tuple[Array, Array, Array]:
-    """p, Q and U after one SDP in (p - at, Q, U, mu^2/norm^2)."""
+    """Solve one SDP in (p - at, Q, U, mu^2/norm^2) and return p, Q and U."""
     nq, nu = lemmas.LQ.shape[0], lemmas.LU.shape[0]
     ends = np.cumsum([lemmas.at.size, lmi.packed(nq), lmi.packed(nu)])
     every = range(ends[-1] + 1)
@@ -289,7 +289,7 @@ _WIDTH = 5e-3
 
 
 def _bisect(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
-    """(the best coupling, SDPs spent); p holds for its norm."""
+    """Return the best coupling and the number of SDPs; p is feasible for its norm."""
     Q, U = np.linalg.inv(_passivity_storage(family, p)), _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
     lemmas = _Lemmas(family, p, Q, U, norm)
     low, high, best, sdps = 0.5 * norm, norm, p, 0
@@ -305,7 +305,7 @@ def _bisect(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: in
 
 
 def _complementary(lemmas: _Lemmas, mu: float, holds: _Judge, patience: int) -> tuple[Array | None, int]:
-    """(a coupling that holds for mu or None, SDPs spent)."""
+    """Return a coupling that is feasible for mu, or None, and the number of SDPs."""
     sizes = (lemmas.LQ.shape[0],) * 2 + (lemmas.LU.shape[0],) * 2  # of Q, Y, U and X
     ends = np.cumsum([lemmas.at.size, *map(lmi.packed, sizes)])
 
@@ -366,7 +366,7 @@ class FixedPoles:
             self.frequencies.append(peak)
 
     def search(self, start: Sequence[float], evaluations: int = 60) -> tuple[Lti, float]:
-        """`best` over one pole per channel, by a simplex search from `start`."""
+        """Minimise `best` over one pole per channel, by a simplex search from `start`."""
         import scipy
 
         def norm(x: Array) -> float:
@@ -410,7 +410,9 @@ class FixedPoles:
         cuts = lmi.gain_block([*range(gains), len(every)], late @ right, slopes, base, 0 * slopes[:, :, :N])
         blocks = [Inequality.of(passive, every), Inequality.of(storage, every), cuts]
 
-        def certified(x: Array) -> bool:  # or poles are chosen at which a solver's tolerance passes for passivity
+        def certified(
+            x: Array,
+        ) -> bool:  # else a solver's tolerance could hide a violation
             return any_environment(self.units.si(unit(x)), self.shaping.loop, self.phi).certified
 
         x = ConeProgram(np.append(np.zeros(len(every)), 1.0), blocks).solve("the coupling with fixed poles", certified)
@@ -423,7 +425,7 @@ _START_ROOM = 1e-3
 
 
 def design(loop: Loop, order: int = 1, diagonal: bool = True, method: str = "inner", most_sdps: int = 100) -> Design:
-    """The coupling with `order` states per channel that `method` finds, from strictly feasible spring-damper gains.
+    """Design a coupling with `order` states per channel by `method`, from strictly feasible spring-damper gains.
 
     Raises Infeasible if Theorem 4 admits no spring-damper to start from, DesignFailed if no result is certified.
     """
@@ -449,7 +451,7 @@ def design(loop: Loop, order: int = 1, diagonal: bool = True, method: str = "inn
         family = FixedOrder(shaping, phi, order, diagonal)
 
         def holds(p: Array, mu: float) -> bool:
-            """Whether the coupling p is certified and ||W1 L W2||_inf <= mu, from the coupling alone."""
+            """Return whether the coupling p is certified and ||W1 L W2||_inf <= mu, judged from the coupling alone."""
             V = family.coupling(p)
             return V.is_stable() and judged(V).certified and shaping.norm(V)[0] <= mu
 

@@ -1,4 +1,4 @@
-"""How close what the devices see comes to the environment: the mismatch (8) and its figures."""
+"""Transparency: the mismatch (8) between what the devices feel and the environment, and its figures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design.frequency import frequencies, integral, on_circle, supremum
 
 BAND_HZ = (0.5, 80.0)
-_ROUNDING = 1e-10  # of the environment: two responses that differ by less are one
+_ROUNDING = 1e-10  # relative to the environment; responses that differ by less count as equal
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Transparency:
 
     @property
     def reason(self) -> str | None:
-        """Why a figure is infinite in decibels."""
+        """The reason why a figure is infinite in decibels."""
         if self.relative_mismatch == 0:
             return "the devices see the reference exactly: the mismatch is zero, minus infinity in dB"
         if math.isinf(self.tau):
@@ -62,7 +62,7 @@ class Transparency:
         return None
 
     def part(self) -> dict[str, Any]:
-        """As JSON has it: the mismatch in decibels, `reason` only where there is one."""
+        """Return the figures for JSON: the mismatch in decibels, and `reason` if there is one."""
         part = {
             "tau_db": decibels(self.tau),
             "relative_mismatch_db": self.mismatch_db,
@@ -75,7 +75,7 @@ class Transparency:
 
 
 def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
-    """The figures for the force map F against Lambda E."""
+    """Compute the figures of the force map F against Lambda E."""
     target = delay(lam, F.T) @ environment
     per_hz = 2 * np.pi * F.T
     low, high = band_hz[0] * per_hz, min(band_hz[1] * per_hz, np.pi)
@@ -85,7 +85,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
         return F.at(z) - target.at(z)
 
     def sizes(w: Array) -> tuple[Array, Array, Array]:
-        """sigma_max(M), sigma_max(E) and sigma_min(E), (k,) each; those of the grid once."""
+        """Return sigma_max(M), sigma_max(E) and sigma_min(E), (k,) each; those of the grid are cached."""
         if w is grid and known:
             return known[0]
         E = np.linalg.svd(environment.at(on_circle(w)), compute_uv=False)
@@ -104,7 +104,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
     peak, _ = supremum(lambda w: sizes(w)[0], grid)
     least, _ = supremum(lambda w: -sizes(w)[2], grid)
     static = np.linalg.svd(environment.dc(), compute_uv=False)
-    rounding = 1e-9 * float(np.abs(environment.D).max())  # a stiffness of zero comes out of larger numbers
+    rounding = 1e-9 * float(np.abs(environment.D).max())  # a zero stiffness is the difference of larger numbers
     least = 0.0 if static[-1] < 1e-9 * static[0] else min(-least, float(static[-1]))
     worst = supremum(relative, grid)[0]
     if worst < _ROUNDING:
@@ -121,7 +121,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
 
 
 def decibels(ratio: float) -> float:
-    """20 log10(ratio); -inf for 0."""
+    """Return 20 log10(ratio); -inf for 0."""
     return float(20 * np.log10(ratio)) if ratio > 0 else -np.inf
 
 
@@ -132,7 +132,7 @@ def _ratio(numerator: float, denominator: float) -> float:
 
 
 def _rms(mismatch, environment: Lti, grid: Array) -> float:
-    """sqrt of the mean over log frequency between the ends of `grid`, which is dense where the ratio may be sharp."""
+    """Return the root mean square over log frequency; `grid` is dense where the ratio may be sharp."""
 
     def square(logarithm: Array) -> Array:
         w = np.exp(logarithm)

@@ -1,8 +1,8 @@
-"""The worst passive human: a seeded global search over lossless ladders for the largest growth of the exact loop.
+"""Search for the worst passive human: a seeded global search over lossless chains for the largest growth of the loop.
 
-A lossless chain of masses and springs presents any reactance that a passive hand could at the frequency where the
-loop is weakest, and takes no energy out. Ranges are bounded so that no mode of a human exceeds about 3 kHz:
-beyond that a matrix exponential, not a hand, would decide.
+A lossless chain of masses and springs can present any reactance at the frequency where the loop is weakest, and takes
+no energy out. Ranges are bounded so that no mode of a human exceeds about 3 kHz; above that, errors of the matrix
+exponential would decide.
 
 The condition counts |dx|^2 / T where a device dissipates the integral of v^2, which is more unless v is constant
 between samples: for a sinusoid, |dx|^2 / T is (sin x / x)^2 of it, x = pi f T. So the condition asks for that much
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
 _MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
-_DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
+_DESTABILISED = 1e-6  # [1/s] least growth that counts as destabilising; rounding gives up to 1e-9
 
 
 class _Pass(NamedTuple):
     """One search. Slow modes of a lossless hand barely decay and would hide the one that grows."""
 
-    links: int  # of each arm; one mass and spring already present every reactance at one frequency
+    links: int  # of each arm; a single mass and spring present every reactance at one frequency
     min_frequency_hz: float  # of the modes looked at
-    held: bool = False  # by one person, whose body and cross spring present every reactance matrix
+    held: bool = False  # by one person, whose body and cross spring present every reactance matrix at one frequency
 
 
 _PASSES = (_Pass(1, 2.0), _Pass(2, 2.0), _Pass(1, 0.0), _Pass(1, 2.0, held=True))
@@ -47,7 +47,7 @@ _CANDIDATES = 120  # sets of humans in a generation
 
 @dataclass(frozen=True)
 class Worst:
-    """The worst humans that a search found."""
+    """The worst humans of a search."""
 
     humans: tuple[Hand, ...]
     persons: tuple[Person, ...]  # who hold several devices
@@ -69,11 +69,11 @@ def search(
     first: bool = False,
     progress: Progress = lambda done, total: None,
 ) -> Worst:
-    """The lossless humans with the largest growth that were found; with `first`, the first that destabilise.
+    """Search for the lossless humans with the largest growth; with `first`, stop at the first that destabilise.
 
     `progress` is called after every generation.
     """
-    from scipy.optimize import differential_evolution  # slow to load, and seldom needed
+    from scipy.optimize import differential_evolution  # slow to load, seldom needed
 
     m, done = len(scenario.device), 0
     passes = [p for p in _PASSES if m > 1 or not p.held]
@@ -119,10 +119,10 @@ def search_population(
     generations: int = 150,
     progress: Progress = lambda done, total: None,
 ) -> Worst:
-    """The worst sets of hands that the scenario's population can draw.
+    """Search for the worst sets of hands that the scenario's population can draw.
 
     Every generation half of the sets are new draws; the others take each device's hand from one of the worst sets so
-    far, or from a new draw. So each hand is one that the population drew, and no assumption is made of what it is.
+    far, or from a new draw. So the population has drawn each hand, and nothing is assumed about its kind.
     """
     rng, m = np.random.default_rng(np.random.SeedSequence((seed, len(_PASSES)))), len(scenario.device)
     elite: list[tuple[float, tuple[Hand, ...]]] = []
@@ -138,7 +138,7 @@ def search_population(
 
 
 def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> list[tuple[float, tuple[Hand, ...]]]:
-    """Each set with its growth [1/s]: of the modes above 2 Hz while none grows, since slow ones barely decay."""
+    """Rank sets by growth [1/s], of modes above 2 Hz while none grows, because slow modes barely decay."""
     layouts: dict[object, list[tuple[Hand, ...]]] = {}
     for hands in sets:
         layouts.setdefault(tuple(hand.port().layout for hand in hands), []).append(hands)
@@ -151,7 +151,7 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
 
 
 def _ladders(x: Array, devices: int, kind: _Pass) -> Crowd:
-    """Logs of masses and stiffnesses, (2 devices links, nsim), as lossless humans.
+    """Turn logarithms of masses and stiffnesses, (2 devices links, nsim), into lossless humans.
 
     Where one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness.
     """
@@ -166,13 +166,13 @@ def _ladders(x: Array, devices: int, kind: _Pass) -> Crowd:
 
 
 def _loops(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets) -> ClosedLoop:
-    """In periods of the longest length, with forces that latch at the latest."""
+    """Return the loops in periods of the longest length, with forces that latch as late as possible."""
     late = None if scenario.latency is None else [most for _, most in scenario.latency]
     return exact_loops(variants(scenario.device, crowd), F, scenario.longest_period, late)
 
 
 def _losses(x: Array, scenario: Scenario, F: Lti, kind: _Pass) -> Array:
-    """Minus the largest growth [1/s] among the modes looked at, for every column of x."""
+    """Return minus the largest growth [1/s] among the modes of the pass, for every column of x."""
     loops = _loops(scenario, F, _ladders(x.reshape(x.shape[0], -1), len(scenario.device), kind))
     (growth,) = loops.growths(kind.min_frequency_hz)
     return -growth

@@ -1,14 +1,12 @@
-"""Many random passive humans on one loop: drawn, decided by both engines, in batches over processes or a cluster.
+"""Validate a loop with many random passive humans, by both engines, in batches over processes or a cluster.
 
-Human i depends on the seed and i alone, whoever draws it and with whom. Batches are always the same ones, so that the
-merged result of shards and of a cluster is that of a single run, bit for bit (a cluster's workers need this package
-and the same versions of NumPy, SciPy and MuJoCo). MuJoCo decides by the map of its Runge-Kutta
-integrator, which shares nothing with the exact engine but the model; its traces take the exponential one, at a fifth
-of the cost.
+Human i depends on the seed and on i alone. Batches do not depend on the number of processes, so the merged result is
+that of a single run, bit for bit (the workers of a cluster need this package and the same versions of NumPy, SciPy and
+MuJoCo). MuJoCo decides by the map of its Runge-Kutta integrator, which shares only the model with the exact engine. Its
+traces use the exponential integrator, at a fifth of the cost.
 
-A batch whose worker died is done again by another. Every batch that is done stands in a table, on disk if a folder is
-given for it, so that nothing is lost with a process, and memory does not grow with the number of humans. Workers end
-with the process that started them, however that ends.
+A batch whose worker died is repeated by another worker. A table, on disk if a folder is given for it, keeps every
+finished batch, so memory does not grow with the number of humans. Workers end with the process that started them.
 """
 
 from __future__ import annotations
@@ -73,7 +71,7 @@ _BATCH = 125  # humans that are decided together
 
 
 def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], HumanSets]]:
-    """Humans of a user's own population, grouped by how they are built: (indices of the group, sets)."""
+    """Draw humans of a user's population, grouped by their structure: (indices of the group, sets)."""
     drawn, layouts = {}, {}
     for i in indices:
         rng = np.random.default_rng(np.random.SeedSequence((seed, i)))
@@ -89,17 +87,17 @@ def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterat
 
 @dataclass(frozen=True)
 class Validation:
-    """A loop, the humans that are to hold it, and how they are decided."""
+    """A loop, the humans that hold it, and how they are judged."""
 
     scenario: Scenario
     coupling: Coupling
     seed: int
     humans: int
     links: int
-    engine: str | Callable[[Simulation], Engine]  # exact | mujoco | both, or what makes one of a user's own
+    engine: str | Callable[[Simulation], Engine]  # exact | mujoco | both, or a factory of a user's engine
     duration: float  # [s] of the traces; 0 for none
     threads: int = 0  # of MuJoCo; 0 for all
-    environments: tuple[Member, ...] = ()  # that the humans are spread over; empty: all meet the scenario's own
+    environments: tuple[Member, ...] = ()  # humans meet these in turn; empty: all meet the scenario's
     lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of the limiter; None: forces are clipped
 
     @property
@@ -107,18 +105,18 @@ class Validation:
         return round(self.duration / self.scenario.T)
 
     def batches(self) -> list[range]:
-        """All indices, _BATCH of them at a time, all in one environment."""
+        """Yield all indices in batches of _BATCH; each batch meets one environment."""
         spread = max(1, len(self.environments))
         each = [range(i, self.humans, spread) for i in range(min(spread, self.humans))]
         return [indices[i : i + _BATCH] for indices in each for i in range(0, len(indices), _BATCH)]
 
     def environment(self, index: int) -> Member | None:
-        """What the humans of this index meet, None for the scenario's own environment: each in turn."""
+        """Return the environment that the humans of this index meet; None is the scenario's own."""
         return self.environments[index % len(self.environments)] if self.environments else None
 
     @property
     def digest(self) -> str:
-        """A digest of everything that the findings depend on."""
+        """The digest of everything that the findings depend on."""
         how = (
             self.coupling.form(),
             self.seed,
@@ -132,7 +130,7 @@ class Validation:
         return hashlib.sha256(f"{self.scenario.digest} {how!r}".encode()).hexdigest()[:16]
 
     def crowds(self, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
-        """The humans of these indices, held together as the scenario's persons hold its devices.
+        """Draw the humans of these indices, joined as the scenario's persons join its devices.
 
         A user's own population draws from the same seeds, with the persons as they stand in the scenario.
         """
@@ -145,14 +143,14 @@ class Validation:
         return crowds(scenario.population, len(counts), self.seed, indices, self.links, holds, axes)
 
     def crowd(self, index: int) -> Crowd | HumanSets:
-        """The one set of humans with this index."""
+        """Draw the set of humans with this index."""
         ((_, crowd),) = self.crowds([index])
         return crowd
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """One entry per set of humans, sorted by index; nan where an engine or a trace was not asked for.
+    """The results for every set of humans, sorted by index; nan where an engine or a trace was not requested.
 
     Attributes:
         index: (n,) number of each set, which together with the seed draws it.
@@ -213,12 +211,12 @@ class Findings:
         return np.abs(self.trace) > self.trace_error
 
 
-#: what Findings have one entry of for every set of humans
+#: fields of Findings with one entry for every set of humans
 _COLUMNS = tuple(f.name for f in fields(Findings) if f.name not in ("simulated", "interrupted", "lost"))
 
 
 def _merge(parts: Sequence[Findings]) -> Findings:
-    """The findings of the groups of a batch as one."""
+    """Merge the findings of the groups of a batch."""
     order = np.argsort(np.concatenate([p.index for p in parts]), kind="stable")
     joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts])[order] for name in _COLUMNS}
     return Findings(**joined, simulated=math.fsum(p.simulated for p in parts))
@@ -231,7 +229,7 @@ def _merge(parts: Sequence[Findings]) -> Findings:
 def _examine(
     validation: Validation, indices: Sequence[int], ticked: Callable[[int], None] = lambda ticks: None
 ) -> Findings:
-    """Decide and simulate the humans of `indices`, who all meet the same environment.
+    """Judge and simulate the humans of `indices`, who all meet the same environment.
 
     `ticked` is called with the number of ticks that were simulated for all of them.
     """
@@ -262,7 +260,7 @@ def _group(
         mujoco = np.array([simulated_growth(one, None, None, make) for one in each])
 
         def one_by_one(integrator: str, timing: Timing | None) -> Engine:
-            """The user's own, which integrates as it does and has the timing from the simulation."""
+            """Make the user's engine, which takes its timing from the simulation."""
             return OneByOne([make_engine(one, make) for one in each])
 
         other = one_by_one
@@ -296,7 +294,7 @@ def _group(
     )
 
 
-_Other = Callable[[str, Timing | None], Engine]  # MuJoCo's integrator, timing -> what is compared with the exact engine
+_Other = Callable[[str, Timing | None], Engine]  # (integrator, timing) -> the other engine
 
 
 def _batch(held_by: Variants, T: float, threads: int, integrator: str, timing: Timing | None) -> Engine:
@@ -304,7 +302,7 @@ def _batch(held_by: Variants, T: float, threads: int, integrator: str, timing: T
 
 
 def _geometric_mean(values: Array) -> Array:
-    """Over the channels, (n, channels) -> (n,); 0 where one of them is."""
+    """Return the geometric mean over the channels, (n, channels) -> (n,); 0 where a channel is 0."""
     with np.errstate(divide="ignore"):
         return np.exp(np.log(values).mean(axis=1))
 
@@ -335,20 +333,23 @@ def _tests(
 # ----------------------------------------------------------------------------------------------------
 # All batches: in this process, in several, or on a Dask cluster.
 
-_PATIENCE = 3.0  # [s] for a scheduler to answer, and again for its first worker
-_AGAIN = 3  # times in a row that workers may die without finishing a batch
-_LOOK, _DESERTED = 5.0, 60.0  # [s] between looks for workers of a cluster, and without any until it is given up
-_AHEAD = 4  # batches in hand for every worker: results are put away before others are begun
+_PATIENCE = 3.0  # [s] that a scheduler has to answer, and again its first worker
+_AGAIN = 3  # consecutive deaths of workers without a finished batch
+_LOOK, _DESERTED = 5.0, 60.0  # [s] between checks for workers, and without any worker until the cluster is given up
+_AHEAD = 4  # batches in flight for every worker, so that results do not pile up
 
 
 class Table:
-    """The findings, a column for each figure: in memory, or in a file that is mapped only while it is used."""
+    """The findings by column, in memory or in a file that is mapped only while it is used."""
 
     def __init__(self, question: Validation, folder: Path | None = None, resume: bool = False) -> None:
-        """With `resume` the unfinished file of the same question goes on. Raises InputError where there is none."""
+        """Open the table; `resume` continues an unfinished file. Raises InputError if none exists."""
         self._batches = question.batches()
         self._path = folder / f"unfinished-{question.digest}.npy" if folder else None
-        shape = len(_COLUMNS) + 2, question.humans  # the last two: simulated seconds, and whether it is done
+        shape = (
+            len(_COLUMNS) + 2,
+            question.humans,
+        )  # the last two columns: simulated seconds, and whether the set is done
         self._memory = None if self._path else np.zeros(shape)
         if self._path and resume and not self._path.is_file():
             raise InputError(f"--resume: {self._path.parent} holds nothing unfinished of these humans and this loop")
@@ -365,12 +366,12 @@ class Table:
         return np.load(self._path, mmap_mode=mode)
 
     def missing(self) -> list[int]:
-        """Numbers of the batches that are not done."""
+        """The numbers of the unfinished batches."""
         done = self._open("r")[-1]
         return [number for number, batch in enumerate(self._batches) if not done[batch[0]]]
 
     def put(self, number: int, part: Findings) -> None:
-        """The findings of a batch; that it is done is written last."""
+        """Store the findings of a batch; the mark "done" is written last."""
         batch, table = self._batches[number], self._open("r+")
         where = slice(batch.start, batch.stop, batch.step)
         for row, name in zip(table, _COLUMNS, strict=False):
@@ -379,13 +380,13 @@ class Table:
         table[-1, where] = 1
 
     def findings(self, interrupted: bool = False, lost: str = "") -> Findings:
-        """Of all batches that are done; the file goes where that is all of them."""
+        """Return the findings of all finished batches, and remove the file once all are finished."""
         table = self._open("r")
         done, rows = table[-1] != 0, dict(zip(_COLUMNS, table, strict=False))
         if not done.all():
             rows = {name: row[done] for name, row in rows.items()}
         elif self._path:
-            self._path.unlink()  # what is mapped stays readable
+            self._path.unlink()  # the mapped pages stay readable
         for name in ("index", "clipped"):
             rows[name] = rows[name].astype(int)
         return Findings(**rows, simulated=float(table[-2].sum()), interrupted=interrupted, lost=lost)
@@ -397,9 +398,9 @@ def validate(
     progress: Progress = lambda done, total: None,
     table: Table | None = None,
 ) -> Findings:
-    """Examine every batch that is missing in the table, all of them without one.
+    """Examine every batch that is missing in the table, or all batches without a table.
 
-    From the keyboard it stops with the batches that are done, and so it does where workers die again and again.
+    An interruption and repeated deaths of workers end the validation with the batches that are finished.
     """
     table = table or Table(question)
     lost = ""
@@ -443,7 +444,7 @@ def _in_processes(question: Validation, table: Table, shards: int, progress: Pro
 
 
 def _pool(question: Validation, table: Table, missing: list[int], shards: int, progress: Progress) -> int:
-    """How many of the missing batches were done before a worker died, or all of them."""
+    """Return how many of the missing batches were finished before a worker died."""
     batches, alone, done = question.batches(), replace(question, threads=1), 0
     # a forked child would inherit locks of MuJoCo's threads and of the progress bar
     context = multiprocessing.get_context("spawn")
@@ -468,7 +469,7 @@ def _pool(question: Validation, table: Table, missing: list[int], shards: int, p
     except BaseException:
         _finished(running, table)
         for worker in set(multiprocessing.active_children()) - strangers:
-            worker.terminate()  # a batch may take half a minute, and keeps nothing before its end
+            worker.terminate()  # a batch may take half a minute and stores nothing before its end
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
@@ -573,7 +574,7 @@ def _examine_alone(question: Validation, indices: Sequence[int]) -> Findings:
 
 @contextmanager
 def _client(address: str, patience: float) -> Iterator[Client]:
-    """A client of the cluster, checked to be there. Raises InputError."""
+    """Return a client of the cluster. Raises InputError where none answers."""
     try:
         from distributed import Client
         from distributed.comm.core import connect
@@ -581,7 +582,7 @@ def _client(address: str, patience: float) -> Iterator[Client]:
         from distributed.security import Security
     except ImportError:
         raise InputError("--dask needs Dask: pip install 'distributed>=2024.8'") from None
-    for name in ("distributed", "distributed.client"):  # what goes wrong is said once, in our words
+    for name in ("distributed", "distributed.client"):  # errors are reported once, by us
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
     async def reach() -> None:
@@ -589,7 +590,7 @@ def _client(address: str, patience: float) -> Iterator[Client]:
         await comm.close()
 
     try:
-        asyncio.run(reach())  # a Client that finds nobody complains once more when it is collected
+        asyncio.run(reach())  # a Client without a scheduler would complain again when it is collected
         client = Client(address, timeout=patience, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"--dask {address}: no cluster there: {error}; expected HOST:PORT of a scheduler") from None

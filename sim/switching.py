@@ -1,13 +1,12 @@
-"""Delays that vary: the loop as a system that switches, its worst switching, and what certificates say of it.
+"""Delays that vary: the loop as a switched system, its worst switching, and the certificates that cover it.
 
 The loop is linear, with one matrix for each set of ages of the forces in use. Its state is
 xi = [s; z; g_1[k-1] .. g_1[k-d_1]; g_2[k-1] ..]: plant, process block G (without Theta), forces on their way.
 
-The worst delays are sought greedily. The loop starts from an impulse on every handle. At every tick and on every
-channel the device is handed, of the forces that a delay in [lo, hi] allows, the one that brakes it least or pushes it
-most: the largest -f v. Ages grow by one per tick at most, as they do where packets are held. Of all windows of that
-sequence that may be repeated, the one whose product of mode matrices has the largest spectral radius per tick is the
-worst period found: a proof of instability where it exceeds 1.
+The search for the worst delays is greedy. The loop starts from an impulse on every handle. At every tick each device
+receives the force, among those that a delay in [lo, hi] allows, that gives it the most power -f v. Ages grow by at most
+one per tick, because packets are held. The worst period is the window of this sequence that may be repeated and whose
+product of mode matrices has the largest spectral radius per tick. A radius above 1 proves instability.
 """
 
 from __future__ import annotations
@@ -36,17 +35,17 @@ from haptic_loop.sim.run import Simulation
 from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import impulse_forces, impulse_growth
 
-_SEARCHED = 1600  # ticks of greedy switching in which the worst period is sought
+_SEARCHED = 1600  # ticks of greedy switching that are searched for the worst period
 _LONGEST_PERIOD = 250  # [ticks]
-_STARTS = 6  # windows begin at so many ticks of the greedy sequence
-_MOST_ENDS = 256  # constant delays, each at an end of its range, that are compared
-_SHORTEST = 4  # ticks that are drawn at least: a growth compares quarters
-_STREAM = 5  # keeps these draws apart from those of the humans with the same seed and index
+_STARTS = 6  # number of ticks of the greedy sequence at which windows begin
+_MOST_ENDS = 256  # most combinations of constant delays, each at an end of its range, that are compared
+_SHORTEST = 4  # least number of ticks, since a growth compares quarters
+_STREAM = 5  # separates these draws from those of the humans with the same seed and index
 
 
 @dataclass(frozen=True, eq=False)
 class Period:
-    """Switching that repeats, with the exact growth of the loop under it."""
+    """Periodic switching with the exact growth of the loop."""
 
     ages: Ticks  # (period, m)
     delays: Ticks  # (period, m) of the packets that make these ages
@@ -58,7 +57,7 @@ class Period:
 
 
 def switching(simulation: Simulation, seed: int, ticks: int, index: int = 0) -> tuple[Simulation, Period | None]:
-    """The loop with the scenario's varying delays in place of theta, and their period where they are adversarial."""
+    """Return the loop under the scenario's varying delays, and their period if they are adversarial."""
     varying = simulation.scenario.varying_delay
     assert varying is not None
     period = _worst_switching(simulation, varying) if varying.pattern == "adversarial" else None
@@ -68,7 +67,7 @@ def switching(simulation: Simulation, seed: int, ticks: int, index: int = 0) -> 
 
 
 def _worst_switching(simulation: Simulation, varying: VaryingDelay) -> Period:
-    """The periodic switching within the range that was found to grow fastest in this loop."""
+    """Return the fastest growing periodic switching that the search finds in this loop."""
     plant, process = simulation.plant, simulation.process
     one = HeldPlant(plant.A[None], plant.B[None], plant.C, plant.T)
     ages = _greedy_ages(process, one, simulation.scene, varying, _SEARCHED)
@@ -76,7 +75,7 @@ def _worst_switching(simulation: Simulation, varying: VaryingDelay) -> Period:
 
 
 def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: Ticks | None = None) -> Ticks:
-    """Delays (ticks, m) of run number `index`; they depend on (seed, index) and the scenario only."""
+    """Draw the delays (ticks, m) of run `index`; they depend on (seed, index) and the scenario only."""
     assert scenario.varying_delay is not None
     rows = np.array([scenario.theta]) if scenario.varying_delay.pattern == "constant" else given
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, _STREAM)))
@@ -88,7 +87,7 @@ def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: T
 
 
 def _mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[int]) -> Array:
-    """A of xi[k+1] = A xi[k] while the forces in use have these ages [samples], age_i <= depth_i."""
+    """Return A of xi[k+1] = A xi[k] while the forces in use have these ages [samples], age_i <= depth_i."""
     states, m = plant.A.shape[0], G.outputs
     n, first = states + G.order + sum(depth), states + G.order
     sent = np.zeros((m, n))
@@ -111,7 +110,7 @@ def _mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[
 
 
 def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: VaryingDelay, ticks: int) -> Ticks:
-    """Ages (ticks, m, nsim) that feed the linear loop of every plant."""
+    """Return ages (ticks, m, nsim) that feed energy into the linear loop of every plant."""
     nsim, states, nv = plants.A.shape[0], plants.A.shape[1], scene.model.nv
     m, law = process.channels, process.law.without_theta
     free = replace(process, law=law, force_limit=np.full(m, np.inf), delays=None)
@@ -134,7 +133,7 @@ def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Var
         engine.advance(0)
         buffer.rewind(1)
         ages[k] = age
-        if k % 32 == 31 and not pushed[k:].any():  # the choice does not depend on the scale
+        if k % 32 == 31 and not pushed[k:].any():  # rescaling does not change the choice
             size = np.maximum(np.abs(buffer.s[0]).max(axis=0), 1e-200)
             buffer.s[0] /= size
             buffer.z[0] /= size
@@ -143,7 +142,7 @@ def _greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: Var
 
 
 def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay) -> Period:
-    """The fastest growing repetition of a window of `ages` (ticks, m), or of one delay at an end of its range."""
+    """Return the fastest growing repetition of a window of `ages` (ticks, m), or of a constant delay."""
     ticks = ages.shape[0]
     matrix = cache(lambda *now: _mode_matrix(plant, G, varying.hi, now))
     best, chosen = -np.inf, ages[:1]
@@ -164,7 +163,7 @@ def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay) 
 
 
 def _running_products(matrices: list[Array]) -> tuple[Array, Array]:
-    """A_p .. A_2 A_1 for every p, each divided by exp(scale_p)."""
+    """Return A_p .. A_2 A_1 for every p, each divided by exp(scale_p)."""
     power, scale = np.eye(matrices[0].shape[0]), 0.0
     products, scales = [], []
     for A in matrices:
@@ -178,17 +177,17 @@ def _running_products(matrices: list[Array]) -> tuple[Array, Array]:
 
 # ---- many humans under delays that vary: each meets delays of its own, drawn or found worst, in one batch
 
-_SHORTEST_CROWD = 2.0  # [s] of every trace: a growth of 1 1/s stands out from how an impulse spreads
-_DOUBTFUL = 1.0  # [1/s]: a slower growth may be two modes that beat, and is judged again ..
-_LONGER = 5  # .. on traces so many times as long
+_SHORTEST_CROWD = 2.0  # [s] of every trace; a growth of 1 1/s then exceeds the spreading of the impulse
+_DOUBTFUL = 1.0  # [1/s] a slower growth may be two modes that beat: it is judged again
+_LONGER = 5  # on traces this many times as long
 
 
 @dataclass(frozen=True, eq=False)
 class Switched:
-    """Growth [1/s] of the handles' speeds after an impulse, (nsim,) each."""
+    """The growth [1/s] of the handles' speeds after an impulse, (nsim,) each."""
 
     exact: Array  # of the linear loop
-    mujoco: Array  # of the other engine's; nan where it was not asked for, or a force reached its limit
+    mujoco: Array  # of the other engine's trace; nan without that engine, or where a force reached its limit
 
 
 def switched_crowd(
@@ -199,11 +198,10 @@ def switched_crowd(
     duration: float,
     other: Callable[[Timing | None], Engine] | None,
 ) -> Switched:
-    """The impulse test for every set of humans, under the delays of its index: of (seed, index) and the loop only.
+    """Run the impulse test for every set of humans, each under the delays of its index.
 
-    `other` makes the engine that is compared with the exact one.
-
-    Periods that vary and forces that latch late are the same for all of them, of the seed only.
+    Delays depend on (seed, index) and the loop only; varying periods and latencies depend on the seed and are the same
+    for all sets. `other` makes the engine that is compared with the exact one.
     """
     scenario, nsim, scene = simulation.scenario, len(held_by), held_by.scene
     plants = hold(held_by.plants(), scenario.T, scenario.usual_latency)
@@ -241,7 +239,7 @@ def _crowd_delays(
     seed: int,
     ticks: int,
 ) -> Ticks:
-    """(ticks, m, nsim)"""
+    """Return the delays (ticks, m, nsim) of a batch."""
     assert scenario.varying_delay is not None
     given: list[Ticks | None] = [None] * len(index)
     if scenario.varying_delay.pattern == "adversarial":
@@ -256,7 +254,7 @@ def _crowd_delays(
 
 @dataclass(frozen=True)
 class DelaysCovered:
-    """Whether what is certified covers the delays of a scenario, and what switching asks."""
+    """Whether a certificate covers the delays of a scenario, and the damping that switching requires."""
 
     covered: bool
     covers: str  # which delays, in words
@@ -265,7 +263,7 @@ class DelaysCovered:
 
     @classmethod
     def of(cls, scenario: Scenario, assessment: Assessment, on_file: DelayRange | None = None) -> DelaysCovered:
-        """`on_file` is the range of delays within which the coupling's file proves any switching."""
+        """Judge the coupling; `on_file` is the range of delays for which its file proves any switching."""
         constant_delays = (need for name, need in assessment.requirements.items() if name != SWITCHING.name)
         certified = any(need.certified for need in constant_delays)
         varying, span = scenario.varying_delay, scenario.delay_range
@@ -294,7 +292,7 @@ class DelaysCovered:
 
 
 def _how_proved(figures: Switching, on_file: DelayRange | None) -> str:
-    """What shows that any switching within the range is safe, "" where nothing does."""
+    """Name the evidence that any switching within the range is safe; "" if there is none."""
     if on_file:
         return f"proved in the coupling's file for {switching_guarantee(on_file)}"
     if not figures.requirement.certified:

@@ -1,7 +1,6 @@
 """The search for the worst passive human finds one where this-environment fails, and none where it holds."""
 
 import json
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -116,9 +115,8 @@ def test_the_command_keeps_the_human_for_a_replay(tmp_path):
 def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypatch):
     """Were a certificate wrong, the command would say so: here the search is told of another loop."""
     F = assemble(SCENARIO, NoCoupling()).F
-    command = sys.modules[main.__module__]
     monkeypatch.setattr(
-        command, "search", lambda scenario, certified, seed, generations, progress: search(scenario, F, seed, 4)
+        adversary, "search", lambda scenario, certified, seed, generations, progress: search(scenario, F, seed, 4)
     )
     options = ["--humans", "5", "--engine", "exact", "--duration", "0", "--no-plot", "--adversary"]
     assert main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 1
