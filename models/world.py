@@ -31,6 +31,7 @@ PROXY_MASS = 0.03  # [kg] of a contact for which the scene gives no mass
 ITERATIONS, TOLERANCE = 100, 1e-10  # of the Newton solver
 MOST_REPETITIONS = 8  # of a step whose forces are limited
 _LIMIT_SLACK = 1e-9  # of a limit, relatively: a force that is this near counts as limited by it
+_DIRECTION_SLACK = 1e-6  # of a limit: a repetition that turns a limited force by less is the last one
 _TOO_LARGE = 50_000_000  # [bytes] of one file of a scene
 
 
@@ -190,9 +191,14 @@ class World:
         """[s] of one step of the scene."""
         return self.model.opt.timestep
 
-    def port(self, force_limit: Sequence[float] | Array | None = None) -> Port:
-        """A simulation of the scene from its initial pose, whose contacts feel at most these forces (m,) [N]."""
-        return Port(self, np.full(self.channels, np.inf) if force_limit is None else np.array(force_limit, float))
+    def port(self, force_limit: Sequence[float] | Array | None = None, balls: Sequence[slice] = ()) -> Port:
+        """A simulation of the scene from its initial pose, whose contacts feel at most these forces (m,) [N].
+
+        The limit of a contact whose channels are one of the `balls` bounds the length of its force, elsewhere it bounds
+        each component.
+        """
+        limits = np.full(self.channels, np.inf) if force_limit is None else np.array(force_limit, float)
+        return Port(self, limits, balls)
 
     def linear(self, pose: Array | str | None = None, step: float = 1e-6) -> tuple[Array, Array, Array, Array]:
         """The scene near a pose, without the springs G: A, B, C, D from forces on the contacts [N] to u [m].
@@ -407,15 +413,22 @@ _TWO_SIDED = int(mujoco.mjtConstraint.mjCNSTR_FRICTION_TENDON)  # rows of equali
 class Port:
     """One simulation of a world, a tick at a time, and what it has given so far."""
 
-    def __init__(self, world: World, force_limit: Array) -> None:
-        """`force_limit` (m,) [N], inf where there is none. Raises ValueError for a limit on slides that are turned."""
+    def __init__(self, world: World, force_limit: Array, balls: Sequence[slice] = ()) -> None:
+        """`force_limit` (m,) [N], inf where there is none, and how it limits each contact. Raises ValueError."""
         if force_limit.shape != (world.channels,) or not (force_limit > 0).all():
             raise ValueError(f"force_limit is {force_limit.tolist()}, expected {world.channels} positive forces in N")
         self.world, self.data = world, mujoco.MjData(world.model)
-        self._limits, self._any_limit = force_limit, bool((force_limit < np.inf).any())
-        if self._any_limit and any(len(contact.along) > 1 for contact in world.contacts):
-            raise ValueError("force_limit: limited forces are only known for contacts with one direction")
-        self._saved = np.zeros(mujoco.mj_stateSize(world.model, _STATE)) if self._any_limit else None
+        self._axes = np.array([len(contact.along) for contact in world.contacts])
+        self._first = np.cumsum(self._axes) - self._axes  # the first channel of each contact
+        channels = [slice(first, first + axes) for first, axes in zip(self._first, self._axes, strict=True)]
+        self._limits = force_limit
+        self._radial = np.array([own in balls and own.stop - own.start > 1 for own in channels])
+        for contact, own, radial in zip(world.contacts, channels, self._radial, strict=True):
+            if radial and (force_limit[own] != force_limit[own.start]).any():
+                limits = force_limit[own].tolist()
+                raise ValueError(f"force_limit of contact {contact.body!r} is {limits}, expected one for its length")
+        any_limit = bool((force_limit < np.inf).any())
+        self._saved = np.zeros(mujoco.mj_stateSize(world.model, _STATE)) if any_limit else None
         self.ticks = 0
         self.created = 0.0  # [J] what contacts have created, D2 of the lemma
         self.unsettled = 0  # ticks in which the limited channels still changed after MOST_REPETITIONS
@@ -429,12 +442,31 @@ class Port:
         """
         world = self.world
         goal = world._Q.T @ u0
-        if not self.ticks % world.every:
-            force = self._stepped(goal)
-        else:  # the scene stands still and does no work
-            force = np.clip(world._g * (goal - self.data.qpos[world._qpos]), -self._limits, self._limits)
+        # between its steps the scene stands still and does no work
+        force = self._within(self._spring(goal)) if self.ticks % world.every else self._stepped(goal)
         self.ticks += 1
-        return world._Q @ force
+        return force
+
+    def _spring(self, goal: Array) -> Array:
+        """G (u0 - u) (m,) [N] where the scene is now."""
+        world = self.world
+        return world._Q @ (world._g * (goal - self.data.qpos[world._qpos]))
+
+    def _used(self, force: Array) -> Array:
+        """(contacts,) the share of its limit that each contact's force is."""
+        share = np.abs(force) / self._limits
+        most = np.maximum.reduceat(share, self._first)
+        return (
+            np.where(self._radial, np.sqrt(np.add.reduceat(share**2, self._first)), most)
+            if self._radial.any()
+            else most
+        )
+
+    def _within(self, force: Array) -> Array:
+        """The force that the motors give in place of `force` (m,) [N]."""
+        if self._radial.any():
+            force = force / np.repeat(np.where(self._radial, np.maximum(self._used(force), 1.0), 1.0), self._axes)
+        return np.clip(force, -self._limits, self._limits)
 
     @property
     def u(self) -> Array:
@@ -446,7 +478,7 @@ class Port:
         model.qpos_spring[world._qpos] = goal
         if self._saved is None:
             mujoco.mj_step(model, data)
-            force = world._g * (goal - data.qpos[world._qpos])
+            force = self._spring(goal)
         else:
             force = self._limited(goal, self._saved)
         if data.nefc:
@@ -455,28 +487,29 @@ class Port:
         return force
 
     def _limited(self, goal: Array, saved: Array) -> Array:
-        """Step until the channels that are limited agree with the forces; in these the limit acts, not the spring."""
-        model, data, world, limits = self.world.model, self.data, self.world, self._limits
+        """Step until the contacts whose force is limited agree with it; on these the force acts, not the spring."""
+        model, data, world = self.world.model, self.data, self.world
         mujoco.mj_getState(model, data, saved, _STATE)
-        pushed = np.zeros(world.channels)  # +-1 where the limit acts in place of the spring
+        pushed, push = np.zeros(len(self._axes), dtype=bool), np.zeros(world.channels)
         repetition = 0
         while True:
-            spring, push = np.where(pushed == 0, world._g, 0.0), pushed * np.where(pushed == 0, 0.0, limits)
-            model.jnt_stiffness[world._joint], data.qfrc_applied[world._dof] = spring, push
+            held = np.repeat(pushed, self._axes)
+            model.jnt_stiffness[world._joint] = np.where(held, 0.0, world._g)
+            data.qfrc_applied[world._dof] = world._Q.T @ push
             mujoco.mj_step(model, data)
-            free = world._g * (goal - data.qpos[world._qpos])
-            starts = np.where(np.abs(free) > limits * (1 + _LIMIT_SLACK), np.sign(free), 0.0)
-            stays = (pushed != 0) & (pushed * free >= limits * (1 - _LIMIT_SLACK))
-            wanted = np.where(stays, pushed, starts)
-            if settled := bool((wanted == pushed).all()):
+            free = self._spring(goal)
+            limited = self._used(free) > np.where(pushed, 1 - _LIMIT_SLACK, 1 + _LIMIT_SLACK)
+            wanted = np.where(np.repeat(limited, self._axes), self._within(free), 0.0)
+            off = np.abs(wanted - push) > _DIRECTION_SLACK * np.where(held, self._limits, np.inf)
+            if settled := bool((limited == pushed).all() and not off.any()):
                 break
             if repetition == MOST_REPETITIONS:
                 break
-            repetition, pushed = repetition + 1, wanted
+            repetition, pushed, push = repetition + 1, limited, wanted
             mujoco.mj_setState(model, data, saved, _STATE)
         self.unsettled += not settled
         model.jnt_stiffness[world._joint], data.qfrc_applied[world._dof] = world._g, 0.0
-        return np.clip(np.where(pushed == 0, free, push), -limits, limits)
+        return self._within(np.where(held, push, free))
 
     def _potential(self) -> float:
         """U [J] of gravity and the scene's own springs at the present positions, without the springs G."""

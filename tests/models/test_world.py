@@ -86,6 +86,45 @@ def test_limited_forces_are_felt_by_the_scene(tmp_path):
     assert port.unsettled == 0
 
 
+@pytest.mark.parametrize("radial", [True, False])
+def test_limited_forces_in_a_plane_are_felt(tmp_path, radial):
+    """m (v+ - v)/h is the force that was given, and that one is G (u0 - u) within a ball or a box."""
+    text = f'<mujoco><worldbody><body name="tip">{FREE}</body><body name="one">{FREE}</body></worldbody></mujoco>'
+    path = tmp_path / "scene.xml"
+    path.write_text(text)
+    plane = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    G = np.array([[900.0, 300.0, 0.0], [300.0, 400.0, 0.0], [0.0, 0.0, 700.0]])
+    scene = World(path, [Contact("tip", plane), Contact("one")], [G[:2, :2], G[2:, 2:]], T)
+    port, limits = scene.port([3.0, 3.0, 2.0], [slice(0, 2)] * radial), np.array([3.0, 3.0, 2.0])
+
+    def given(force):
+        inside = np.clip(force, -limits, limits)
+        if radial and np.linalg.norm(force[:2]) > 3.0:
+            inside[:2] = force[:2] * 3.0 / np.linalg.norm(force[:2])
+        return inside
+
+    v, u, hit, inner = np.zeros(3), np.zeros(3), 0, 0
+    for k in range(1500):
+        goal = 0.02 * np.sin(2 * np.pi * np.array([20.0, 17.0, 30.0]) * k * T)
+        force = port.step(goal)
+        v = v + T * force / 0.03
+        u = u + T * v
+        assert np.abs(port.u - u).max() < 1e-11
+        spring = G @ (goal - u)
+        assert np.abs(force - given(spring)).max() < 1e-5  # a limited force is turned by less than 1e-6 of its limit
+        hit += np.abs(force - spring)[:2].max() > 1e-3
+        inner += np.abs(force - spring)[:2].max() < 1e-9
+    assert min(hit, inner) > 20
+    assert port.unsettled == 0
+
+
+def test_a_ball_has_one_limit(tmp_path):
+    text = f'<mujoco><worldbody><body name="tip">{FREE}</body></worldbody></mujoco>'
+    scene = world(tmp_path, text, ["tip"], [np.eye(2) * 500], along=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+    with pytest.raises(ValueError, match="expected one for its length"):
+        scene.port([3.0, 4.0], [slice(0, 2)])
+
+
 def test_a_slow_scene_stands_still_between_its_steps(tmp_path):
     port = world(tmp_path, LINE, every=4).port()
     assert port.world.h == 4 * T
