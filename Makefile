@@ -75,6 +75,7 @@ figures: .venv/ready
 	cd docs/pictures && ../../$(PY) ../../examples/limits_of_any_coupling.py
 	$(PY) -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0 --out out/zwidth || test $$? -eq 1 # 1: not certified
 	cp out/zwidth/zwidth.png docs/pictures/zwidth.png
+	PYTHONPATH=. $(PY) tests/tools/pictures_of_worlds.py docs/pictures/worlds.png
 	$(PY) -m sim.zwidth --coupling optimal --out out/zwidth-optimal
 	cp out/zwidth-optimal/zwidth.png docs/pictures/zwidth-optimal.png
 	$(PY) docs/regenerate.py

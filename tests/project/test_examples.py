@@ -27,6 +27,10 @@ SAYS = {
     "simulate_and_plot": [r"no coupling: growth \+1.48. 1/s at 84.0 Hz", "designed coupling: growth -0.848 1/s"],
     "limits_of_any_coupling": [r"1.37 +-34.8. ", r"1.918 +-60.00 "],
     "monte_carlo": [r"no coupling: 4\d\d of 500 unstable", "designed coupling: 0 of 500 unstable; .* 0.6 %"],
+    "touch_a_scene": [
+        r"environment.world +stack +\d+\.\d N +0.0 % +0 of  2 +0 of  2",
+        r"environment.world +block +\d+\.\d N +0.0 % +0 of  2 +0 of  2",
+    ],
     "your_own_device": [
         "certified = True",
         "wall of 1000 N/m .* needs 0.7749 N s/m, .* late 1.8000",
@@ -36,7 +40,7 @@ SAYS = {
 }
 
 
-ASKS = {"limits_of_any_coupling": ("damping",)}
+ASKS = {"limits_of_any_coupling": ("damping",), "touch_a_scene": ("2", "0.3")}
 
 
 def test_missing_damping_ends_the_example_clearly(tmp_path):

@@ -1,0 +1,49 @@
+"""Every packaged MuJoCo world with 100 pairs of hands, and 120,000 contacts against the lemma."""
+
+import numpy as np
+import pytest
+from hands import Hands
+
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.world import START_J
+from tests.models.test_world import SCENES, count_of_the_lemma
+from tests.sim.test_world import NAMES, Touch
+
+pytestmark = pytest.mark.validate
+PAIRS, TICKS = 50, 500
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_fifty_pairs_are_given_no_more_than_released(name, lossless):
+    """Delays 0 to 3: energy of the hands by the textbook; the shell acts on no tick, or on one in a thousand."""
+    rng, acted, worst = np.random.default_rng(7), 0, -np.inf
+    for run in range(PAIRS):
+        loop = load(f"world-{name}").replace(theta=(run % 4, (run // 4) % 4))
+        touch = Touch(loop, Hands(rng, 1, lossless, 0.3, T=loop.T, delta=loop.delta))
+        for _ in range(TICKS):
+            worst = max(worst, touch.tick() - touch.port.released)
+        acted += int(touch.shell.limited[0])
+    kind = "lossless" if lossless else "random"
+    print(f"\n{name}, {kind}: shell {acted} of {PAIRS * TICKS}, excess {1e3 * worst:.3f} mJ")
+    assert worst <= START_J + 1e-12
+    assert acted <= (PAIRS * TICKS // 1000 if lossless else 0)
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_fifty_pairs_without_gravity_gain_nothing(name, lossless):
+    """Energy of hands, devices and scene, whose springs' energy counts as released, against what they began with."""
+    rng = np.random.default_rng(8)
+    for run in range(PAIRS):
+        loop = load(f"world-{name}").replace(theta=(run % 4, (run // 4) % 4))
+        touch = Touch(loop, Hands(rng, 1, lossless, 0.3, T=loop.T, delta=loop.delta), gravity=False)
+        data, mass = touch.port.data, np.diag(touch.port.world.model.dof_M0)
+        for _ in range(TICKS):
+            risen = touch.tick()
+            kinetic = data.qvel @ mass @ data.qvel / 2  # bodies here translate, or turn about one fixed hinge
+            assert risen + kinetic <= START_J + touch.port.released + 1e-9
+
+
+def test_120_000_contacts_stay_within_the_lemma(tmp_path):
+    assert sum(count_of_the_lemma(tmp_path, scene, 6000) for scene in SCENES) > 120_000
