@@ -111,9 +111,9 @@ def publish(
         kept = folder / "report.json"
         outcome["files"] = [*map(str, files), str(kept)]
         write_json(kept, outcome)
-    screen = console(args)
     if verdict:
-        screen.print(verdict, soft_wrap=True)
+        announce(args, verdict)
+    screen = console(args)
     for table in shown:
         screen.print(table)
     for line in (*lines, *(details if getattr(args, "details", False) else ())):
@@ -122,6 +122,11 @@ def publish(
         screen.print("files: " + ", ".join(outcome["files"]), soft_wrap=True)
     if args.json:
         write_json(args.json, outcome)
+
+
+def announce(args: argparse.Namespace, verdict: str) -> None:
+    """Print a verdict, before a picture is drawn or the rest of a report is worked out."""
+    console(args).print(verdict, soft_wrap=True)
 
 
 def is_drawn(args: argparse.Namespace, picture: Path, content: bool = True) -> bool:

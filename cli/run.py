@@ -56,9 +56,10 @@ def main(argv: list[str]) -> int:
     report = replace(report, nearby=nearby)
     if args.paper:
         report = replace(report, paper=_paper(args, simulated, report))
-    files = _save(args, out, done, report)
-    said = verdicts.verdict(assessment, nearby, report.ideal_force.error_percent, report.encoder)
-    render.publish(args, report, _tables(scenario, report), report.remarks, out, files, said, _details(report))
+    render.announce(args, verdicts.verdict(assessment, nearby, report.ideal_force.error_percent, report.encoder))
+    with render.progress("storing the trace and drawing the picture"):
+        files = _save(args, out, done, report)
+    render.publish(args, report, _tables(scenario, report), report.remarks, out, files, details=_details(report))
     return options.exit_code(True, done.trace.interrupted)
 
 

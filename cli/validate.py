@@ -89,6 +89,8 @@ def _parser() -> options.Parser:
     add("--engine", choices=ENGINES, default="both", help="who decides (default both)")
     seconds = "length of the traces (default 2; 0 for none)"
     add("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
+    made = "hands that MuJoCo simulates, too: sampled (default: nearest to the limit, lossless, 64 others) or all"
+    add("--traces", choices=("sampled", "all"), default="sampled", help=made)
     add("--shards", type=whole(1, 256), default=1, metavar="K", help="local processes, for the same result (default 1)")
     add("--dask", metavar="HOST:PORT", help="work on an existing Dask cluster; the result is the same")
     add("--resume", action="store_true", help="go on with what a run of the same words left unfinished in the folder")
@@ -130,7 +132,8 @@ def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, asse
     """The loop, the humans that are to hold it, and the engines that decide. Raises InputError."""
     links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
     work, met = (args.humans, links, args.engine, args.duration), _environments(args, assessment.ranges)
-    return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=assessment.force_limits.rho)
+    lag, every = assessment.force_limits.rho, args.traces == "all"
+    return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=lag, all_traces=every)
 
 
 def _findings(args: argparse.Namespace, question: Validation, table: Table) -> tuple[Findings, float]:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -223,20 +223,45 @@ def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int 
 
 def edge(ratio: _Ratio, inside: float, outside: float) -> float:
     """Return the argument nearest `outside` at which the damping still suffices, to a relative EDGE."""
-    from scipy.optimize import brentq  # slow to load, and seldom needed
-
     if suffices(ratio(outside)):
         return outside
 
     def above(x: float) -> float:
         return float(np.clip(math.log(max(ratio(x), 1e-9) / (1 - GUARD)), -3, 3))
 
-    root = cast(float, brentq(above, inside, outside, rtol=np.float64(_EDGE), xtol=_EDGE * inside))
+    root = _crossing(above, inside, outside)
     for back in _EDGE * 4.0 ** np.arange(12):
         x = root + back * (inside - root)
         if suffices(ratio(x)):
             return float(x)
     return inside
+
+
+def _crossing(f: Callable[[float], float], inside: float, outside: float) -> float:
+    """Return where `f` changes its sign, to a relative _EDGE of the place and of `inside`.
+
+    Bisection, or inverse quadratic interpolation where it is safe (T. R. Chandrupatla, Adv. Eng. Software 28, 1997).
+    Importing scipy.optimize for its brentq takes longer than the ten values that either of them asks for.
+    """
+    a, b = outside, inside
+    fa, fb = f(a), f(b)
+    share = 0.5
+    while True:
+        x = a + share * (b - a)
+        fx = f(x)
+        if fx * fa > 0:
+            c, fc = a, fa
+        else:
+            c, fc, b, fb = b, fb, a, fa
+        a, fa = x, fx
+        best = a if abs(fa) < abs(fb) else b
+        least = _EDGE * (abs(best) + abs(inside)) / abs(b - a)
+        if least > 0.5 or not fa:
+            return best
+        place, level, share = (a - b) / (c - b), (fa - fb) / (fc - fb), 0.5
+        if 1 - math.sqrt(1 - place) < level < math.sqrt(place):
+            share = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+        share = min(1 - least, max(least, share))
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -94,10 +94,10 @@ def _command_starts() -> bool:
     return os.path.basename(started) == "haptic-loop" or started.endswith(os.path.join("cli", "__main__.py"))
 
 
-# MuJoCo's import fails where MUJOCO_GL names a backend that is not installed, and no command renders through it. A
-# user's script keeps its setting.
+# No command renders through MuJoCo's OpenGL context. Its import takes longer than the rest of MuJoCo, and fails where
+# MUJOCO_GL names a backend that is not installed. A user's script keeps its setting.
 if _command_starts():
-    os.environ.pop("MUJOCO_GL", None)
+    os.environ["MUJOCO_GL"] = "disable"
 
 
 def __getattr__(name: str) -> Any:

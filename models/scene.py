@@ -745,12 +745,12 @@ class Variants:
 
     def repeated(self, times: int) -> Variants:
         """Return a copy in which every set of humans stands `times` times in succession."""
+        return self.taken(np.repeat(np.arange(len(self)), times))
 
-        def again(rows: _Array) -> _Array:
-            return np.repeat(rows, times, axis=0)
-
-        felt = tuple(_Felt(row, z.changed(again)) for row, z in self.impedances)
-        return Variants(self.scene, {name: again(rows) for name, rows in self.fields.items()}, felt)
+    def taken(self, sets: NDArray[np.intp]) -> Variants:
+        """Return these sets of humans, by their numbers and in this order."""
+        felt = tuple(_Felt(row, z.changed(lambda part: part[sets])) for row, z in self.impedances)
+        return Variants(self.scene, {name: rows[sets] for name, rows in self.fields.items()}, felt)
 
     def plants(self) -> Plant:
         """Return all plants, A (nsim, 2n, 2n) and B (nsim, 2n, inputs), equal to the plant of each model."""

@@ -196,6 +196,7 @@ def validate(
     shards: int = 1,
     progress: Progress = lambda done, total: None,
     limiter: bool = True,
+    traces: str = "sampled",
 ) -> crowds.Findings:
     """Let `humans` random passive humans (one per device each time) hold the devices, without voluntary motion.
 
@@ -203,7 +204,8 @@ def validate(
     "both", or a class of your own (sim.engines.Engine), of which one is made for each set of humans and compared with
     the exact one; `duration` [s] of the traces, 0 for none (then growth rates are those of the period maps alone);
     `shards` local processes (a script that asks for more than 1 needs `if __name__ == "__main__"`); `progress` is
-    called with the parts done and all of them; `limiter` as of `simulate`.
+    called with the parts done and all of them; `limiter` as of `simulate`; `traces` of the other engine than the exact
+    one: "sampled" (the hands nearest to the limit, the lossless ones and 64 at random), or "all".
 
     Returns Findings, n = humans: `exact` and `mujoco` (n,) growth rates [1/s], positive where a human makes the loop
     unstable, `radius` (n,) of the exact loop, `frequency` (n,) [Hz], `disagreements` (n,) of the engines, and more.
@@ -222,6 +224,7 @@ def validate(
     require_linear(scenario, "validate", walls=True)
     humans, seed = whole("humans", humans, 1, _MOST_HUMANS), whole("seed", seed, 0)
     shards = whole("shards", shards, 1)
+    one_of("traces", traces, ("sampled", "all"))
     if not callable(engine):
         one_of("engine", engine, crowds.ENGINES)
     duration = number("duration", duration, "a number of seconds")
@@ -230,5 +233,6 @@ def validate(
     links = getattr(scenario.population, "links", 1)  # of a user's own population there are none
     alone = scenario.replace(ranges=None) if scenario.ranges else scenario
     lag = assessed(alone, "I", chosen, limiter=None if limiter else False).force_limits.rho
-    question = crowds.Validation(scenario, chosen.coupling, seed, humans, links, engine, duration, lag=lag)
+    work = (humans, links, engine, duration)
+    question = crowds.Validation(scenario, chosen.coupling, seed, *work, lag=lag, all_traces=traces == "all")
     return validate_all(question, shards, progress)

@@ -3,7 +3,8 @@
 Human i depends on the seed and on i alone. Batches do not depend on the number of processes, so the merged result is
 that of a single run, bit for bit (the workers of a cluster need this package and the same versions of NumPy, SciPy and
 MuJoCo). MuJoCo decides by the map of its Runge-Kutta integrator, which shares only the model with the exact engine. Its
-traces use the exponential integrator, at a fifth of the cost.
+traces use the exponential integrator, at a fifth of the cost. The exact step simulates all humans, MuJoCo those whose
+traces say most (`_witnessed`).
 
 A batch whose worker died is repeated by another worker. A table, on disk if a folder is given for it, keeps every
 finished batch, so memory does not grow with the number of humans. Workers end with the process that started them.
@@ -65,6 +66,8 @@ if TYPE_CHECKING:
 
 ENGINES = ("exact", "mujoco", "both")
 _BATCH = 125  # humans that are decided together
+_NEAREST = 4  # of each group of alike humans in a batch, which are nearest to the limit
+_AT_RANDOM = 64  # of all humans
 
 
 # ---- random passive humans, each from its own seed
@@ -99,6 +102,7 @@ class Validation:
     threads: int = 0  # of MuJoCo; 0 for all
     environments: tuple[Member, ...] = ()  # humans meet these in turn; empty: all meet the scenario's
     lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of the limiter; None: forces are clipped
+    all_traces: bool = False  # of MuJoCo, or of a user's own engine: not only of the humans that say most
 
     @property
     def ticks(self) -> int:
@@ -126,6 +130,7 @@ class Validation:
             self.ticks,
             self.environments,
             self.lag,
+            *(["all traces"] if self.all_traces else []),
         )
         return hashlib.sha256(f"{self.scenario.digest} {how!r}".encode()).hexdigest()[:16]
 
@@ -158,7 +163,8 @@ class Findings:
         exact: (n,) growth rate of the exact loop [1/s]; above zero the set makes the loop unstable.
         frequency: (n,) frequency of that mode [Hz].
         mujoco: (n,) growth rate [1/s] of the period map of MuJoCo, or of a user's own engine.
-        trace: (n,) growth rate [1/s] on its trace, or on the exact one where no other is asked.
+        trace: (n,) growth rate [1/s] on its trace, or on the exact one where no other was made.
+        witnessed: (n,) whether MuJoCo, or a user's own engine, made that trace.
         trace_error: (n,) error of that rate [1/s]; a rate within it does not vote.
         clipped: (n,) number of ticks with a force at its limit, on that trace.
         energy: (n,) least energy W(N) on the exact trace [J].
@@ -180,6 +186,7 @@ class Findings:
     frequency: Array
     mujoco: Array
     trace: Array
+    witnessed: NDArray[np.bool_]
     trace_error: Array
     clipped: NDArray[np.int64]
     energy: Array
@@ -253,25 +260,32 @@ def _group(
     loops = exact_loops(held_by, simulation.F, late=late)
     frozen = [replace(simulation.process, law=Law(F)) for F in simulation.process.law.frozen().values()]
     mode = Mode.worst([dominant_mode(exact_loops(held_by, process.F, late=late)) for process in frozen])
+    damping = np.stack([port.damping.min(axis=1) for port in crowd.ports], axis=1)
+    lossless = np.stack([port.damping.max(axis=1) for port in crowd.ports], axis=1).min(axis=1) == 0
     other: _Other | None = None
     if not isinstance(validation.engine, str):
         each = [simulation.held_by(crowd.humans(i), crowd.persons(i)) for i in range(len(crowd))]
         make = validation.engine
         mujoco = np.array([simulated_growth(one, None, None, make) for one in each])
 
-        def one_by_one(integrator: str, timing: Timing | None) -> Engine:
+        def one_by_one(sets: NDArray[np.intp], integrator: str, timing: Timing | None) -> Engine:
             """Make the user's engine, which takes its timing from the simulation."""
-            return OneByOne([make_engine(one, make) for one in each])
+            return OneByOne([make_engine(each[i], make) for i in sets])
 
         other = one_by_one
     elif validation.engine != "exact":
         maps = (mujoco_loops(held_by, process, nthread=validation.threads, late=late) for process in frozen)
         mujoco = Mode.worst([dominant_mode(loop) for loop in maps]).growth
         other = partial(_batch, held_by, scenario.T, validation.threads)
-    exact, last = _tests(validation, simulation, held_by, loops, other, ticked) if validation.ticks else (None, None)
+    exact: ImpulseTest | None = None
+    witnesses = np.zeros(0, dtype=np.intp)
+    if validation.ticks:
+        if other:
+            witnesses = _witnessed(validation, index, mode.growth, lossless)
+        exact = _traced(validation, simulation, held_by, loops, other, witnesses, ticked)
     switched = Switched(nowhere, nowhere)
     if scenario.switches or scenario.uneven:
-        also = partial(other, "RK4") if other and validation.ticks else None
+        also = partial(other, np.arange(len(crowd)), "RK4") if other and validation.ticks else None
         switched = switched_crowd(simulation, held_by, index, validation.seed, validation.duration, also)
     return Findings(
         index=index,
@@ -279,26 +293,32 @@ def _group(
         exact=mode.growth,
         frequency=mode.frequency_hz,
         mujoco=mujoco,
-        trace=last.growth if last else nowhere,
-        trace_error=last.error if last else nowhere,
-        clipped=last.clipped if last else np.zeros(len(crowd), dtype=int),
+        trace=exact.growth if exact else nowhere,
+        witnessed=np.isin(np.arange(len(crowd)), witnesses),
+        trace_error=exact.error if exact else nowhere,
+        clipped=exact.clipped if exact else np.zeros(len(crowd), dtype=int),
         energy=exact.least_energy if exact else nowhere,
         audited=exact.audited if exact else nowhere,
         settling=exact.settling if exact else nowhere,
         contacts=exact.contacts if exact else np.zeros(len(crowd), dtype=int),
         mass=_geometric_mean(np.stack([port.mass.sum(axis=1) for port in crowd.ports], axis=1)),
-        damping=_geometric_mean(np.stack([port.damping.min(axis=1) for port in crowd.ports], axis=1)),
+        damping=_geometric_mean(damping),
         switching=switched.exact,
         switching_mujoco=switched.mujoco,
-        simulated=sum(test.simulated for test in dict.fromkeys((exact, last)) if test),
+        simulated=exact.simulated if exact else 0.0,
     )
 
 
-_Other = Callable[[str, Timing | None], Engine]  # (integrator, timing) -> the other engine
+#: (numbers of the sets of humans, integrator, timing) -> the other engine
+_Other = Callable[[NDArray[np.intp], str, Timing | None], Engine]
 
 
-def _batch(held_by: Variants, T: float, threads: int, integrator: str, timing: Timing | None) -> Engine:
-    return MujocoBatchEngine(held_by, T, integrator, 1 if integrator == EXPONENTIAL else LEAST, threads, timing)
+def _batch(
+    held_by: Variants, T: float, threads: int, sets: NDArray[np.intp], integrator: str, timing: Timing | None
+) -> Engine:
+    return MujocoBatchEngine(
+        held_by.taken(sets), T, integrator, 1 if integrator == EXPONENTIAL else LEAST, threads, timing
+    )
 
 
 def _geometric_mean(values: Array) -> Array:
@@ -307,27 +327,50 @@ def _geometric_mean(values: Array) -> Array:
         return np.exp(np.log(values).mean(axis=1))
 
 
-def _tests(
+def _witnessed(
+    validation: Validation, index: NDArray[np.intp], growth: Array, lossless: NDArray[np.bool_]
+) -> NDArray[np.intp]:
+    """Numbers of the humans of one group that the other engine simulates, too.
+
+    These are all lossless ones, the _NEAREST whose `growth` [1/s] is nearest to zero, and whoever is among the
+    _AT_RANDOM of all humans. They follow from the question and the group alone, whoever works on it.
+    """
+    if validation.all_traces:
+        return np.arange(len(index))
+    rng = np.random.default_rng(np.random.SeedSequence((validation.seed, validation.humans)))
+    drawn = rng.choice(validation.humans, min(_AT_RANDOM, validation.humans), replace=False)
+    chosen = lossless | np.isin(index, drawn)
+    chosen[np.argsort(np.abs(growth), kind="stable")[:_NEAREST]] = True
+    return np.flatnonzero(chosen)
+
+
+def _traced(
     validation: Validation,
     simulation: Simulation,
     held_by: Variants,
     loops: ClosedLoop,
     other: _Other | None,
+    witnesses: NDArray[np.intp],
     ticked: Callable[[int], None],
-) -> tuple[ImpulseTest, ImpulseTest]:
-    """The exact engine's impulse test, which costs next to nothing, and the other's, or again the first.
+) -> ImpulseTest:
+    """Return the exact engine's impulse test, with growth and clipped ticks of the other engine's for `witnesses`.
 
     In even periods, with forces that latch in the middle of their range: what their spread does is `switched_crowd`'s.
     """
     process, T = simulation.process, validation.scenario.T
-    late = validation.scenario.usual_latency
-    settings = held_by.scene, loops, Balance.of(held_by, simulation.loop, late), validation.ticks
-    engine = ExactEngine(hold(held_by.plants(), T, late))
-    exact = impulse_test(process, engine, *settings)
+    late, ticks = validation.scenario.usual_latency, validation.ticks
+    balance, engine = Balance.of(held_by, simulation.loop, late), ExactEngine(hold(held_by.plants(), T, late))
+    exact = impulse_test(process, engine, held_by.scene, loops, balance, ticks)
     if not other:
-        return exact, exact
+        return exact
     timing = Timing(np.array([T]), np.array([late])) if late else None
-    return exact, impulse_test(process, other(EXPONENTIAL, timing), *settings, ticked)
+    few = held_by.taken(witnesses)
+    settings = few.scene, exact_loops(few, simulation.F, late=late), Balance.of(few, simulation.loop, late), ticks
+    last = impulse_test(process, other(witnesses, EXPONENTIAL, timing), *settings, ticked)
+    growth, error, clipped = (getattr(exact, name).copy() for name in ("growth", "error", "clipped"))
+    growth[witnesses], error[witnesses], clipped[witnesses] = last.growth, last.error, last.clipped
+    simulated = exact.simulated + last.simulated
+    return replace(exact, growth=growth, error=error, clipped=clipped, simulated=simulated)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -389,6 +432,7 @@ class Table:
             self._path.unlink()  # the mapped pages stay readable
         for name in ("index", "clipped"):
             rows[name] = rows[name].astype(int)
+        rows["witnessed"] = rows["witnessed"].astype(bool)
         return Findings(**rows, simulated=float(table[-2].sum()), interrupted=interrupted, lost=lost)
 
 

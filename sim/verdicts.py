@@ -142,9 +142,11 @@ class Traces:
     """What the traces say, and whether they are long enough for hands to be slower at their end."""
 
     duration_s: float
+    humans: int
     clipped_runs: int
     contacts: int
     measured: int
+    witnessed: int  # traces that MuJoCo, or a user's own engine, made besides the exact step
     undecided: int  # traces that are too short for the sign of their rate, which do not vote
     largest_difference_per_s: float | None
     stable_and_settling: int
@@ -162,9 +164,11 @@ class Traces:
         slow = f"the slowest mode decays in {decay or 0:.3g} s: in {duration:g} s its hands need not be slower"
         return cls(
             duration_s=duration,
+            humans=findings.index.size,
             clipped_runs=int((findings.clipped > 0).sum()),
             contacts=int(findings.contacts.sum()),
             measured=int(np.isfinite(findings.trace).sum()),
+            witnessed=int(findings.witnessed.sum()),
             undecided=int((np.isfinite(findings.trace) & ~findings.trace_decides).sum()),
             largest_difference_per_s=largest(np.abs(findings.trace - findings.exact)),
             stable_and_settling=int((stable & (findings.settling < 1)).sum()),
@@ -177,6 +181,8 @@ class Traces:
 
     def rows(self) -> Iterator[tuple[str, str | None]]:
         yield "traces", f"{self.duration_s:g} s each, {self.clipped_runs} reached a force limit"
+        some = f"{self.witnessed} of {self.humans}: random ones, the nearest to the limit, all lossless ones"
+        yield "traces by both engines", some if 0 < self.witnessed < self.humans else None
         undecided = f"not decidable in {self.duration_s:g} s: {self.undecided} of {self.measured}, left to eigenvalues"
         yield "growth on traces", undecided if self.undecided else None
         yield "contacts made", f"{self.contacts} on these traces" if self.contacts else None

@@ -12,6 +12,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
+# Hundreds of tests start commands: without bytecode each of them would compile a hundred files.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # What a test finds does not depend on what ran before it.
 
 import pytest  # noqa: E402

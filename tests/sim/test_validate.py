@@ -11,6 +11,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from driven import driven
+from msgspec.structs import replace as replace_fields
 
 from haptic_loop.cli import run as run_command
 from haptic_loop.cli.validate import main
@@ -19,7 +20,7 @@ from haptic_loop.controller.delay import VaryingDelay
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.models.hold import hold
-from haptic_loop.models.human import Person
+from haptic_loop.models.human import Human, Person
 from haptic_loop.models.scene import MIXED, Crowd, build, crowds, draw, plant, variants
 from haptic_loop.sim import crowds as examine_module
 from haptic_loop.sim.couplings import choose
@@ -187,6 +188,41 @@ def test_shards_repeat_the_single_run_bit_for_bit():
     assert np.isfinite(alone.trace).mean() > 0.9
     # the trace is MuJoCo's own, not the exact engine's again
     assert not np.array_equal(alone.trace[:20], validate(replace(question, humans=20, engine="exact")).trace)
+
+
+class EveryThirdLossless:
+    """The packaged population; one set of hands in three has no dampers."""
+
+    def draw(self, rng, channels):
+        hands = SCENARIO.population.draw(rng, channels)
+        if rng.random() > 1 / 3:
+            return hands
+        return [Human(tuple(replace_fields(link, damping=0.0) for link in hand.links)) for hand in hands]
+
+
+def test_sampled_traces_are_those_of_all_hands():
+    """MuJoCo's for the lossless ones, the nearest to the limit and 64 more, the exact step's for the others."""
+    people = SCENARIO.replace(population=EveryThirdLossless())
+    question = Validation(people, PUBLISHED["I"], 3, 200, 1, "both", 0.3)
+    some, every = validate(question), validate(replace(question, all_traces=True))
+    exact = validate(replace(question, engine="exact"))
+    chosen = some.witnessed
+    assert every.witnessed.all()
+    assert not exact.witnessed.any()
+    for name in ("trace", "trace_error", "clipped"):
+        given = getattr(some, name)
+        np.testing.assert_array_equal(given[chosen], getattr(every, name)[chosen])
+        np.testing.assert_array_equal(given[~chosen], getattr(exact, name)[~chosen])
+    np.testing.assert_array_equal(some.mujoco, every.mujoco)  # growth rates are both engines', of every hand
+    assert np.isfinite(some.mujoco).all()
+    lossless = some.damping == 0
+    assert 40 < lossless.sum() < 100
+    assert chosen[lossless].all()
+    for batch in question.batches():
+        assert chosen[batch[int(np.abs(some.exact[list(batch)]).argmin())]]
+    assert 64 <= chosen.sum() < 160
+    more = Traces.of(question, some)
+    assert (more.witnessed, more.humans) == (chosen.sum(), 200)
 
 
 def test_designed_coupling_holds_for_everyone():
