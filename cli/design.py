@@ -16,7 +16,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.design.assessment import SAMPLES, Assessment, assess
 from haptic_loop.design.certificate import named
 from haptic_loop.design.designs import KINDS, design_by_kind, kind_of, usual_condition
-from haptic_loop.design.files import out_file
+from haptic_loop.design.files import off_table, out_file
 from haptic_loop.design.gain_search import SOFTEST, STIFFEST
 from haptic_loop.design.program import DEFAULT, OBJECTIVES, Options
 from haptic_loop.design.result import Design, DesignFailed, finite, listed
@@ -53,12 +53,15 @@ def main(argv: list[str]) -> int:
     design, dies_away = _design(args, loop, scenario)
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
+    useless = " [red]Useless[/]: the coupling renders next to nothing." if _is_useless(assessment) else ""
+    slow = args.coupling == "optimal"  # its bound and its price take seconds
+    if slow:
+        render.announce(args, verdicts.verdict(assessment) + useless)
     report = replace(_reported(args, loop, design, assessment, stored), ringing=dies_away)
-    said = verdicts.verdict(assessment, report.nearby)
-    if _is_useless(assessment):
-        said += " [red]Useless[/]: the coupling renders next to nothing."
-    render.publish(args, report, _tables(scenario, report), verdict=said)
-    return options.exit_code(assessment.holds)
+    said = verdicts.lost(assessment, report.nearby) if slow else verdicts.verdict(assessment, report.nearby) + useless
+    lines = ["Interrupted: the bound and the robustness are not complete."] if report.interrupted else []
+    render.publish(args, report, _tables(scenario, report), lines, verdict=said)
+    return options.exit_code(assessment.holds, report.interrupted)
 
 
 def _parser() -> options.Parser:
@@ -260,9 +263,16 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
     known = assessment.requirements.get("switching")
     switching = coverage.Switching.of(loop, design.coupling, known) if loop.varying_delay else None
     asked = Options(**_asked_of(args, "optimal")) if best else DEFAULT
-    with render.progress("working out robustness and its price, and the bound"):
-        nearby = nearby_of(loop, design.coupling, asked, named(design.asked))
-        limit = best and BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, asked)
+    nearby, limit, interrupted = Nearby(), None, False
+    kept = f"{stored.file} is stored (Ctrl-C leaves out what follows)"
+    try:
+        if best:
+            with render.progress(f"{kept}: working out the bound"):
+                limit = BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, asked)
+        with render.progress(f"{kept}: working out robustness and its price"):
+            nearby = nearby_of(loop, design.coupling, asked, named(design.asked))
+    except KeyboardInterrupt:
+        interrupted = True
     nominal = None
     if kind_of(args.coupling).model:
         nominal = partial(design_by_kind, kind=args.coupling, **_asked_of(args, args.coupling))
@@ -281,6 +291,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
         best=best and _Best(limit, best.g, best.ladder, best.hurried),
         sdps=design.sdps,
         stored=stored,
+        interrupted=interrupted,
         claim=design.own and design.own.said(assessment.requirements[design.condition]),
     )
 
@@ -378,6 +389,7 @@ class _Report:
     best: _Best | None = render.several(_Best.rows, "inlined")
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
     stored: Filed = render.several(_stored_rows)
+    interrupted: bool = off_table()
     claim: str | None = render.figure("claim", default=None, json="if given")  # of a condition of the user's own
 
     @property

@@ -87,10 +87,15 @@ def verdict(
         words.append("By a refined sweep, without an exact proof.")
     if encoder and not encoder.covered:
         words.append("Not covered: the encoder steps of the devices.")
-    there = nearby and nearby.robustness
-    if there and not there.certified and not guarantee.any_environment:
-        words.append(f"Lost with {there.where}.")
-    return " ".join(words)
+    return " ".join([*words, *filter(None, [lost(assessment, nearby)])])
+
+
+def lost(assessment: Assessment, nearby: Nearby | None) -> str:
+    """Say which change of the environment within ten percent ends the guarantee; "" where none does."""
+    there, guarantee = nearby and nearby.robustness, assessment.guarantee
+    if there is None or there.certified or guarantee is None or guarantee.any_environment:
+        return ""
+    return f"Lost with {there.where}."
 
 
 def _who(guarantee: Guarantee) -> str:

@@ -1,23 +1,26 @@
 """Speed beside error, goal by goal, in one run.
 
-PYTHONPATH=. python tests/benchmarks/goals.py [--write] [engines|hands|cold|peers ..]
+PYTHONPATH=. python tests/benchmarks/goals.py [--write] [engines|cold|first|long|peers ..]
 
-CPU seconds. Ratios are medians of rounds in which both sides alternate; commands are the least of three, each in a
-process of its own, with matplotlib's list of fonts made before. `--write` puts the tables of engines and cold into the
-pages: on an idle machine.
+CPU seconds. Ratios are medians of rounds in which both sides alternate; commands are medians of three, each in a
+process of its own, beside the floor: the import of NumPy and MuJoCo in the same round. `--write` puts the tables of
+engines and cold into the pages: on an idle machine.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import resource
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -32,14 +35,28 @@ from haptic_loop.sim.stability import exact_growth
 ROOT = Path(__file__).parents[2]
 PAGES = {"engines": "docs/accuracy.md", "cold": "docs/accuracy.md"}
 ROUNDS = 9
+FLOOR = "-c import numpy, mujoco"  # what every command that simulates has to wait for
+
+#: words of a command -> goal in floors; {} is a folder that all commands share
 COMMANDS = {
-    "sim.run --help": 0.3,
-    "design --help": 0.3,
-    "design --out coupling.json": 1.2,
-    "design.check coupling.json": 0.8,
-    "design.audit --K 800 --B 0.5": 0.8,
+    **{
+        f"{name} --help": 1.0 for name in ("sim.run", "design", "design.audit", "sim.validate", "hw.bridge", "sim.view")
+    },
+    "design --out {}/coupling.json --json {}/r.json": 3.0,
+    "design.check {}/coupling.json --json {}/r.json": 1.5,
+    "design.audit --K 800 --B 0.5 --out {} --json {}/r.json": 2.0,
+    "sim.run --case I --no-plot --out {} --json {}/r.json": 2.5,
+    "sim.run --case I --out {} --json {}/r.json": 4.0,
 }
-RUN = 2.5
+#: commands of many seconds, once -> goal in floors
+LONG = {
+    "sim.validate --humans 1000 --no-plot --out {} --json {}/r.json": 7.3,
+    "sim.validate --humans 1000 --no-plot --traces all --out {} --json {}/r.json": None,
+    "sim.validate --humans 10000 --duration 0 --no-plot --out {} --json {}/r.json": 7.3,
+    "design --coupling optimal --out {}/optimal.json --json {}/r.json": None,
+}
+#: commands whose first line comes before their end -> goal in floors, of wall time
+FIRST = {"sim.run --case I --out {}": 2.5, "design --coupling optimal --out {}/optimal.json": 6.4}
 
 
 def engines() -> Iterator[Sequence[str]]:
@@ -70,33 +87,85 @@ def engines() -> Iterator[Sequence[str]]:
         yield *row, f"{np.median(ratios):.2f}", f"{np.median(least):.2f}", f"{position:.1e}", f"{growth:+.1e} 1/s"
 
 
-def command(words: str, folder: str) -> float:
+def started(words: str, folder: str) -> subprocess.Popen[bytes]:
+    """The command in a process of its own, with bytecode and matplotlib's list of fonts as a user has them."""
+    environment = os.environ | {"MPLCONFIGDIR": matplotlib.get_cachedir(), "PYTHONPATH": str(ROOT)}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    arguments = ["-c", words[3:]] if words.startswith("-c ") else ["-m", *words.format(*[folder] * 2).split()]
+    call = [sys.executable, *arguments]
+    return subprocess.Popen(call, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+
+
+def cost(words: str, folder: str) -> float:
     """CPU seconds of a command and what it starts."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    kept = {"MPLCONFIGDIR": matplotlib.get_cachedir()}
-    subprocess.run(
-        [sys.executable, "-m", *words.split()],
-        cwd=folder,
-        env=os.environ | kept | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-    )
+    started(words, folder).communicate()
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def hands() -> Iterator[Sequence[str]]:
-    yield "command", "CPU [s]", "goal"
+def first_line(words: str, folder: str) -> float:
+    """Seconds until a command has printed a line; of the floor, until it has ended."""
+    begin = time.perf_counter()
+    process = started(words, folder)
+    assert process.stdout is not None
+    process.stdout.readline()
+    spent = time.perf_counter() - begin
+    process.communicate()
+    return spent
+
+
+def error(report: dict[str, Any]) -> str:
+    """What stands beside the speed: errors of a simulation, or how the requirement was proved."""
+    if "traces" in report:
+        traced = report["traces"] and f", {report['traces']['witnessed']} traces by both engines"
+        apart = f"growth rates {report['largest_difference_per_s']:.1e} 1/s apart"
+        return f"{apart}, {report['disagreements']} disagreements{traced or ''}"
+    if "stability" in report:
+        stability, position = report["stability"], report["error"]["position_relative_rms"]
+        growth = stability["growth_rate_per_s"] - stability["exact_growth_rate_per_s"]
+        return f"position {position:.1e}, growth {growth:+.1e} 1/s"
+    assessment = report.get("assessment") or report
+    needs = [need for need in assessment["requirements"].values() if need["certified"]]
+    return ", ".join(f"{need['condition']}: {need['proof']}" for need in needs) or "not certified"
+
+
+def interleaved(
+    commands: Mapping[str, float | None], spent: Callable[[str, str], float], rounds: int
+) -> Iterator[Sequence[str]]:
+    """A row for each command: the median of its seconds, and of its ratios to the floor beside it."""
     with tempfile.TemporaryDirectory() as folder:
-        yield "sim.validate --humans 1000, with traces", f"{command('sim.validate --humans 1000', folder):.1f}", "15"
+        for words in [*commands] if rounds > 1 else []:
+            spent(words, folder)
+        seconds: dict[str, list[float]] = {words: [] for words in [FLOOR, *commands]}
+        beside = {}
+        for _ in range(rounds):
+            for words in seconds:
+                Path(folder, "r.json").unlink(missing_ok=True)
+                seconds[words].append(spent(words, folder))
+                if Path(folder, "r.json").exists():
+                    beside[words] = error(json.loads(Path(folder, "r.json").read_text()))
+        floor = np.array(seconds[FLOOR])
+        for words, spent_on in seconds.items():
+            goal = commands.get(words)
+            figures = f"{np.median(spent_on):.2f}", f"{np.median(spent_on / floor):.2f}", f"{goal:g}" if goal else ""
+            name = words.replace(" --json {}/r.json", "").replace(" --out {}/", " --out ").replace(" --out {}", "")
+            yield f"`{name.replace('{}/', '')}`", *figures, beside.get(words, "")
 
 
 def cold() -> Iterator[Sequence[str]]:
-    yield "command", "CPU [s]", "goal"
-    with tempfile.TemporaryDirectory() as folder:
-        for words, goal in COMMANDS.items():
-            yield f"`{words}`", f"{min(command(words, folder) for _ in range(3)):.2f}", f"{goal:g}"
-        best = min(command("sim.run", folder) for _ in range(3))
-        yield "`sim.run` with its picture", f"{best:.2f}", f"{RUN:g}"
+    yield "command", "CPU [s]", "floors", "goal", "error or proof"
+    yield from interleaved(COMMANDS, cost, 3)
+
+
+def long() -> Iterator[Sequence[str]]:
+    yield "command", "CPU [s]", "floors", "goal", "error or proof"
+    yield from interleaved(LONG, cost, 1)
+
+
+def first() -> Iterator[Sequence[str]]:
+    yield "first line of", "wall [s]", "floors", "goal", ""
+    yield from interleaved(FIRST, first_line, 3)
 
 
 def peers() -> Iterator[Sequence[str]]:
@@ -125,7 +194,7 @@ def write(name: str, made: str) -> None:
 
 
 if __name__ == "__main__":
-    known = {f.__name__: f for f in (engines, hands, cold, peers)}
+    known = {f.__name__: f for f in (engines, cold, first, long, peers)}
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("goals", nargs="*", metavar="|".join(known), help="by default all")
     parser.add_argument("--write", action="store_true", help="into the pages")

@@ -641,6 +641,22 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     assert "designed for 10 % more or less" in " ".join(capsys.readouterr().out.split())
 
 
+def test_an_interruption_keeps_the_printed_design(tmp_path, capsys, monkeypatch):
+    """The verdict is printed and the proof is stored before the bound and the robustness are worked out."""
+    file, printed = tmp_path / "c.json", []
+
+    def interrupted(*arguments):
+        printed.append(capsys.readouterr().out)
+        assert verify(load_file(file)).proved
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(BoundBeside, "of", interrupted)
+    assert main(["--coupling", "optimal", "--scenario", str(next(LOOPS.glob("n3*.toml"))), "--out", str(file)]) == 130
+    assert printed[0].startswith("Stable for every passive hand")
+    assert "Interrupted: the bound and the robustness are not complete" in capsys.readouterr().out
+    assert verify(load_file(file)).proved
+
+
 # the period, the latency and the limiter ------------------------------------------------------------------------------
 
 
