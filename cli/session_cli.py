@@ -90,9 +90,10 @@ def add_safety_options(parser: options.Parser) -> None:
 
 
 def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
-    """The scenario, which a serial link wants linear, with even ticks and constant delays. Raises InputError."""
+    """Return the scenario, which needs ideal devices, even ticks and constant delays. Raises InputError."""
     scenario = options.scenario_from(args)
-    for require in (require_linear, require_constant_delay, require_even_ticks):
+    require_linear(scenario, command, walls=True)
+    for require in (require_constant_delay, require_even_ticks):
         require(scenario, command)
     return scenario
 

@@ -281,7 +281,7 @@ def rehearse(
     seconds, seed = number("seconds", seconds, "a number of seconds"), whole("seed", seed, 0)
     if not 0.1 <= seconds <= 3600:
         raise InputError(f"seconds is {seconds:g}, allowed are 0.1 to 3600")
-    require_linear(scenario, "rehearse")
+    require_linear(scenario, "rehearse", walls=True)
     require_constant_delay(scenario, "rehearse")
     require_even_ticks(scenario, "rehearse")
     if min(scenario.delta) <= 0:

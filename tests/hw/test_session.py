@@ -6,10 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from rich.console import Console
+from scipy.optimize import brentq
 from sessions import AT_REST, FAST, rehearsal_of, session_with
 from worlds import FakePort
 
 from haptic_loop.cli import bridge
+from haptic_loop.cli import replay as replay_command
 from haptic_loop.controller.law import Law
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.coupling_file import save as save_coupling
@@ -21,13 +23,14 @@ from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.protocol import Command, Decoder, Force, Hello, Phase, SafetyStop, State, Stop, encode
 from haptic_loop.hw.recording import Recorder, _recipes_of, load, replay
-from haptic_loop.hw.rehearsal import Rehearsal
+from haptic_loop.hw.rehearsal import Rehearsal, rehearse
 from haptic_loop.hw.session import Driver, Session
 from haptic_loop.hw.session_report import outcome, save
 from haptic_loop.models.hold import hold
 from haptic_loop.models.scene import plant
 from haptic_loop.sim.run import assemble, outside_forces, run
 from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.scenario import load as load_scenario
 from tests.checks.faults import CASES, Fault, _rehearse_case, at, person
 
 # faults
@@ -430,3 +433,39 @@ def test_the_bridges_budget_limits_a_thief(scenario, rungs, monkeypatch, tmp_pat
         assert part.limited_ticks > 50 or budget > 1
         assert taken[budget] <= budget + 1e-5
     assert taken[10.0] > 2 * 0.01
+
+
+# walls
+
+
+def test_a_rehearsed_wall_pushes_and_never_pulls():
+    """Coupling and wall in series, by bisection: Kc d + Bc dd/T = max(0, K h + B dh/T), h = max(0, x - d - gap)."""
+    scenario = load_scenario("one-wall")
+    session = rehearse(scenario, seconds=3.0)
+    assert (session.stage, session.assessment.guarantee.condition) == ("finished", "any-environment")
+    (Kc,), (Bc,), wall, T = session.coupling.K, session.coupling.B, scenario.environment.walls[0], scenario.T
+    pushes, d, h = [], 0.0, 0.0
+    for x in session.result.x[:, 0]:
+
+        def give(way, x=x, d=d):
+            return Kc * way + Bc * (way - d) / T
+
+        def push(way, x=x, h=h):
+            deep = max(0.0, x - way - wall.gap)
+            return max(0.0, wall.stiffness * deep + wall.damping * (deep - h) / T)
+
+        way = brentq(lambda way, give=give, push=push: push(way) - give(way), -0.1, 0.1, xtol=1e-16)
+        pushes.append(give(way))
+        d, h = way, max(0.0, x - way - wall.gap)
+    felt = session.result.f[400:-120, 0]  # full gain
+    assert felt.max() > 1.0
+    assert (felt == 0).mean() > 0.3
+    np.testing.assert_allclose(felt, pushes[399:-121], atol=6e-4)  # the force is rounded to steps of 0.5 mN
+
+
+def test_a_wall_on_the_bridge_replays_bit_by_bit(tmp_path):
+    words = ["--scenario", "one-wall", "--duration", "1", "--out", str(tmp_path), "--no-plot"]
+    assert bridge.main(["--rehearse", *words]) == 0
+    assert replay_command.main([str(tmp_path / "trace.npz")]) == 0
+    with pytest.raises(ValueError, match="cannot face walls"):
+        bridge.main(["--rehearse", "--coupling", "optimal", *words])
