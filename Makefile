@@ -73,6 +73,7 @@ figures: .venv/ready
 	for name in required-damping perceived singular-values; do cp out/couplings/$$name.png docs/pictures/; done
 	$(PY) -m sim.view --case I --video docs/pictures/view.gif --fps 5
 	cd docs/pictures && ../../$(PY) ../../examples/limits_of_any_coupling.py
+	$(PY) examples/wheel.py docs/pictures/wheel.png
 	$(PY) -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0 --out out/zwidth || test $$? -eq 1 # 1: not certified
 	cp out/zwidth/zwidth.png docs/pictures/zwidth.png
 	PYTHONPATH=. $(PY) tests/tools/pictures_of_worlds.py docs/pictures/worlds.png

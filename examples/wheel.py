@@ -1,0 +1,59 @@
+"""A force-feedback wheel whose game sends torques at 60 or 360 Hz: which delay theta stands for a held torque?
+
+The equations are those of handles; rad, N m, N m s/rad and kg m2 stand in the places of m, N, N s/m and kg. A torque
+that is computed within a period of the game and held for the next, n ticks of the wheel's own 1 kHz loop, has a mean age
+of 3 n/2 ticks. A tick holds for half a tick by itself, so theta = 3 n/2 - 1/2 stands for it. Certified is the exact loop,
+whose period is the game's (theta = 1); the 1 kHz loop with that theta needs nearly the same damping.
+"""
+
+import math
+import sys
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from haptic_loop import Scenario, SpringDamper, certify, design_coupling, load
+
+BASE = load("omega-pair").replace(
+    name="wheel",
+    T=1e-3,
+    theta=(1,),
+    psi=(0,),
+    device=[{"kind": "rigid", "mass": 0.02, "damping": 0.1, "force_limit": 8.0}],  # kg m2, N m s/rad, N m: assumptions
+    human=[{"links": [{"mass": 0.02, "damping": 0.3, "stiffness": 10.0}]}],
+    environment={"contacts": ["rim"], "springs": [{"between": ["rim", "ground"], "stiffness": 20.0, "damping": 0.02}]},
+    tap=None,
+)
+RIGID = SpringDamper([1e6], [0.0])  # as good as no coupling
+
+
+def theta_of(hertz: float) -> int:
+    """Return the delay in ticks of 1 ms, rounded up, that stands for torques held for a period of the game."""
+    return math.ceil(1.5 / (hertz * BASE.T) - 0.5)
+
+
+def needed(scenario: Scenario) -> float:
+    """Return the damping [N m s/rad] that the bare stiffness of 20 N m/rad needs."""
+    return certify(scenario.loop("I"), RIGID)["this-environment"].required[0]
+
+
+def main() -> None:
+    figure, axis = plt.subplots(figsize=(6, 4), layout="constrained")
+    hertz = np.geomspace(0.1, 20, 200)
+    for rate, style in ((1000, "-"), (360, "--"), (60, "-")):
+        game, theta = BASE.replace(T=1 / rate), theta_of(rate)
+        bare = (
+            f"bare, it needs {needed(game):.4f} of 0.1 N m s/rad ({needed(BASE.replace(theta=(theta,))):.4f} by theta)"
+        )
+        loop = game.loop("I")
+        felt = np.abs(loop.F(design_coupling(loop).coupling).at(np.exp(2j * np.pi * hertz / rate)))[:, 0, 0]
+        print(f"{rate:4d} Hz: theta = {theta:2d}; {bare}; coupled, {felt[0]:.2f} of 20 N m/rad are felt")
+        axis.semilogx(hertz, felt, style, label=f"{rate} Hz, theta = {theta}")
+    axis.set(xlabel="frequency [Hz]", ylabel="felt stiffness [N m/rad]", title="What the wheel passes on of 20 N m/rad")
+    axis.set_ylim(bottom=0)
+    axis.legend()
+    figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "wheel.png", dpi=120)
+
+
+if __name__ == "__main__":
+    main()
