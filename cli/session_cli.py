@@ -19,13 +19,14 @@ from typing import Any
 from haptic_loop.cli import options
 from haptic_loop.cli.render import console, progress
 from haptic_loop.hw.control import Armable
+from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import KINDS, Emulator, FaultInjection
 from haptic_loop.hw.force_dimension import FORCE_DIMENSION, ForceDimension
 from haptic_loop.hw.haptic_device import HapticDevice, SerialDevice
 from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.rehearsal import Rehearsal
-from haptic_loop.hw.session import Operator, Session
+from haptic_loop.hw.session import Session
 from haptic_loop.hw.session_report import IncidentLog
 from haptic_loop.hw.transport import Live, SerialPort, preflight
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear

@@ -21,13 +21,14 @@ from haptic_loop.design.arguments import number, of_kind, whole
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.result import Design
 from haptic_loop.hw.control import Armable, CertifiedCoupling, certified_coupling, certified_couplings, timed
+from haptic_loop.hw.driver import Driver, Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection, Line
 from haptic_loop.hw.haptic_device import PortLost, SerialDevice
 from haptic_loop.hw.limits import ENDED, Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.protocol import Phase
 from haptic_loop.hw.recording import Recorder
-from haptic_loop.hw.session import Driver, Operator, Said, Session, session_for
+from haptic_loop.hw.session import Said, Session, session_for
 from haptic_loop.sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from haptic_loop.sim.trace import Trace
 

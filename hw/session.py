@@ -10,12 +10,10 @@ answers nothing but repeats its STOP to a device that still drives; it never arm
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from haptic_loop.hw import protocol as wire
 from haptic_loop.hw.control import Armable, Arming, BudgetPlan, Drive, SentBudget, TraceRow, WorldController
-from haptic_loop.hw.haptic_device import HapticDevice, PortLost
 from haptic_loop.hw.limits import (
     DRIVING,
     ENDED,
@@ -25,19 +23,16 @@ from haptic_loop.hw.limits import (
     probe_delay,
     watchdog_for,
 )
-from haptic_loop.hw.monitor import Ages, Counters, EncoderNoise, Expected, LinkMonitor, LinkSettings, Measurement
+from haptic_loop.hw.monitor import Counters, EncoderNoise, Expected, LinkMonitor, LinkSettings, Measurement
 from haptic_loop.sim.scenario import InputError, Scenario
 
-_PATIENCE_US = 2_000_000  # after which a question is given up
-_ARMING_US = 500_000  # for each axis, in which a device must follow ARM and its encoders be tested
+_PATIENCE_US = 2_000_000  # a question without an answer is given up after this time
+_ARMING_US = 500_000  # per axis: the device must follow ARM and pass the test of its encoders within this time
 _QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
-_STOPPING_US = 50_000  # in which STOP is repeated to a device that says nothing
-_OBEYING_US = 30_000  # in which one that was told to stop must rest: the longest hold and ramp, and half as long again
-_DEADMAN_US = 1_000_000  # after which nobody is there
-_ELSEWHERE = 5e-3  # [m] from its place, where a handle is at another one
-_LET_GO_US = 5_000_000  # in which whoever moved a handle lets go of it, where the session arms by itself
+_STOPPING_US = 50_000  # STOP is repeated for so long to a device that says nothing
+_OBEYING_US = 30_000  # a device must rest so soon after STOP: 1.5 times the longest hold and ramp
+_ELSEWHERE = 5e-3  # [m] a handle that moved by this much is at another place
 _STRONGEST = 12.0  # [N] whatever a scenario allows
-_KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
 
 
 Said = tuple[wire.Force | wire.Stop, ...]  # to the device
@@ -52,7 +47,7 @@ class _Event(NamedTuple):
 
 
 class Session:
-    """The host's side of the link."""
+    """Run the host's side of the link."""
 
     def __init__(self, scenario: Scenario, limits: SafetyLimits, settings: LinkSettings | None = None) -> None:
         if len(limits.cap) != scenario.channels:
@@ -82,17 +77,17 @@ class Session:
 
     @property
     def gain(self) -> float:
-        """The factor in front of every force; 0 unless forces act."""
+        """Return the factor in front of every force; it is 0 unless forces act."""
         return self.drive.gain.value if self.drive else 0.0
 
     @property
     def held(self) -> bool:
-        """Whether forces may act, by the deadman at the device."""
+        """Return whether the deadman at the device lets forces act."""
         return not self.settings.deadman or (self.link.last is not None and self.link.last.deadman)
 
     @property
     def hindrance(self) -> str | None:
-        """Why it cannot be armed at the moment."""
+        """Return why the session cannot be armed at the moment, or None."""
         if not self.held:
             return "the deadman at the device is not held"
         last, before = self.link.last, self.settings.elsewhere
@@ -107,7 +102,7 @@ class Session:
 
     @property
     def units(self) -> Units:
-        """The device's units, once it is known."""
+        """Return the units of a device that has sent its INFO."""
         assert self._units
         return self._units
 
@@ -159,7 +154,7 @@ class Session:
         return SentBudget(BudgetPlan.of(*self.settings.energy_budget, scenario.delta, self.units, config, longest))
 
     def stop(self, cause: str, now: int) -> Said:
-        """The planned end: by a ramp where forces act, at once where none do."""
+        """End the session as planned: by a ramp where forces act, at once where none do."""
         self.now = now
         if self.stage in ENDED:
             return ()
@@ -172,30 +167,30 @@ class Session:
         return self._end(Stage.FINISHED, cause, wire.Reason.DONE)
 
     def fail(self, cause: str, now: int) -> Said:
-        """A fault found outside of the session: zero force at once."""
+        """End the session at zero force, at once, for a fault that was found outside of it."""
         self.now = now
         return () if self.stage in ENDED else self._end(Stage.STOPPED, cause)
 
     def estop(self, cause: str, now: int) -> Said:
-        """Zero force at once, latched on both sides. Also from a session that has ended."""
+        """Latch zero force on both sides at once, also where the session has ended."""
         self.now = now
         if self.stage == Stage.ESTOP:
             return ()
         return self._end(Stage.ESTOP, cause, wire.Reason.ESTOP)
 
     def lost(self, cause: str, now: int) -> Said:
-        """The port is gone."""
+        """End the session because the port is gone."""
         self.now = now
         return () if self.stage in ENDED else self._end(Stage.LOST, cause)
 
     # what the link does
 
     def met(self, info: wire.Info, now: int) -> Said:
-        """The device has said what it is."""
+        """Take INFO, in which the device says what it is."""
         return self._guarded(now, self._on_info, info)
 
     def configured(self, refused: int, now: int) -> Said:
-        """The device confirms `config`, or says why it refuses."""
+        """Take ACK, in which the device confirms `config` or says why it refuses."""
         return self._guarded(now, self._on_answer, refused)
 
     def take(self, state: wire.State, now: int) -> Said:
@@ -317,7 +312,7 @@ class Session:
         return self._answer(state, wire.Command.RUN if ready else wire.Command.ARM, steps)
 
     def _answer(self, state: wire.State, command: wire.Command, steps: tuple[int, ...] | None = None) -> Said:
-        """The FORCE for a STATE: zero where no `steps` are given."""
+        """Return the FORCE for a STATE; it is zero where no `steps` are given."""
         assert self.config
         apply_at = (state.tick + self.config.theta) & 0xFFFF
         return (wire.Force(command, apply_at, state.tick, steps or (0,) * state.axes),)
@@ -335,7 +330,7 @@ class Session:
     # to zero force, and what comes then
 
     def _soften(self, late: str) -> None:
-        """To zero force by a ramp, and to the next coupling where there is one."""
+        """Ramp out, and continue with the next coupling if there is one."""
         assert self.program is not None
         softer = self.programs.index(self.program) + 1 < len(self.programs)
         self._ramp_out(None if softer else Stage.STOPPED, late + ("" if softer else ", and nothing softer is left"))
@@ -384,12 +379,12 @@ def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: flo
 
 
 def _expected(scenario: Scenario) -> list[Expected]:
-    """What the free handles of a scenario's devices are expected to do."""
+    """Return how the free handles of a scenario's devices are expected to move."""
     return [Expected(device, scenario.T) for device in scenario.axis_devices]
 
 
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
-    """A session that never asks for more than `cap` [N]. Raises InputError for impossible `more` limits, or T."""
+    """Return a session that asks for at most `cap` [N]. Raises InputError for impossible `more` limits, or T."""
     caps = tuple(min(cap, limit) for limit in scenario.box_limits)
     try:
         return Session(scenario, SafetyLimits(caps, watchdog_us=watchdog_for(scenario.T), **more), settings)
@@ -398,7 +393,7 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONG
 
 
 class _Shutdown:
-    """STOP, repeated until the device rests; an emergency stop, until the device has latched it."""
+    """Repeat STOP until the device rests, or an emergency stop until the device has latched it."""
 
     def __init__(self, reason: wire.Reason, acted: bool, now: int, T: float) -> None:
         """`acted`: forces have acted, so that a device which says nothing is told again, every T seconds."""
@@ -408,7 +403,7 @@ class _Shutdown:
         self._rests, self._obeys = False, True
 
     def answer(self, state: wire.State) -> Said:
-        """The answer to a STATE that came after the end."""
+        """Return the answer to a STATE that came after the end."""
         self._rests = not state.drives and (not self._latch or state.phase == wire.Phase.ESTOP)
         return () if self._rests else self._stop
 
@@ -426,128 +421,3 @@ class _Shutdown:
             return None
         self._obeys = False
         return f"told to stop, the device still drives after {_OBEYING_US // 1000} ms: cut its power"
-
-
-@dataclass
-class Operator:
-    """A person's part in a session: arming, the planned end, keys. It arms by itself at most once, ever.
-
-    With a `deadman`, forces act only as long as it is told every second that the user is there: by any key, or by
-    whatever answers `deadman`.
-    """
-
-    auto_arm: bool
-    seconds: float  # of forces at full gain, from each arming on
-    deadman: Callable[[], bool] | None = None  # whether the user gave a sign since the last call
-    _asked: bool = False  # auto_arm has been used up
-    _armed_at: int | None = None  # [us]
-    _seen_at: int | None = None  # [us] when the user gave a sign last
-    _free_at: int = 0  # [us] before which it does not arm by itself
-
-    def decide(self, session: Session, now: int) -> Said:
-        """The message that is due at `now` [us] in this stage."""
-        if session.stage == Stage.DISARMED:
-            self._armed_at = None
-            if self.auto_arm and session.hindrance:
-                self._free_at = now + _LET_GO_US * bool(session.settings.elsewhere)
-            elif self.auto_arm and now >= self._free_at:
-                return self._arm_once(session, now)
-        if session.stage == Stage.ARMED and self._armed_at is None:
-            self._armed_at = now
-        if self.deadman:
-            if self.deadman() or session.stage not in DRIVING or self._seen_at is None:
-                self._seen_at = now
-            if now - self._seen_at > _DEADMAN_US and session.stage != Stage.DISARMING:
-                return session.stop(f"the deadman was let go for {_DEADMAN_US / 1e6:g} s", now)
-        if self._armed_at is not None and now - self._armed_at > 1e6 * self.seconds:
-            return session.stop("the time is over", now)
-        return ()
-
-    def press(self, key: str, session: Session, now: int) -> Said:
-        """A key was pressed, so a person is there. `a` arms a disarmed session only."""
-        self._seen_at = now
-        match _KEYS.get(key):
-            case "arm" if session.stage == Stage.DISARMED:
-                self._asked = True
-                return session.arm(now)
-            case "stop":
-                return session.stop(f"key {key}", now)
-            case "estop":
-                return session.estop("space bar", now)
-        return ()
-
-    def _arm_once(self, session: Session, now: int) -> Said:
-        if self._asked:  # a softer coupling is ready, and nobody is there to arm it
-            softer = session.program.name if session.program else "none"
-            return session.refuse(f"nobody to arm the softer coupling, {softer}", now)
-        self._asked = True
-        return session.arm(now)
-
-
-class Driver:
-    """Makes the calls for a session, turn by turn."""
-
-    def __init__(
-        self,
-        session: Session,
-        device: HapticDevice,
-        plan: Callable[[Ages], Sequence[Armable]],
-        clock: Callable[[], int],
-    ) -> None:
-        """`plan` gives couplings for the delay that was measured, `clock` the time [us]."""
-        self.session, self.device, self.plan, self.clock = session, device, plan, clock
-        self._force: wire.Force | None = None
-
-    def do(self, said: Said) -> None:
-        """Carry out what the session asks for."""
-        for message in said:
-            if isinstance(message, wire.Force):
-                self._force = message
-            else:
-                self._force = None
-                self.device.stop(wire.Reason(message.reason))
-
-    def turn(self) -> None:
-        """One call of the device, and what the session makes of it."""
-        session = self.session
-        try:
-            self._call(session)
-            session.counters.host_errors = self.device.errors
-            if said := session.poll(self.clock()):
-                self.do(said)
-            if session.stage == Stage.MEASURED:
-                self.load()
-        except PortLost as lost:
-            session.lost(str(lost), self.clock())
-
-    def _call(self, session: Session) -> None:
-        answer: Any
-        if session.stage == Stage.CONNECTING:
-            if (answer := self.device.info()) is not None:
-                self.do(session.met(answer, self.clock()))
-        elif session.stage == Stage.CONFIGURING:
-            assert session.config
-            try:
-                answer = self.device.configure(session.config)
-            except wire.SafetyStop as fault:
-                return self.do(session.fail(str(fault), self.clock()))
-            if answer is not None:
-                self.do(session.configured(answer, self.clock()))
-        else:
-            force, self._force = self._force, None
-            try:
-                state = self.device.exchange(force)
-            except wire.SafetyStop as fault:
-                return self.do(session.fail(str(fault), self.clock()))
-            if state is not None:
-                self.do(session.take(state, self.clock()))
-        return None
-
-    def load(self) -> None:
-        """Couplings for the measured delay, while the device rests at zero force."""
-        session = self.session
-        try:
-            programs = self.plan(session.measurement.result)
-        except wire.SafetyStop as fault:
-            return self.do(session.refuse(str(fault), self.clock()))
-        return self.do(session.load(programs, self.clock()))

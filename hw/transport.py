@@ -17,11 +17,12 @@ from contextlib import contextmanager, suppress
 from typing import Self
 
 from haptic_loop.hw.control import Armable
+from haptic_loop.hw.driver import Driver, Operator
 from haptic_loop.hw.haptic_device import HapticDevice, PortLost
 from haptic_loop.hw.limits import ENDED, Stage
 from haptic_loop.hw.monitor import Ages
 from haptic_loop.hw.protocol import SafetyStop
-from haptic_loop.hw.session import Driver, Operator, Session
+from haptic_loop.hw.session import Session
 from haptic_loop.sim.scenario import InputError
 
 _CHUNK = 4096  # bytes read at once; a tick brings a few dozen

@@ -18,13 +18,14 @@ import time
 from collections import defaultdict
 
 from haptic_loop.hw.control import certified_couplings
+from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import Emulator
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.limits import ENDED, Stage
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.protocol import Command, Decoder, Force, State, encode
 from haptic_loop.hw.recording import Recorder
-from haptic_loop.hw.session import Operator, session_for
+from haptic_loop.hw.session import session_for
 from haptic_loop.hw.transport import Live, SerialPort
 from haptic_loop.sim.scenario import load
 from tests.checks.faults import _lively

@@ -8,6 +8,7 @@ from worlds import FakePort
 
 from haptic_loop.design.files import plain
 from haptic_loop.hw.device_state import Device
+from haptic_loop.hw.driver import Driver
 from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.identify import chirp
@@ -37,7 +38,7 @@ from haptic_loop.hw.protocol import (
 )
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.rehearsal import Rehearsal
-from haptic_loop.hw.session import Driver, Session, _check_state
+from haptic_loop.hw.session import Session, _check_state
 from haptic_loop.hw.session_report import outcome
 from haptic_loop.sim.scenario import load as scenario_of
 from haptic_loop.sim.trace import growths

@@ -14,6 +14,7 @@ from haptic_loop.cli.session_cli import check_link
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.hw.control import certified_coupling, certified_couplings, timed
 from haptic_loop.hw.device_state import Device
+from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import info_of
 from haptic_loop.hw.force_dimension import ForceDimension, library
 from haptic_loop.hw.haptic_device import PortLost, SerialDevice
@@ -21,7 +22,7 @@ from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.protocol import Command, Config, Decoder, Force, Hello, Phase, Reason, Refused, State, encode
 from haptic_loop.hw.recording import Recorder
-from haptic_loop.hw.session import Operator, Session
+from haptic_loop.hw.session import Session
 from haptic_loop.hw.session_report import save
 from haptic_loop.hw.transport import Live
 from haptic_loop.models.scene import build, plant

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from haptic_loop.cli.identify import main as identify_command
+from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection, nobody
 from haptic_loop.hw.identify import Estimate, Swing, capped, chirp, estimate, held, identify, settled
 from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.rehearsal import Rehearsal
-from haptic_loop.hw.session import Operator, Session
+from haptic_loop.hw.session import Session
 from haptic_loop.hw.viscosity import Viscosity
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim.scenario import InputError, load
@@ -260,7 +261,7 @@ def test_damping_in_one_sitting_is_refused(tmp_path):
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_second_sitting_waits_for_moved_handles(axis, sign, monkeypatch):
     """By 5 mm or more. Where it arms by itself, whoever did so has 5 s (here 0.2) to let go, and again later."""
-    monkeypatch.setattr("haptic_loop.hw.session._LET_GO_US", 200_000)
+    monkeypatch.setattr("haptic_loop.hw.driver._LET_GO_US", 200_000)
     scenario = nobody(load("omega-pair-rigid"))
     session = Session(scenario, SafetyLimits((1.0, 1.0)), LinkSettings(measure=60, elsewhere=(0, 0)))
     excitation = chirp(2, scenario.T, 1, 1.0, (3.0, 200.0), 0.5)

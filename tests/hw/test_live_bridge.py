@@ -26,10 +26,11 @@ from haptic_loop.cli.options import Parser
 from haptic_loop.cli.session_cli import add_link_options, check_link
 from haptic_loop.controller.delay import VaryingDelay
 from haptic_loop.hw.control import certified_coupling
+from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
-from haptic_loop.hw.session import Operator, Session
+from haptic_loop.hw.session import Session
 from haptic_loop.hw.session_report import IncidentLog
 from haptic_loop.hw.transport import Live, SerialPort
 from haptic_loop.sim.scenario import InputError

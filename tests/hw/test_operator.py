@@ -2,11 +2,12 @@
 
 import pytest
 
+from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.rehearsal import Rehearsal
-from haptic_loop.hw.session import Operator, Session
+from haptic_loop.hw.session import Session
 
 
 def rehearsal_of(scenario, rungs, operator, *faults):

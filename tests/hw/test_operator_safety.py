@@ -18,13 +18,14 @@ from haptic_loop.cli import bridge, replay
 from haptic_loop.cli.bridge import _parser
 from haptic_loop.cli.session_cli import limits_from, touched
 from haptic_loop.hw import transport
+from haptic_loop.hw.driver import Driver, Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.limits import SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.rehearsal import Rehearsal
-from haptic_loop.hw.session import Driver, Operator, Session, session_for
+from haptic_loop.hw.session import Session, session_for
 from haptic_loop.hw.session_report import IncidentLog, outcome
 from haptic_loop.sim.scenario import InputError
 

@@ -17,6 +17,7 @@ from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.coupling_file import save as save_coupling
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.hw.control import _HostController, certified_coupling, certified_couplings
+from haptic_loop.hw.driver import Driver
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.limits import SafetyLimits, Stage
@@ -24,7 +25,7 @@ from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.protocol import Command, Decoder, Force, Hello, Phase, SafetyStop, State, Stop, encode
 from haptic_loop.hw.recording import Recorder, _recipes_of, load, replay
 from haptic_loop.hw.rehearsal import Rehearsal, rehearse
-from haptic_loop.hw.session import Driver, Session
+from haptic_loop.hw.session import Session
 from haptic_loop.hw.session_report import outcome, save
 from haptic_loop.models.hold import hold
 from haptic_loop.models.scene import plant

@@ -1,0 +1,142 @@
+"""The operator (a person, or a rule in the place of one) and the driver, which together make a session's calls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from haptic_loop.hw import protocol as wire
+from haptic_loop.hw.control import Armable
+from haptic_loop.hw.haptic_device import HapticDevice, PortLost
+from haptic_loop.hw.limits import DRIVING, Stage
+from haptic_loop.hw.monitor import Ages
+from haptic_loop.hw.session import Said, Session
+
+_DEADMAN_US = 1_000_000  # after so long without a sign nobody is there
+_LET_GO_US = 5_000_000  # a person who moved a handle has let go of it by then, where the session arms by itself
+_KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
+
+
+@dataclass
+class Operator:
+    """Play a person's part in a session: arming, the planned end, keys. It arms by itself at most once.
+
+    With a `deadman`, forces act only while the user gives a sign every second: any key, or a true answer of `deadman`.
+    """
+
+    auto_arm: bool
+    seconds: float  # of forces at full gain, from each arming on
+    deadman: Callable[[], bool] | None = None  # whether the user gave a sign since the last call
+    _asked: bool = False  # auto_arm has been used up
+    _armed_at: int | None = None  # [us]
+    _seen_at: int | None = None  # [us] when the user gave a sign last
+    _free_at: int = 0  # [us] before which it does not arm by itself
+
+    def decide(self, session: Session, now: int) -> Said:
+        """Return the messages that are due at `now` [us] in this stage."""
+        if session.stage == Stage.DISARMED:
+            self._armed_at = None
+            if self.auto_arm and session.hindrance:
+                self._free_at = now + _LET_GO_US * bool(session.settings.elsewhere)
+            elif self.auto_arm and now >= self._free_at:
+                return self._arm_once(session, now)
+        if session.stage == Stage.ARMED and self._armed_at is None:
+            self._armed_at = now
+        if self.deadman:
+            if self.deadman() or session.stage not in DRIVING or self._seen_at is None:
+                self._seen_at = now
+            if now - self._seen_at > _DEADMAN_US and session.stage != Stage.DISARMING:
+                return session.stop(f"the deadman was let go for {_DEADMAN_US / 1e6:g} s", now)
+        if self._armed_at is not None and now - self._armed_at > 1e6 * self.seconds:
+            return session.stop("the time is over", now)
+        return ()
+
+    def press(self, key: str, session: Session, now: int) -> Said:
+        """Take a key, which tells that a person is there. `a` arms a disarmed session only."""
+        self._seen_at = now
+        match _KEYS.get(key):
+            case "arm" if session.stage == Stage.DISARMED:
+                self._asked = True
+                return session.arm(now)
+            case "stop":
+                return session.stop(f"key {key}", now)
+            case "estop":
+                return session.estop("space bar", now)
+        return ()
+
+    def _arm_once(self, session: Session, now: int) -> Said:
+        if self._asked:  # a softer coupling is ready, and nobody is there to arm it
+            softer = session.program.name if session.program else "none"
+            return session.refuse(f"nobody to arm the softer coupling, {softer}", now)
+        self._asked = True
+        return session.arm(now)
+
+
+class Driver:
+    """Make a session's calls of its device, turn by turn."""
+
+    def __init__(
+        self,
+        session: Session,
+        device: HapticDevice,
+        plan: Callable[[Ages], Sequence[Armable]],
+        clock: Callable[[], int],
+    ) -> None:
+        """Take `plan`, which returns couplings for the measured delay, and `clock`, which returns the time [us]."""
+        self.session, self.device, self.plan, self.clock = session, device, plan, clock
+        self._force: wire.Force | None = None
+
+    def do(self, said: Said) -> None:
+        """Carry out what the session asks for."""
+        for message in said:
+            if isinstance(message, wire.Force):
+                self._force = message
+            else:
+                self._force = None
+                self.device.stop(wire.Reason(message.reason))
+
+    def turn(self) -> None:
+        """Call the device once and let the session answer."""
+        session = self.session
+        try:
+            self._call(session)
+            session.counters.host_errors = self.device.errors
+            if said := session.poll(self.clock()):
+                self.do(said)
+            if session.stage == Stage.MEASURED:
+                self.load()
+        except PortLost as lost:
+            session.lost(str(lost), self.clock())
+
+    def _call(self, session: Session) -> None:
+        answer: Any
+        if session.stage == Stage.CONNECTING:
+            if (answer := self.device.info()) is not None:
+                self.do(session.met(answer, self.clock()))
+        elif session.stage == Stage.CONFIGURING:
+            assert session.config
+            try:
+                answer = self.device.configure(session.config)
+            except wire.SafetyStop as fault:
+                return self.do(session.fail(str(fault), self.clock()))
+            if answer is not None:
+                self.do(session.configured(answer, self.clock()))
+        else:
+            force, self._force = self._force, None
+            try:
+                state = self.device.exchange(force)
+            except wire.SafetyStop as fault:
+                return self.do(session.fail(str(fault), self.clock()))
+            if state is not None:
+                self.do(session.take(state, self.clock()))
+        return None
+
+    def load(self) -> None:
+        """Load couplings for the measured delay while the device rests at zero force."""
+        session = self.session
+        try:
+            programs = self.plan(session.measurement.result)
+        except wire.SafetyStop as fault:
+            return self.do(session.refuse(str(fault), self.clock()))
+        return self.do(session.load(programs, self.clock()))
