@@ -1,4 +1,4 @@
-"""The optimal coupling of every loop in tests/loops: what it reaches, how long it takes, and what no coupling can do.
+"""The optimal coupling of the loops n and o of benchmarks/loops: what it reaches, in which time, and what none can do.
 
 PYTHONPATH=. python tests/benchmarks/optimal_loops.py [--bound 4] [--only n0,o03]     (some minutes)
 
@@ -27,7 +27,7 @@ from haptic_loop.sim.scenario import load
 
 T = TypeVar("T")
 PATIENT = Options(seconds=600)  # so that a busy machine climbs as far as an idle one
-LOOPS = Path(__file__).parents[1] / "loops"
+LOOPS = Path(__file__).parents[2] / "benchmarks" / "loops"
 
 #: by loop: rms mismatch [dB] of version 0.1 (or why there was none), figure [dB] and stiffness to beat
 BEFORE = {
@@ -52,7 +52,7 @@ def main() -> None:
     print(f"{'loop':28} {'before':>8} {'to beat':>13} {'now':>7} {'g':>6} {'bound':>7} {'s':>5} {'states':>6}", end=" ")
     print(f"{'proved':>6} {'need':>7} {'gain':>5} {'at 10 %':>8} {'limited':>8} {'bound s':>7}")
     with threadpool_limits(1, user_api="blas"):
-        for path in sorted(LOOPS.glob("*.toml")):
+        for path in sorted(LOOPS.glob("[no]*.toml")):
             if path.stem.startswith(tuple(chosen.only.split(","))):
                 _row(path, chosen.bound, chosen.limiter)
 

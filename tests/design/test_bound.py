@@ -14,7 +14,7 @@ from haptic_loop.design.dual_matrix import DualMatrix
 from haptic_loop.design.frequency import hermitian
 from haptic_loop.sim.scenario import load
 
-LOOPS = Path(__file__).parents[1] / "loops"
+LOOPS = Path(__file__).parents[2] / "benchmarks" / "loops"
 POINTS = 2**20  # of the transform
 
 

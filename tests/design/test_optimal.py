@@ -34,7 +34,7 @@ from haptic_loop.design.transparency import transparency
 from haptic_loop.sim.scenario import load
 from tests.benchmarks.hostile_loops import hostile
 
-LOOPS = Path(__file__).parents[1] / "loops"
+LOOPS = Path(__file__).parents[2] / "benchmarks" / "loops"
 SHORT = Options(ladder=((4, 3), (8, 6)))
 
 

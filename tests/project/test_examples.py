@@ -24,7 +24,15 @@ SAYS = {
         "behind a coupling certified for any environment",
         "no passive hand is given more than 0.01 J",
     ],
-    "simulate_and_plot": [r"no coupling: growth \+1.48. 1/s at 84.0 Hz", "designed coupling: growth -0.848 1/s"],
+    "first_steps": [
+        r"no coupling: growth \+1.48. 1/s at 84.0 Hz",
+        "designed coupling: growth -0.848 1/s",
+        r"Findings\(50 sets of hands: 0 unstable",
+    ],
+    "mujoco_two_fingers": ["4000 samples of 2 channels", "no passive hand is given more than W0 = 2 mJ"],
+    "omega_in_space": ["this-environment: needs 0.46.. of the damping", "every passive hand", "of 6 channels"],
+    "teleoperation": [rf"{d} samples: {0.5 * (d + 1):.4f} N s/m for each robot" for d in range(9)],
+    "hapkit_wall": ["wall of 792 N/m: .* certified, rational", "wall of 4800 N/m: .* not certified"],
     "limits_of_any_coupling": [r"1.37 +-34.8. ", r"1.918 +-60.00 "],
     "monte_carlo": [r"no coupling: 4\d\d of 500 unstable", "designed coupling: 0 of 500 unstable; .* 0.6 %"],
     "touch_a_scene": [
@@ -45,6 +53,9 @@ SAYS = {
 }
 
 
+#: what people look for: under 60 lines, and a picture
+SEARCHED_FOR = ("first_steps", "mujoco_two_fingers", "omega_in_space", "teleoperation", "hapkit_wall")
+
 ASKS = {"limits_of_any_coupling": ("damping",), "touch_a_scene": ("2", "0.3")}
 
 
@@ -63,3 +74,6 @@ def test_an_example_runs(path, tmp_path):
     assert done.returncode == 0, done.stderr
     missing = [words for words in SAYS[path.stem] if not re.search(words, done.stdout)]
     assert not missing, done.stdout
+    if path.stem in SEARCHED_FOR:
+        assert [file for file in tmp_path.rglob("*") if file.suffix in (".png", ".pdf") and file.stat().st_size > 5000]
+        assert len(path.read_text().splitlines()) < 60

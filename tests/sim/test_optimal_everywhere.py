@@ -34,7 +34,7 @@ from haptic_loop.sim.scenario import load
 from haptic_loop.sim.view import session as live
 from haptic_loop.sim.view.session import GIVEN, Menu, first_loop
 
-FREE_MASS = next((Path(__file__).parents[1] / "loops").glob("n4*.toml"))
+FREE_MASS = next((Path(__file__).parents[2] / "benchmarks" / "loops").glob("n4*.toml"))
 SMALL = ((4, 3),)
 FORMS = ("filter", "delayed", "pair")
 CC = shutil.which("gcc") or shutil.which("cc")

@@ -19,7 +19,7 @@ from hashlib import sha256
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-LOOPS = ROOT / "tests" / "loops"
+LOOPS = ROOT / "benchmarks" / "loops"
 QUICK = {
     "n3": ("--scenario", str(LOOPS / "n3-free1.toml"), "--coupling", "optimal"),
     "n3 with ranges": ("--scenario", str(LOOPS / "n3-free1.toml"), "--coupling", "optimal", "--ranges", "10"),

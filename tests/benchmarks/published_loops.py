@@ -1,0 +1,90 @@
+"""Write benchmarks/figures.csv: PYTHONPATH=. python tests/benchmarks/published_loops.py     (a quarter of an hour)
+
+The cheap columns are computed from each loop in a second. `designed` takes up to a minute for eight devices. The
+columns of the optimal coupling and of the bound are taken over from the file: tests/benchmarks/optimal_loops.py prints
+them.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
+from haptic_loop.controller.loop import Loop
+from haptic_loop.design.api import design_coupling, transparency_of
+from haptic_loop.design.audit import requirement
+from haptic_loop.design.certificate import judged
+from haptic_loop.design.environments import SWITCHING
+from haptic_loop.design.result import DesignFailed
+from haptic_loop.sim.run import assemble
+from haptic_loop.sim.scenario import load
+from haptic_loop.sim.stability import worst_mode
+
+ROOT = Path(__file__).parents[2] / "benchmarks"
+#: columns that only long computations give, with their command in benchmarks/README.md
+EXPENSIVE = ("designed_rms_db", "best_rms_db", "best_stiffness_share", "bound_rms_db")
+
+
+def cheap(path: Path) -> dict[str, float | None]:
+    """Return the figures of a loop that take less than a second; None where a condition does not apply."""
+    scenario = load(path)
+    loop = scenario.loop("I")
+    reference = SpringDamper([d / (2 * loop.T) for d in loop.delta], [d / 4 for d in loop.delta])
+    mode = worst_mode(assemble(scenario, NoCoupling()))
+    figures: dict[str, float | None] = {"devices": loop.channels}
+    figures |= {"growth_without_coupling_per_s": float(mode.growth), "growth_frequency_hz": float(mode.frequency_hz)}
+    figures["without_coupling"] = _here(loop, NoCoupling())
+    figures["reference_this_environment"] = _here(loop, reference)
+    figures["reference_any_environment"] = requirement(loop, reference, "any-environment").ratio
+    known = requirement(loop, reference, "known-device").ratio if loop.known_devices else None
+    return figures | {"reference_known_device": known}
+
+
+def _here(loop: Loop, coupling: Coupling) -> float:
+    """Return what this-environment requires over what there is, under any switching where delays switch."""
+    if loop.varying_delay:
+        return judged(loop, coupling, SWITCHING).ratio
+    return requirement(loop, coupling, "this-environment").ratio
+
+
+def designed(path: Path) -> float | None:
+    """Return the mismatch [dB] of the designed spring-damper; None where no one is certified."""
+    loop = load(path).loop("I")
+    try:
+        return transparency_of(loop, design_coupling(loop)).rms_mismatch_db
+    except DesignFailed:
+        return None
+
+
+def written(value: float | None) -> str:
+    """Return a figure as the table has it: six digits, nothing where there is none."""
+    return "" if value is None else f"{value:.6g}"
+
+
+def table() -> list[dict[str, str]]:
+    """Return the rows of the table as it stands."""
+    with (ROOT / "figures.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def main() -> None:
+    before: Mapping[str, dict[str, str]] = {row["loop"]: row for row in table()}
+    rows = []
+    with threadpool_limits(1, user_api="blas"):
+        for path in sorted((ROOT / "loops").glob("*.toml")):
+            row = {"loop": path.stem} | {name: written(value) for name, value in cheap(path).items()}
+            row |= {name: before.get(path.stem, {}).get(name, "") for name in EXPENSIVE}
+            rows.append(row | {"designed_rms_db": written(designed(path))})
+            print(*rows[-1].values(), sep=", ", flush=True)
+    with (ROOT / "figures.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()
