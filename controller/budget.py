@@ -39,6 +39,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -138,6 +139,15 @@ class Packets:
     hold: int = 0  # ticks more for which a device holds a force whose successors are lost
 
 
+def _principal(level: Array) -> tuple[Array, Array]:
+    """The eigenvalues (m,) and eigenvectors (m, m) of a block diagonal matrix, which do not mix its blocks."""
+    m, starts = len(level), [k for k in range(len(level)) if not level[:k, k:].any()]
+    values, axes = np.zeros(m), np.zeros((m, m))
+    for a, b in pairwise([*starts, m]):
+        values[a:b], axes[a:b, a:b] = np.linalg.eigh(level[a:b, a:b])
+    return values, axes
+
+
 class EnergyBudget(_Net):
     """Scales the forces that are sent to the devices; see the head of this file.
 
@@ -156,13 +166,20 @@ class EnergyBudget(_Net):
         cap: float = np.inf,
         nsim: int = 1,
     ) -> None:
-        """`delta` (m,) damping that the devices guarantee [N s/m], `T` the (largest) period [s].
+        """`delta` (m,) or Delta_D (m, m) damping that the devices guarantee [N s/m], `T` the (largest) period [s].
+
+        A matrix is taken to its principal axes, device by device: r(f) = T f' Delta^-1 f/4. The scale of forces is one
+        number, so that it is the same in all axes; encoder errors are bounded in these axes.
 
         `encoder_step` (m,) or one for all [m]: positions are rounded to it. `start` and `cap` are W0 and the most that
         W may be [J]. Raises ValueError for numbers out of range.
         """
         super().__init__(start, cap, nsim)
         delta = np.array(delta, dtype=float)
+        self._axes: Array | None = None  # (m, m) orthogonal: its columns are the principal axes
+        if delta.ndim == 2:
+            delta, self._axes = _principal(delta)
+            encoder_step = np.abs(self._axes.T) @ np.broadcast_to(np.array(encoder_step, dtype=float), delta.shape)
         lo, hold = np.array(packets.lo, dtype=np.int64), packets.hold
         oldest = (lo if packets.hi is None else np.array(packets.hi, dtype=np.int64)) + hold
         if delta.ndim != 1 or lo.shape != delta.shape or oldest.shape != delta.shape:
@@ -207,20 +224,26 @@ class EnergyBudget(_Net):
         able to apply what is sent: clip what is wanted. What is not a number, or beyond all bounds, is sent as zero.
         """
         if self.ticks:
-            self._book(np.asarray(dx, dtype=float), None if acted is None else np.asarray(acted, dtype=float))
+            self._book(self._turned(dx), None if acted is None else self._turned(acted))
         wanted, spoilt = _finite(wanted)
+        wanted = self._turned(wanted)
         scale = self._scale(wanted)
         sent = scale * wanted
         np.maximum(self._reserve, self._loss(sent), out=self._reserve, where=self._reached[:, :, None])
         self._sent[self.ticks % len(self._sent)] = sent
         self._count(scale, spoilt)
-        return sent
+        return sent if self._axes is None else self._axes @ sent
+
+    def _turned(self, values: ArrayLike) -> Array:
+        """Values (m, nsim) in the principal axes."""
+        values = np.asarray(values, dtype=float)
+        return values if self._axes is None else self._axes.T @ values
 
     def tell(self, tick: int, acted: ArrayLike) -> None:
         """The forces that acted in a tick (counted from 0) that was booked as its largest loss, (m, nsim)."""
         if tick not in self._untold:
             raise ValueError(f"tick {tick} does not wait for the devices' word")
-        self._settle(tick, np.asarray(acted, dtype=float), *self._untold.pop(tick))
+        self._settle(tick, self._turned(acted), *self._untold.pop(tick))
 
     def _book(self, dx: Array, acted: Array | None) -> None:
         """W after the tick that has just ended."""

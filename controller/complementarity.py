@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -192,3 +194,178 @@ class BoxProblem(_Problem):
             if not left.size:
                 return np.where(signs * v > 0, v, 0.0)
         raise SingularLoop(f"limited forces are not determined: {self.M.tolist()}")
+
+
+# ----------------------------------------------------------------------------------------------------
+# Forces that are limited as vectors: the limits of a device with several axes are a Euclidean ball.
+
+
+def magnitudes(force: Array, balls: Sequence[int]) -> Array:
+    """Return |f| of the vector that each entry of forces (.., m, nsim) belongs to; `balls` are the sizes of vectors."""
+    if not balls:
+        return np.abs(force)
+    starts = np.concatenate([[0], np.cumsum(balls)[:-1]]).astype(int)
+    return np.repeat(np.sqrt(np.add.reduceat(force**2, starts, axis=-2)), balls, axis=-2)
+
+
+def within_balls(force: Array, limit: Array, balls: Sequence[int]) -> Array:
+    """Return forces (.., m, nsim) with every vector scaled to its limit (m, 1) where it is longer."""
+    size = magnitudes(force, balls)
+    over = size > limit
+    return force * np.divide(limit, size, out=np.ones_like(size), where=over) if over.any() else force
+
+
+@dataclass(frozen=True, eq=False)
+class BallProblem(_Problem):
+    """f = q - M v with f in a product of balls, and v along the outward normal where f is on the sphere, else 0.
+
+    There is one solution for every q where M is block triangular over the vectors, in some order, and its diagonal
+    blocks have a positive definite symmetric part. Blocks are solved one after the other: a semismooth Newton iteration
+    in u = f + v tau, which begins with the radial scaling of q, and behind it a bisection for a single vector or an
+    iteration of Douglas and Rachford for several. What these do not solve to `RESIDUAL` gets f = 0 and is counted.
+
+    Raises:
+        SingularLoop: A block's symmetric part has a negative eigenvalue.
+    """
+
+    limit: Array  # (n,) the same for all entries of a vector; inf without a limit
+    balls: tuple[int, ...]  # sizes of the vectors
+    unsolved: list[int] = field(default_factory=lambda: [0])  # how often no force was found
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "M", frozen(self.M, 2))
+        object.__setattr__(self, "limit", frozen(self.limit, 1))
+        _ = self._blocks
+
+    @cached_property
+    def _blocks(self) -> list[_BallBlock]:
+        """The blocks of M, each after those that act on it."""
+        owner = np.repeat(np.arange(len(self.balls)), self.balls)
+        joined = np.zeros((len(self.balls),) * 2, dtype=bool)
+        np.logical_or.at(joined, (owner[:, None], owner[None]), self.M != 0)
+        reach = joined | np.eye(len(joined), dtype=bool)
+        for k in range(len(reach)):
+            reach |= reach[:, k : k + 1] & reach[k]
+        strong = reach & reach.T
+        first = sorted({int(np.argmax(row)) for row in strong}, key=lambda i: int(reach[i].sum()))
+        blocks = []
+        for i in first:
+            members = np.flatnonzero(strong[i])
+            at = np.flatnonzero(np.isin(owner, members))
+            blocks.append(_BallBlock(at, self.M, self.limit[at, None], tuple(self.balls[j] for j in members)))
+        return blocks
+
+    def solve(self, q: Array) -> tuple[Array, Array]:
+        """Return (v, f), both (n, nsim), for every column of q."""
+        v, f = np.zeros_like(q), q.copy()
+        for block in self._blocks:
+            asked = q[block.at] - self.M[block.at] @ v
+            v[block.at], f[block.at], missed = block.solve(asked)
+            self.unsolved[0] += missed
+        return v, f
+
+
+RESIDUAL = 1e-12  # of the limit
+_NEWTON, _SPLIT, _HALVINGS = 40, 4000, 80  # iterations
+_FULL, _SHARES = 10, (1.0, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01)  # full Newton steps; shares of later ones that are tried
+_ROUNDED = 16 * np.finfo(float).eps  # rounding of f + M v - q, relative to its terms
+
+
+class _BallBlock:
+    """Vectors whose slips act on each other's forces."""
+
+    def __init__(self, at: Array, M: Array, limit: Array, balls: tuple[int, ...]) -> None:
+        self.at, self.limit, self.balls = at, limit, balls
+        own = M[np.ix_(at, at)]
+        mean = np.concatenate([[part.mean()] * len(part) for part in np.split(np.diag(own), np.cumsum(balls)[:-1])])
+        tau = np.where(mean > 0, mean, 1.0)
+        unit = own / np.sqrt(tau[:, None] * tau)
+        least = float(np.linalg.eigvalsh((unit + unit.T) / 2)[0])
+        if least < -GROUNDED:
+            rows = (at + 1).tolist()
+            raise SingularLoop(f"forces {rows} that are limited as vectors are not determined: {own.tolist()}")
+        self.M = own + max(0.0, GROUNDED - least) * np.diag(tau)  # f is unique nevertheless
+        self._radial = len(balls) == 1 and not (self.M - np.diag(tau)).any()
+        self._by_tau, self._tau = self.M / tau, tau[:, None]
+        self._inverse = np.linalg.inv(self.M)
+
+    def _missing(self, v: Array, f: Array, q: Array) -> Array:
+        """Where f + M v - q is beyond its tolerance, (nsim,)."""
+        terms = np.abs(f) + np.abs(self.M) @ np.abs(v) + np.abs(q)
+        finite = np.where(np.isfinite(self.limit), self.limit, np.abs(q))
+        allowed = np.maximum(RESIDUAL * finite, _ROUNDED * terms.max(axis=0))
+        return ~(np.abs(f + self.M @ v - q) <= allowed).all(axis=0)
+
+    def _of(self, u: Array) -> tuple[Array, Array]:
+        f = within_balls(u, self.limit, self.balls)
+        return (u - f) / self._tau, f
+
+    def solve(self, q: Array) -> tuple[Array, Array, int]:
+        """Return (v, f) for every column of q, and of how many none was found."""
+        if self._radial:
+            return *self._of(q), 0
+        u = self._newton(q.copy(), q)
+        v, f = self._of(u)
+        left = np.flatnonzero(self._missing(v, f, q))
+        if not left.size:
+            return v, f, 0
+        behind = self._bisected if len(self.balls) == 1 else self._split
+        v[:, left], f[:, left] = behind(q[:, left])
+        lost = np.flatnonzero(self._missing(v, f, q))
+        v[:, lost], f[:, lost] = self._inverse @ q[:, lost], 0.0
+        return v, f, lost.size
+
+    def _newton(self, u: Array, q: Array) -> Array:
+        """Improve u, of which P(u) + M (u - P(u))/tau = q is asked, column by column."""
+        one, starts = np.eye(len(q)), np.cumsum((0, *self.balls))
+        for turn in range(_NEWTON):
+            v, f = self._of(u)
+            left = np.flatnonzero(self._missing(v, f, q))
+            if not left.size:
+                break
+            at = u[:, left]
+            size = magnitudes(at, self.balls)
+            P = np.zeros((left.size, len(q), len(q)))
+            for a, b in pairwise(starts.tolist()):
+                over = (size[a] > self.limit[a])[:, None, None]
+                share = np.where(over[:, 0, 0], self.limit[a] / np.maximum(size[a], 1e-300), 1.0)[:, None, None]
+                n = (at[a:b] / np.maximum(size[a], 1e-300)).T
+                P[:, a:b, a:b] = np.where(over, share * (one[a:b, a:b] - n[:, :, None] * n[:, None]), one[a:b, a:b])
+            slope = P + self._by_tau @ (one - P)
+            missing = (f + self.M @ v - q)[:, left].T[..., None]
+            step = np.linalg.solve(slope, missing)[..., 0].T
+            if turn < _FULL:
+                u[:, left] = at - step
+                continue
+            tried = [at - share * step for share in _SHARES]  # full steps may cycle
+            errors = [np.abs(f + self.M @ v - q[:, left]).max(axis=0) for v, f in map(self._of, tried)]
+            u[:, left] = np.take_along_axis(np.array(tried), np.argmin(errors, axis=0)[None, None], axis=0)[0]
+        return u
+
+    def _bisected(self, q: Array) -> tuple[Array, Array]:
+        """One vector: f = (I + lam M)^-1 q has the length of the limit, and gets shorter with lam."""
+        one, limit = np.eye(len(q)), self.limit[0]
+        excess = np.linalg.norm(q, axis=0) / limit - 1
+        low, high = excess / np.linalg.norm(self.M, 2), excess / np.linalg.eigvalsh((self.M + self.M.T) / 2)[0]
+
+        def force(lam: Array) -> Array:
+            return np.linalg.solve(one + lam[:, None, None] * self.M, q.T[..., None])[..., 0].T
+
+        for _ in range(_HALVINGS):
+            between = np.sqrt(low * high)
+            longer = np.linalg.norm(force(between), axis=0) > limit
+            low, high = np.where(longer, between, low), np.where(longer, high, between)
+        f = within_balls(force(high), self.limit, self.balls)
+        return high * f, f
+
+    def _split(self, q: Array) -> tuple[Array, Array]:
+        """Douglas and Rachford's iteration, which converges for every monotone M; Newton finishes it."""
+        u, resolvent = q.copy(), np.linalg.inv(self._by_tau + np.eye(len(q)))
+        for turn in range(_SPLIT):
+            f = within_balls(u, self.limit, self.balls)
+            u = u + resolvent @ (self._by_tau @ (2 * f - u) + q) - f
+            if turn % 500 == 499:
+                v, f = self._of(self._newton(u.copy(), q))
+                if not self._missing(v, f, q).any():
+                    break
+        return v, f

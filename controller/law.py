@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haptic_loop.controller.complementarity import BoxProblem, Complementarity
+from haptic_loop.controller.complementarity import BallProblem, BoxProblem, Complementarity, magnitudes
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.environment import Wall
 from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen, taps
@@ -225,6 +225,11 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 # together with the walls, whose forces are the same kind of unknown over the box (-inf, 0]: a box problem.
 
 
+def inner_box(limit: Array, sizes: Sequence[int]) -> Array:
+    """Return (m,) [N] a limit of each channel that implies those of the vectors."""
+    return limit / np.sqrt(np.repeat(sizes, sizes)) if sizes else limit
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Limiter(Law):
     """The forces of a loop before Theta, [x; p] -> [f_e; y], limited by a slip e; walls turn y into p.
@@ -233,8 +238,9 @@ class Limiter(Law):
     Raises SingularLoop where the limited forces are not determined.
     """
 
-    limit: Array  # (m,) [N], inf where there is none
+    limit: Array  # (m,) [N], inf where there is none; the same for all axes of a vector
     rho: Array  # (m,) [N/m] the slip's lag: 0 under any-environment, beta delta/T under this-environment
+    balls: tuple[slice, ...] = ()  # neighbouring channels whose force is limited as a vector; others by themselves
 
     if TYPE_CHECKING:  # what __post_init__ accepts is more than what the fields then hold
 
@@ -246,6 +252,7 @@ class Limiter(Law):
             *,
             limit: ArrayLike,
             rho: ArrayLike,
+            balls: Sequence[slice] = (),
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -259,7 +266,22 @@ class Limiter(Law):
             raise ValueError(f"limit is {self.limit.tolist()}, expected positive forces in N")
         if not ((self.rho >= 0) & (self.rho < np.inf)).all():
             raise ValueError(f"rho is {self.rho.tolist()}, expected stiffnesses >= 0 in N/m")
+        for ball in self.balls:
+            if len(set(self.limit[ball].tolist())) != 1:
+                raise ValueError(f"limit is {self.limit.tolist()}, expected one value for all axes of a vector")
+        if self.balls and self.walls:
+            raise ValueError("walls: forces that are limited as vectors are not solved together with walls: limit axes")
         _ = self.problem
+
+    @cached_property
+    def _sizes(self) -> tuple[int, ...]:
+        """How many channels each limited vector has, if any has several; () otherwise."""
+        sizes, at = [], 0
+        while self.balls and at < self.channels:
+            end = next((ball.stop for ball in self.balls if ball.start == at), at + 1)
+            sizes.append(end - at)
+            at = end
+        return tuple(sizes)
 
     @property
     def unlimited(self) -> Self:
@@ -267,7 +289,7 @@ class Limiter(Law):
 
     @property
     def bounds(self) -> list[tuple[int, float]]:
-        return list(zip(self.sent_rows.tolist(), self.limit.tolist(), strict=True))
+        return list(zip(self.sent_rows.tolist(), inner_box(self.limit, self._sizes).tolist(), strict=True))
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
         """Where the contact slipped, which is before the force arrives."""
@@ -289,9 +311,11 @@ class Limiter(Law):
         return self._delayed(self._step)
 
     @cached_property
-    def problem(self) -> BoxProblem:
+    def problem(self) -> BoxProblem | BallProblem:
         """What a tick solves for [e; p]; all its limits are in N."""
         m, w = self.channels, len(self.walls)
+        if self.balls:
+            return BallProblem(-self._step.D[:, m:], self.limit, self._sizes)
         scale = np.concatenate([np.ones(m), self.steepness])[:, None]
         M = -scale * self._step.D[:, m:] + np.diag(np.concatenate([np.zeros(m), np.ones(w)]))
         lower = np.concatenate([-self.limit, np.full(w, -np.inf)])
@@ -313,13 +337,13 @@ class Limiter(Law):
     def transition(self) -> Transition:
         m, w, F, step, whole = self.channels, len(self.walls), self.open, self._step, self._block
         linear, kick, sent = self.linear.dot, self.kick, self.sent_rows
-        limit, solve = self.limit[:, None], self.problem.solve
+        limit, solve, balls = self.limit[:, None], self.problem.solve, self._sizes
         if not w:
 
             def tick(before: Array, after: Array) -> None:
                 linear(before, after)
                 free = after.take(sent, axis=0)
-                touched = np.abs(free) > limit
+                touched = magnitudes(free, balls) > limit
                 if b"\1" not in touched.tobytes():  # a sixth of the time that any() takes, of a few channels
                     return
                 at = slice(None) if touched.shape[1] == 1 else np.flatnonzero(touched.any(axis=0))
@@ -335,13 +359,14 @@ class Limiter(Law):
         memory = np.array([wall.damping / F.T for wall in self.walls])[:, None]
         way_of = np.hstack([step.C[m:], np.zeros((w, whole.order - step.order + w)), step.D[m:, :m]]).dot
         give, depth = step.D[m:, m:], slice(whole.order, whole.order + w)
-        upper = self.problem.upper[:, None]
+        assert isinstance(self.problem, BoxProblem)
+        upper, lower = self.problem.upper[:, None], self.problem.lower[:, None]
 
         def walled_tick(before: Array, after: Array) -> None:
             way = way_of(before) - gap  # into the walls, if these did not push and nothing slipped
             linear(before, after)
             asked = np.vstack([after.take(sent, axis=0), steep * way - memory * before[depth]])
-            touched = ((asked > upper) | (asked[: m + w] < self.problem.lower[:, None])).any(axis=0)
+            touched = ((asked > upper) | (asked[: m + w] < lower)).any(axis=0)
             at = np.flatnonzero(touched)
             if at.size:
                 v, f = solve(asked[:, at])
@@ -363,7 +388,7 @@ class Limiter(Law):
         def together(before: Array, after: Array) -> None:
             linear(before, after)
             free = after[sent]
-            for i in np.flatnonzero((np.abs(free) > limit).any(axis=0)).tolist():
+            for i in np.flatnonzero((magnitudes(free, self._sizes) > limit).any(axis=0)).tolist():
                 slip, force = limiters[i].problem.solve(free[:, i : i + 1])
                 after[:, i : i + 1] += limiters[i].kick @ slip
                 after[sent, i] = force[:, 0]
@@ -378,7 +403,12 @@ class Limiter(Law):
         m, G = self.channels, self.sent
         free = Lti(G.A, G.B[:, :m], G.C[:m], G.D[:m, :m], G.T)
         stiffness = np.stack([free.C @ free.at_rest(unit) for unit in np.eye(m)], axis=1) + free.D
-        (e,), (f,) = (side.T for side in BoxProblem(stiffness, -self.limit, self.limit).solve(stiffness @ x[:, None]))
+        problem = (
+            BallProblem(stiffness, self.limit, self._sizes)
+            if self.balls
+            else BoxProblem(stiffness, -self.limit, self.limit)
+        )
+        (e,), (f,) = (side.T for side in problem.solve(stiffness @ x[:, None]))
         lines = np.repeat(f, self.theta)
         return np.concatenate([free.at_rest(x - e), e, lines, np.zeros(len(self.walls))])
 

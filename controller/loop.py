@@ -249,8 +249,16 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         T = self.period(exact)
         return Lti.diag(delay(steps, T), Lti.constant(np.eye(len(self.environment.walls)), T))
 
-    def law(self, coupling: Coupling, limit: ArrayLike | None = None, rho: ArrayLike | None = None) -> Law:
+    def law(
+        self,
+        coupling: Coupling,
+        limit: ArrayLike | None = None,
+        rho: ArrayLike | None = None,
+        balls: Sequence[slice] = (),
+    ) -> Law:
         """What a tick computes; with `rho` (m,) [N/m] forces leave through a limiter of `limit` (m,) [N].
+
+        `balls` are neighbouring channels whose force is limited as a vector, the others by themselves.
 
         Raises SingularLoop, and ValueError for a coupling that walls cannot stand behind.
         """
@@ -258,7 +266,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         sent = self.walled_before_delay(coupling) if walls else self.sent(coupling)
         if limit is None or rho is None:
             return Law(sent, self.theta, walls)
-        return Limiter(sent, self.theta, walls, limit=limit, rho=rho)
+        return Limiter(sent, self.theta, walls, limit=limit, rho=rho, balls=tuple(balls))
 
     def members(self) -> tuple[Member, ...]:
         """The environment, and the vertices of its ranges where it has some."""

@@ -34,6 +34,7 @@ from typing import Any
 import numpy as np
 
 from haptic_loop.controller.arithmetic import Number, SingularLoop, inverse, numbers
+from haptic_loop.controller.complementarity import magnitudes
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay, moving_sum
 from haptic_loop.controller.loop import Loop
@@ -579,15 +580,18 @@ def l1_gain(F: Lti) -> Array:
     return total + tail
 
 
-def encoder_friction(F: Lti, steps: Sequence[float]) -> Array:
+def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -> Array:
     """(p,) [N] Coulomb friction at each device that pays for encoder steps (m,) [m], whatever condition F satisfies.
 
     It is the friction at the encoder's own coordinate, beside the damping delta. Not behind a limiter or walls.
+    Friction of a device with several `axes` opposes its velocity in space, and needs |W|_2 of these axes: the errors
+    work at most sum W_i |v_i| <= |W|_2 |v|_2.
     """
     q = np.asarray(steps, dtype=float)
     if q.shape != (F.inputs,) or not (q >= 0).all():
         raise ValueError(f"steps is {q.tolist()}, expected {F.inputs} encoder steps >= 0 in m")
-    return l1_gain(F) @ (q / 2)
+    W = l1_gain(F) @ (q / 2)
+    return magnitudes(W[:, None], axes)[:, 0] if axes else W
 
 
 # Many couplings or environments at once: a row for each, as a map asks for them.

@@ -59,7 +59,7 @@ class EncoderSteps:
         given = tuple(steps), tuple(friction), published
         if loop.environment.walls:
             return cls(*given, None, False, f"encoder steps of {widths} um: with walls nothing is proved of them")
-        needed = encoder_friction(loop.F(coupling), steps)
+        needed = encoder_friction(loop.F(coupling), steps, loop.axes or ())
         covered = bool((needed <= np.asarray(friction)).all())
         amounts, has = (", ".join(f"{f:.4g}" for f in some) for some in (needed, friction))
         verdict = "are covered while forces stay below the limits" if covered else "are not covered"

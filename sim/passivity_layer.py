@@ -52,7 +52,13 @@ class EnergyNet:
         packets, longest = Packets(span.lo, span.hi, hold), loop.T_max or loop.T  # a longer tick may lose more
         given: dict[str, Any] = {"start": self.start, "cap": self.cap, "nsim": nsim}
         try:
-            budget = EnergyBudget(loop.delta, longest, packets, encoder_step=process.encoder_step, **given)
+            budget = EnergyBudget(
+                loop.Delta() if loop.levels else loop.delta,
+                longest,
+                packets,
+                encoder_step=process.encoder_step,
+                **given,
+            )
         except ValueError as error:
             raise InputError(f"energy budget: {error}") from None
         late = ages(process.delays) if lost else None

@@ -149,7 +149,9 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
     if scenario.environment.world:  # the scene's forces come from a net (sim.world), and no linear law is known
         law = Law(Lti.constant(np.zeros((scenario.channels,) * 2), scenario.T), scenario.theta)
     else:
-        law = scenario.loop("I").law(coupling, scenario.box_limits, lag)
+        box = bool(scenario.environment.walls)  # vectors are not solved together with walls
+        limited = (scenario.box_limits, lag) if box else (limits, lag, scenario.balls)
+        law = scenario.loop("I").law(coupling, *limited)
     process = Process(law, limits, steps, balls=scenario.balls)
     scene = build(scenario.device, scenario.human, scenario.person)
     plant = hold(scene.plant, scenario.T, scenario.usual_latency)
