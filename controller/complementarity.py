@@ -9,6 +9,7 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haptic_loop.controller.arithmetic import SingularLoop
 from haptic_loop.controller.lti import Array, ReadOnly, frozen
@@ -274,7 +275,7 @@ _ROUNDED = 16 * np.finfo(float).eps  # rounding of f + M v - q, relative to its 
 class _BallBlock:
     """Vectors whose slips act on each other's forces."""
 
-    def __init__(self, at: Array, M: Array, limit: Array, balls: tuple[int, ...]) -> None:
+    def __init__(self, at: NDArray[np.intp], M: Array, limit: Array, balls: tuple[int, ...]) -> None:
         self.at, self.limit, self.balls = at, limit, balls
         own = M[np.ix_(at, at)]
         mean = np.concatenate([[part.mean()] * len(part) for part in np.split(np.diag(own), np.cumsum(balls)[:-1])])
@@ -360,6 +361,7 @@ class _BallBlock:
 
     def _split(self, q: Array) -> tuple[Array, Array]:
         """Douglas and Rachford's iteration, which converges for every monotone M; Newton finishes it."""
+        v, f = self._of(q)
         u, resolvent = q.copy(), np.linalg.inv(self._by_tau + np.eye(len(q)))
         for turn in range(_SPLIT):
             f = within_balls(u, self.limit, self.balls)

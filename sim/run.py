@@ -150,8 +150,8 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
         law = Law(Lti.constant(np.zeros((scenario.channels,) * 2), scenario.T), scenario.theta)
     else:
         box = bool(scenario.environment.walls)  # vectors are not solved together with walls
-        limited = (scenario.box_limits, lag) if box else (limits, lag, scenario.balls)
-        law = scenario.loop("I").law(coupling, *limited)
+        most, balls = (scenario.box_limits, ()) if box else (limits, scenario.balls)
+        law = scenario.loop("I").law(coupling, most, lag, balls)
     process = Process(law, limits, steps, balls=scenario.balls)
     scene = build(scenario.device, scenario.human, scenario.person)
     plant = hold(scene.plant, scenario.T, scenario.usual_latency)
