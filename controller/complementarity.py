@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -290,7 +291,7 @@ class _BallBlock:
         self._by_tau, self._tau = self.M / tau, tau[:, None]
         self._inverse = np.linalg.inv(self.M)
 
-    def _missing(self, v: Array, f: Array, q: Array) -> Array:
+    def _missing(self, v: Array, f: Array, q: Array) -> Any:
         """Where f + M v - q is beyond its tolerance, (nsim,)."""
         terms = np.abs(f) + np.abs(self.M) @ np.abs(v) + np.abs(q)
         finite = np.where(np.isfinite(self.limit), self.limit, np.abs(q))
