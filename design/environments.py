@@ -78,8 +78,7 @@ class Multiplied(Condition):
 
     def named(self, loop: Loop, multiplier: Sequence[Any]) -> dict[str, Sequence[Any]]:
         """The numbers of the multipliers by name. Raises ValueError where there are too few or too many."""
-        unknowns = self.unknowns(loop)
-        return {each.name: part for each, part in zip(unknowns, _parted(unknowns, multiplier), strict=True)}
+        return named_parts(self.unknowns(loop), multiplier)
 
     def check(self, loop: Loop, multiplier: Sequence[Any]) -> None:
         """Raise ValueError unless the numbers are multipliers."""
@@ -133,6 +132,11 @@ class Multiplied(Condition):
 
     def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
         return {each.name: len(each.units) for each in self.unknowns(loop)}
+
+
+def named_parts(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> dict[str, Sequence[Any]]:
+    """The values of each multiplier by name. Raises ValueError where there are too few or too many."""
+    return {each.name: part for each, part in zip(unknowns, _parted(unknowns, values), strict=True)}
 
 
 def _parted(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> list[Sequence[Any]]:

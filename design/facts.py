@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -225,6 +225,42 @@ def _admits(loop: Loop, d: int, entries: Sequence[float]) -> bool:
     return min(least) >= 0
 
 
+class PeriodCost(NamedTuple):
+    """L(dx, v, v+) = dx^2 move - 2 dx vb cross + vb^2 mean + (v+ - v)^2 step, vb = (v + v+)/2; (m,) each.
+
+    In floating point or over Fractions, [N/m], [N s/m], [N s^2/m] and [N s^2/m].
+    """
+
+    move: Any  # c0/(T - q)
+    cross: Any  # c0 q/(T - q)
+    mean: Any  # c0 q T/(T - q)
+    step: Any  # c2/q
+
+
+class KnownMotor(HandsSide):
+    """Motors and transmissions within known bounds (Theorem B): f'(dx + beta dv) + L, of the speed v at a tick."""
+
+    name = "known-device"
+
+    def __init__(self, cost: PeriodCost, beta: Any) -> None:
+        self.cost, self.beta = cost, beta
+
+    def inputs(self, loop: Loop, T: Number) -> list[Input]:
+        speeds = [Input("v", i, moved=(-b, b), follows=0, slips=False) for i, b in enumerate(numbers(self.beta, T))]
+        return [*(Input("dx", i) for i in range(len(speeds))), *speeds]
+
+    def damping(self, loop: Loop, T: Number, values: Values) -> Any:
+        return np.zeros((2 * len(self.beta),) * 2, dtype=int)
+
+    def rest(self, loop: Loop, T: Number, values: Values) -> Sequence[Any]:
+        move, cross, mean, step = (np.diag(part) for part in self.cost)
+        zero = 0 * move
+        return (
+            np.block([[move, zero], [-cross, mean / 2 + 2 * step]]),
+            np.block([[zero, zero], [-cross, mean / 2 - 2 * step]]),
+        )
+
+
 def hands_side(loop: Loop) -> HandsSide:
     return Latency() if loop.latency else EvenPeriods()
 
@@ -403,12 +439,14 @@ def compose(
     values: Values | None = None,
     late: bool = True,
     scaled: bool = False,
+    hands: HandsSide | None = None,
 ) -> Demand[Block]:
     """The block of the loop's hands' side with these facts, at these values of their multipliers.
 
     Args:
         G: [x; p], displacements (m,) and wall forces, to [f_e; y], forces as they leave and ways into the walls.
         late: whether the delays Theta are still to come; False where G has them.
+        hands: the hands' side, where it is not that of the loop.
         scaled: whether the values of the hands' side are s times its multipliers, which makes the block affine in both.
 
     Raises ValueError for values that are no multipliers.
@@ -417,7 +455,7 @@ def compose(
     path: list[Weights] = [(1,)] * loop.channels
     if late:
         path = _paths(loop, any(isinstance(fact, Switching) for fact in facts))
-    hands, T = hands_side(loop), G.T
+    hands, T = hands or hands_side(loop), G.T
     walls = len(loop.environment.walls) if any(isinstance(fact, Walls) for fact in facts) else 0
     block: Collected[Block] = Collected(T, path, walls, hands.inputs(loop, T))
     if any(isinstance(fact, Limiter) for fact in facts):
@@ -457,14 +495,19 @@ def _paths(loop: Loop, switch: bool) -> list[Weights]:
 
 
 def compose_any(
-    V: Block, loop: Loop, facts: Sequence[Fact] = (), values: Values | None = None, scaled: bool = False
+    V: Block,
+    loop: Loop,
+    facts: Sequence[Fact] = (),
+    values: Values | None = None,
+    scaled: bool = False,
+    hands: HandsSide | None = None,
 ) -> Demand[Block]:
     """The block of the loop's hands' side before any passive object behind the coupling V, without delay in between.
 
     On the inputs of hands and facts and, last in the order of rows, df_e, the steps of the forces as they leave: its
     own row is V(1)/2 - (V - V(1))/(z-1). Raises ValueError for values that are no multipliers.
     """
-    values, hands, T = values or {}, hands_side(loop), V.T
+    values, hands, T = values or {}, hands or hands_side(loop), V.T
     path = _paths(loop, any(isinstance(fact, Switching) for fact in facts))
     block: Collected[Lti] = Collected(T, path, 0, hands.inputs(loop, T), any_object=True)
     _take(block, hands, loop, values, scaled)

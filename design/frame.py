@@ -130,11 +130,10 @@ class Collected(Generic[AnyBlock]):
         self._keep: list[tuple[int, float]] = []
         for i in hands:
             row, weights = self.input(i.name, i.channel), product(path[i.channel], i.moved)
-            if any_object:
+            if any_object or not i.follows:  # no pole: the weights of a speed add up to 0
                 self.steps(row, i.channel, less_advance(weights, i.follows))
-                continue
-            self.sums(row, i.channel, weights)
-            if i.follows:
+            else:
+                self.sums(row, i.channel, weights)
                 self._into.append((i.channel, row, (1,)))
 
     def limit(self) -> None:

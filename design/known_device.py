@@ -27,31 +27,20 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers, rational
 from haptic_loop.controller.coupling import Coupling
-from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import DeviceBounds, Loop
-from haptic_loop.controller.lti import Array, Complex, Lti, hstack, taps, vstack
+from haptic_loop.controller.lti import Array, Block, Complex, Lti, constant_like
 from haptic_loop.controller.ranges import Member
-from haptic_loop.design.conditions import FULL_LEVELS, Condition, Demand, even_damping, v_hat
-from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.design.conditions import BEYOND, FULL_LEVELS, Condition, Demand, even_damping, v_hat
+from haptic_loop.design.environments import THIS_ENVIRONMENT, Multiplied, named_parts
 from haptic_loop.design.exact import require_size
+from haptic_loop.design.facts import KnownMotor, PeriodCost, Unknowns, Values, Walls, compose, compose_any
+from haptic_loop.design.frame import signals_of
 from haptic_loop.design.frequency import Response, frequencies, hermitian, largest_eigenvalue, on_circle, supremum
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
-from haptic_loop.design.result import Environments, NotProved, Requirement, from_ratio, refusal, suffices
+from haptic_loop.design.result import MAKING, Environments, NotProved, Requirement, from_ratio, refusal, suffices
 
 # ----------------------------------------------------------------------------------------------------
 # The least cost of a period.
-
-
-class PeriodCost(NamedTuple):
-    """L(dx, v, v+) = dx^2 move - 2 dx vb cross + vb^2 mean + (v+ - v)^2 step, vb = (v + v+)/2; (m,) each.
-
-    In floating point or over Fractions, [N/m], [N s/m], [N s^2/m] and [N s^2/m].
-    """
-
-    move: Any  # c0/(T - q)
-    cross: Any  # c0 q/(T - q)
-    mean: Any  # c0 q T/(T - q)
-    step: Any  # c2/q
 
 
 def shortest_period(loop: Loop) -> float | None:
@@ -213,48 +202,6 @@ def exact_cost(
 
 
 # ----------------------------------------------------------------------------------------------------
-# The blocks, in floating point or over Fractions.
-
-
-def known_device_block(F: Lti, cost: PeriodCost, beta: Any) -> tuple[Array, Lti]:
-    """Return F(1) and the block of Theorem B on (dx, v), which must be strictly positive real.
-
-        [[F/(z-1) + move, 0], [-beta F/z - cross (1 + 1/z), mean (1 + 1/z)/2 + 2 step (1 - 1/z)]]
-    with the pole at z = 1 split off. Everything that comes a sample late shares one delay per channel.
-    """
-    m, T = F.inputs, F.T
-    zero, one = (numbers(part, T) for part in (np.zeros((m, m)), np.eye(m)))
-    move, cross, mean, step = (np.diag(part) for part in cost)
-    static, regular = F.over_z_minus_one()
-    weights = np.block([[one, zero], [zero, -np.diag(numbers(beta, T))]])
-    early = weights @ (vstack(regular, F) @ np.hstack([one, zero]))
-    early = early + np.block([[move, zero], [-cross, mean / 2 - 2 * step]])
-    lines = Lti.diag(Lti.constant(one, T), delay((1,) * m, T))
-    return static, lines @ early + np.block([[zero, zero], [-cross, mean / 2 + 2 * step]])
-
-
-def known_device_any_block(V: Lti, theta: Sequence[int], cost: PeriodCost, beta: Any) -> tuple[Array, Lti]:
-    """Return V(1) and the block on (dx, v, df_e) for every passive environment behind the coupling V with psi = 0.
-
-    It is the block above with F = 0 and a third column [-vt; -beta z^-n; V(1)/2 - (V - V(1))/(z-1)], n = theta + 1 and
-    vt = 1 + 1/z + .. + z^-theta; the third row is otherwise zero.
-    """
-    m, T = len(theta), V.T
-    nothing = Lti.constant(np.zeros((m, m), dtype=int), T)
-    _, device = known_device_block(nothing, cost, beta)
-    lines = [_window_and_last(n, b, T) for n, b in zip(theta, numbers(beta, T), strict=True)]
-    columns = Lti.diag(*lines).rows([*range(0, 2 * m, 2), *range(1, 2 * m, 2)])
-    V1, own = v_hat(V)
-    return V1, vstack(hstack(device, -columns), own @ np.eye(3 * m, dtype=int)[2 * m :])
-
-
-def _window_and_last(theta: int, beta: Any, T: Number) -> Lti:
-    """[1 + 1/z + .. + z^-theta; beta z^-(theta + 1)] of one channel over one line of delays."""
-    window, last = taps([1] * (theta + 1) + [0], T), taps([0] * (theta + 1) + [beta], T)
-    return Lti(window.A, window.B, np.vstack([window.C, last.C]), np.vstack([window.D, last.D]), T)
-
-
-# ----------------------------------------------------------------------------------------------------
 # The required damping s Delta: the least s for which some beta satisfies the condition with the same other bounds.
 #
 # For a fixed beta each frequency has a least s, because L grows with the damping; s(beta) is the largest of them. A
@@ -266,7 +213,7 @@ _BISECTIONS = 52  # of an interval of shares: to 2e-16 of its length
 _THIN = 5  # every so many frequencies of the grid are looked at while the best beta is located
 _WORST = 6  # frequencies of least room at which the least share is found at once
 _IN_A_CUT, _MOST_CUTS = 28, 40  # bisections of a cut, whose result is from above
-_GOLDEN, _SECTIONS = (5**0.5 - 1) / 2, 30  # thirty sections locate log beta to 1e-6 of the bracket
+_GOLDEN = (5**0.5 - 1) / 2
 _STEPS = 0.2, 0.05, 0.0125, 0.003  # of log beta, channel by channel
 _MOST_MOVES = 12  # per channel and step
 _DIGITS = 7  # of beta, which the exact proof takes as it is printed
@@ -290,6 +237,11 @@ class _Sampled(NamedTuple):
 
 class Sweep(ABC):
     """The least share of the damping for which Theorem B holds, with its best beta; one subclass per form."""
+
+    scanned, sections = (
+        _SCANNED,
+        30,
+    )  # shares of the largest beta; thirty sections locate log beta to 1e-6 of the bracket
 
     def __init__(self, loop: Loop, *systems: Lti) -> None:
         self.loop, known = loop, _known(loop, loop.T)
@@ -357,12 +309,13 @@ class Sweep(ABC):
         def along(logarithm: float) -> float:
             return self.least(np.exp(logarithm) * scale, high)
 
-        logs = np.log(_LARGEST_ETA * _SCANNED)
-        values = [self.least(eta * scale, high, thin=True) for eta in _LARGEST_ETA * _SCANNED]
+        etas = _LARGEST_ETA * self.scanned
+        logs = np.log(etas)
+        values = [self.least(eta * scale, high, thin=True) for eta in etas]
         at = int(np.argmin(values))
         if not np.isfinite(values[at]):
             return Best(np.inf, 0.0, ())
-        beta = np.exp(_golden(along, logs[max(at - 1, 0)], logs[min(at + 1, logs.size - 1)])) * scale
+        beta = np.exp(_golden(along, logs[max(at - 1, 0)], logs[min(at + 1, logs.size - 1)], self.sections)) * scale
         if self.loop.channels > 1:
             beta = self._each_channel(beta, high)
         beta = np.array([float(f"{b:.{_DIGITS}g}") for b in beta])
@@ -388,11 +341,11 @@ class Sweep(ABC):
 _SAME = 1e-9  # a smaller relative gain is rounding
 
 
-def _golden(value: Callable[[float], float], left: float, right: float) -> float:
+def _golden(value: Callable[[float], float], left: float, right: float, sections: int) -> float:
     """Return where `value` is least in [left, right], if it has one valley there."""
     inner = [right - _GOLDEN * (right - left), left + _GOLDEN * (right - left)]
     found = [value(x) for x in inner]
-    for _ in range(_SECTIONS):
+    for _ in range(sections):
         if found[0] < found[1]:
             right, inner, found = inner[1], [0.0, inner[0]], [0.0, found[0]]
             inner[0] = right - _GOLDEN * (right - left)
@@ -453,6 +406,66 @@ class AnyEnvironmentSweep(Sweep):
         return here.own - chi(here.z, theta, cost, beta)[..., None] * np.eye(beta.shape[-1])
 
 
+class WallsSweep(Sweep):
+    """Theorem B before walls that make and break contact, at given multipliers of their facts."""
+
+    scanned, sections = _SCANNED[::2], 8  # beta and the multipliers are searched in turn, several times
+
+    def __init__(self, G: Lti, loop: Loop, values: Values) -> None:
+        """Take G from [x; p] to [f_e; y]; the block is affine in beta and in L."""
+        self._speeds, m = slice(loop.channels, 2 * loop.channels), loop.channels
+        none = PeriodCost(*np.zeros((4, m)))
+        each = [compose(G, loop, (Walls(),), values, hands=KnownMotor(none, b)).free for b in (np.zeros(m), *np.eye(m))]
+        self._idle, self._by_beta = each[0], each[1:]
+        super().__init__(loop, each[0])
+        size = np.abs(np.diagonal(self._all.own, axis1=1, axis2=2)).max(axis=0)
+        cost = period_cost(loop, np.ones(1), largest_beta(loop) / 2)
+        size[:m] += cost.move[0]
+        size[self._speeds] += cost.step[0]
+        self._root = 1 / np.sqrt(size)
+
+    def sampled(self, w: Array) -> _Sampled:
+        z = on_circle(w)
+        idle = hermitian(self._idle.at(z))
+        return _Sampled(z, idle, np.stack([hermitian(block.at(z)) - idle for block in self._by_beta], axis=1))
+
+    def room(self, here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
+        own, cross, speed = device_rows(here.z, cost)
+        room, m = here.own + np.tensordot(here.forces, beta, axes=(1, 0)), beta.size
+        for i in range(m):
+            room[:, i, i] += own[:, i]
+            room[:, m + i, m + i] += speed[:, i]
+            room[:, m + i, i] += cross[:, i] / 2
+            room[:, i, m + i] += np.conj(cross[:, i]) / 2
+        return room
+
+
+class _AtBeta(Multiplied):
+    """The best multipliers of walls for one beta and one share of the damping: those that leave most of L unused."""
+
+    name, covers = "known-device", BEYOND
+
+    def __init__(self, cost: PeriodCost, beta: Array) -> None:
+        self.cost, self.beta = cost, beta
+
+    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
+        return Walls().unknowns(loop)
+
+    def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
+        return loop.walled_before_delay(coupling, exact)
+
+    def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
+        """The block less the diagonal of L, which s multiplies: it holds where s < 1 is enough."""
+        made = compose(G, loop, (Walls(),), self.named(loop, multiplier), hands=KnownMotor(self.cost, self.beta))
+        diagonal = np.zeros(signals_of(made.free))
+        diagonal[: 2 * len(self.beta)] = *self.cost.move, *(self.cost.mean / 2 + 2 * self.cost.step)
+        gain = np.diag(_SPARED * diagonal)
+        return Demand(made.free - gain, constant_like(G, gain), made.static, made.semidefinite)
+
+    def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
+        return None  # this-environment has looked at it
+
+
 def chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Array:
     """l Lam^-1 l*/4 with l = [(z^n - 1)/(z - 1), beta z^n], n = theta + 1: what V must exceed, (k, m) [m/N]."""
     own, cross, speed = device_rows(z, cost)
@@ -466,6 +479,8 @@ def chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Arra
 # ----------------------------------------------------------------------------------------------------
 # The conditions.
 
+_SPARED = 0.1  # of the diagonal of L: what multipliers are searched to leave unused
+_ROUNDS, _GAIN = 6, 1e-3  # of beta and multipliers in turn, before walls; the least gain of the share that goes on
 _NONE = "the devices have no guaranteed bounds: declare [device.guaranteed] of every device, or give --known-device"
 _NO_SHORTEST = "periods up to T_max need a shortest one, T_min, for a known device"
 _MOST_SHARE = 1e3  # of the damping, up to which a beta on file is swept
@@ -478,7 +493,7 @@ class KnownDevice(Condition):
     condition that knows nothing of the device asks less.
     """
 
-    name, source, covers = "known-device", "Theorem B, docs/theory.md", ("psi", "T_max", "ranges")
+    name, source, covers = "known-device", "Theorem B, docs/theory.md", ("psi", "T_max", "walls", "ranges")
     plain: Condition = THIS_ENVIRONMENT  # as beta -> 0
 
     def beyond(self, loop: Loop) -> str | None:
@@ -502,20 +517,25 @@ class KnownDevice(Condition):
             multiplier = self.required(loop, coupling).multiplier or (0.0,) * 3 * loop.channels
         m = loop.channels
         beta, below, above = (multiplier[i : i + m] for i in (0, m, 2 * m))
+        own, walls = tuple(multiplier[3 * m :]), Walls().unknowns(loop) if loop.environment.walls else ()
         if not any(beta):
-            return self.plain.demand(loop, coupling, exact)
+            return self.plain.demand(loop, coupling, exact, own) if own else self.plain.demand(loop, coupling, exact)
+        values = named_parts(walls, own)
+        for each in walls:
+            each.check(values[each.name])
         if not exact:
-            return self._block(loop, coupling, period_cost(loop, 1.0, np.array(beta, dtype=float)), beta, exact)
+            hands = KnownMotor(period_cost(loop, 1.0, np.array(beta, dtype=float)), beta)
+            return self._block(loop, coupling, hands, values, exact)
         rationals = [[rational(v) for v in part] for part in (beta, below, above)]
         check_q(loop, *rationals)
-        return self._block(loop, coupling, exact_cost(loop, *rationals), rationals[0], exact)
+        return self._block(loop, coupling, KnownMotor(exact_cost(loop, *rationals), rationals[0]), values, exact)
 
-    def _block(self, loop: Loop, coupling: Coupling, cost: PeriodCost, beta: Any, exact: bool) -> Demand[Lti]:
-        F = loop.F(coupling, exact)
+    def _block(self, loop: Loop, coupling: Coupling, hands: KnownMotor, values: Values, exact: bool) -> Demand[Lti]:
+        walls = bool(loop.environment.walls)
+        G = loop.walled_before_delay(coupling, exact) if walls else loop.F(coupling, exact)
         if exact:
-            require_size(F.order + loop.channels)
-        static, block = known_device_block(F, cost, beta)
-        return Demand(block, _zero(block), {"F(1)": static}, ("F(1)",))
+            require_size(G.order + loop.channels + (sum(loop.theta) if walls else 0))
+        return compose(G, loop, (Walls(),) if walls else (), values, late=walls, hands=hands)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """Return the least damping over beta, or that of the beta given, the most of all members of the ranges.
@@ -524,6 +544,8 @@ class KnownDevice(Condition):
         """
         if reason := self.without(coupling):
             return refusal(self.name, loop.delta, reason)
+        if loop.environment.walls and type(self) is KnownDevice:
+            return self._before_walls(loop, coupling, multiplier)
         loops, m = self._loops(loop), loop.channels
         if multiplier is not None and len(multiplier) != 3 * m:
             reason = f"the multiplier has {len(multiplier)} numbers, expected beta and two bounds of q for {m} channels"
@@ -556,6 +578,55 @@ class KnownDevice(Condition):
         requirement = from_ratio(self.name, share, loop.delta, w / (2 * np.pi * loop.T))
         return replace(requirement, multiplier=(*beta, *bounds))
 
+    def _before_walls(self, loop: Loop, coupling: Coupling, multiplier: Any) -> Requirement:
+        """Before walls: beta and the multipliers of the walls in turn, or those given."""
+        m, expected = loop.channels, sum(self.multiplier_sizes(loop).values())
+        if multiplier is not None and len(multiplier) != expected:
+            reason = f"the multiplier has {len(multiplier)} numbers, expected {expected}"
+            return refusal(self.name, loop.delta, reason)
+        numbers_on_file = tuple(float(v) for v in multiplier or ())
+        beta, bounds, own = (numbers_on_file[part] for part in (slice(m), slice(m, 3 * m), slice(3 * m, None)))
+        plain = self.plain.required(loop, coupling, own if own and not any(beta) else None)
+        if plain.reason or (own and not any(beta)):
+            return replace(plain, condition=self.name, multiplier=(*(0.0,) * 3 * m, *(plain.multiplier or ())))
+        G, unknowns = loop.walled_before_delay(coupling), Walls().unknowns(loop)
+        if own:
+            share, w = WallsSweep(G, loop, named_parts(unknowns, own)).required(np.array(beta), _MOST_SHARE)
+            if not np.isfinite(share):
+                reason = f"beta = {list(beta)} s proves nothing for these devices, whatever the damping"
+                return replace(refusal(self.name, loop.delta, reason), multiplier=numbers_on_file)
+            found = from_ratio(self.name, share, loop.delta, w / (2 * np.pi * loop.T))
+            return replace(found, multiplier=(*beta, *bounds, *own))
+        best, own = Best(min(plain.ratio, _MOST_SHARE), 0.0, ()), plain.multiplier or ()
+        values, high = own, best.share
+        for _ in range(_ROUNDS):
+            found = WallsSweep(G, loop, named_parts(unknowns, values)).best(high)
+            if not found.share < best.share:
+                break
+            enough = found.share < best.share * (1 - _GAIN)
+            best, own, high = found, values, found.share * (1 + _GAIN)
+            if not enough:
+                break
+            at = np.array(found.beta)
+            cost = PeriodCost(*(part[0] for part in period_cost(loop, np.array([found.share]), at)))
+            values = _AtBeta(cost, at).required_of(G, loop).multiplier or values
+        if not best.beta:
+            return replace(plain, condition=self.name, multiplier=(*(0.0,) * 3 * m, *own))
+        bounds = (0.0,) * 2 * m
+        if best.share < 1:
+            below, above = q_bounds(loop, [rational(b) for b in best.beta])
+            bounds = below + above
+        requirement = from_ratio(self.name, best.share, loop.delta, best.w / (2 * np.pi * loop.T))
+        return replace(requirement, multiplier=(*best.beta, *bounds, *own))
+
+    def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
+        if loop.environment.walls and type(self) is KnownDevice:
+            return None, "before walls every coupling would need a search for its own beta and multipliers"
+        return super().least_multiplier(loop)
+
+    def words(self, loop: Loop) -> str:
+        return MAKING if loop.environment.walls and type(self) is KnownDevice else super().words(loop)
+
     def _may_help(self, plain: Requirement) -> bool:
         """Whether the condition may hold where the plain one is refused."""
         return False
@@ -564,6 +635,8 @@ class KnownDevice(Condition):
         if multiplier is None:
             multiplier = self.required(loop, coupling).multiplier
         beta = np.array((multiplier or (0.0,))[: loop.channels], dtype=float)
+        if loop.environment.walls and type(self) is KnownDevice:
+            return None
         if not beta.any():
             return self.plain.over_frequency(loop, coupling)
         sweep = self.sweep(loop, coupling)
@@ -607,7 +680,9 @@ class KnownDevice(Condition):
         return "every variation would need a search for its own beta: not searched"
 
     def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
-        return dict.fromkeys(("beta", "q_below", "q_above"), loop.channels)
+        walls = Walls().unknowns(loop) if loop.environment.walls and type(self) is KnownDevice else ()
+        own = dict.fromkeys(("beta", "q_below", "q_above"), loop.channels)
+        return own | {each.name: len(each.units) for each in walls}
 
 
 class KnownDeviceAny(KnownDevice):
@@ -626,13 +701,12 @@ class KnownDeviceAny(KnownDevice):
         assert V is not None  # `without` refuses
         return AnyEnvironmentSweep(V, loop)
 
-    def _block(self, loop: Loop, coupling: Coupling, cost: PeriodCost, beta: Any, exact: bool) -> Demand[Lti]:
+    def _block(self, loop: Loop, coupling: Coupling, hands: KnownMotor, values: Values, exact: bool) -> Demand[Lti]:
         V = coupling.compliance(loop.period(exact))
         assert V is not None
         if exact:
             require_size(V.order + sum(loop.theta) + 2 * loop.channels)
-        static, block = known_device_any_block(V, loop.theta, cost, beta)
-        return Demand(block, _zero(block), {"V(1)": static})
+        return compose_any(V, loop, hands=hands)
 
     def drawn(self, loop: Loop, coupling: Coupling, w: Array) -> _Sampled:
         m, z = loop.channels, on_circle(w)
@@ -686,10 +760,6 @@ def _shares_hold(
         served = (largest_eigenvalue(-matrix).reshape(-1, points) < 0).all(axis=1)
         holds[left], last[left[served]] = served, which[served]
     return holds
-
-
-def _zero(block: Lti) -> Lti:
-    return Lti.constant(np.zeros(block.D.shape, dtype=int), block.T)
 
 
 def described(loop: Loop) -> str:
@@ -820,7 +890,7 @@ def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None)
 
     `proved` is what known-device asks, if it has been asked already.
     """
-    if KNOWN_DEVICE.beyond(loop) or loop.ranges or loop.T_max not in (None, loop.T):
+    if KNOWN_DEVICE.beyond(loop) or loop.ranges or loop.environment.walls or loop.T_max not in (None, loop.T):
         return None
     try:
         F = loop.F(coupling)

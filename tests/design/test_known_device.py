@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from worlds import PAIR
 
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
-from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring
+from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall
 from haptic_loop.controller.loop import DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
@@ -23,6 +23,7 @@ from haptic_loop.design.audit import audit
 from haptic_loop.design.certificate import named, prove, required_damping, verify
 from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.exact import find_storage, prove_positive_real
+from haptic_loop.design.facts import KnownMotor, compose, compose_any
 from haptic_loop.design.files import InputError
 from haptic_loop.design.gain_search import KnownDeviceLoop
 from haptic_loop.design.known_device import (
@@ -32,8 +33,6 @@ from haptic_loop.design.known_device import (
     alias_sums,
     check_q,
     exact_cost,
-    known_device_any_block,
-    known_device_block,
     left_over,
     necessary_share,
     period_cost,
@@ -55,6 +54,18 @@ def one(T, delta, theta=0, device=DEVICE, **more) -> Loop:
 def wall(K, B, theta, T) -> Lti:
     """A spring-damper to ground that answers `theta` samples late."""
     return taps([0.0] * theta + [K + B / T, -B / T], T)
+
+
+def known_device_block(F, cost, beta):
+    """F(1) and the block of Theorem B on (dx, v)."""
+    made = compose(F, loop_of(F.T, (1.0,) * F.inputs), late=False, hands=KnownMotor(cost, beta))
+    return made.static["F(1)"], made.free
+
+
+def known_device_any_block(V, theta, cost, beta):
+    """V(1) and the block on (dx, v, df_e)."""
+    made = compose_any(V, loop_of(V.T, (1.0,) * V.inputs, theta), hands=KnownMotor(cost, beta))
+    return made.static["V(1)"], made.free
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -774,3 +785,76 @@ def test_every_device_within_the_bounds_is_covered():
         member = one(T, 1.0, 1, DeviceBounds(mass, k, b, b))
         drawn = ladders(rng, 120, int(rng.integers(1, 3)), T)
         assert radii(F, member, 1.01 * more * needed, drawn).max() < 1 + 1e-9
+
+
+# ----------------------------------------------------------------------------------------------------
+# Walls that make and break contact on known devices.
+
+
+def on_a_wall(k, damping, theta, delta=1.37):
+    network = Network(("tip",), walls=(Wall(("tip", GROUND), k, damping),))
+    return Loop(1e-3, (theta,), (0,), (0,), (delta,), network, known_devices=(DEVICE,))
+
+
+@cache
+def wall_needs(k, damping, theta):
+    return required_damping(on_a_wall(k, damping, theta), NoCoupling(), "known-device").required[0]
+
+
+WALLS = [(1000.0, 5.0, 0, 0.566, 5.5), (3000.0, 2.0, 0, 1.524, 3.5)]
+
+
+@pytest.mark.parametrize(("k", "damping", "theta", "known", "plain"), WALLS)
+def test_a_damped_wall_needs_less_than_the_known_figure(k, damping, theta, known, plain):
+    """Separate code needs `known` with a coarse sweep and m = 0; the touched wall alone needs less."""
+    touched = ThisEnvironmentSweep(wall(k, damping, theta, 1e-3), one(1e-3, 1.0, theta)).best(plain).share
+    assert touched * (1 - 1e-4) < wall_needs(k, damping, theta) < known
+
+
+def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3):
+    """How many lossless hands behind the transmission have more energy at the end than in the middle."""
+    rng = np.random.default_rng(seed)
+    M, k = 10 ** rng.uniform(-3.5, 0.5, hands), 10 ** rng.uniform(0, 5, hands)
+    m, kt, b = DEVICE.motor_mass_min, DEVICE.transmission_stiffness_max, DEVICE.transmission_damping_min
+    A = np.zeros((hands, 5, 5))  # motor x and v, hand x and v, the held force
+    A[:, 0, 1] = A[:, 2, 3] = 1
+    A[:, 1, :] = np.array([-kt, -delta - b, kt, b, -1]) / m
+    A[:, 3, :4] = np.stack([kt + 0 * k, b + 0 * k, -kt - k, -b + 0 * k], axis=1) / M[:, None]
+    step = expm(A * loop.T)[:, :4]
+    law = loop.law(NoCoupling())
+    tick, state = law.transition(), rng.standard_normal((hands, 4)) * (1e-2, 0.1, 1e-2, 0.1)
+    before, after = np.zeros((2, law.open.order + 1, hands))
+    late, energy = [np.zeros(hands)] * (loop.theta[0] + 1), np.zeros((2, hands))
+    for j in range(ticks):
+        before[-1] = state[:, 0]
+        tick(before, after)
+        before[:-1] = after[1:]
+        late = [after[0].copy(), *late[:-1]]
+        state = np.einsum("hij,hj->hi", step, np.column_stack([state, late[-1]]))
+        x, v, y, u = state.T
+        now = (m * v**2 + M * u**2 + kt * (x - y) ** 2 + k * y**2) / 2
+        if now.max() > 1e6:  # [J]
+            return int((now > 1.0).sum())
+        at = 0 if 0.4 * ticks < j < 0.5 * ticks else 1 if j > 0.9 * ticks else None
+        if at is not None:
+            energy[at] = np.maximum(energy[at], now)
+    return int((energy[1] > 1.02 * energy[0]).sum())
+
+
+@pytest.mark.parametrize(("k", "damping", "theta", "known", "plain"), WALLS)
+def test_no_hand_behind_the_transmission_grows_on_a_wall(k, damping, theta, known, plain):
+    loop = on_a_wall(k, damping, theta)
+    assert hands_on_a_wall(loop, 1.01 * wall_needs(k, damping, theta)) == 0
+
+
+def test_some_hands_grow_on_a_wall_far_below():
+    assert hands_on_a_wall(on_a_wall(3000.0, 2.0, 1), 0.3) > 0
+
+
+def test_a_wall_on_a_known_device_is_proved_from_its_file():
+    loop = on_a_wall(1000.0, 5.0, 0)
+    stored = Stored.of(loop, NoCoupling(), prove(loop, NoCoupling(), "known-device"))
+    assert stored.certificate.facts == ("walls",)
+    assert verify(msgspec.json.decode(msgspec.json.encode(stored), type=Stored)).proved
+    less = {name: values for name, values in stored.certificate.multipliers.items() if name != "d"}
+    assert not verify(change(stored, certificate=sealed(change(stored.certificate, multipliers=less)))).proved
