@@ -273,6 +273,27 @@ def test_the_linear_model_is_mujocos_own_derivative(tmp_path):
     assert B.shape == (n, 2)
 
 
+@pytest.mark.filterwarnings("ignore:flex")  # MuJoCo warns of a flex whose elasticity it does integrate
+def test_a_soft_body_only_loses_energy_and_is_listed(tmp_path):
+    """MuJoCo's sensors leave elastic energy out, so that it never counts as released."""
+    text = f"""<mujoco><option gravity="0 0 0"/><worldbody><body name="left" pos="-1 0 0">{FREE}</body>
+    <body name="right" pos="1 0 0">{FREE}</body>
+    <flexcomp name="soft" type="grid" count="3 3 3" spacing="0.03 0.03 0.03" radius="0.005" dim="3" mass="0.3"
+    dof="trilinear"><elasticity young="1e4" poisson="0.2"/></flexcomp></worldbody></mujoco>"""
+    port = world(tmp_path, text).port()
+    model, data = port.world.model, port.data
+    data.qvel[2:] = 0.3 * np.random.default_rng(0).normal(size=model.nv - 2)
+    kinetic = []
+    for _ in range(300):
+        port.step(np.zeros(2))
+        mujoco.mj_energyVel(model, data)
+        kinetic.append(data.energy[1])
+    assert max(kinetic) <= kinetic[0]
+    assert min(kinetic) < 0.9 * kinetic[0]
+    assert port.released == 0.0
+    assert [part.what for part in port.world.parts() if part.what == "soft bodies"]
+
+
 # ---- refusals
 
 
