@@ -168,7 +168,7 @@ class Touched:
         except ValueError as error:
             raise InputError(f"energy budget: {error}") from None
         damping = np.array(simulation.loop.delta)[:, None] / (simulation.loop.T_max or simulation.loop.T)
-        return InWorld(shell, [scene.port(process.force_limit) for _ in range(nsim)], damping)
+        return InWorld(shell, [scene.port(process.force_limit, process.balls) for _ in range(nsim)], damping)
 
 
 def live(simulation: Simulation, start: float = START_J) -> Simulation:
