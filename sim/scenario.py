@@ -855,7 +855,7 @@ def _hint(what: str) -> str:
     unknown = re.search(r"unknown field `(.*)`", what)
     if unknown:
         known = {name for struct in _STRUCTS for name in struct.__struct_fields__}
-        close = difflib.get_close_matches(unknown[1], sorted(known), n=1)
+        close = difflib.get_close_matches(unknown[1], sorted(known - {unknown[1]}), n=1)
         return f" (did you mean `{close[0]}`?)" if close else ""
     if what.startswith("Invalid value"):
         return f", allowed are {' and '.join(repr(d.__struct_config__.tag) for d in get_args(Device))}"

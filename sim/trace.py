@@ -307,7 +307,7 @@ class Growth:
 
     def words(self, T: float) -> str:
         """Describe the growth in one line, for ticks of T [s]."""
-        where = f"ticks {self.first} to {self.stop} ({(self.stop - self.first) * T:.2f} s)"
+        where = f"ticks {self.first} to {self.stop} ({(self.stop - self.first) * T:.7g} s)"
         above = "" if self.slowest_hz is None else f" (from {self.slowest_hz:.3g} Hz up)"
         if self.reason or self.amplitude_m is None:
             return f"{where}: {self.reason}{above}"
