@@ -32,6 +32,7 @@ from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Complex, Lti
 from haptic_loop.controller.passivity import sizes_around
+from haptic_loop.design import budgets
 from haptic_loop.design.barrier import EntryInequality, Program, centre, packed, towards
 from haptic_loop.design.conditions import even_damping
 from haptic_loop.design.dual_matrix import DualMatrix, dilogarithm
@@ -48,7 +49,6 @@ _NO_BOUND = f"no bound for more than {MOST} devices: half a minute for one that 
 _NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the ends of the band
 _NEAR_MODE = 1.0  # of the width of a mode, from it: further knots
 _CLOSEST = 0.1  # of a step: nearer knots are one
-_MOST_FORBIDDEN = 240  # sums of coefficients: more take long, and add little
 _MOST_ADDED = 96  # frequencies after a sweep
 _AWAY = np.exp(np.geomspace(0.002, 0.5, 18))  # of the band's ends: D bends there
 _AROUND = np.array(
@@ -58,12 +58,10 @@ _DEGREE = 3  # of the splines that h is made of
 _FIRST, _STEEPER = 5.0, 6.0  # the barrier's first t, in degrees by the objective, and by how much it rises
 _GAP = 0.004  # of the bound, relatively, that the barrier leaves
 _LEAST = 1e-9  # mean square below which a bound says nothing
-_SWEEPS = 6
 _WANTED = 1e-3  # of the bound: what may be charged for the error of the bounds of D between frequencies
 _QUADRATURE = 1e-8  # of the mean square, charged in any case: the estimate's rule has no bound of its error
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(12)  # in each interval, for the bound that remains
 _DISK = 4.0  # half-widths of an interval: the disk in which the integrand is bounded, away from the poles
-_MOST_INTERVALS = 20_000
 _UNIT = 2.0**-53
 _LARGEST_CHARGE = 0.005  # of the bound, for what D lacks between the frequencies where it is imposed
 
@@ -217,7 +215,9 @@ class _Dual:
         middle, found = self.grid[:-1] + half, []
         while middle.size:
             bounds = np.stack(sizes_around(E, middle, _DISK * half))
-            done = np.isfinite(bounds[0]) | (sum(part[0].size for part in found) + 2 * middle.size > _MOST_INTERVALS)
+            done = np.isfinite(bounds[0]) | (
+                sum(part[0].size for part in found) + 2 * middle.size > budgets.BOUND_INTERVALS
+            )
             found.append((middle[done], half[done], bounds[:, done]))
             half = np.repeat(half[~done] / 2, 2)
             middle = np.repeat(middle[~done], 2) + half * np.tile([-1.0, 1.0], half.size // 2)
@@ -276,7 +276,7 @@ class _Dual:
         looked = self.block(swept)
         A, b, c = self.objective()
         nothing, found, remains, x, t = float(b @ b), 0.0, 0.0, self.start, 0.0
-        for _ in range(_SWEEPS):
+        for _ in range(budgets.BOUND_SWEEPS):
             program = Program(A, b, c, (self.block(imposed),))
             t, path = max(t, _FIRST * program.degree / nothing), [towards(self.start, x, program)]
             while True:
@@ -361,7 +361,7 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
     """
     import scipy
 
-    m, span = E.inputs, min(max(loop.psi), _MOST_FORBIDDEN // E.inputs)
+    m, span = E.inputs, min(max(loop.psi), budgets.BOUND_SUMS // E.inputs)
     found: list[tuple[int, Array]] = []
     for i, theta in enumerate(loop.theta):
         for k in range(1, theta + 1):
@@ -390,7 +390,7 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
 
 def _first(sums: list[tuple[int, Array]]) -> tuple[tuple[int, Array], ...]:
     """Those that begin first, as many as are taken."""
-    return tuple(sorted(sums, key=lambda one: int(np.flatnonzero(one[1].any(axis=1))[0]))[:_MOST_FORBIDDEN])
+    return tuple(sorted(sums, key=lambda one: int(np.flatnonzero(one[1].any(axis=1))[0]))[: budgets.BOUND_SUMS])
 
 
 def _causal(grid: Array, heights: Array, w: Array) -> Complex:

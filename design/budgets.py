@@ -39,6 +39,32 @@ UNPROVED_BASES = 2
 #: Bases, the best first, until one is proved at every vertex of ranges.
 RANGED_BASES = 3
 
+# Sizes of proofs, and rounds of searches that converge earlier: how many the measured ones took ----------------------
+
+#: States of a block that is proved: .3 s at 100, 1 s at 200, 5 s at 400, 30 s at 800.
+PROOF_STATES = 800
+#: Rounds of cuts of a multiplier. one-wall takes 8. Rounds without a rise of its bound: rounding.
+MULTIPLIER_ROUNDS, MULTIPLIER_STALLED = 40, 3
+#: Rows of a block whose multiplier is searched: those of twelve devices with limited forces.
+MULTIPLIER_ROWS = 24
+#: Searches for gains with further frequencies, and steps of each: from every start of many devices, from the likeliest
+#: of many, from each of few. Case I takes 3 searches.
+GAIN_ROUNDS, GAIN_STEPS = 8, (15, 60, 100)
+#: Rounds with further frequencies of Theorem 4. Only delays of a hundred samples and more take any.
+THEOREM_4_ROUNDS = 12
+#: Steps of the sequence of convex problems for gains. Case I takes 2.
+SEQUENCE_STEPS = 60
+#: Designs for less damping where a condition is judged that no design knows. one-wall takes 2.
+LESS_DAMPING_ROUNDS = 6
+#: Rounds with further frequencies of an optimal coupling. Case I takes 4.
+PROGRAM_SWEEPS = 6
+#: The same of the bound on linear couplings; sums of coefficients that it uses; intervals of its integral. Cases I
+#: and II take 2 rounds and 568 intervals; a sum is a step of a delay in one row.
+BOUND_SWEEPS, BOUND_SUMS, BOUND_INTERVALS = 6, 240, 20_000
+#: Points between the vertices of ranges: on all edges, least and most on one, on faces and inside, starts uphill.
+#: These are the some 500 sweeps of RANGES.
+RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
+
 _Value = TypeVar("_Value")
 
 

@@ -33,7 +33,6 @@ from haptic_loop.design.environments import (
     worst,
 )
 from haptic_loop.design.exact import (
-    LARGEST,
     Matrix,
     Violated,
     definiteness,
@@ -189,7 +188,7 @@ def _with_proof(loop: Loop, coupling: Coupling, condition: Condition, needs: Req
 
 #: More delays, states or digits than these are not looked at: a proof would take minutes.
 _MOST_BITS = 400  # of the denominator of a coefficient: a decimal of 120 places
-_MOST_COST = 2  # environments of ranges, each as many as LARGEST states are
+_MOST_COST = 2  # environments of ranges, each as many as PROOF_STATES are
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
@@ -208,7 +207,7 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
     members = len(condition.members(loop))
     states += sum(loop.theta) if members else 0  # what holds in any environment has V's states alone
     require_size(states)
-    if members * states**3 > _MOST_COST * LARGEST**3:
+    if members * states**3 > _MOST_COST * budgets.PROOF_STATES**3:
         raise NotProved(f"a proof in {members} environments over {states} states each takes long")
 
 

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from haptic_loop.controller.loop import Loop
+from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT
 from haptic_loop.design.guarantees import ANY
@@ -178,7 +179,7 @@ def own_coupling(name: str, loop: Loop) -> Any:
 
 
 #: A design for late forces, walls or another condition leaves at most this share of the damping; is sought so often.
-_UNUSED, _MOST_ROUNDS = 0.005, 6
+_UNUSED = 0.005
 
 
 def _with_less_damping(loop: Loop, made: Callable[[Loop], Design], condition: Condition) -> Design:
@@ -188,7 +189,7 @@ def _with_less_damping(loop: Loop, made: Callable[[Loop], Design], condition: Co
     where delays switch. The condition is about the loop as it is.
     """
     share, best, shortfall = 1.0, None, ""
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(budgets.LESS_DAMPING_ROUNDS):
         constant = loop.delayed(loop.delays.hi) if condition.guarantee(loop) == ANY else loop
         part = msgspec.structs.replace(constant, latency=None, delta=tuple(share * d for d in loop.delta))
         found = made(part)

@@ -20,6 +20,7 @@ from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Block, Lti
 from haptic_loop.controller.ranges import Member
+from haptic_loop.design import budgets
 from haptic_loop.design.conditions import (
     BEYOND,
     Condition,
@@ -148,8 +149,6 @@ def _parted(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> list[Sequenc
     return [values[a:b] for a, b in pairwise(ends)]
 
 
-_MOST_ROWS = 24  # of a block whose multiplier is searched: twelve devices with limited forces
-_MOST_ROUNDS, _MOST_STALLED = 40, 3  # rounds; those in which the bound does not rise
 _MOST_PEAKS = 3  # frequencies that join at once
 _NEAR = 0.1  # of the highest peak, relatively: lower ones do not join
 _SETTLED = 5e-7  # relative gap between what the multiplier asks and the bound
@@ -173,7 +172,7 @@ class _Search:
         self._spare = np.diag(np.zeros(system.outputs) if asked.spare is None else asked.spare)
         self._plain: list[Demand[Lti]] = []  # the blocks of no multiplier, and of each unknown alone
         self._root = np.ones(system.outputs)  # what makes the rows of an inequality about one
-        self.pays = system.outputs <= _MOST_ROWS and self._searched.size > 0
+        self.pays = system.outputs <= budgets.MULTIPLIER_ROWS and self._searched.size > 0
 
     def swept(self, values: Sequence[float]) -> tuple[float, float]:
         """(the ratio that the block asks at these values, where [rad/sample]), by a refined sweep."""
@@ -197,8 +196,8 @@ class _Search:
         blocks = [*low, Inequality.least([count], 0.0), *high, *self._rooms(count)]
         top, w = self._worst(values, bound)
         best, least, stalled = values, top, 0
-        for _ in range(_MOST_ROUNDS):
-            if not w.size or stalled == _MOST_STALLED:
+        for _ in range(budgets.MULTIPLIER_ROUNDS):
+            if not w.size or stalled == budgets.MULTIPLIER_STALLED:
                 break
             blocks.append(self._inequality(w))
             try:
@@ -303,7 +302,7 @@ class ThisEnvironment(Multiplied):
         ]
         units = next(each.units for each in unknowns if each.name == "alpha")
         tried = []
-        for share in _SHARES if 2 * m > _MOST_ROWS else (1.0,):
+        for share in _SHARES if 2 * m > budgets.MULTIPLIER_ROWS else (1.0,):
             alpha = np.maximum(share * -loop.per_device(-most), 1e-8 * np.array(units)).tolist()
             tried.append([v for part in others for v in (part or alpha)])
         return min(tried, key=lambda values: float(least_scale(self.block(G, loop, values), w).max()))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.arithmetic import rational, spend
 from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.design import budgets
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle, supremum
 from haptic_loop.design.result import NotProved, Requirement
 
@@ -279,7 +280,6 @@ def _whitening(W: Floats) -> _Integers | None:
 # are tested exactly for P rounded to some bits, a P as good as any other; what else is rounded is bounded and paid.
 
 
-LARGEST = 800  # states of a model that a proof is tried for: .3 s at 100, 1 s at 200, 5 s at 400, 30 s at 800
 _MOST_BITS = 4000  # of the common denominator of a stored P, a power of two of some hundred bits when we made it
 _STORED_BITS = 48  # of each entry of P, relative to its diagonal
 _EXTENDED_BITS = 96  # of what is multiplied exactly, relative to the largest entry: more than extended precision has
@@ -331,9 +331,9 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, fl
 
 def too_large(states: int) -> str | None:
     """Why no proof is tried for a model of so many states, or None."""
-    if states <= LARGEST:
+    if states <= budgets.PROOF_STATES:
         return None
-    return f"a proof over {states} states takes long: up to {LARGEST} are tried"
+    return f"a proof over {states} states takes long: up to {budgets.PROOF_STATES} are tried"
 
 
 def require_size(states: int, requirement: Requirement | None = None) -> None:

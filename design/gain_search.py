@@ -21,6 +21,7 @@ from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array, Complex, Sampled
+from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Demand, even_damping, this_environment, this_environment_demand
 from haptic_loop.design.environments import LIMITER, SWITCHING
 from haptic_loop.design.frequency import frequencies, hermitian, on_circle
@@ -37,9 +38,7 @@ _SAMPLED_RESERVE = 1.5 * RESERVE
 SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
 _CLOSEST_POLE = 1e-5  # from the unit circle
 _STUCK = 1e-3  # a search that leaves the sampled condition violated by this has no feasible point nearby
-_MOST_ROUNDS = 8
-#: Devices up to which steps are cheap; steps from every start beyond, from the likeliest one, and from each of these.
-FEW, _MOST_STEPS = 12, (15, 60, 100)
+FEW = 12  # devices up to which steps are cheap
 _ROUGH = 0.01  # a violation that further steps will mend
 _DIFFERENCE = 1e-7
 
@@ -387,8 +386,8 @@ class KnownDeviceLoop(SampledLoop):
 def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, int]:
     """(x of a local optimum that passes the refined sweep of its condition or None, searches)."""
     x = sampled.point(start)
-    for searches in range(1, _MOST_ROUNDS + 1):
-        x = sampled.search(x, _MOST_STEPS[1 + (sampled.loop.channels <= FEW)]).x
+    for searches in range(1, budgets.GAIN_ROUNDS + 1):
+        x = sampled.search(x, budgets.GAIN_STEPS[1 + (sampled.loop.channels <= FEW)]).x
         requirement = sampled.judged(x)
         if requirement.ratio <= 1 - RESERVE:
             return x, searches
@@ -396,7 +395,7 @@ def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, i
         if stuck or requirement.frequency_hz is None:  # None: unstable, so there is no frequency to add
             return None, searches
         sampled.add(max(2 * np.pi * sampled.loop.T * requirement.frequency_hz, 1e-6))
-    return None, _MOST_ROUNDS
+    return None, budgets.GAIN_ROUNDS
 
 
 def least_rms(
@@ -425,6 +424,6 @@ def least_rms(
 
 def likeliest_first(sampled: SampledLoop, starts: Sequence[SpringDamper]) -> list[SpringDamper]:
     """Where a few steps lead from each start, the least mismatch first; last what then still violates the condition."""
-    points = [sampled.search(sampled.point(start), _MOST_STEPS[0]).x for start in starts]
+    points = [sampled.search(sampled.point(start), budgets.GAIN_STEPS[0]).x for start in starts]
     points.sort(key=lambda x: (sampled.room(x).min() < -_ROUGH, sampled.square_mismatch(x)))
     return [sampled.coupling(x) for x in points]

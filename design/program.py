@@ -21,6 +21,7 @@ from haptic_loop.controller.coupling import ForceFilter, basis
 from haptic_loop.controller.delay import delay
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array, Complex, Lti, Sampled, as_like
+from haptic_loop.design import budgets
 from haptic_loop.design.arguments import number, one_of
 from haptic_loop.design.barrier import EntryInequality, MatrixInequality, Program, centre, joined, packed, towards
 from haptic_loop.design.conditions import Demand, even_damping, this_environment_demand
@@ -49,7 +50,6 @@ _SMALL = 1e-5  # weight of the coefficients themselves: some have no effect wher
 _DECIMALS = 10
 _GAPS = (0.05, 0.01)  # of the objective, or of what it gains over no force: gaps at which the inequalities are swept
 _FORGIVEN = 5e-4  # by which an inequality may fail between its frequencies: scaling makes up for it
-_MOST_SWEEPS = 6
 _FEW = 12  # frequencies of a sparse grid beside the modes
 _STEEPER = 3.0  # factor between one centre of the barrier and the next
 _POINT = 5e-6  # units of counted work of a constraint at a frequency
@@ -552,7 +552,7 @@ class Problem:
         nothing = float(b @ b) + float(c.any())  # without any force; a supremum is 1 then
         demanding = any(len(case.constraints) > 1 for case in self.cases)  # else scaling, which is exact, does the rest
         lower = _STEEPER**4 if demanding else _STEEPER
-        for _ in range(_MOST_SWEEPS):
+        for _ in range(budgets.PROGRAM_SWEEPS):
             program, y, back = posed(A, b, c, asked, imposed, start, x)
             t = program.degree / max(program.value(y), 1e-12) if t is None else t / lower
             y = centre(program, y, t)

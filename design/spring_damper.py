@@ -18,6 +18,7 @@ import numpy as np
 from haptic_loop.controller.coupling import Compliance, Coupling, MovingAverage, SpringDamper
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti, hstack, taps, vstack
+from haptic_loop.design import budgets
 from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import even_damping, theta_hat, this_environment
 from haptic_loop.design.cone import ConeProgram, Inequality
@@ -65,7 +66,6 @@ from haptic_loop.design.transparency import BAND_HZ, decibels, transparency
 _MOST_STORED = 180  # unknowns besides the gains, of all channels
 _PER_LOBE = 8  # frequencies per ripple of a delay at which the inequality is imposed first
 _MISSED = 2e-6  # of the usable damping: what the inequality may miss in between, far less than the reserve of a design
-_MOST_ROUNDS = 12
 
 
 @dataclass(frozen=True)
@@ -144,14 +144,14 @@ class GainSet:
                 blocks.append(channel.exactly([*gains, *range(ends[i], ends[i + 1])]))
             return ConeProgram(np.append(cost, np.zeros(self._stored.sum())), blocks).solve(what)[:own]
         w = [channel.grid() for channel in self.channels]
-        for _ in range(_MOST_ROUNDS):
+        for _ in range(budgets.THEOREM_4_ROUNDS):
             sets = [channel.sampled(gains, w[i]) for i, (channel, gains) in enumerate(each)]
             x = ConeProgram(cost, [*blocks, *sets]).solve(what)
             missed = [channel.missed(x[list(gains)]) for channel, gains in each]
             if not any(further.size for further in missed):
                 return x
             w = [np.union1d(known, further) for known, further in zip(w, missed, strict=True)]
-        line = f"{what}: after {_MOST_ROUNDS} rounds Theorem 4 still fails between the frequencies"
+        line = f"{what}: after {budgets.THEOREM_4_ROUNDS} rounds Theorem 4 still fails between the frequencies"
         raise DesignFailed(None, (), line)
 
 
@@ -189,7 +189,6 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
 
 #: The sequence stops when a step improves the norm by less than this, relatively.
 _SETTLED = 1e-6
-_MOST_STEPS = 60
 #: A damper of less than this share of the device's damping is none: solvers leave 1e-9 where the optimum has zero.
 _NEGLIGIBLE = 1e-6
 
@@ -275,7 +274,7 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
     gains, sdps = _start(loop, certified, start), 1
     norm, peak = shaping.norm(_coupling(loop, gains).compliance(loop.T))
     frequencies = [peak]
-    for _ in range(_MOST_STEPS):
+    for _ in range(budgets.SEQUENCE_STEPS):
         gains, bound = step(shaping, certified, gains, norm, np.array(frequencies))
         sdps += 1
         before, (norm, peak) = norm, shaping.norm(_coupling(loop, gains).compliance(loop.T))

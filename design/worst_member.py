@@ -25,10 +25,9 @@ from haptic_loop.design.conditions import ratio_in
 _Ratio = Callable[[Member], float]  # required over available damping
 Progress = Callable[[int, int], None]  # points tried, points expected
 
-_ON_EDGES, _ALONG = 240, (3, 9)  # points on all edges of a region; least and most on one edge
-_DRAWN, _SEED = 48, 0xFACE  # random points on faces and inside of each region
+_SEED = 0xFACE
 _MANY = 7  # with more parameters, vertices and edges are drawn at random, too
-_STARTS, _APART, _SAME = 4, 0.2, 0.05  # starts of the compass search; least distance between starts, between maxima
+_APART, _SAME = 0.2, 0.05  # least distance between starts of the compass search, between maxima
 _FIRST, _LAST = 1 / 16, 1 / 128  # first and last step of the compass search, in widths of the ranges
 
 SEARCH = "along all edges, or many of them, on faces and inside, then uphill from the worst points"
@@ -65,7 +64,9 @@ def search(
     """
     ended, until = False, spent_after(work)
     points = [list(_points(region)) for region in regions]
-    refinements = [min(_STARTS, len(some)) * 8 * region.low.size for region, some in zip(regions, points, strict=True)]
+    refinements = [
+        min(budgets.RANGE_STARTS, len(some)) * 8 * region.low.size for region, some in zip(regions, points, strict=True)
+    ]
     tried, total = 0, sum(map(len, points)) + sum(refinements)
     maxima: list[_Worst] = []
 
@@ -82,7 +83,7 @@ def search(
                 known[point.tobytes()] = ratio(_member(region, point))
             return known[point.tobytes()]
 
-        starts = _apart(some, [need(point) for point in some], _APART)[:_STARTS]
+        starts = _apart(some, [need(point) for point in some], _APART)[: budgets.RANGE_STARTS]
         climbed = [_climbed(need, *start) for start in starts]
         distinct = _apart([point for point, _ in climbed], [value for _, value in climbed], _SAME)
         maxima += [_Worst(_member(region, point), value) for point, value in distinct if value > -np.inf]
@@ -100,24 +101,24 @@ def _points(region: Region) -> Iterator[Array]:
     n = region.low.size
     rng = np.random.default_rng(_SEED)
     if n > _MANY:
-        yield from rng.integers(0, 2, (_ON_EDGES, n)).astype(float)
-        for corner in rng.integers(0, 2, (_ON_EDGES, n)).astype(float):
+        yield from rng.integers(0, 2, (budgets.RANGE_EDGES, n)).astype(float)
+        for corner in rng.integers(0, 2, (budgets.RANGE_EDGES, n)).astype(float):
             corner[rng.integers(n)] = rng.random()
             yield corner
-        yield from rng.random((_DRAWN, n))
+        yield from rng.random((budgets.RANGE_DRAWN, n))
         return
     yield from (np.array(corner, dtype=float) for corner in product((0.0, 1.0), repeat=n))
     if n == 0:
         return
-    least, most = _ALONG
-    count = int(np.clip(_ON_EDGES // (n * 2 ** (n - 1)), least, most))
+    least, most = budgets.RANGE_ALONG
+    count = int(np.clip(budgets.RANGE_EDGES // (n * 2 ** (n - 1)), least, most))
     for i in range(n):
         for others in product((0.0, 1.0), repeat=n - 1):
             for x in np.arange(1, count + 1) / (count + 1):
                 yield np.insert(np.array(others), i, x)
     if n == 1:
         return
-    for _ in range(_DRAWN):  # each coordinate is an end of its range with probability 1/2
+    for _ in range(budgets.RANGE_DRAWN):  # each coordinate is an end of its range with probability 1/2
         between, end, coin = rng.random(n), rng.integers(0, 2, n), rng.random(n) < 0.5
         yield np.where(coin, between, end)
 

@@ -12,7 +12,7 @@ from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
 from haptic_loop.controller.delay import delay, moving_sum
 from haptic_loop.controller.environment import Network, Spring, environment
 from haptic_loop.controller.lti import Lti
-from haptic_loop.design import exact
+from haptic_loop.design import budgets, exact
 from haptic_loop.design.exact import Matrix, definiteness, find_storage, prove_positive_real, reached, strictly_positive
 
 T = 1.2e-3
@@ -301,8 +301,8 @@ def test_exact_arithmetic_takes_numbers_beyond_floats(recwarn):
 
 
 def test_models_with_too_many_states_are_reported():
-    assert exact.too_large(exact.LARGEST) is None
-    assert exact.too_large(exact.LARGEST + 1) == "a proof over 801 states takes long: up to 800 are tried"
+    assert exact.too_large(budgets.PROOF_STATES) is None
+    assert exact.too_large(budgets.PROOF_STATES + 1) == "a proof over 801 states takes long: up to 800 are tried"
 
 
 @pytest.mark.parametrize(("bits", "others"), [(3, 3), (16, 15), (192, 57), (31, 500)])

@@ -12,7 +12,7 @@ from haptic_loop.cli.design import main as design_main
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.lti import Lti, Sampled, taps
 from haptic_loop.controller.ranges import Ranges
-from haptic_loop.design import environments
+from haptic_loop.design import budgets, environments
 from haptic_loop.design.certificate import lag, prove, required_damping, verify
 from haptic_loop.design.conditions import least_multiple
 from haptic_loop.design.coupling_file import Certificate, Stored, load, save, sealed
@@ -137,7 +137,7 @@ def test_no_multiplier_on_a_grid_is_better():
 def test_for_many_devices_no_multiplier_is_sought(monkeypatch):
     """The search grows with the fourth power of their number; at c = 0 one sweep is left, which asks for more."""
     best = required_damping(PAIR, BUILT, LIMITER)
-    monkeypatch.setattr(environments, "_MOST_ROWS", 3)
+    monkeypatch.setattr(budgets, "MULTIPLIER_ROWS", 3)
     monkeypatch.setattr(environments._Search, "best", None)
     simple = required_damping(PAIR, BUILT, LIMITER)
     assert simple.multiplier == (0.0, 0.0)

@@ -22,7 +22,7 @@ from haptic_loop.controller.environment import environment
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti, Sampled
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
-from haptic_loop.design import exact as positive_real
+from haptic_loop.design import budgets
 from haptic_loop.design.certificate import prove, verify
 from haptic_loop.design.coupling_file import Stored, digest, load, save, sealed
 from haptic_loop.design.environments import SWITCHING
@@ -295,7 +295,7 @@ def test_validate_and_audit_say_the_same(file, constant_file, tmp_path, capsys):
 
 def test_without_proof_files_keep_constant_delays(tmp_path, capsys, monkeypatch):
     """A limit on states between the two models: said in the report, and the file claims no switching."""
-    monkeypatch.setattr(positive_real, "LARGEST", exact_block(LOOP, SOFT, (1.0, 1.0)).order - 1)
+    monkeypatch.setattr(budgets, "PROOF_STATES", exact_block(LOOP, SOFT, (1.0, 1.0)).order - 1)
     out = str(tmp_path / "c.json")
     options = ["--condition", "this-environment", "--varying-delay", "1,2", "--out", out]
     code, outcome = told(capsys, design_main, *options)

@@ -14,7 +14,7 @@ from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, environment
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Lti, Sampled
-from haptic_loop.design import environments
+from haptic_loop.design import budgets
 from haptic_loop.design.certificate import judged, prove, required_damping
 from haptic_loop.design.coverage import Switching
 from haptic_loop.design.environments import SWITCHING
@@ -246,7 +246,7 @@ def test_the_multiplier_is_best_in_random_loops():
 def test_many_devices_use_the_springs_multiplier(monkeypatch):
     """Of springs the best one; of these gains it asks a few percent more than the best, and any multiplier is safe."""
     best, spring = required_damping(loop_of((1, 1), (2, 2)), SOFT, SWITCHING), Lti.constant([[800.0]], T)
-    monkeypatch.setattr(environments, "_MOST_ROWS", 1)
+    monkeypatch.setattr(budgets, "MULTIPLIER_ROWS", 1)
     simple = required_damping(loop_of((1, 1), (2, 2)), SOFT, SWITCHING)
     assert best.ratio <= simple.ratio < 1.1 * best.ratio
     assert simple.bound is None
