@@ -1,6 +1,7 @@
 """python -m design.audit: closed forms, the paper's gains, edges that are edges, strict JSON, bad calls."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -354,7 +355,11 @@ def test_the_catalogue_has_a_source_for_every_number(run):
     assert code == 0
     assert set(devices) >= {
         "omega.3",
+        "omega.6",
+        "omega.7",
         "delta.3",
+        "delta.6",
+        "sigma.7",
         "falcon",
         "touch",
         "phantom-premium",
@@ -367,7 +372,19 @@ def test_the_catalogue_has_a_source_for_every_number(run):
         for field, fact in device.items():
             assert field == "title" or fact is None or fact["source"]
     assert devices["falcon"]["damping"] is None
+    assert devices["omega.3"]["kind"]["value"] == "rigid"
+    assert [devices[name]["force_limit"]["value"] for name in ("omega.7", "delta.6", "sigma.7")] == [12.0, 20.0, 12.0]
     assert "unknown" in err
+
+
+@pytest.mark.parametrize("B", [0.0, 0.37])
+def test_a_rigid_audit_names_the_stiffest_wall(run, B):
+    """Without delay a wall behind K and B needs K T/2 + B of damping, Colgate and Schenkel's condition."""
+    _, out, _ = run(*f"--rigid --K 5000 --B {B} --T 1e-3 --theta 0 --delta 1.37".split())
+    named = float(re.search(rf"The stiffest wall with B = {B:g} N s/m: ([\d.]+) N/m", out.replace("\n", " "))[1])
+    assert named == pytest.approx(2 * (1.37 - B) / 1e-3, rel=1e-4)
+    _, out, _ = run("--rigid", "--K", "5000", "--B", "2", "--T", "1e-3", "--theta", "0", "--delta", "1.37")
+    assert "No wall with B = 2 N s/m was found to be certified" in out.replace("\n", " ")
 
 
 def test_help_has_an_example(run):

@@ -54,7 +54,7 @@ SAYS = {
 
 
 #: what people look for: under 60 lines, and a picture
-SEARCHED_FOR = ("first_steps", "mujoco_two_fingers", "omega_in_space", "teleoperation", "hapkit_wall")
+SEARCHED_FOR = ("first_steps", "mujoco_two_fingers", "omega_in_space", "teleoperation", "hapkit_wall", "wheel")
 
 ASKS = {"limits_of_any_coupling": ("damping",), "touch_a_scene": ("2", "0.3")}
 
