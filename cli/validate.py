@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from haptic_loop.cli import options, render, world
+from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts_of
 from haptic_loop.cli.verdict import assessment_of, chosen_by
 from haptic_loop.controller.ranges import Member
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from haptic_loop.design.assessment import Assessment, RangesResult
     from haptic_loop.sim.adversary import Worst
 
-_HUMANS = 1000  # unless a user asks for others
+_HUMANS, _IN_A_WORLD = 1000, 100  # unless a user asks for others
 _ENVIRONMENTS = ("nominal", "ranges")
 _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
@@ -44,8 +44,10 @@ def main(argv: list[str]) -> int:
     """Test random humans. 0: what is claimed holds, 1: it does not, 3: workers were lost, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
-    args.humans = args.humans or (world.HUMANS if is_world(scenario) else _HUMANS)
+    args.humans = args.humans or (_IN_A_WORLD if is_world(scenario) else _HUMANS)
     if is_world(scenario):
+        from haptic_loop.cli import world
+
         return world.validate(args, scenario, out)
     chosen = chosen_by(args, scenario)
     assessment = assessment_of(args, scenario, chosen)
@@ -83,7 +85,7 @@ def _parser() -> options.Parser:
     parser.add_coupling(", ".join(NAMES))
     parser.add_human(", or a population with draw(rng, n), in a .py")
     parser.add_limiter()
-    many = f"random humans per device (default {_HUMANS}, in a world {world.HUMANS})"
+    many = f"random humans per device (default {_HUMANS}, in a world {_IN_A_WORLD})"
     add("--humans", type=whole(1, 1_000_000), metavar="N", help=many)
     add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
     add("--engine", choices=ENGINES, default="both", help="who decides (default both)")

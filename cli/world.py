@@ -36,8 +36,6 @@ from haptic_loop.sim.world import (
     thrown,
 )
 
-HUMANS = 100  # sets of hands that sim.validate throws at a world, unless it is asked for others
-
 
 @dataclass(frozen=True)
 class _Scene:

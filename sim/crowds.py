@@ -12,7 +12,6 @@ finished batch, so memory does not grow with the number of humans. Workers end w
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import logging
 import math
@@ -619,6 +618,8 @@ def _examine_alone(question: Validation, indices: Sequence[int]) -> Findings:
 @contextmanager
 def _client(address: str, patience: float) -> Iterator[Client]:
     """Return a client of the cluster. Raises InputError where none answers."""
+    import asyncio  # slow to load
+
     try:
         from distributed import Client
         from distributed.comm.core import connect
