@@ -107,7 +107,7 @@ class SampledLoop:
         return demand.free + demand.gain * (1 - _SAMPLED_RESERVE)
 
     def mu(self, x: Array) -> tuple[Array, Array]:
-        """The multiplier in x and its derivative by what is in x, (active,) each."""
+        """The multiplier in x (active,) and its derivative by what is in x, (active,) or a symmetric matrix."""
         return np.zeros(0), np.zeros(0)
 
     def multiplier(self, x: Array) -> Sequence[Sequence[float]] | None:
@@ -194,7 +194,8 @@ class SampledLoop:
             here = np.concatenate([v[:, :m], v[:, active], v[:, m:], v[:, m:]], axis=1)
             sent = np.concatenate([Gv, Gv[:, active], 0 * v[:, m:], 0 * v[:, m:]], axis=1)
             each = (rows * (of_mu * here + of_both * sent)).real
-            slope.append((each[:, active] + sum(np.split(each[:, m:], 3, axis=1))) * moves)
+            by_mu = each[:, active] + sum(np.split(each[:, m:], 3, axis=1))
+            slope.append(by_mu @ moves if moves.ndim > 1 else by_mu * moves)
         slope = np.concatenate(slope, axis=1)
         return np.vstack([slope, self._stability_slope(x)]) if any(self.loop.psi) else slope
 
@@ -292,6 +293,9 @@ class LimiterLoop(SampledLoop):
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.active = np.arange(loop.channels)
+        self.lead = [own.start for own in loop.devices]  # of the channels, which share one multiplier in a device
+        of = np.array(loop.per_channel(range(len(loop.devices))))
+        self.shared = (of[:, None] == of) / np.bincount(of)[of]  # (m, m) the mean over the axes of a device
         super().__init__(loop, band_hz)
 
     def point(self, coupling: SpringDamper) -> Array:
@@ -299,16 +303,17 @@ class LimiterLoop(SampledLoop):
         return np.append(super().point(coupling), np.full(self.loop.channels, self._first))
 
     def judged(self, x: Array) -> Requirement:
-        return LIMITER.required(self.loop, self.coupling(x), self.mu(x)[0])
+        return LIMITER.required(self.loop, self.coupling(x), self.mu(x)[0][self.lead])
 
     def demand(self, G: Sampled, mu: Array) -> Demand[Sampled]:
-        return LIMITER.block(G, self.loop, mu)
+        return LIMITER.block(G, self.loop, mu[self.lead])
 
     def mu(self, x: Array) -> tuple[Array, Array]:
-        return np.maximum(x[2 * self.loop.channels :], 0.0), np.ones(self.loop.channels)
+        c = np.maximum(x[2 * self.loop.channels :], 0.0)
+        return (c, np.ones(c.size)) if self.loop.axes is None else (self.shared @ c, self.shared)
 
     def multiplier(self, x: Array) -> Sequence[Sequence[float]]:
-        return np.round(self.mu(x)[0][:, None], 6).tolist()
+        return np.round(self.mu(x)[0][self.lead, None], 6).tolist()
 
 
 class KnownDeviceLoop(SampledLoop):

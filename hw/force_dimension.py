@@ -63,7 +63,7 @@ def library() -> Any:
 
 
 class ForceDimension:
-    """One axis of each of several Force Dimension devices, clocked by this host.
+    """Axes of one or several Force Dimension devices, clocked by this host.
 
     The state machine is the firmware's (hw/device_state.py): armed by ARM, capped, slewed, ramped out.
     """
@@ -78,8 +78,11 @@ class ForceDimension:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Open the devices that `axes` names, such as "0x,1x" (default: x of the first ones). Raises InputError."""
-        self._where = _axes(axes, scenario.channels)
+        """Open the devices that `axes` names, such as "0x,1x" (default: the scenario's axes of the first ones).
+
+        Raises InputError.
+        """
+        self._where = _axes(axes, scenario)
         self._sdk = sdk or library()
         self._clock, self._sleep, self._begun = clock, sleep, clock()
         self._ids: dict[str, int] = {}
@@ -206,11 +209,13 @@ class ForceDimension:
         return code
 
 
-def _axes(text: str | None, channels: int) -> list[tuple[str, int]]:
+def _axes(text: str | None, scenario: Scenario) -> list[tuple[str, int]]:
     """Parse the device (its index, or "sn" and its serial number) and the axis of every channel. Raises InputError."""
-    parts = text.split(",") if text else [f"{i}x" for i in range(channels)]
+    channels = scenario.channels
+    usual = [f"{i}{'xyz'[axis]}" for i, device in enumerate(scenario.device) for axis in device.free]
+    parts = text.split(",") if text else usual
     if len(parts) != channels or not all(re.fullmatch(r"(sn)?\d+[xyz]", part) for part in parts):
-        example = ",".join(f"{i}x" for i in range(channels))
+        example = ",".join(usual)
         raise InputError(
             f"--port {FORCE_DIMENSION}:{text}: expected a device's index and an axis for each of {channels} channels, "
             f"as in {FORCE_DIMENSION}:{example}"
