@@ -9,6 +9,7 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 
 import msgspec
+import numpy as np
 
 from haptic_loop.cli import options, render
 from haptic_loop.cli.verdict import assessment_of, chosen_by
@@ -130,7 +131,11 @@ def _mark(text: str) -> tuple[float, float]:
 
 def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) -> zwidth.Sweep:
     """What varies over the map: the couplings of a loop, or the environments behind one coupling. Raises InputError."""
-    devices, loop = scenario.device, scenario.loop("I")
+    devices, loop = scenario.axis_devices, scenario.loop("I")
+    if loop.axes:
+        raise InputError(
+            f"device #1.axes: sim.zwidth maps devices of one axis, these have {loop.axes[0]}; clamp the others"
+        )
     if args.rigid:
         devices, loop = devices[:1], options.rigid_loop(args, scenario)
     loop = msgspec.structs.replace(loop, ranges=None, varying_delay=None)
@@ -141,7 +146,7 @@ def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) 
 
 
 def _plan(args: argparse.Namespace, sweep: zwidth.Sweep) -> Plan:
-    coarsest = max(device.encoder_step for device in sweep.devices)
+    coarsest = max(float(np.max(device.encoder_step)) for device in sweep.devices)
     threshold = max(2 * coarsest, _FINEST) if args.threshold is None else args.threshold
     shortest = max(1.5, 1024 * sweep.loop.T)
     if not shortest <= args.duration <= 1e4:

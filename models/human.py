@@ -457,7 +457,7 @@ class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if len(self.holds) < 2 or len(set(self.holds)) < len(self.holds) or min(self.holds) < 1:
-            raise ValueError(f"holds is {list(self.holds)}, expected two or more different channels, counted from 1")
+            raise ValueError(f"holds is {list(self.holds)}, expected two or more different devices, counted from 1")
         require("mass", self.mass, 1e-6, 1e3, "kg")
         require("damping", self.damping, 0.0, 1e6, "N s/m")
         require("stiffness", self.stiffness, 0.0, 1e9, "N/m")

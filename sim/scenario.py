@@ -95,6 +95,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def __post_init__(self) -> None:
         if len(self.name) > _LONGEST_NAME:
             raise ValueError(f"name has {len(self.name)} characters, allowed are {_LONGEST_NAME}")
+        if self.environment.world and (several := [len(device.free) for device in self.device if len(device.free) > 1]):
+            allowed = "a contact of a world slides along one direction; clamp the others"
+            raise ValueError(f"device.axes leaves {several[0]} free axes: {allowed}")
         self._per_channel()
         if self.channels > _MOST_CHANNELS:
             raise ValueError(f"environment.contacts has {self.channels} entries, allowed are 1 to {_MOST_CHANNELS}")

@@ -212,7 +212,7 @@ def test_voluntary_velocity_is_the_motions_derivative():
         (lambda: Link(0.1, -1.0, 1.0), "damping is -1"),
         (lambda: Human((Link(0.1, 1.0, 1.0), Link(0.0, 1.0, 1.0))), r"links #2.mass is 0"),
         (lambda: Population(mass=(1.0, 0.1)), r"mass #2 is 0.1, allowed are 1 to"),
-        (lambda: Person((1,), 1.0, 0.0, 0.0), r"holds is \[1\], expected two or more different channels"),
+        (lambda: Person((1,), 1.0, 0.0, 0.0), r"holds is \[1\], expected two or more different devices"),
         (lambda: Person((1, 1), 1.0, 0.0, 0.0), r"holds is \[1, 1\]"),
         (lambda: Person((1, 2), 0.0, 0.0, 0.0), "mass is 0, allowed are 1e-06 to 1000 kg"),
         (lambda: Person((1, 2), 1.0, -1.0, 0.0), "damping is -1"),

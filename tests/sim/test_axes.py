@@ -15,13 +15,14 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.tick import at_limit
 from haptic_loop.design.files import InputError
+from haptic_loop.design.gain_search import LimiterLoop
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Cross, Human, Link, Person, Population, Voluntary, directions
 from haptic_loop.models.scene import Scene, build, draw, variants
 from haptic_loop.sim.crowds import Validation
 from haptic_loop.sim.run import assemble, outside_forces, run
-from haptic_loop.sim.scenario import Scenario, held_by, parse, save_humans
+from haptic_loop.sim.scenario import SCENARIOS, Scenario, held_by, parse, save_humans
 from haptic_loop.sim.stability import dominant_mode, exact_loops, mujoco_loops
 
 TEXT = """
@@ -104,6 +105,16 @@ def test_refuses_impossible_axes_in_one_line(first: str, more: str, words: tuple
     assert "\n" not in str(refused.value)
     for word in words:
         assert word in str(refused.value)
+
+
+def test_world_devices_slide_along_one_axis() -> None:
+    text = (SCENARIOS / "world-cube.toml").read_text()
+    several = text.replace('kind = "rigid"', 'kind = "rigid", axes = 3')
+    assert several != text
+    with pytest.raises(InputError, match="leaves 3 free axes: a contact of a world slides along one direction"):
+        parse(several, folder=SCENARIOS)
+    clamped = text.replace('kind = "rigid"', 'kind = "rigid", axes = 3, clamped = ["y", "z"]')
+    assert parse(clamped, folder=SCENARIOS).loop("I").axes is None
 
 
 def test_delays_are_one_for_each_device() -> None:
@@ -300,3 +311,14 @@ def test_clipped_runs_stay_within_the_ball() -> None:
     assert lengths.max() <= 0.05 * (1 + 1e-14)
     assert traces[0].clipped(simulation.process.force_limit, simulation.process.balls).mean() > 0.1
     assert np.abs(traces[0].x - traces[1].x).max() < 1e-9
+
+
+def test_search_shares_a_multiplier_within_a_device() -> None:
+    """The slope of the limited condition by gains and multipliers is that of its differences."""
+    loop = LimiterLoop(scenario('clamped = ["x"]', 'clamped = ["x"]').loop("I"))
+    x = loop.point(SpringDamper([3000.0, 4000.0, 2000.0, 2500.0], [0.3, 0.4, 0.5, 0.2]))
+    x[8:] += [0.1, -0.2, 0.3, 0.05]
+    assert len(loop.multiplier(x)) == 2
+    steps = 1e-6 * np.eye(x.size)
+    differences = np.stack([(loop.room(x + step) - loop.room(x - step)) / 2e-6 for step in steps], axis=1)
+    assert np.abs(loop.room_slope(x) - differences).max() < 1e-5 * np.abs(differences).max()
