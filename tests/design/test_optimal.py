@@ -623,6 +623,15 @@ def test_a_basis_is_larger_for_few_devices():
     assert beside.used[:, :, 8].all()
 
 
+@pytest.mark.parametrize(("seconds", "ended"), [("1e-3", True), ("3600", False)])
+def test_the_report_says_that_seconds_ended_it(tmp_path, capsys, seconds, ended):
+    scenario, report = next(LOOPS.glob("n3*.toml")), tmp_path / "r.json"
+    options = ["--coupling", "optimal", "--scenario", str(scenario), "--seconds", seconds]
+    main([*options, "--out", str(tmp_path / "c.json"), "--json", str(report)])
+    assert json.loads(report.read_text())["ended_by_seconds"] == ended
+    assert ("ended by --seconds" in capsys.readouterr().out) == ended
+
+
 def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     scenario, report = next(LOOPS.glob("n3*.toml")), tmp_path / "r.json"
     options = ["--coupling", "optimal", "--scenario", str(scenario), "--out", str(tmp_path / "c.json")]
