@@ -129,6 +129,9 @@ def design_by_kind(
     if asked not in able:
         raise ValueError(f"condition is {asked!r}, for {kind} allowed are {', '.join(able)}")
     made_for = able[asked]
+    if loop.levels and kind != "moving-average":
+        why = "is designed for devices whose Delta_i is diagonal; a moving-average takes any, and a file is judged"
+        raise ValueError(f"levels: {kind} {why}")
     if chosen.model and loop.environment.walls:
         reason = f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls"
         raise ValueError(f"{reason}{_before_walls(loop)}")

@@ -347,8 +347,8 @@ class _AnyEnvironment(Multiplied):
     def beyond(self, loop: Loop) -> str | None:
         if loop.environment.walls and any(loop.psi):
             return "with delay in the environment its multiplier is of a linear one: no walls"
-        if loop.levels and any(loop.psi):
-            return f"{conditions.FULL_LEVELS} where the environment is late (psi >= 1)"
+        if loop.levels and (any(loop.psi) or _in_frame(loop)):
+            return f"{conditions.FULL_LEVELS} with a late environment, a latency or delays that switch"
         if _in_frame(loop) and any(loop.psi):
             what = "a latency" if loop.latency else "delays that switch"
             return f"with delay in the environment its multiplier is of whole, constant samples: no {what}"

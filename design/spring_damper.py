@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 
 from haptic_loop.controller.coupling import Compliance, Coupling, MovingAverage, SpringDamper
+from haptic_loop.controller.delay import moving_sum
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti, hstack, taps, vstack
 from haptic_loop.design import budgets
 from haptic_loop.design.certificate import named
-from haptic_loop.design.conditions import even_damping, theta_hat, this_environment
+from haptic_loop.design.conditions import even_damping, even_level, theta_hat, this_environment
 from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.environments import LIMITER
 from haptic_loop.design.facts import Latency
@@ -513,6 +514,8 @@ def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
         return _stiffest_in_frame(loop)
     started = time.perf_counter()
     phi = least_phi(loop)
+    if loop.levels:
+        return _moving_average_of_levels(loop, started)
     weight, terms = loop.T / (2 * even_damping(loop)), np.array(loop.theta) + 1
     coupling = MovingAverage(weight, terms.tolist(), RESERVE / (1 - RESERVE) * terms**2 * weight)
     return _verified(loop, coupling, phi, "stiffness", float(coupling.stiffness.sum()), 0, started)
@@ -588,6 +591,21 @@ def _best_charge(loop: Loop, i: int, theta: int) -> Array:
 
 
 _Q = "q11", "q12", "q22"
+
+
+def _moving_average_of_levels(loop: Loop, started: float) -> Design:
+    """The stiffest linear coupling of matrix levels: V = T/2 Delta^-1 (1 + .. + z^-theta), and a little more.
+
+    It attains V(1) = T/2 blockdiag(n_i Delta_i^-1), the least of all by a matrix inequality.
+    """
+    inverses = np.linalg.inv(even_level(loop)) * loop.T / 2
+    weight = np.array([[float(f"{v:.{_TAP_DIGITS}g}") for v in row] for row in (inverses + inverses.T) / 2])
+    terms = np.array(loop.theta) + 1
+    late = moving_sum(loop.theta, loop.T)
+    constant = RESERVE / (1 - RESERVE) * terms**2 * weight
+    V = Lti(late.A, late.B, weight @ late.C, weight @ late.D + (constant + constant.T) / 2, loop.T)
+    stiffness = float(np.trace(np.linalg.inv(V.dc())))
+    return _verified(loop, Compliance(V), least_phi(loop), "stiffness", stiffness, 0, started)
 
 
 def _verified(

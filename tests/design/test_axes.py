@@ -16,6 +16,7 @@ from haptic_loop.controller.loop import DelayRange, DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.conditions import encoder_friction
+from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import SWITCHING, LimitedForces
 from haptic_loop.design.known_device import KNOWN_DEVICE
 
@@ -372,3 +373,17 @@ def test_encoder_friction_is_a_length_in_space() -> None:
     F, steps = LOOP.F(BUILT), [1e-5, 2e-5, 1e-5, 1e-5]
     each, whole = encoder_friction(F, steps), encoder_friction(F, steps, (2, 2))
     np.testing.assert_allclose(whole, np.repeat([np.hypot(*each[:2]), np.hypot(*each[2:])], 2))
+
+
+def test_stiffest_coupling_attains_the_matrix_bound() -> None:
+    """V(1) >= T/2 blockdiag(n_i Delta_i^-1): K = Delta_1/T = [[1500, 400], [400, 900]] N/m for device 1."""
+    design = design_by_kind(LOOP, "moving-average")
+    assert design.requirement.certified
+    V1 = design.coupling.compliance(LOOP.T).dc()
+    np.testing.assert_allclose(np.linalg.inv(V1)[:2, :2], [[1500, 400], [400, 900]], rtol=2e-4)
+    bound = LOOP.T / 2 * np.diag([2.0, 2.0, 3.0, 3.0]) @ np.linalg.inv(LOOP.Delta())
+    assert np.linalg.eigvalsh(V1 - bound)[0] > 0
+    assert prove(LOOP, design.coupling, "any-environment").proof == "rational"
+    for kind in ("spring-damper", "ccl", "optimal"):
+        with pytest.raises(ValueError, match=r"levels: .* Delta_i is diagonal"):
+            design_by_kind(LOOP, kind)
