@@ -339,7 +339,7 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
                 raise ValueError(f"the network has {count} {what}, allowed are {most}")
         for name, mass in self.masses.items():
             _check_amount(f"mass of {name!r}", mass, "kg")
-            if not set(self.coordinates(name)) <= {*nodes, GROUND}:
+            if name == GROUND or not set(self.coordinates(name)) <= {*nodes, GROUND}:
                 raise ValueError(f"masses names {name!r}, which no spring reaches; nodes: {', '.join(nodes)}")
         ends = [node for part in (*self.springs, *self.walls) for node in part.between]
         held = {node for end in (*ends, *self.masses) for node in self.coordinates(end)}

@@ -135,7 +135,9 @@ def _proof(
 ) -> tuple[Requirement, dict[str, Rows]]:
     """What a condition asks, and the matrices that prove it. Raises NotProved."""
     _require_limits(loop, coupling, condition)
-    requirement = swept or required_damping(loop, coupling, condition, multiplier)
+    numbers = sum(condition.multiplier_sizes(loop).values())
+    complete = swept is not None and len(swept.multiplier or ()) == numbers  # quick sweeps search no multipliers
+    requirement = swept if swept and complete else required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
         members = condition.members(loop)
         each = [required_damping(loop.at(m.network), coupling, condition) for m in members if len(members) > 1]

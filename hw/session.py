@@ -384,7 +384,13 @@ def _expected(scenario: Scenario) -> list[Expected]:
 
 
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
-    """Return a session that asks for at most `cap` [N]. Raises InputError for impossible `more` limits, or T."""
+    """Return a session that asks for at most `cap` [N].
+
+    Raises:
+        InputError: A limit or T is impossible, or the damping of a device is a full matrix, which INFO cannot state.
+    """
+    if scenario.loop("I").levels is not None:
+        raise InputError("damping is a full matrix: a session states it axis by axis; give one number for each axis")
     caps = tuple(min(cap, limit) for limit in scenario.box_limits)
     try:
         return Session(scenario, SafetyLimits(caps, watchdog_us=watchdog_for(scenario.T), **more), settings)

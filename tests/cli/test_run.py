@@ -209,7 +209,10 @@ def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):
     """Each stage by its name, the optimal design by what it has reached; standard output is the report alone."""
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setattr(couplings, "design_by_kind", design_by_kind)  # one that is made before one's eyes
-    one_device = ("--scenario", str(Path(__file__).parents[1] / "loops/o13-no-mass.toml"))  # designed in a second
+    one_device = (
+        "--scenario",
+        str(Path(__file__).parents[2] / "benchmarks/loops/o13-no-mass.toml"),
+    )  # designed in a second
     code, _ = run(tmp_path, *one_device, "--coupling", "optimal", "--duration", "0.1", "--no-plot")
     shown, err = capsys.readouterr()
     assert code == 0

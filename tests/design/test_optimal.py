@@ -409,7 +409,7 @@ def test_robustness_price_keeps_the_limiter(monkeypatch):
 def test_partial_delay_constraints_leave_a_bound(monkeypatch):
     loop = loop_of("n3")
     whole = bound(loop, knots=8).rms
-    monkeypatch.setattr("haptic_loop.design.bound._MOST_FORBIDDEN", 2)
+    monkeypatch.setattr("haptic_loop.design.budgets.BOUND_SUMS", 2)
     assert 0 < bound(loop, knots=8).rms < whole < best("n3").figures.rms_mismatch
 
 
