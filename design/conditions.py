@@ -481,7 +481,7 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
     demand = any_environment_demand(V, loop, phi)
     if reason := asymmetric(demand.static["V(1)"]):
         return refused(reason)
-    if phi is not None and uncovered(loop.E(), loop.psi, phi)[0] > 0:
+    if phi is not None and uncovered(loop.E(), loop.psi, phi)[0] > _ROUNDING * max(even_damping(loop)):
         return refused("E-hat + Phi is not passive for this multiplier")
     least = partial(least_scale, demand) if phi is not None else partial(_scale_beside_zeros, V, demand)
     ratio, w = supremum(least, np.concatenate([[0.0], frequencies(V)]))
@@ -490,6 +490,9 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
     return from_ratio("any-environment", ratio, available, w / (2 * np.pi * V.T))
 
 
+#: What a sweep may find uncovered, relative to the damping: a lossless E has 2e-13 by rounding. Such a shortage would
+#: raise Phi by as much, a hundredth of the guard band of verdicts.
+_ROUNDING = 1e-9
 #: V is taken to vanish in a direction in which it is smaller than this, beside V(1): nearer to a zero is rounding.
 _VANISHES = 1e-5
 #: What stands there in place of its passivity, beside V(1), and the ratio from which on nothing else does.

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from haptic_loop.controller.complementarity import GROUNDED, PIVOT_ROUNDING
+from haptic_loop.controller.complementarity import GROUNDED, PIVOT_ROUNDING, BoxProblem
 from haptic_loop.controller.law import Limiter
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
@@ -201,8 +201,10 @@ def sequential(
 
 def _box_matrix(limiter: Limiter) -> Array:
     """M of the box problem, (m, m), regular also where nothing holds the environment."""
-    M = limiter.problem.M
-    return M if limiter.problem.regular else M + GROUNDED * np.diag(M).max() * np.eye(len(M))
+    problem = limiter.problem
+    assert isinstance(problem, BoxProblem)  # the exported tick limits channel by channel
+    M = problem.M
+    return M if problem.regular else M + GROUNDED * np.diag(M).max() * np.eye(len(M))
 
 
 def _turns(m: int) -> int:

@@ -441,20 +441,20 @@ class Expected:
     """What the encoder of a free handle shows under a force: a mass, or a motor and a handle with a spring between."""
 
     def __init__(self, device: Device, T: float) -> None:
-        """`device` is its model, T [s] the time for which a force is held."""
+        """`device` is a model with one axis, T [s] the time for which a force is held."""
         import scipy
 
         masses, link = list(device.bodies.values()), device.transmission or (0.0, 0.0)
         n = len(masses)
         a = np.zeros((2 * n + 1, 2 * n + 1))
         a[:n, n : 2 * n] = np.eye(n)
-        a[n, n], a[n, 2 * n] = -device.damping / masses[0], 1 / masses[0]
+        a[n, n], a[n, 2 * n] = -device.matrix("damping")[0, 0] / masses[0], 1 / masses[0]
         if n == 2:
             for column, value in ((0, link[1]), (2, link[0])):
                 spring = value * np.array([-1.0, 1.0])
                 a[2, column : column + 2] += spring / masses[0]
                 a[3, column : column + 2] -= spring / masses[1]
-        self.mass, self._friction, self._n = sum(masses), device.friction, n
+        self.mass, self._friction, self._n = sum(masses), float(np.max(device.friction)), n
         self._held = np.asarray(scipy.linalg.expm(a * T))
         self._state = np.zeros(2 * n + 1)
 

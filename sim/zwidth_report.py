@@ -145,8 +145,8 @@ class _Simulated:
         """The points that were reached, and what they have beside the linear loop."""
         points, (K, B) = drawn.points, (axis[drawn.points.cell] for axis in drawn.grid.flat)
         figures = (K, B, points.verdicts, points.amplitude, points.frequency_hz, points.growth, points.differ)
-        steps = [device.encoder_step for device in sweep.devices]
-        friction = [device.friction for device in sweep.devices]
+        steps = [float(np.max(device.encoder_step)) for device in sweep.devices]
+        friction = [float(np.max(device.friction)) for device in sweep.devices]
         return cls(
             Shown(steps, friction, sweep.walls),
             sweep.walls or any(steps) or any(friction),

@@ -361,12 +361,14 @@ def test_the_bridge_reports_the_longest_hold(tmp_path):
     loop = change(LOOP, theta=(1, 1), lam=(1, 1))
     save(Stored.of(loop, SOFT, prove(loop, SOFT, "this-environment")), tmp_path / "one.json")
     scenario = scenario_of().replace(theta=(1, 1))
-    first, second = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)
+    (first,) = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)  # no reserve of itself
     assert first.remarks() == ["a force that is held through 1 missed answer is covered by the file's proof"]
     missed = np.ones((40, 2, 1), dtype=np.int64)
     missed[5::3] = LOST
     met = ages(missed)[1:]
     assert RANGE.contains(DelayRange(tuple(met.min(axis=(0, 2))), tuple(met.max(axis=(0, 2)))))
+    later = scenario.replace(theta=(2, 2))
+    (second,) = certified_couplings(later, "I", str(tmp_path / "one.json"), None, 2, spare=0)
     assert second.scenario.theta == (2, 2)
     assert second.remarks() == [
         "the file proves delays switching within [1, 2] samples, which covers the constant theta = [2, 2]"
