@@ -1,8 +1,8 @@
-"""The optimal coupling: the force filter R of least mismatch whose loop keeps a condition, with an exact proof.
+"""Design the optimal coupling: the force filter R of least mismatch whose loop satisfies a condition, with a proof.
 
-The basis of R grows rung by rung; each rung is solved (design.program), scaled until a refined sweep passes, rounded to
-decimals and proved in exact arithmetic before the next is tried. The best one that is proved is returned. With
-R(1) = g I the static stiffness F(1) = g E(1) is symmetric whatever the environment's springs are.
+The search tries larger and larger bases of R. For each basis it solves the program (design.program), scales the
+solution until a refined sweep passes, rounds it to decimals and proves it in exact arithmetic. It returns the best
+proved solution. With R(1) = g I the static stiffness F(1) = g E(1) is symmetric for all springs of the environment.
 """
 
 from __future__ import annotations
@@ -31,36 +31,35 @@ from haptic_loop.design.spring_damper import design as design_spring_damper
 from haptic_loop.design.transparency import Transparency, decibels, transparency
 from haptic_loop.design.worst_member import Searched, search_ranges
 
-_PROVING, _PROOF = (
-    1 / 3,
-    1.2e-6,
-)  # of the price's budget, the part for proofs; units of a proof per states^2.7: 0.3 at 100
-_PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # up to so many devices over this basis
-_FIRST = 3  # of the environments: those that the nominal design misses most are imposed first
-_SETTLED_DB = 0.05  # a rung that gains less ends the climb
+# _PROVING is the share of the robustness budget that is reserved for proofs.
+# A proof costs _PROOF * states^2.7 units of counted work: 0.3 at 100 states.
+_PROVING, _PROOF = 1 / 3, 1.2e-6
+_PRICED_BY = {2: (8, 6), 4: (4, 3), 10**3: (2, 2)}  # largest number of devices: (taps, poles) of the basis in `spread`
+_FIRST = 3  # The program starts with this many environments, those that the nominal design misses most.
+_SETTLED_DB = 0.05  # The search ends when a larger basis gains less than this.
 _SETTLED = f"it gains less than {_SETTLED_DB:g} dB"
-_LARGE, _PROMISING_DB = 26, 0.1  # taps: one of more is tried after one that gains so much, proved if it is worth it
-_FEWEST_TAPS = {True: 22, False: 14}  # of a rung that may end the climb; whether this-environment alone is asked
-_KEPT_STIFFNESS = 0.5  # of the most static stiffness of a rung that was best: one that renders less is not taken
-_FELT_STIFFNESS = 0.02  # of the environment's: where a rung renders less than this, merit alone decides
-_LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # (beta, c) of a limiter to begin with: without psi the first alone
-_HOPELESS = 0.9  # relative mismatch from which on the climb is compared with other couplings
-_TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
-_SEARCHED = 0.2  # of --seconds, at least: the time of the search between the vertices of ranges
+_LARGE, _PROMISING_DB = 26, 0.1  # Bases of more than 26 taps are tried only after a gain of 0.1 dB.
+_FEWEST_TAPS = {True: 22, False: 14}  # taps from which a small gain ends the search; the key is `_Search.simply`
+_KEPT_STIFFNESS = 0.5  # A solution is rejected below this share of the largest static stiffness of earlier best ones.
+_FELT_STIFFNESS = 0.02  # Below this share of the environment's stiffness only `_Search.merit` decides.
+_LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # Starting (beta, c) of a limiter; only the first if psi = 0.
+_HOPELESS = 0.9  # Above this relative mismatch the result is compared with simpler couplings.
+_TOLERATED = 0.02  # An environment enters the program if it exceeds the damping by more; scaling covers less.
+_SEARCHED = 0.2  # least share of --seconds for the search between the vertices of ranges
 
 
 @dataclass(frozen=True)
 class _Rung:
-    """One step of the climb."""
+    """Result of the design over one basis."""
 
     taps: int
     poles: int
     states: int  # of the loop
-    mismatch_db: float  # what was minimised
+    mismatch_db: float  # objective
     g: float  # rendered share of the static stiffness
-    reason: str | None  # why it is not certified and proved
-    seconds: float  # since the design began
-    left: str | None = None  # why it is not taken, though it is certified
+    reason: str | None  # reason why the coupling is not certified and proved, or None
+    seconds: float  # time since the design began
+    left: str | None = None  # reason why the coupling is rejected although it is proved, or None
 
     @property
     def proved(self) -> bool:
@@ -73,15 +72,15 @@ class _Rung:
 
 @dataclass(frozen=True, eq=False)
 class Optimal(Design):
-    """The best coupling that is proved, with the climb that led to it."""
+    """Best proved coupling, with the results of all bases that were tried."""
 
     figures: Transparency = field(kw_only=True)
-    g: float = field(kw_only=True)  # F(1) = g E(1); of another kind than a force filter the ratio of their norms
-    states: int = field(kw_only=True)  # of the loop
-    certificate: Certificate | None = field(kw_only=True)  # of the loop with its ranges and its switching delays
+    g: float = field(kw_only=True)  # F(1) = g E(1); for a coupling that is no force filter the ratio of the norms
+    states: int = field(kw_only=True)  # order of the loop
+    certificate: Certificate | None = field(kw_only=True)  # It covers the loop's ranges and switching delays.
     ladder: tuple[_Rung, ...] = field(kw_only=True, default=())
-    reason: str | None = field(kw_only=True, default=None)  # why nothing is proved, where nothing is
-    searched: Searched | None = field(kw_only=True, default=None)  # between the vertices of ranges
+    reason: str | None = field(kw_only=True, default=None)  # reason why there is no proof, or None
+    searched: Searched | None = field(kw_only=True, default=None)  # result of the search between the vertices of ranges
 
     @property
     def proved(self) -> bool:
@@ -94,9 +93,9 @@ def design_with(
     switching: tuple[Sequence[int], Sequence[int]] | None = None,
     **options: Any,
 ) -> Optimal:
-    """The optimal coupling for Options(**options), also safe while delays vary within `switching`, (lo, hi) [samples].
+    """Design the optimal coupling for Options(**options); it is also safe while delays vary within `switching`.
 
-    Each rung of its ladder is a step of `progress`.
+    `switching` is (lo, hi) [samples]. `progress` is called after each basis of the ladder.
     """
     asked, done = program.Options(**options), 0
 
@@ -114,14 +113,15 @@ def design(
     options: program.Options = program.DEFAULT,
     progress: Callable[[_Rung], None] = lambda rung: None,
 ) -> Optimal:
-    """The coupling of the least mismatch in the loop's environment, certified and proved.
+    """Return the coupling of least mismatch in the loop's environment, with its certificate and proof.
 
-    With ranges around the environment this-environment is kept at every vertex and wherever the search between them
-    looks; with a range of delays any switching within it is safe.
-    Where nothing that was designed can be proved the environment scaled down is returned, or the best spring-damper
-    where that is better.
+    With ranges around the environment, this-environment holds at every vertex and at every point that the search
+    between the vertices visits. With a range of delays, any switching within the range is safe.
+    If no optimal coupling can be proved or its mismatch is large, the function compares it with the environment scaled
+    down and with the best spring-damper, and returns the best of them.
 
-    Raises ValueError for a loop with walls or an environment that no damping makes safe, as it is not passive.
+    Raises ValueError for a loop with walls, and for an environment that is unsafe with any damping because it is not
+    passive.
     """
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
@@ -175,14 +175,14 @@ def design(
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """The loop and what is asked of it."""
+    """A loop, the design's options and the environments with their constraints."""
 
     loop: Loop
     options: program.Options
-    cases: tuple[program.Case, ...]  # the loop's own environment first, then the vertices of its ranges
-    bare: float  # damping that the environments themselves need, the most
-    started: float  # [s] of the clock, for the report and for --seconds
-    spent: int  # work counted before
+    cases: tuple[program.Case, ...]  # the loop's nominal environment, then the vertices of its ranges
+    bare: float  # largest share of the damping that an environment needs without a coupling
+    started: float  # clock time [s] of the start, for the report and for --seconds
+    spent: int  # counted work at the start
 
     @classmethod
     def of(cls, loop: Loop, options: program.Options) -> _Search:
@@ -215,26 +215,29 @@ class _Search:
         return time.perf_counter() - self.started
 
     def over(self, share: float = 1.0) -> bool:
-        """Whether the time that the user allowed, or this share of it, is over. It never is without --seconds."""
+        """Return whether this share of --seconds is over; without --seconds return False."""
         return self.options.seconds is not None and self.elapsed > share * self.options.seconds
 
     @property
     def left(self) -> float:
-        """The counted work that is left for larger bases."""
+        """Counted work that is left for larger bases."""
         return max(budgets.CLIMB - units_since(self.spent), 0.0)
 
     @property
     def constrained(self) -> bool:
-        """Whether anything but this-environment is asked."""
+        """Whether the design has constraints besides this-environment."""
         return self.options.limiter or any(len(case.constraints) > 1 for case in self.cases)
 
     @property
     def simply(self) -> bool:
-        """Whether this-environment is asked, in one environment and of forces that latch at the tick."""
+        """Whether this-environment is the only constraint, without ranges and without a latency."""
         return not (self.constrained or self.loop.latency or self.loop.ranges)
 
     def slips(self, before: Optimal | None) -> tuple[program.Slip | None, ...]:
-        """The limiters that a rung is solved for: that of the rung before, with the best multiplier that it has."""
+        """Return the limiters to solve for: that of the solution `before` with its certified multiplier, or the starts.
+
+        Without `options.limiter` return (None,).
+        """
         if not self.options.limiter:
             return (None,)
         if before and before.certificate:
@@ -245,7 +248,7 @@ class _Search:
         return tuple(program.Slip.even(self.loop, *some) for some in (_LAGS if any(self.loop.psi) else _LAGS[:1]))
 
     def slip_of(self, coupling: Coupling) -> program.Slip | None:
-        """The limiter with which this coupling needs the least damping, with its best multiplier."""
+        """Return the limiter with which this coupling needs the least damping, with its best multiplier."""
         if not self.options.limiter:
             return None
         slips = [slip for slip in self.slips(None) if slip]
@@ -254,14 +257,14 @@ class _Search:
         return replace(slip, c=slip.condition.rows(self.loop, need.multiplier)) if need.multiplier else slip
 
     def asked(self, slip: program.Slip | None) -> tuple[program.Case, ...]:
-        """The environments with all that holds in each."""
+        """Return the environments with their constraints, including the limiter's block for `slip`."""
         if slip is None:
             return self.cases
         here = program.limiter(self.loop, slip)
         return tuple(replace(case, constraints=(*case.constraints, here)) for case in self.cases)
 
     def mismatch(self, found: Optimal) -> float:
-        """What is minimised, relative to the environment."""
+        """Return the objective: the rms or largest mismatch relative to the environment, as a ratio."""
         figures = found.figures
         return figures.rms_mismatch if self.options.objective == "rms" else figures.relative_mismatch
 
@@ -269,21 +272,21 @@ class _Search:
         return decibels(self.mismatch(found))
 
     def merit(self, found: Optimal) -> float:
-        """The objective of the climb: mismatch and lost static stiffness, as a ratio."""
+        """Return the objective that ranks solutions: mismatch combined with lost static stiffness, as a ratio."""
         static = program.static_weight(self.loop) * (found.g - 1) if np.isfinite(found.g) else 0.0
         return float(np.hypot(self.mismatch(found), static))
 
     def gained(self, before: Optimal | None, found: Optimal) -> float:
-        """By how much it is better than the one before [dB]."""
+        """Return the improvement of the merit over the solution `before` [dB]; infinity if `before` is None."""
         return np.inf if before is None else decibels(self.merit(before)) - decibels(self.merit(found))
 
     @property
     def simple(self) -> float:
-        """kappa for which this-environment holds of the environment scaled down, R = kappa I."""
+        """Largest kappa for which R = kappa I, the environment scaled down, satisfies this-environment."""
         return (1 - program.MARGIN) / self.bare if self.bare > 0 else 1.0
 
     def nothing(self) -> Optimal | None:
-        """No coupling, where that is exact and safe."""
+        """Return the design without a coupling if it is exact and safe, else None."""
         loop = self.loop
         exact_delay = all(n == t + p for n, t, p in zip(loop.lam, loop.theta, loop.psi, strict=True))
         more = any(len(case.constraints) > 1 for case in self.cases)
@@ -297,23 +300,27 @@ class _Search:
         return program.span_of(self.cases[0].E, taps, poles, self.options.band_hz[1], full)
 
     def room(self, taps: int, poles: int, before: int) -> bool:
-        """Whether a rung is tried: by its states, as many on a busy machine, which are more than `before`."""
+        """Return whether a basis is small enough to be tried, and larger than `before` [states].
+
+        The decision depends on numbers of states and unknowns only, so that it is the same on a busy machine.
+        """
         span, loop = self.span(taps, poles), self.loop
         m = loop.channels
         own, full = int((span.used.sum(axis=1) > 0)[:, :m].sum()), span.used.shape[2] == m
         states = own + (0 if full else len(span.used) - own // m)
         states += self.cases[0].E.order + sum(loop.theta) + sum(loop.psi)
-        proofs = len(self.cases) * states**2.7  # what they take, in seconds
+        proofs = len(self.cases) * states**2.7  # cost of the proofs, in the unit of budgets.BASIS_PROOFS
         beside = taps <= _LARGE and m * span.unknowns <= budgets.BASIS_BESIDE
         solved = span.unknowns <= budgets.BASIS_UNKNOWNS if full and self.simply else beside
         return before < states <= budgets.BASIS_STATES and solved and proofs <= budgets.BASIS_PROOFS
 
     def rung(self, taps: int, poles: int, before: Optimal | None, floor: float, least: float) -> tuple[Optimal, _Rung]:
-        """The optimum over a basis, scaled until every sweep passes, and proved where it gains this much [dB].
+        """Return the optimum over a basis, scaled until every sweep passes, and proved if it gains `least` dB.
 
-        Where it renders less than this share of the static stiffness, that counts more.
+        If the optimum renders less than the share `floor` of the static stiffness, it is solved again with a larger
+        weight of the stiffness.
         """
-        for heavier in (1.0, 2.5, 6.0):  # times its weight
+        for heavier in (1.0, 2.5, 6.0):
             tried = [self.solved(taps, poles, before, slip, heavier, least) for slip in self.slips(before)]
             found = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
             if found.g >= floor or found.reason:
@@ -335,7 +342,7 @@ class _Search:
         coupling, needs = self.kept_in_all(problem, [0])
         if slip:
             needs.append(min(required_damping(self.loop, coupling, LimitedForces(slip.beta)).ratio, 1 + _TOLERATED))
-        for share in (0.95, 2.5, 50.0):  # of the margin, which stays unused until the rung is proved
+        for share in (0.95, 2.5, 50.0):  # The unused share of the margin grows until the proof succeeds.
             limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
@@ -349,9 +356,10 @@ class _Search:
     def kept_in_all(
         self, problem: program.Problem, active: list[int], until: float = np.inf, **how: Any
     ) -> tuple[ForceFilter, list[float]]:
-        """Find the optimum where the environments `active` are imposed, and those that turn out to be missed.
+        """Find the optimum for the environments `active`, and add environments whose requirement is exceeded.
 
-        It ends when the work counted so far (`spent`) exceeds `until`. Returns what each of all needs, too.
+        The search ends when the work counted so far (`spent`) exceeds `until`.
+        Returns (coupling, share of the damping that each environment needs).
         """
         while True:
             some = replace(problem, cases=tuple(problem.cases[i] for i in active))
@@ -363,7 +371,10 @@ class _Search:
             active = active + missed[:2]
 
     def fitted(self, coupling: ForceFilter, slip: program.Slip | None, limit: float) -> tuple[Optimal, list[float]]:
-        """(the coupling scaled until no environment needs more than `limit` of the damping, what each needs then)."""
+        """Scale the coupling until no environment needs more than the share `limit` of the damping.
+
+        Returns (design, share of the damping that each environment needs after the scaling).
+        """
         needs = [ratio_in(case.loop, coupling) for case in self.cases]
         if slip:
             needs[0] = max(needs[0], required_damping(self.loop, coupling, LimitedForces(slip.beta)).ratio)
@@ -374,9 +385,10 @@ class _Search:
     def proofs(
         self, found: Optimal, needs: Sequence[float], slip: program.Slip | None, work: float
     ) -> tuple[int, str | None]:
-        """In how many environments it is proved, the worst first, and why it is not in the next.
+        """Prove the coupling in one environment after another, the worst first.
 
-        Proofs end before they exceed `work`, which their number of states foretells.
+        The proofs stop before their work, estimated from the number of states, exceeds `work`.
+        Returns (number of environments with a proof, reason why the next proof failed or None).
         """
         here = self._proved(found, slip)
         if not here.proved:
@@ -393,9 +405,9 @@ class _Search:
         return len(needs), None
 
     def between(self, found: Optimal) -> Optimal:
-        """The coupling for ranges after the search between the vertices, and proved at each of them.
+        """Return the coupling for ranges after the search between the vertices, with a proof at each vertex.
 
-        Where the worst environment that was found asks for more damping than there is, the forces are scaled down.
+        If the worst environment of the search needs more damping than the devices have, the forces are scaled down.
         """
         whole = found.coupling
         assert isinstance(whole, ForceFilter)
@@ -405,7 +417,7 @@ class _Search:
         for limit in (1 - program.MARGIN / 2, 1 - 2.5 * program.MARGIN):
             share = min(1.0, limit / ratio)
             coupling = _scaled(whole, share)
-            lower = tuple(replace(one, ratio=one.ratio * share) for one in searched.worst)  # each need scales
+            lower = tuple(replace(one, ratio=one.ratio * share) for one in searched.worst)  # Needs scale with forces.
             last = self._proved(self._assessed(coupling, coupling.g), None)
             last = replace(last, searched=replace(searched, worst=lower))
             if last.proved:
@@ -413,7 +425,7 @@ class _Search:
         return last
 
     def scaled(self) -> Optimal:
-        """The environment itself, scaled down until it is safe."""
+        """Return the environment itself as a coupling R = kappa I, scaled down until it is proved."""
         span = program.Span(np.zeros(0), NO_PAIRS, np.zeros((0, self.loop.channels, self.loop.channels), dtype=bool))
         (slip, *_) = self.slips(None)
         problem = program.Problem(span, self.asked(slip), self.options, 0.0)
@@ -426,7 +438,7 @@ class _Search:
         return found
 
     def spring_damper(self) -> Optimal | None:
-        """The best spring-damper of this-environment, where nothing else is asked and one is found."""
+        """Return the best spring-damper under this-environment, or None with other constraints or without a result."""
         if len(self.cases) > 1 or self.constrained or self.loop.latency:
             return None
         try:
@@ -436,10 +448,10 @@ class _Search:
             return None
 
     def _start(self, problem: program.Problem) -> Array:
-        """R = kappa I that keeps every constraint with room to spare.
+        """Return the unknowns of R = kappa I that satisfy every constraint strictly.
 
-        There is one: no force keeps each strictly. Of the limiter's block with F = 0 the Schur complement is
-        2 rho (Re M/z - beta/4), and Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) is at least 1.
+        They exist because zero force satisfies each constraint strictly. For F = 0 the Schur complement of the
+        limiter's block is 2 rho (Re M/z - beta/4), and Re M/z = 1 + sum c_j (j - cos w - .. - cos jw) is at least 1.
         """
         kappa = 0.5 / max(self.bare, 0.5)
         while problem.room(start := problem.start(kappa)) <= 0:
@@ -447,7 +459,7 @@ class _Search:
         return start
 
     def _assessed(self, coupling: Coupling, g: float) -> Optimal:
-        """The coupling with its figures, and what a sweep of it alone asks for."""
+        """Return the coupling with its figures and its swept requirement, without a proof."""
         loop, members = self.loop, self.loop.members()
         F = loop.F(coupling)
         requirements = [requirement_of(F, loop), *in_each(loop, coupling, members[1:])]
@@ -470,7 +482,7 @@ class _Search:
         )
 
     def _proved(self, found: Optimal, slip: program.Slip | None) -> Optimal:
-        """The same with its certificate, or why it has none."""
+        """Return `found` with its certificate, or with the reason why the proof failed."""
         loop, coupling = self.loop, found.coupling
         try:
             if slip:
@@ -486,12 +498,12 @@ class _Search:
 
 
 def _felt(g: float) -> float:
-    """The least share of the static stiffness that is asked, or 0 where that would be nothing to feel."""
+    """Return g as least share of the static stiffness, or 0 if g is below _FELT_STIFFNESS."""
     return g if g >= _FELT_STIFFNESS else 0.0
 
 
 def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
-    """The filter times a number, in decimals for which R(1) = g I holds exactly."""
+    """Return the filter times `scale`, rounded to decimals for which R(1) = g I holds exactly."""
     every = np.ones((len(coupling.R) - 1, *coupling.R.shape[1:]), dtype=bool)
     return program.Span(coupling.poles, coupling.pairs, every).filter(
         np.append(coupling.g, coupling.R[1:].ravel()), scale
@@ -499,7 +511,7 @@ def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
 
 
 # ----------------------------------------------------------------------------------------------------
-# What a design for more than one environment costs.
+# The mismatch that a design for several environments costs.
 
 
 def spread(
@@ -509,10 +521,11 @@ def spread(
     percent: float = 10.0,
     work: float | None = None,
 ) -> Spread:
-    """The better of a design over a small basis and the nominal one scaled down, both safe over `vertices`.
+    """Return figures of a coupling that is safe at all `vertices`, `percent` around the environment's parameters.
 
-    Each rung's own frequencies are those of the nominal environment; the vertices are imposed at few, and where sweeps
-    find that they are missed.
+    The coupling is the better of a design over a small basis and the nominal one scaled down. The program has a dense
+    grid for the nominal environment. For vertices it has a sparse grid and the frequencies at which sweeps find a
+    violation.
     """
     work = work or budgets.of_channels(budgets.PRICE, loop.channels)
     until = spent_after(work * (1 - _PROVING))
@@ -545,10 +558,11 @@ def nearby(
     options: program.Options = program.DEFAULT,
     condition: Condition = THIS_ENVIRONMENT,
 ) -> Nearby:
-    """What the condition asks of a coupling within ten percent, and what a design for that would cost.
+    """Return the condition's requirement for environments within ten percent, and the cost of a design for them.
 
-    Empty where it holds in any environment. Without the design for a condition of the user's own, before walls, with
-    ranges, for an environment that is no network of springs, and for a coupling that is no optimal one.
+    The result is empty for a condition that holds in any environment. The cost is left out for a condition of the
+    user's own, for walls, for ranges, for an environment that is no network of springs, and for a coupling other than
+    a force filter or none.
     """
     if condition.guarantee(loop) == ANY or condition.not_varied(loop):
         return Nearby()

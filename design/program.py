@@ -1,8 +1,8 @@
-"""The convex program of the optimal coupling: a basis of filters R, what is asked of F = Theta R Psi E, its optimum.
+"""Convex program of the optimal coupling: a basis of filters R, the constraints of F = Theta R Psi E, the optimum.
 
-Everything is affine in R, and R = kappa I keeps every condition for a small kappa: there is always a start.
-Each condition is a linear matrix inequality at every frequency; design.barrier solves for those on a grid, and a dense
-sweep adds the frequencies at which it is missed.
+All constraints are affine in R, and R = kappa I satisfies each of them for a small kappa, so a start always exists.
+Each constraint is a linear matrix inequality at every frequency. design.barrier solves the program on a grid of
+frequencies, and a dense sweep adds the frequencies at which the solution violates a constraint.
 """
 
 from __future__ import annotations
@@ -30,41 +30,42 @@ from haptic_loop.design.frequency import frequencies, hermitian, on_circle, peak
 from haptic_loop.design.transparency import BAND_HZ
 
 OBJECTIVES = ("rms", "sup")
-MARGIN = 0.002  # share of the damping that stays unused: what an exact proof always finds room in
-LADDER = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10), (32, 24), (48, 34))  # taps, real poles: those with room
-_FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # distance to 1 of the real poles' ends
-_FASTER = 0.25  # modes of smaller radius are left to the filter of the sum of all forces
-_NEAR = 0.3  # of its distance to 1: a real pole so close to a mode gives way to it
-_SLOWER = 0.999  # modes of larger radius get no section
-RICH = 8  # channels up to which there are sections at the band's end
-_EDGED = {1: 20, 2: 20}  # by channels, the taps from which on there are
-_EDGED_OF_MANY = 6
-_EDGES = (0.2, 0.07, 0.02)  # their damping ratios: they crowd at the band's end, where the error may jump
-FULL, FULL_BESIDE = 8, 5  # channels up to which every force has a filter to every device; where more is asked
+MARGIN = 0.002  # unused share of the damping, which the exact proof needs for rounding
+LADDER = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10), (32, 24), (48, 34))  # (taps, real poles) of the bases
+_FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # range of the real poles' distances to 1
+_FASTER = 0.25  # Modes of smaller radius are only in the filter of the sum of all forces.
+_NEAR = 0.3  # A real pole is dropped if a real mode is nearer than this share of the pole's distance to 1.
+_SLOWER = 0.999  # Modes of larger radius get no section.
+RICH = 8  # largest number of channels for which the basis has sections at the band's end
+_EDGED = {1: 20, 2: 20}  # number of channels: least number of taps for these sections
+_EDGED_OF_MANY = 6  # least number of taps for these sections with more than two channels
+_EDGES = (0.2, 0.07, 0.02)  # damping ratios of these sections; they are small because the error may jump at the end
+# Up to FULL channels every force has a filter to every device. With further constraints the limit is FULL_BESIDE.
+FULL, FULL_BESIDE = 8, 5
 _STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weight of g - 1 beside the relative mismatch; for more than RICH channels
-HIGH_HZ = 100.0  # above it the force is kept low by a soft row, or capped
-SOFT = 0.05, 0.3  # the soft row's weight: the first number times the mismatch so far, which counts up to the second
-_EVEN = 0.002  # weight of the error relative to the force of each motion, however small that is
-_LEAST_FORCE = 0.01  # of the largest: what counts as a force then
-_SMALL = 1e-5  # weight of the coefficients themselves: some have no effect where the environment has no inverse
+HIGH_HZ = 100.0  # Above this frequency a soft row or a cap keeps the force low.
+SOFT = 0.05, 0.3  # The soft row's weight is SOFT[0] min(mismatch so far, SOFT[1]).
+_EVEN = 0.002  # weight of the error relative to the force of each motion, which may be small
+_LEAST_FORCE = 0.01  # floor of this force, as a share of the largest force
+_SMALL = 1e-5  # weight of the coefficients; some have no other effect if the environment has no inverse
 _DECIMALS = 10
-_GAPS = (0.05, 0.01)  # of the objective, or of what it gains over no force: gaps at which the inequalities are swept
-_FORGIVEN = 5e-4  # by which an inequality may fail between its frequencies: scaling makes up for it
-_FEW = 12  # frequencies of a sparse grid beside the modes
-_STEEPER = 3.0  # factor between one centre of the barrier and the next
-_POINT = 5e-6  # units of counted work of a constraint at a frequency
-_SMALLEST = 1e-5  # least frequency of an inequality [rad/sample]: below it nothing changes
+_GAPS = (0.05, 0.01)  # duality gaps before a sweep, relative to the objective or to its gain over zero force
+_FORGIVEN = 5e-4  # allowed violation of an inequality between its frequencies; scaling removes it
+_FEW = 12  # number of frequencies of a sparse grid besides the modes
+_STEEPER = 3.0  # factor between successive weights of the barrier method
+_POINT = 5e-6  # counted work for one constraint at one frequency
+_SMALLEST = 1e-5  # least frequency of an inequality [rad/sample]; the matrices are constant below it
 
 
 @dataclass(frozen=True)
 class Options:
-    """What is asked of an optimal coupling beside its loop. Raises ValueError naming the field that is wrong."""
+    """Options of the design of an optimal coupling. Raises ValueError with the name of a wrong field."""
 
-    objective: Literal["rms", "sup"] = "rms"  # of the mismatch relative to the environment, over the band
+    objective: Literal["rms", "sup"] = "rms"  # norm of the mismatch relative to the environment, over the band
     band_hz: tuple[float, float] = BAND_HZ
-    high_gain: float | None = None  # largest |F|/|E| above 100 Hz; None: kept low by a soft row
-    limiter: bool = False  # covered also while forces are limited
-    seconds: float | None = None  # of a clock, after which no larger basis is tried; None: no clock ends the search
+    high_gain: float | None = None  # largest |F|/|E| above 100 Hz; None: a soft row keeps the force low instead
+    limiter: bool = False  # whether the coupling is also safe while forces are limited
+    seconds: float | None = None  # time [s] after which no larger basis is tried; None: no time limit
     ladder: tuple[tuple[int, int], ...] = LADDER  # (taps, real poles)
 
     def __post_init__(self) -> None:
@@ -84,30 +85,30 @@ DEFAULT = Options()
 
 @dataclass(frozen=True, eq=False)
 class _Constraint:
-    """A linear matrix inequality that the forces G = R Psi E as they leave are to keep at every frequency.
+    """Linear matrix inequality for the forces G = R Psi E before their delay Theta, at every frequency.
 
-    `block` is a condition's own statement, He[block(G, x)] > 0, affine in G and in own unknowns x together.
+    The inequality is He[block(G, x)] > 0. The block is jointly affine in G and in the constraint's own unknowns x.
     """
 
     name: str
     block: Callable[[Sampled, Array], Sampled]
-    unit: Array  # (r,) rows and columns of the block are scaled by it, so that its eigenvalues count in one measure
+    unit: Array  # (r,) scale of the block's rows and columns, so that its eigenvalues have one unit
     low: float = _SMALLEST  # [rad/sample]
     high: float = np.pi
-    start: tuple[float, ...] = ()  # own unknowns for which R = kappa I is strictly feasible for a small kappa
-    cost: tuple[float, ...] = ()  # of the own unknowns in the objective
-    through: bool = False  # whether the block is a constant and L(z) G, with as many rows as there are forces
+    start: tuple[float, ...] = ()  # own unknowns with which R = kappa I is strictly feasible for a small kappa
+    cost: tuple[float, ...] = ()  # coefficients of the own unknowns in the objective
+    through: bool = False  # whether the block is a constant plus L(z) G, with one row for each force
 
     def at(self, G: Sampled, own: Array) -> Complex:
-        """The scaled matrices, (n, k, r, r)."""
+        """Return the Hermitian part of the scaled block, (n, k, r, r)."""
         return hermitian(self.unit[:, None] * self.block(G, own).G * self.unit)
 
 
-# what is asked --------------------------------------------------------------------------------------------------------
+# constraints ----------------------------------------------------------------------------------------------------------
 
 
 def this_environment(loop: Loop) -> _Constraint:
-    """design.conditions.this_environment_demand with a little of the damping unused, in units of Delta/T."""
+    """Return this-environment as a constraint with the share MARGIN of the damping unused, in units of Delta/T."""
 
     def block(G: Sampled, own: Array) -> Sampled:
         demand = _demand(loop, loop.late(G))
@@ -122,7 +123,7 @@ def _demand(loop: Loop, F: Any) -> Demand[Any]:
 
 
 def switching(loop: Loop, span: DelayRange) -> _Constraint:
-    """SWITCHING for delays that switch within the span; alpha T/Delta are its unknowns."""
+    """Return SWITCHING as a constraint for delays that switch within the span; its own unknowns are alpha T/Delta."""
     scale = even_damping(loop) / loop.T
     switched = loop.switching(span)
     moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
@@ -139,7 +140,7 @@ def switching(loop: Loop, span: DelayRange) -> _Constraint:
 
 @dataclass(frozen=True)
 class Slip:
-    """The limiter's lag and multiplier: its block is affine in the forces for given ones."""
+    """Lag and multiplier of the limiter. For fixed values the limiter's block is affine in the forces."""
 
     beta: float  # rho = beta delta/T
     c: tuple[tuple[float, ...], ...]  # (m, lags)
@@ -154,7 +155,7 @@ class Slip:
 
 
 def limiter(loop: Loop, slip: Slip) -> _Constraint:
-    """design.environments.LimitedForces: forces that are limited. A little of rho stays unused, as of the damping."""
+    """Return LimitedForces as a constraint with the share MARGIN of the damping and of rho unused."""
     condition, c = slip.condition, [v for row in slip.c for v in row]
 
     def block(G: Sampled, own: Array) -> Sampled:
@@ -169,7 +170,7 @@ def limiter(loop: Loop, slip: Slip) -> _Constraint:
 
 
 def most_gain(loop: Loop, cap: float) -> _Constraint:
-    """|F| < cap |E| above 100 Hz."""
+    """Return the constraint |F| < cap |E| above 100 Hz."""
     E = loop.E()
 
     def block(G: Sampled, own: Array) -> Sampled:
@@ -180,7 +181,7 @@ def most_gain(loop: Loop, cap: float) -> _Constraint:
 
 
 def worst_mismatch(loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> _Constraint:
-    """|F - Lambda E| < tau |E| over the band, with tau its own unknown and its cost."""
+    """Return the constraint |F - Lambda E| < tau |E| over the band; its own unknown tau is added to the objective."""
     E = loop.E()
 
     def block(G: Sampled, own: Array) -> Sampled:
@@ -191,7 +192,7 @@ def worst_mismatch(loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> _Const
 
 
 def _within(M: Sampled, E: Complex, cap: float) -> Sampled:
-    """A block whose Hermitian part is [[cap I, M/|E|], [., cap I]]: |M| < cap |E| in the largest singular value."""
+    """Return a block with the Hermitian part [[cap I, M/|E|], [., cap I]]: |M| < cap |E| in the spectral norm."""
     m = M.G.shape[-1]
     S = np.zeros((*M.G.shape[:-2], 2 * m, 2 * m), dtype=complex)
     S[..., np.arange(2 * m), np.arange(2 * m)] = cap
@@ -204,7 +205,7 @@ def _within(M: Sampled, E: Complex, cap: float) -> Sampled:
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """The functions of R, and which of them have a coefficient where: unknowns are g and R_1, R_2, .. there."""
+    """Basis functions of R, and the entries of R_1, R_2, .. that are unknowns; the first unknown is g."""
 
     poles: Array  # (n,)
     pairs: Array  # (p, 2)
@@ -215,22 +216,22 @@ class Span:
         return 1 + int(self.used.sum())
 
     def responses(self, z: Complex) -> Complex:
-        """b_k(z) - 1 for k >= 1, shape (k, n + 2 p): what stays when R_0 = g I less the others."""
+        """Return b_j(z) - 1 for j >= 1, (k, n + 2 p): the factors of R_j where R_0 = g I - R_1 - R_2 - ..."""
         return basis(self.poles, z, self.pairs)[:, 1:] - 1
 
     def sources(self) -> Array:
-        """The filtered signals as rows over the forces, (m or m + 1, m)."""
+        """Return the filtered signals as rows over the forces, (m or m + 1, m): each force, then perhaps their sum."""
         m, columns = self.used.shape[1:]
         return np.vstack([np.eye(m), np.ones((columns - m, m))])
 
     def matrices(self, x: Array) -> Array:
-        """R_1, R_2, .. of the unknowns, (n + 2 p, m, m or m + 1)."""
+        """Return R_1, R_2, .. for the unknowns x, (n + 2 p, m, m or m + 1)."""
         R = np.zeros(self.used.shape)
         R[self.used] = x[1 : self.unknowns]
         return R
 
     def filter(self, x: Array, scale: float = 1.0) -> ForceFilter:
-        """The force filter in decimals: R_0 is what is missing to exactly g I."""
+        """Return the force filter times `scale` in decimals, with R_0 such that R(1) = g I holds exactly."""
         unit = 10**_DECIMALS
         later = np.array([round(v * unit) for v in (scale * self.matrices(x)).ravel().tolist()], dtype=object)
         later = later.reshape(self.used.shape)
@@ -241,17 +242,17 @@ class Span:
         return ForceFilter(self.poles, self.pairs, np.array([int(v) / unit for v in R.flat]).reshape(R.shape))
 
     def chain(self, T: float) -> Lti:
-        """A block with the poles of the basis."""
-        one = np.append(np.zeros(len(self.used)), 1.0)[:, None, None]  # the last function has every section
+        """Return a block with the poles of the basis; T in s."""
+        one = np.append(np.zeros(len(self.used)), 1.0)[:, None, None]  # The last function contains every section.
         return ForceFilter(self.poles, self.pairs, one).filter(T)
 
 
 def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int = FULL) -> Span:
-    """Taps, real poles even in the logarithm of the time constant, and the modes of E and of its inverse.
+    """Return a basis of taps, real poles, and the modes of E and of its inverse.
 
-    Poles are decimals from the start; a larger basis for one or two channels has slower ones, and sections where the
-    band ends. With more than `full` channels every device has a filter of its own force and one of the sum of all, and
-    fast modes are left to the latter.
+    The real poles are evenly spaced in the logarithm of the time constant. All poles are decimals. Large bases for at
+    most RICH channels also have slower poles, and sections at the band's end. With more than `full` channels every
+    device has a filter of its own force and one of the sum of all forces, and only the latter has the fast modes.
     """
     m = E.inputs
     modes = np.concatenate([E.poles(), _zeros(E)])
@@ -273,7 +274,9 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int
         pairs += [(-2 * mode.real, abs(mode) ** 2) for mode in q if mode.imag > 0]
     own = len(real) + taps - 1 + 2 * len(pairs)
     fast += [0.0] * (len(fast) % 2)
-    pairs += [(-(a + b), a * b) for a, b in zip(fast[::2], fast[1::2], strict=True)]  # last: own chains end before
+    pairs += [
+        (-(a + b), a * b) for a, b in zip(fast[::2], fast[1::2], strict=True)
+    ]  # These are last because the filters of own forces end before them.
     all_poles = np.concatenate([np.zeros(taps - 1), np.round(real, 4)])
     count = all_poles.size + 2 * len(pairs)
     used = np.ones((count, m, m), dtype=bool)
@@ -285,7 +288,7 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int
 
 
 def _zeros(E: Lti) -> Complex:
-    """The poles of E^-1; contacts are grounded by a millionth, so that there is one."""
+    """Return the poles of E^-1; a millionth of E's feedthrough is added to its diagonal so that the inverse exists."""
     D = E.D + 1e-6 * max(float(np.trace(E.D)) / E.inputs, 1e-12) * np.eye(E.inputs)
     return np.linalg.eigvals(E.A - E.B @ np.linalg.solve(D, E.C)).astype(complex)
 
@@ -306,32 +309,32 @@ _Posed = tuple[Program, Array, Callable[[Array], Array]]
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One environment in which the constraints are to hold, and how much its mismatch counts."""
+    """One environment with its constraints and the weight of its mismatch."""
 
-    loop: Loop  # around this environment alone
+    loop: Loop  # loop with this environment, without ranges
     E: Lti
     constraints: tuple[_Constraint, ...] = ()
     weight: float = 1.0
 
     def delayed(self, z: Complex) -> Sampled:
-        """Psi E at z (k,)."""
+        """Return Psi E at z (k,)."""
         return Sampled.of(delay(self.loop.psi, self.loop.T) @ self.E, z[None])
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The unknowns [g, R_1, R_2, .., own unknowns of the demands] with objective and inequalities."""
+    """Program in the unknowns [g, R_1, R_2, .., own unknowns of the constraints]: objective and inequalities."""
 
     span: Span
     cases: tuple[Case, ...]
     options: Options
     soft: float  # weight of the force above 100 Hz
-    heavier: float = 1.0  # times the weight of the static stiffness
-    sparse: bool = False  # few frequencies at first where only constraints count
+    heavier: float = 1.0  # factor of the static stiffness's weight
+    sparse: bool = False  # whether environments of weight 0 start with few frequencies
 
     @property
     def own(self) -> list[tuple[int, int]]:
-        """Where the own unknowns of each demand begin and end, case by case."""
+        """First and end index of each constraint's own unknowns, case by case."""
         counts = [len(constraint.start) for case in self.cases for constraint in case.constraints]
         return list(pairwise(accumulate(counts, initial=self.span.unknowns)))
 
@@ -340,7 +343,7 @@ class Problem:
         return self.span.unknowns + sum(len(c.start) for case in self.cases for c in case.constraints)
 
     def start(self, kappa: float) -> Array:
-        """R = kappa I."""
+        """Return the unknowns of R = kappa I, with the constraints' own unknowns at their start."""
         x = np.zeros(self.unknowns)
         x[0] = kappa
         own = [value for case in self.cases for constraint in case.constraints for value in constraint.start]
@@ -348,10 +351,10 @@ class Problem:
         return x
 
     def objective(self) -> tuple[Array, Array, Array]:
-        """A, b, c of |A x - b|^2 + c'x: squared relative mismatch, soft rows, and the share of static stiffness.
+        """Return A, b, c of |A x - b|^2 + c'x: squared relative mismatch, soft rows, and lost static stiffness.
 
-        The forces of a device are those of its own row of R: each row is a least-squares problem beside g, of which the
-        triangle is kept.
+        The forces of a device depend on g and on the device's own row of R only. So each row is a separate
+        least-squares problem, which is reduced to its triangular factor.
         """
         parts = [part for case in self.cases if case.weight for part in self._weighed(case)]
         rows, right, row_of = [], [], np.argwhere(self.span.used)[:, 1]
@@ -371,7 +374,10 @@ class Problem:
         return np.vstack([*rows, static, small]), np.concatenate([*right, [held], np.zeros(len(small))]), cost
 
     def _weighed(self, case: Case) -> list[tuple[Case, Array, Complex, Complex]]:
-        """(case, w, L, target): the squares of (F - target') L count, with weight/|E| and `_evened` in L."""
+        """Return parts (case, w, L, target L) of the objective |F L - target L|^2.
+
+        L contains weight/|E|, and for the mismatch also `_evened`; the target of soft rows is zero.
+        """
         loop, found = case.loop, []
 
         def add(w: Array, weight: Array, ideal: bool) -> None:
@@ -393,7 +399,7 @@ class Problem:
         return found
 
     def _force_rows(self, case: Case, w: Array, L: Complex, target: Complex, i: int, mine: NDArray[np.intp]) -> Array:
-        """Row i of F L by these unknowns, and that of the target, as real rows."""
+        """Return row i of F L for each of the unknowns `mine`, and row i of `target`, as real rows."""
         z = on_circle(w)
         moved = case.delayed(z).G[0] @ L * (z ** -float(case.loop.theta[i]))[:, None, None]
         functions, signals = self.span.responses(z), self.span.sources() @ moved
@@ -404,7 +410,7 @@ class Problem:
         return np.vstack([slope.real, slope.imag])
 
     def _slopes(self, case: Case, z: Complex) -> Sampled:
-        """What each of g, R_1, R_2, .. adds to the forces G as they leave, (unknowns, k, m, m)."""
+        """Return the derivatives of the forces G = R Psi E by g and the entries of R_1, .., (unknowns, k, m, m)."""
         delayed = case.delayed(z).G[0]
         signals = self.span.sources() @ delayed  # (k, sources, m)
         functions = self.span.responses(z)
@@ -416,7 +422,7 @@ class Problem:
         return Sampled(z[None], G, case.loop.T)
 
     def block(self, case: Case, constraint: _Constraint, own: tuple[int, int], w: Array) -> MatrixInequality:
-        """The inequality of a constraint at these frequencies: an affine map, by what it makes of each unknown."""
+        """Return the inequality of a constraint at the frequencies w, from the block's value for each unit unknown."""
         slopes = self._slopes(case, on_circle(w))
         nothing, units = Sampled(slopes.z, np.zeros_like(slopes.G[:1]), slopes.T), np.eye(own[1] - own[0])
         none = np.zeros(len(units))
@@ -429,7 +435,7 @@ class Problem:
         return MatrixInequality.of(constant[0], np.swapaxes(slope, 0, 1))
 
     def _positive(self, at: int) -> MatrixInequality:
-        """g > 0, where g is this unknown."""
+        """Return the inequality g > 0, where g is the unknown with the index `at`."""
         slope = np.zeros((1, self.unknowns, 1, 1), dtype=complex)
         slope[0, at] = 1
         return MatrixInequality.of(np.zeros((1, 1, 1), dtype=complex), slope)
@@ -437,7 +443,10 @@ class Problem:
     def _dense(
         self, A: Array, b: Array, c: Array, asked: _Asked, imposed: list[Array], start: Array, x: Array
     ) -> _Posed:
-        """(the program in other coordinates y, x there or what is feasible towards it, the way back)."""
+        """Return (program in well-conditioned coordinates y, feasible start y, map from y to x).
+
+        The start is x, or if x is infeasible a feasible point between `start` and x.
+        """
         import scipy
 
         parts = [self.block(*one, own, w) for one, own, w in zip(asked, self.own, imposed, strict=True)]
@@ -448,14 +457,17 @@ class Problem:
 
     @property
     def _entries(self) -> bool:
-        """Whether R has every entry, for more than two devices, and nothing is asked but what it goes through."""
+        """Whether `_by_entries` applies: R is full, m > 2, and every block is a constant plus L(z) G."""
         full = self.span.used.all() and self.span.used.shape[1] == self.span.used.shape[2] > 2
         return bool(full) and all(constraint.through for case in self.cases for constraint in case.constraints)
 
     def _by_entries(
         self, A: Array, b: Array, c: Array, asked: _Asked, imposed: list[Array], start: Array, x: Array
     ) -> _Posed:
-        """The same as `_dense` for R entry by entry, its functions balanced, and then g."""
+        """Return (program, feasible start y, map from y to x) like `_dense`, with y ordered by entries of R, then g.
+
+        The basis functions are orthogonalised, and the inequalities have the structure of EntryInequality.
+        """
         import scipy
 
         n, m, _ = self.span.used.shape
@@ -487,7 +499,7 @@ class Problem:
         return program, towards(there(start), there(x), program), back
 
     def least(self, case: Case, constraint: _Constraint, own: tuple[int, int], x: Array, w: Array) -> Array:
-        """The least eigenvalue of a constraint at x, (k,)."""
+        """Return the least eigenvalue of a constraint at x for each frequency w, (k,)."""
         spend(_POINT * w.size)
         z = on_circle(w)
         R = self.span.matrices(x) @ self.span.sources()
@@ -498,7 +510,7 @@ class Problem:
         return np.linalg.eigvalsh(constraint.at(G, x[own[0] : own[1]])[0])[:, 0]
 
     def grid(self, case: Case, constraint: _Constraint) -> Array:
-        """The frequencies at which a constraint is imposed first."""
+        """Return the initial frequencies of a constraint [rad/sample]."""
         if self.sparse and not case.weight:
             modes = case.E.poles()
             w = np.union1d(np.geomspace(_SMALLEST, np.pi, _FEW), np.angle(modes[modes.imag > 1e-6]))
@@ -512,7 +524,7 @@ class Problem:
         return w[(w >= max(constraint.low, _SMALLEST)) & (w <= constraint.high)]
 
     def room(self, x: Array, dense: bool = False) -> float:
-        """The least eigenvalue of any constraint at x, where each is imposed first or over the whole sweep."""
+        """Return the least eigenvalue of all constraints at x, on the initial grids or on dense sweeps."""
         rooms, own = [], iter(self.own)
         for case in self.cases:
             for constraint in case.constraints:
@@ -521,11 +533,11 @@ class Problem:
         return float(min(rooms))
 
     def _sweep(self, case: Case, constraint: _Constraint) -> Array:
-        """A grid that knows every pole, over the band of a constraint."""
+        """Return a dense grid that resolves every pole, over the band of a constraint [rad/sample]."""
         return frequencies(case.E, self.span.chain(case.E.T), low=max(constraint.low, _SMALLEST), high=constraint.high)
 
     def missed(self, x: Array) -> tuple[list[Array], float]:
-        """(where each constraint fails, case by case and constraint by constraint; by how much the worst does)."""
+        """Return (frequencies of the violations of each constraint in each case, largest violation)."""
         found, own, worst = [], iter(self.own), 0.0
         for case in self.cases:
             for constraint in case.constraints:
@@ -537,9 +549,9 @@ class Problem:
         return found, worst
 
     def solve(self, start: Array, forgiven: float = _FORGIVEN, until: float = math.inf) -> Array:
-        """Find the optimum, from a strictly feasible start: on a dense sweep it fails by no more than `forgiven`.
+        """Find the optimum from a strictly feasible start, with violations below `forgiven` on a dense sweep.
 
-        It may fail by more if the search ends because the work counted so far (`spent`) exceeds `until`.
+        Violations may be larger if the search ends because the work counted so far (`spent`) exceeds `until`.
         """
         asked = [(case, constraint) for case in self.cases for constraint in case.constraints]
         imposed = [self.grid(case, constraint) for case, constraint in asked]
@@ -549,8 +561,10 @@ class Problem:
         A, b = R[:, :-1], R[:, -1]
         x, t, gaps = start, None, list(_GAPS[:1] if self.sparse else _GAPS)
         inner = start
-        nothing = float(b @ b) + float(c.any())  # without any force; a supremum is 1 then
-        demanding = any(len(case.constraints) > 1 for case in self.cases)  # else scaling, which is exact, does the rest
+        nothing = float(b @ b) + float(c.any())  # objective of zero force, for which tau is 1
+        demanding = any(
+            len(case.constraints) > 1 for case in self.cases
+        )  # Otherwise exact scaling ensures feasibility.
         lower = _STEEPER**4 if demanding else _STEEPER
         for _ in range(budgets.PROGRAM_SWEEPS):
             program, y, back = posed(A, b, c, asked, imposed, start, x)
@@ -572,7 +586,10 @@ class Problem:
         return self._kept(inner, start, x) if demanding else x
 
     def _kept(self, inner: Array, start: Array, x: Array) -> Array:
-        """The point from x towards one inside where no constraint fails by the sweep: least eigenvalues are concave."""
+        """Return a point between x and an interior point at which no constraint fails on the dense sweep.
+
+        The violation is bounded because the least eigenvalue is concave along the line.
+        """
         _, worst = self.missed(x)
         for base in (inner, start):
             if (room := self.room(base, dense=True)) > 0:
@@ -581,10 +598,10 @@ class Problem:
 
 
 def _evened(E: Complex, size: Array) -> Complex:
-    """L with |M L|^2/|E|^2 = |M|^2/|E|^2 + EVEN mean over motions |M x|^2/(|E x|^2 + LEAST_FORCE^2 |E|^2 |x|^2).
+    """Return L with |M L|^2/|E|^2 = |M|^2/|E|^2 + EVEN mean over motions |M x|^2/(|E x|^2 + LEAST_FORCE^2 |E|^2 |x|^2).
 
-    The mismatch is relative to the largest force. Many couplings have nearly the same, and differ in motions that the
-    environment hardly answers: of these the one is taken that errs little of their forces, too.
+    The mismatch M is relative to the largest force. Many couplings have nearly the same mismatch and differ only in
+    motions with small forces. The second term selects one whose error is small relative to these forces, too.
     """
     unit, one = E / size[:, None, None], np.eye(E.shape[-1], dtype=np.complex128)
     faint = np.linalg.inv(np.conj(np.swapaxes(unit, 1, 2)) @ unit + _LEAST_FORCE**2 * one).astype(np.complex128)
@@ -596,5 +613,5 @@ def static_weight(loop: Loop) -> float:
 
 
 def _band(loop: Loop, band_hz: tuple[float, float]) -> tuple[float, float]:
-    """The band in rad/sample."""
+    """Return the band (low, high) in rad/sample, at most pi."""
     return 2 * np.pi * band_hz[0] * loop.T, min(2 * np.pi * band_hz[1] * loop.T, np.pi)

@@ -1,9 +1,9 @@
-"""From a displacement to the force that answers it: the controller, its certificate for the measured delay, its tick.
+"""Run a controller tick by tick on the host, and certify its coupling for the measured delay of the link.
 
-The link takes `link` ticks from a sample to the latch of its force, for every axis. Channels whose delay theta_i
-in the scenario is longer wait for the rest, theta_i - link, on the host: the loop has the scenario's delays as long
-as the link is no slower, and longer ones where it is. Where the device latches a force as soon as it comes, link is 0
-and the scenario's latency is what was measured.
+The link takes `link` ticks from a sample to the latch of its force, for every axis. Where a channel's delay theta_i
+in the scenario is longer, the host delays its force by the remaining theta_i - link ticks. The loop therefore has the
+scenario's delays unless the link is slower; then it has longer ones. Where the device latches a force on arrival,
+`link` is 0 and the scenario's latency is the measured one.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from haptic_loop.sim.couplings import assessed, choose, given
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, scene_of
 
-_SPEED_SECONDS = 0.01  # over which a speed is taken: one count of the coarsest encoder is 0.03 m/s
-_FALLBACK = ("spring-damper", "any-environment")  # what softer couplings are where the one asked for cannot be had
+_SPEED_SECONDS = 0.01  # window of a speed estimate: one count of the coarsest encoder is 0.03 m/s
+_FALLBACK = ("spring-damper", "any-environment")  # a reserve coupling, where the requested one is not certified
 
 
 class Controller(Protocol):
-    """Answers a displacement with a force, tick by tick."""
+    """A controller that computes a force for a displacement at every tick."""
 
     T: float  # [s]
 
-    def step(self, x: Sequence[float]) -> Sequence[float]: ...  # (m,) [N] fed back for the displacements x (m,) [m]
+    def step(self, x: Sequence[float]) -> Sequence[float]: ...  # (m,) [m] to forces fed back (m,) [N]
 
 
 class _HostController:
-    """A law at work, tick by tick and from rest."""
+    """A control law that starts at rest and advances one tick per call."""
 
     def __init__(self, law: Law) -> None:
         F = law.open
@@ -59,7 +59,7 @@ class _HostController:
         self._tick = partial(law.transition(), before, after)
 
     def step(self, x: Sequence[float]) -> list[float]:
-        """Forces (m,) [N] for the displacements x (m,) [m]; the state moves on by one tick."""
+        """Return forces (m,) [N] for displacements x (m,) [m] and advance the state by one tick."""
         self._x[:] = x
         self._tick()
         self._state[:] = self._next
@@ -69,17 +69,18 @@ class _HostController:
 def host_controller(
     loop: Loop, coupling: Coupling, link: int, cap: Sequence[float], lag: Sequence[float] | None = None
 ) -> Controller:
-    """The loop as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where it is too long.
+    """Return the loop as the host runs it, at rest and without the delay of `link` ticks that the link adds.
 
-    With `lag`, rho (m,) [N/m], forces leave through a limiter of `cap` (m,) [N].
+    With `lag`, which is rho (m,) [N/m], a limiter of `cap` (m,) [N] limits the forces. Raises ValueError where the
+    link is slower than a delay of the loop.
     """
     return _HostController(loop.delayed(tuple(n - link for n in loop.theta)).law(coupling, cap, lag))
 
 
 def _fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tuple[float, ...]]:
-    """Displacements for `ticks` ticks of which only the last was received: a straight line from `previous` to x.
+    """Interpolate linearly from `previous` to x (m,) [m] over `ticks` ticks, of which only the last was received.
 
-    A step would look to a damper like a blow of (dx/T) times its B.
+    A step instead would make a damper B answer with a force of B dx/T.
     """
     line = [tuple(a + (b - a) * (i / ticks) for a, b in zip(previous, x, strict=True)) for i in range(1, ticks)]
     return [*line, tuple(x)]
@@ -87,23 +88,23 @@ def _fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tup
 
 @dataclass(frozen=True)
 class BudgetPlan:
-    """An energy budget for one arming, as plain data: what a replay needs to know."""
+    """The parameters of an energy budget for one arming, as plain data that a replay can read."""
 
     start: float  # W0 [J]
-    cap: float | None  # [J], None where there is none
+    cap: float | None  # [J] largest budget, None for no limit
     delta: tuple[float, ...]  # (m,) [N s/m]
     encoder_step: tuple[float, ...]  # (m,) [m]
     force_step: tuple[float, ...]  # (m,) [N]
     theta: int  # [ticks]
-    longer: int  # ticks for which an older force may act beyond theta
+    longer: int  # ticks beyond theta for which an older force may act
     T: float  # [s]
 
     @classmethod
     def of(cls, start: float, cap: float, delta: Sequence[float], units: Units, config: Config, T: float) -> BudgetPlan:
-        """For a device of this configuration.
+        """Return the plan for a device of this configuration.
 
-        It holds a force for `hold` missed ticks and lets go of it in a ramp. Limited by its slew rate, a force is
-        for so many ticks that are not missed as large as older ones, and then within what was sent since.
+        The device holds a force for `hold` missed ticks, then ramps it to zero. Its slew rate lets an older force
+        last for ceil(cap / slew) further ticks that are not missed; after them the force is within those sent since.
         """
         slews = max(math.ceil(cap / slew) for cap, slew in zip(config.cap, config.slew, strict=True))
         longer = slews * (config.hold + 1) + config.ramp
@@ -112,7 +113,7 @@ class BudgetPlan:
 
 
 class SentBudget:
-    """The energy budget between the shaped forces and the line. Forces are whole steps, so it rounds towards zero."""
+    """The energy budget that limits shaped forces before they are sent. It rounds towards zero to whole steps."""
 
     def __init__(self, plan: BudgetPlan) -> None:
         m, cap = len(plan.delta), math.inf if plan.cap is None else plan.cap
@@ -124,10 +125,10 @@ class SentBudget:
         self._nothing = np.zeros((m, 1))
 
     def limit(self, steps: Sequence[int], x: Sequence[float], applied: Array, missed: int) -> tuple[int, ...]:
-        """What to send instead of `steps`, at x (m,) [m]; f = `applied` (m,) [N] acts from this tick on.
+        """Return the steps to send in place of `steps` at x (m,) [m]; f = `applied` (m,) [N] acts from this tick on.
 
-        Of `missed` ticks before this one nothing was received, and nothing was sent in them: what moved in them is
-        not known, so that they are booked as the most that they may have lost.
+        In the `missed` ticks before this one nothing was received or sent. Their motion is unknown, so each of them
+        is booked with the largest energy that it may have cost.
         """
         now, wanted = np.array(x), (np.array(steps) * self._unit)[:, None]
         for _ in range(missed):
@@ -139,35 +140,35 @@ class SentBudget:
         return tuple(int(n) for n in whole)
 
     def figures(self) -> BudgetFigures:
-        """What it has done since arming."""
+        """Return what the budget has done since arming."""
         given = f"more than {self.plan.start:g} J" if self.plan.start else "any energy"
         dissipated = "in an arming beyond what the devices dissipate, whatever computes the forces"
         return self._budget.figures(f"no passive hand is given {given} {dissipated}")
 
 
 class WorldController:
-    """A MuJoCo scene behind a coupling, and the energy shell that counts the forces as they are sent.
+    """A MuJoCo scene behind a coupling, with an energy shell that accounts for the forces that are sent.
 
-    Every tick is `step`, then `limit` for what the session makes of the forces: gain, caps and whole steps are for the
-    shell a part of the environment. Of a tick without an answer it counts the force that the device holds.
+    Each tick calls `step`, then `limit` with the forces after gain, caps and rounding to whole steps: the shell treats
+    these as a part of the environment. For a tick without an answer the shell books the force that the device holds.
     """
 
     def __init__(
         self, scenario: Scenario, coupling: Coupling, start: float, cap: Sequence[float], waits: Sequence[int]
     ) -> None:
-        """`start` is W0 [J], `waits` (m,) the ticks by which the host delays what it sends. Raises InputError."""
+        """Take W0 = `start` [J] and `waits` (m,), the ticks by which the host delays its forces. Raises InputError."""
         V = coupling.compliance(scenario.T)
         scene = scene_of(scenario, coupling)  # raises InputError for a coupling without V
         assert V is not None
         self.T, self.port, self.shell = scenario.T, scene.port(cap), Shell(V, start=start)
-        self.least = 0.0  # [J] of the sum of f'(u - u_-) so far
-        self.seconds: list[float] = []  # of the processor, for each step of the scene
+        self.least = 0.0  # [J] least value so far of the sum of f'(u - u_-)
+        self.seconds: list[float] = []  # CPU time of each step of the scene
         self._start, self._sent = start, np.zeros((len(waits), 1))
-        self._open = False  # whether a tick was begun whose force is not counted yet
+        self._open = False  # whether the force of the current tick is still to be booked
         self._lines = [deque([0] * n) for n in waits]
 
     def step(self, x: Sequence[float]) -> list[float]:
-        """Forces (m,) [N] of the scene for the displacements x (m,) [m]."""
+        """Return the scene's forces (m,) [N] for displacements x (m,) [m]."""
         if self._open:
             self.shell.book(self._sent)
         free = self.shell.free(np.array(x)[:, None])
@@ -179,7 +180,7 @@ class WorldController:
         return wanted.tolist()
 
     def limit(self, steps: Sequence[int], unit: Sequence[float]) -> tuple[int, ...]:
-        """What the shell lets through of `steps`, which are -`unit` (m,) [N] each: whole steps again."""
+        """Return the whole steps that the shell allows of `steps`; one step is -`unit` (m,) [N]."""
         each = -np.array(unit)[:, None]
         wanted = np.array(steps)[:, None] * each
         self._sent, _ = self.shell.limit(wanted, lambda f: np.where(f == wanted, f, np.trunc(f / each) * each))
@@ -188,7 +189,7 @@ class WorldController:
         return tuple(int(n) for n in np.round(self._sent / each)[:, 0])
 
     def later(self, steps: Sequence[int], ticks: int) -> tuple[int, ...]:
-        """What is to be sent now where `steps` are new, `ticks` after those before."""
+        """Put `steps`, computed `ticks` after the previous ones, into the delay lines and return the steps to send."""
         sent = []
         for line, step in zip(self._lines, steps, strict=True):
             line.extend([line[-1] if line else step] * (ticks - 1) + [step])
@@ -197,30 +198,30 @@ class WorldController:
 
 
 class TraceRow(NamedTuple):
-    """One tick of a trace. Where `state` is None no STATE came: x is filled in and nothing was sent."""
+    """One tick of a trace. If `state` is None, no STATE came: x is interpolated and nothing was sent."""
 
     tick: int  # modulo 2^16
     x: tuple[float, ...]  # (m,) [m]
-    asked: Sequence[float]  # (m,) [N] by the controller
+    asked: Sequence[float]  # (m,) [N] force that the controller computed
     gain: float
     sent: tuple[int, ...]  # [steps]
     state: State | None
-    arming: int = 0  # which arming of the session this belongs to
-    test: tuple[float, ...] | None = None  # (m,) [N] that encoders are tested with, behind the gain
+    arming: int = 0  # number of the arming in the session
+    test: tuple[float, ...] | None = None  # (m,) [N] force of the encoder test, which the gain does not scale
 
 
 @dataclass(frozen=True, eq=False)
 class Arming:
-    """What forces come from, from one arming to the next end."""
+    """The program, configuration and energy budget of one arming."""
 
-    number: int  # of the session, from 0
+    number: int  # counts the armings of a session from 0
     program: Armable
-    config: Config  # of the device
+    config: Config  # configuration of the device
     budget: SentBudget | None = None
 
 
 class Drive:
-    """The coupling at work, from one arming to the next end."""
+    """The controller, limits and monitors that compute forces during one arming."""
 
     def __init__(
         self,
@@ -233,39 +234,39 @@ class Drive:
         still: Sequence[int] | None = None,
         expected: Sequence[monitor.Expected] | None = None,
     ) -> None:
-        """`still` (m,) [counts] are within an encoder's noise, `expected` (m,) is what the test at arming compares."""
+        """Take `still` (m,) [counts], the encoders' noise, and `expected` (m,), the motions that the test compares."""
         self.controller, config = arming.program.controller(limits.cap), arming.config
         self.units, self.config, self.limits = units, config, limits
         self.T = T = self.controller.T
         self.gain = Gain(limits, T)
-        self.force = (0.0,) * config.axes  # [N] the last one sent
-        self.x: tuple[float, ...] | None = None  # [m] of the last STATE
-        self.reference: tuple[int, ...] | None = None  # [counts] that positions are counted from
+        self.force = (0.0,) * config.axes  # [N] last force sent
+        self.x: tuple[float, ...] | None = None  # [m] displacements of the last STATE
+        self.reference: tuple[int, ...] | None = None  # [counts] origin of the displacements
         self._rereference = settings.rereference
         test = monitor.EncoderTest(limits.cap, T, units, still, expected, settings.held)
         self._test = test if settings.test_encoders else None
         self._encoders = monitor.EncoderMonitor(units.encoder_step, units.force_step, T, still)
         self._heat = Heat(limits, T)
-        self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] over which a speed is taken
-        self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] tick by tick
-        self._before: tuple[float, ...] | None = None  # [m] of the STATE before that, where none is missing
+        self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] window of a speed estimate
+        self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] displacements tick by tick
+        self._before: tuple[float, ...] | None = None  # [m] displacements one tick before self.x; None after a gap
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
         self._commands, self._clock = monitor.CommandMonitor(config), monitor.ClockMonitor(limits.watchdog_us, T)
 
     @property
     def dead(self) -> str | None:
-        """What to say of an axis that does not move although a force acts on it for long; None: there is none."""
+        """A message about an axis that stands still although a force has acted on it for long; None without one."""
         return self._encoders.dead
 
     def step(self, state: State, ticks: int, direction: int, now: int) -> tuple[int, ...]:
-        """The force [steps] that answers `state`, which came at `now` [us], `ticks` after the one before.
+        """Return the force [steps] for `state`, which came at `now` [us], `ticks` ticks after the previous STATE.
 
-        The gain rises (direction 1), falls (-1) or stays (0); it rises once every encoder has answered its test.
+        The gain rises (direction 1), falls (-1) or stays (0); it rises only after every encoder has passed its test.
         Raises SafetyStop where the device, an encoder or the controller is out of bounds.
         """
         if self.x is None:
-            ticks = 1  # what went before does not count
+            ticks = 1  # ticks before the arming are no gap
         self._clock.check(state, ticks, now)
         self.units.check_range(state.counts)
         if self.reference is None:
@@ -305,7 +306,7 @@ class Drive:
         return steps
 
     def _check_motion(self, x: tuple[float, ...], ticks: int) -> None:
-        """Raise SafetyStop where no hand moves to x (m,) [m] within so many ticks."""
+        """Raise SafetyStop where no hand can have moved the handles to x (m,) [m] within `ticks` ticks."""
         if self.x is not None:
             self.limits.check_jump(x, self.x, ticks)
             if ticks == 1 and self._before is not None:
@@ -319,7 +320,7 @@ class Drive:
             self.limits.check_speed(x, recent[0], since * self.T)
 
     def _miss(self, state: State, positions: list[tuple[float, ...]]) -> None:
-        """The controller moves on through ticks of which no STATE came."""
+        """Advance the controller through ticks without a STATE, at interpolated positions (m,) [m]."""
         for back, x in zip(range(len(positions), 0, -1), positions, strict=True):
             tick, asked = (state.tick - back) & 0xFFFF, self.controller.step(x)
             self._record(TraceRow(tick, x, asked, self.gain.value, (), None, self._arming))
@@ -331,11 +332,11 @@ class Drive:
 def timed(
     scenario: Scenario, ages: monitor.Ages, quantile: float, guard_us: float, at_once: bool = False
 ) -> tuple[Scenario, int]:
-    """The scenario with what was measured of its ticks, and the ticks that the link takes.
+    """Return the scenario with the measured T_max and latency, and the ticks that the link takes.
 
-    T_max is the length that a fraction `quantile` of the device's ticks keeps, where it exceeds T. `at_once`: forces
-    latch as they come, link 0, between the least age and the one that a fraction keeps, both with the guard. Raises
-    SafetyStop where those are a period or longer.
+    A fraction `quantile` of the device's ticks is no longer than T_max, which is set only where it exceeds T. With
+    `at_once`, forces latch on arrival and the link takes 0 ticks; the latency then ranges from the least age to the
+    quantile of the ages, both widened by `guard_us` [us]. Raises SafetyStop where the latency reaches a period.
     """
     T_us = 1e6 * scenario.T
     longest, known = ages.longest_tick(T_us, quantile), scenario.T_max or scenario.T
@@ -350,17 +351,17 @@ def timed(
 
 
 class Armable(Protocol):
-    """What a session can be armed with."""
+    """A program that a session can be armed with."""
 
     @property
     def link(self) -> int: ...  # ticks from a sample to the latch of its force
     @property
-    def certified(self) -> bool: ...  # for every passive human
+    def certified(self) -> bool: ...  # whether it is certified for every passive human
     @property
-    def name(self) -> str: ...  # for the log
+    def name(self) -> str: ...  # name in the log
     @property
-    def margin_us(self) -> float: ...  # [us] before its latch, or the end of its tick, by which a force must come
-    def controller(self, cap: Sequence[float]) -> Controller: ...  # a fresh one, for forces up to `cap` (m,) [N]
+    def margin_us(self) -> float: ...  # [us] by which a force must precede its latch, or the end of its tick
+    def controller(self, cap: Sequence[float]) -> Controller: ...  # return a new controller for `cap` (m,) [N]
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,14 +369,14 @@ class CertifiedCoupling:
     """A coupling with the delay that it is certified for."""
 
     link: int  # [ticks]
-    scenario: Scenario  # with the delays of this loop
+    scenario: Scenario  # has the delays of this loop
     case: str
     chosen: Chosen
-    assessment: Assessment  # in the loop with these delays
+    assessment: Assessment  # holds for the loop with these delays
 
     @property
     def certified(self) -> bool:
-        """Whether there is a guarantee for this loop, and the user's own condition holds where there is one."""
+        """True if this loop has a guarantee and the user's own condition, if any, holds."""
         return self.assessment.guarantee is not None and not self.chosen.fails(self.assessment.requirements)
 
     @property
@@ -391,7 +392,7 @@ class CertifiedCoupling:
 
     @property
     def held(self) -> int:
-        """Missed answers in a row through which the device may hold a force, as far as the coupling's file proves."""
+        """The number of missed answers in a row for which the coupling's file proves that a force may be held."""
         span = self.chosen.switching
         return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
 
@@ -407,7 +408,7 @@ class CertifiedCoupling:
         return replace(self.assessment, force_limits=self.assessment.force_limits.within(cap))
 
     def remarks(self) -> list[str]:
-        """What a reader should know of the coupling's file, of a condition of the user's own, and of the clock."""
+        """Return remarks on the coupling's file, on the user's own condition and on the clock."""
         said = [*self.chosen.remarks(self.assessment.requirements)]
         if self.scenario.latency:
             least, most = (1e6 * t for t in self.scenario.latency[0])
@@ -430,12 +431,12 @@ def certified_coupling(
     limiter: bool | None = None,
     start: float = START_J,
 ) -> CertifiedCoupling:
-    """The coupling `name`, or one's `own`, for a link of `link` ticks (0: the host is the clock).
+    """Return the coupling `name`, or the user's `own` one, certified for a link of `link` ticks (0: host clock).
 
-    Forces leave through the limiter that these cover, unless `limiter` is False. In a MuJoCo world they leave through
-    the energy shell, with W0 = `start` [J].
+    The coupling's limiter limits the forces unless `limiter` is False. In a MuJoCo world the energy shell limits
+    them, with W0 = `start` [J].
 
-    Raises SafetyStop where no coupling is certified for it, InputError where the request contradicts itself.
+    Raises SafetyStop where the coupling is not certified, InputError where the request contradicts itself.
     """
     if link > MAX_THETA:
         raise SafetyStop(f"the link takes {link} ticks, the protocol carries at most theta = {MAX_THETA}")
@@ -450,7 +451,7 @@ def certified_coupling(
         assessment = assessed(alone, case, chosen, energy_budget=start, limiter=False)
     else:
         assessment = assessed(alone, case, chosen, limiter=limiter)
-    waits = min(MAX_THETA, *slower.theta) if link else 0  # what is longer, the host waits for
+    waits = min(MAX_THETA, *slower.theta) if link else 0  # the host adds the rest of longer delays
     made = CertifiedCoupling(waits, slower, case, chosen, assessment)
     if not made.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
@@ -468,12 +469,12 @@ def certified_couplings(
     limiter: bool | None = None,
     start: float = START_J,
 ) -> tuple[CertifiedCoupling, ...]:
-    """The coupling for the measured delay and up to `spare` in reserve, each certified for one tick more.
+    """Return the coupling for the measured delay and up to `spare` reserves, each certified for one tick more.
 
-    A reserve is softer than the coupling before it on every channel whose delay is longer, stiffer on none, and needs
-    less damping than that coupling would with these delays. It is of the same kind or from the same file, or else the
-    spring-damper by Theorem 4, which guarantees the most. Where neither is certified, there is no further one.
-    Raises SafetyStop where the first coupling is not certified.
+    A reserve is softer than the previous coupling on every channel whose delay is longer, stiffer on none, and needs
+    less damping than the previous coupling would need with these delays. It has the same kind or file; where that is
+    not certified, it is the spring-damper by Theorem 4, which has the strongest guarantee. If neither is certified,
+    the list ends. Raises SafetyStop where the first coupling is not certified.
     """
     found = [certified_coupling(scenario, case, name, condition, link, limiter=limiter, start=start)]
     wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), _FALLBACK]
@@ -491,13 +492,14 @@ def certified_couplings(
     return tuple(found)
 
 
-_EQUAL = 1e-9  # relative difference of static stiffnesses that is rounding
+_EQUAL = 1e-9  # relative rounding error of static stiffnesses
 
 
 def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
-    """Whether it is softer where its delay is longer, stiffer nowhere, and asks less of the devices with its delays.
+    """Return whether `reserve` is softer than `than` at longer delays, nowhere stiffer, and needs less damping.
 
-    A stiffness is the coupling's own K, or else the static one that is felt.
+    Both couplings are compared in the loop with the reserve's delays. The stiffness is the coupling's K, or without
+    one the static stiffness that the devices feel.
     """
     own, other = (made.assessment.gains for made in (reserve, than))
     K, before = (np.array(gains.get("K", np.nan)) for gains in (own, other))
@@ -512,7 +514,7 @@ def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
 
 
 def _felt_at_rest(made: CertifiedCoupling) -> Array:
-    """Static stiffness (m, m) [N/m] that the devices feel; of a world, where nothing in it gives way."""
+    """Return the static stiffness (m, m) [N/m] that the devices feel; in a world, that against fixed bodies."""
     loop = made.scenario.loop(made.case)
     V = made.chosen.coupling.compliance(loop.T) if is_world(made.scenario) else None
     return loop.F(made.chosen.coupling).dc() if V is None else np.linalg.inv(V.dc())

@@ -1,6 +1,6 @@
-"""Limits of forces and encoders, and what a device must declare in INFO before it is driven.
+"""Limit forces and displacements, and check what a device declares in INFO before it is driven.
 
-Pure functions, no clock, no port. Order matters: a number that is not finite is found before any clamping, because
+The functions use no clock and no port. They reject numbers that are not finite before they clamp anything, because
 max(-12, min(12, nan)) is +12.
 """
 
@@ -27,26 +27,26 @@ from haptic_loop.models.device import require
 from haptic_loop.sim.scenario import Scenario
 
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
-_FEWEST_STEPS = 16  # of force up to the cap: coarser, and the certificate's linear loop is another one
-_COARSEST = 0.1  # of the largest displacement in a tick that is taken for a hand's: one count of an encoder
-_LARGEST_MARGIN_US = 30_000  # an age is read from a margin, which is an i16 in microseconds
-_HOLD, _RAMP_US = 4, 5000  # what the device does without answers: ticks held, then microseconds to zero
+_FEWEST_STEPS = 16  # least number of force steps up to the cap; with fewer, the loop is not the certified linear one
+_COARSEST = 0.1  # largest encoder count, as a part of the largest displacement in a tick that a hand can make
+_LARGEST_MARGIN_US = 30_000  # ages are computed from margins, which are i16 in microseconds
+_HOLD, _RAMP_US = 4, 5000  # ticks and then microseconds in which a device without answers holds and releases a force
 
 
 class Stage(StrEnum):
-    """Where a session stands. From the last five there is no way back but a new session."""
+    """The stage of a session. The last five stages are final: only a new session leaves them."""
 
     CONNECTING = "connecting"  # HELLO sent, no INFO yet
     CONFIGURING = "configuring"  # CONFIG sent, no ACK yet
-    MEASURING = "measuring"  # zero force: the age of every answer is collected
-    MEASURED = "measured"  # zero force: waiting for a coupling that is certified for what was measured
-    DISARMED = "disarmed"  # zero force: waiting for a person
+    MEASURING = "measuring"  # zero force: the ages of answers are measured
+    MEASURED = "measured"  # zero force: the session waits for a coupling that is certified for the measured delay
+    DISARMED = "disarmed"  # zero force: the session waits for a person
     ARMING = "arming"  # the gain rises
     ARMED = "armed"
     DISARMING = "disarming"  # the gain falls
-    FINISHED = "finished"  # ended as planned
+    FINISHED = "finished"  # the session ended as planned
     REFUSED = "refused"  # this device, link or coupling may not be armed
-    STOPPED = "stopped"  # a fault
+    STOPPED = "stopped"  # a fault ended the session
     LOST = "lost"  # the device does not answer, or is gone
     ESTOP = "e-stop"
 
@@ -56,31 +56,31 @@ DRIVING = frozenset({Stage.ARMING, Stage.ARMED, Stage.DISARMING})
 
 
 class _Shaped(NamedTuple):
-    """A force that may be sent, and what had to be done to it."""
+    """A force that may be sent, and which limits it has reached."""
 
     force: tuple[float, ...]  # (m,) [N]
-    clipped: bool  # at the cap, by the limiter or by being cut here
-    slowed: bool  # at the slew limit
+    clipped: bool  # whether an entry is at its cap, by the limiter or by clipping here
+    slowed: bool  # whether the slew rate limits an entry
 
 
 def _require_finite(force: Sequence[float]) -> None:
-    """Raise SafetyStop where a force is not a number or infinite."""
+    """Raise SafetyStop where a force (m,) [N] is not a number or infinite."""
     if not all(map(math.isfinite, force)):
         raise SafetyStop(f"the controller asked for {', '.join(f'{f:g}' for f in force)} N, which is no force")
 
 
 @dataclass(frozen=True)
 class SafetyLimits:
-    """The host's own limits; the device has the same ones in its firmware."""
+    """The host's limits on forces and motion. The device has its own force limits in its firmware."""
 
     cap: tuple[float, ...]  # (m,) [N] largest force
     slew: float = 2000.0  # [N/s] fastest change of a force
     jump: float = 3e-3  # [m] largest displacement from tick to tick: 2.5 m/s at T = 1.2 ms
     watchdog_us: int = 6000  # [us] longest silence of a device that is streaming; see watchdog_for
-    ramp_in: float = 0.25  # [s] in which the gain rises from 0 to 1
-    ramp_out: float = 0.1  # [s] in which it falls
+    ramp_in: float = 0.25  # [s] time in which the gain rises from 0 to 1
+    ramp_out: float = 0.1  # [s] time in which the gain falls from 1 to 0
     speed: float = 1.0  # [m/s] fastest motion while forces act
-    continuous: tuple[float, ...] = ()  # (m,) [N] that every motor stands for ever; none: heating is not looked at
+    continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold for ever; empty: no heat check
     thermal: float = 10.0  # [s] time constant of the motors
 
     def __post_init__(self) -> None:
@@ -106,11 +106,10 @@ class SafetyLimits:
         T: float,
         test: Sequence[float] | None = None,
     ) -> _Shaped:
-        """The force to send in place of `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
+        """Return the force to send for `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
 
-        `test` (m,) [N] is added behind the gain: what an encoder is tested with.
-
-        Raises SafetyStop where `asked` is not finite; that is looked at first, and the result is looked at again.
+        `test` (m,) [N] is the force of the encoder test, which is added after the gain. Raises SafetyStop where
+        `asked`, its sum with `test`, or the result is not finite, or the gain is outside of [0, 1].
         """
         _require_finite(asked)
         if not 0.0 <= gain <= 1.0:
@@ -131,7 +130,7 @@ class SafetyLimits:
         return _Shaped(tuple(force), clipped, slowed)
 
     def check_jump(self, x: Sequence[float], previous: Sequence[float], ticks: int) -> None:
-        """Raise SafetyStop where an encoder moved further in `ticks` ticks than a hand can: x, previous (m,) [m]."""
+        """Raise SafetyStop where an encoder moved from `previous` to x (m,) [m] in `ticks` ticks faster than a hand."""
         most = self.jump * ticks
         for i, (now, before) in enumerate(zip(x, previous, strict=True), start=1):
             if not abs(now - before) <= most:
@@ -139,9 +138,9 @@ class SafetyLimits:
                 raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
     def check_jolt(self, x: Sequence[float], previous: Sequence[float], before: Sequence[float]) -> None:
-        """Raise SafetyStop where a speed changed within a tick by more than `jump` per tick, as no mass can.
+        """Raise SafetyStop where a speed changed within a tick by more than `jump` per tick, which no mass can do.
 
-        x, previous, before: (m,) [m], of three ticks in a row.
+        `before`, `previous` and x (m,) [m] are the displacements of three ticks in a row.
         """
         for i, (now, last, first) in enumerate(zip(x, previous, before, strict=True), start=1):
             if not (change := abs(now - 2 * last + first)) <= self.jump:
@@ -151,7 +150,7 @@ class SafetyLimits:
                 )
 
     def check_speed(self, x: Sequence[float], before: Sequence[float], seconds: float) -> None:
-        """Raise SafetyStop where an axis moved faster than allowed: x now, `before` so many `seconds` ago, (m,) [m]."""
+        """Raise SafetyStop where an axis moved from `before` to x (m,) [m] within `seconds` faster than `speed`."""
         most = self.speed * seconds
         for i, (now, then) in enumerate(zip(x, before, strict=True), start=1):
             if not abs(now - then) <= most:
@@ -159,7 +158,7 @@ class SafetyLimits:
                 raise SafetyStop(f"axis {i} moves at {speed:.3g} m/s, allowed are {self.speed:g} m/s while forces act")
 
     def objections(self, info: Info, scenario: Scenario, baud: int | None) -> list[str]:
-        """Why this device may not run this scenario over this line; empty where all is right. baud None: no UART."""
+        """Return the reasons why this device may not run this scenario over this line (baud None: no UART)."""
         if info.version != PROTOCOL:
             spoken = f"the device speaks version {info.version} of the protocol, this host version {PROTOCOL}"
             return [f"{spoken}: give it the firmware of this version (hw/firmware)"]
@@ -189,7 +188,7 @@ class SafetyLimits:
         return reasons
 
     def configuration(self, info: Info, theta: int) -> Config:
-        """The CONFIG for the device: never more than the host allows itself, nor than the device can do."""
+        """Return the CONFIG for the device, within the limits of the host and of the device."""
         T_ns = info.period_ns
         ramp = max(1, min(0xFF, math.ceil(1000 * _RAMP_US / T_ns)))
         steps = [1e-6 * step for step in info.force_step]
@@ -207,9 +206,9 @@ class SafetyLimits:
 
 @dataclass
 class Gain:
-    """The factor in front of every force. It moves linearly in time, never jumps, and starts at 0.
+    """The factor that scales every force. It starts at 0, changes linearly in time and never jumps.
 
-    Any constant gain within [0, 1] keeps a certificate: this-environment holds for g F if it does for F.
+    Any constant gain within [0, 1] keeps a certificate: if this-environment holds for F, it holds for g F.
     """
 
     limits: SafetyLimits
@@ -217,20 +216,20 @@ class Gain:
     value: float = 0.0
 
     def rise(self, ticks: int = 1) -> float:
-        """The gain `ticks` ticks later, on its way to 1."""
+        """Raise the gain towards 1 for `ticks` ticks and return it."""
         self.value = min(1.0, self.value + ticks * self.T / self.limits.ramp_in)
         return self.value
 
     def fall(self, ticks: int = 1) -> float:
-        """The gain `ticks` ticks later, on its way to 0."""
+        """Lower the gain towards 0 for `ticks` ticks and return it."""
         self.value = max(0.0, self.value - ticks * self.T / self.limits.ramp_out)
         return self.value
 
 
 class Heat:
-    """The heating of every motor by the square of its force, I2t: a first-order lag that tends to the square.
+    """A thermal model (I2t) of every motor: a first-order lag with time constant tau of the squared force.
 
-    At a constant force F it reaches the continuous force's square after -tau ln(1 - (F_continuous / F)^2).
+    A constant force F reaches the square of the continuous force after -tau ln(1 - (F_continuous / F)^2).
     """
 
     def __init__(self, limits: SafetyLimits, T: float) -> None:
@@ -238,7 +237,7 @@ class Heat:
         self._squares = [0.0] * len(limits.continuous)  # [N^2]
 
     def check(self, force: Sequence[float], ticks: int) -> None:
-        """Take in the force (m,) [N] that acts for so many ticks. Raise SafetyStop where a motor gets too hot."""
+        """Advance the model by `ticks` ticks of the force (m,) [N]. Raises SafetyStop where a motor gets too hot."""
         part = -math.expm1(-ticks * self._T / self._limits.thermal)
         for i, most in enumerate(self._limits.continuous):
             self._squares[i] += (force[i] ** 2 - self._squares[i]) * part
@@ -248,16 +247,16 @@ class Heat:
                 )
 
 
-# before anything moves: is this the device that the scenario is about, and can the line carry it?
+# Checks of the device and the line before anything moves.
 
 
 @dataclass(frozen=True)
 class Units:
-    """Integers of the wire to SI units and back. The wire carries what the motor does, -f."""
+    """The conversion between integers on the wire and SI units. The wire carries the motors' force, -f."""
 
     encoder_step: tuple[float, ...]  # (m,) [m]
     force_step: tuple[float, ...]  # (m,) [N]
-    range: tuple[int, ...]  # (m,) [counts] the workspace is +-range
+    range: tuple[int, ...]  # (m,) [counts] half the workspace, which is +-range
 
     @classmethod
     def of(cls, info: Info) -> Units:
@@ -265,20 +264,20 @@ class Units:
         return cls(encoder, tuple(1e-6 * step for step in info.force_step), info.range)
 
     def positions(self, counts: Iterable[int]) -> tuple[float, ...]:
-        """Displacements (m,) [m]."""
+        """Return the displacements (m,) [m] for encoder counts (m,)."""
         return tuple([n * step for n, step in zip(counts, self.encoder_step, strict=True)])
 
     def forces(self, steps: tuple[int, ...]) -> tuple[float, ...]:
-        """Forces fed back f (m,) [N], from what the motors do."""
+        """Return the forces fed back f (m,) [N] for the motors' forces (m,) [steps]."""
         return tuple(-n * step for n, step in zip(steps, self.force_step, strict=True))
 
     def steps(self, f: Sequence[float], cap: tuple[int, ...]) -> tuple[int, ...]:
-        """What the motors are to do for the forces fed back f (m,) [N]: whole steps, at most `cap`."""
+        """Return the motors' forces (m,) [steps], at most `cap` (m,), for the forces fed back f (m,) [N]."""
         each = zip(f, self.force_step, cap, strict=True)
         return tuple([max(-most, min(most, round(-force / step))) for force, step, most in each])
 
     def check_range(self, counts: Sequence[int]) -> None:
-        """Raise SafetyStop where an encoder (m,) [counts] is outside of what the device can reach."""
+        """Raise SafetyStop where encoder counts (m,) are outside of the device's workspace."""
         for i, (now, most) in enumerate(zip(counts, self.range, strict=True)):
             if not -most <= now <= most:
                 mm = 1e3 * self.encoder_step[i]
@@ -286,14 +285,14 @@ class Units:
 
 
 def _wire_time(baud: int, axes: int) -> tuple[float, str]:
-    """Seconds for one STATE and one FORCE, and the arithmetic as text."""
+    """Return the time [s] that one STATE and one FORCE take on the line, and its computation as text."""
     up, down = wire_bytes(State, axes), wire_bytes(Force, axes)
     seconds = (up + down) * _BITS_PER_BYTE / baud
     return seconds, f"({up} + {down}) bytes x {_BITS_PER_BYTE} bits / {baud} baud = {1e6 * seconds:.0f} us"
 
 
 def _impossible(i: int, info: Info) -> str | None:
-    """Values of axis i that docs/protocol.md does not allow."""
+    """Return a message about the first value of axis i that docs/protocol.md does not allow, or None."""
     allowed = {"encoder_step": 0xFFFFFFFF, "force_step": 0xFFFFFFFF, "hard_limit": 0x7FFF, "range": 0x7FFFFFFF}
     for name, most in allowed.items():
         if not 1 <= (value := getattr(info, name)[i]) <= most:
@@ -302,7 +301,7 @@ def _impossible(i: int, info: Info) -> str | None:
 
 
 def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
-    """Steps of axis i that are too coarse for limits on forces and displacements."""
+    """Return messages about a force step or encoder step of axis i that is too coarse for the limits."""
     force, count = 1e-6 * info.force_step[i], 1e-12 * info.encoder_step[i]
     most, widest = min(limits.cap[i] / _FEWEST_STEPS, limits.slew * T), _COARSEST * limits.jump
     wide = f"one encoder count of axis {i + 1} is {1e3 * count:g} mm, at most {1e3 * widest:g} mm is allowed"
@@ -311,7 +310,10 @@ def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
 
 
 def probe_delay(T: float) -> int:
-    """The theta to measure with: the longest whose margin can be told. Raises ValueError where there is none."""
+    """Return the theta [ticks] of the measurement, the longest that a margin can express.
+
+    Raises ValueError where T [s] is too long for any.
+    """
     theta = min(MAX_THETA, int(_LARGEST_MARGIN_US / (1e6 * T)))
     if theta < 1:
         raise ValueError(f"T is {T:g} s, a serial link is for at most {1e-6 * _LARGEST_MARGIN_US:g} s")
@@ -319,9 +321,9 @@ def probe_delay(T: float) -> int:
 
 
 def watchdog_for(T: float) -> int:
-    """The longest silence [us] of a device that ticks every T [s]: five ticks, and at least the 6 ms of a busy host.
+    """Return the longest silence [us] of a device that ticks every T [s]: five ticks, and at least 6 ms (busy host).
 
-    Raises ValueError where that is longer than a free handle may be pushed without being asked.
+    Raises ValueError where it exceeds MAX_RELEASE_NS, the longest time for which a handle may be pushed unasked.
     """
     silence = max(6000, math.ceil(round(5e6 * T, 3)))
     if silence > MAX_RELEASE_NS // 1000:
