@@ -351,10 +351,17 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         beside = [name for name in ("springs", "masses", "walls", "block", "elements") if getattr(self, name)]
         if beside:
             raise ValueError(f"world and {beside[0]}: a world is the whole environment, give one of them")
-        if len(world.along) != len(self.contacts):
-            raise ValueError(f"along has {len(world.along)} directions for {len(self.contacts)} contacts")
+        if sum(map(len, world.along)) != len(self.contacts) or len(world.along) != len(self.bodies):
+            count = sum(map(len, world.along))
+            raise ValueError(f"along has {count} directions for {len(self.contacts)} contacts")
         if len(set(self.contacts)) < len(self.contacts):
             raise ValueError(f"contacts must be different bodies, got {list(self.contacts)}")
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The bodies of a world that the devices touch, in the order of the contacts."""
+        point = {node: name for name, nodes in self.points.items() for node in nodes if node != GROUND}
+        return tuple(dict.fromkeys(point.get(name, name) for name in self.contacts))
 
     @property
     def here(self) -> str:

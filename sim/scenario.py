@@ -95,9 +95,6 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     def __post_init__(self) -> None:
         if len(self.name) > _LONGEST_NAME:
             raise ValueError(f"name has {len(self.name)} characters, allowed are {_LONGEST_NAME}")
-        if self.environment.world and (several := [len(device.free) for device in self.device if len(device.free) > 1]):
-            allowed = "a contact of a world slides along one direction; clamp the others"
-            raise ValueError(f"device.axes leaves {several[0]} free axes: {allowed}")
         self._per_channel()
         if self.channels > _MOST_CHANNELS:
             raise ValueError(f"environment.contacts has {self.channels} entries, allowed are 1 to {_MOST_CHANNELS}")
@@ -624,7 +621,7 @@ def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
     counts = [one.get("axes", 1) for one in tables]
     if all(n == 1 for n in counts) or not all(type(n) is int and 1 <= n <= len(AXES) for n in counts):
         return raw  # one axis, or what the fields' own checks refuse
-    if not isinstance(given, dict) or "world" in given or given.get("points"):
+    if not isinstance(given, dict) or given.get("points"):
         return raw
     for i, n in enumerate(counts, start=1):
         if n != counts[0]:
@@ -699,15 +696,27 @@ def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
     name, contacts = given["world"], given.get("contacts", [])
     if not isinstance(name, str) or not isinstance(contacts, list) or not all(isinstance(c, str) for c in contacts):
         raise ValueError("environment.world: expected world = 'FILE.xml' and contacts, names of bodies in that file")
-    along = [[_direction(i, row)] for i, row in enumerate(given.get("along", [_ALONG] * len(contacts)), start=1)]
+    points = given.get("points", {})
+    if points and "along" in given:
+        allowed = "contacts of devices with several axes slide along x, y and z; leave it out and clamp axes"
+        raise ValueError(f"environment.along is {given['along']!r}: {allowed}")
+    given_along = given.get("along", [_ALONG] * len(contacts))
+    along = [_free_axes(nodes) for nodes in points.values()] or [
+        [_direction(*row)] for row in enumerate(given_along, 1)
+    ]
     path = (folder / name).resolve()
     try:
         world = {"file": str(path), "digest": digest_of(path), "along": along, "every": given.get("every", 1)}
-        check_contacts(path, contacts)
+        check_contacts(path, list(points) or contacts)
     except ValueError as error:
         raise ValueError(f"environment.{error}") from None
     rest = {key: value for key, value in given.items() if key not in ("along", "every")}
     return raw | {"environment": rest | {"world": world}}
+
+
+def _free_axes(nodes: Sequence[str]) -> list[list[float]]:
+    """The directions x, y, z in which a contact with these coordinates slides."""
+    return [row for row, node in zip(np.eye(len(AXES)).tolist(), nodes, strict=False) if node != GROUND]
 
 
 def world_environment(table: dict[str, Any], folder: Path = Path()) -> Network:

@@ -122,7 +122,7 @@ def contacts_of(environment: Network) -> list[Contact]:
 
     world = environment.world
     assert world is not None
-    return [Contact(body, along) for body, along in zip(environment.contacts, world.along, strict=True)]
+    return [Contact(body, along) for body, along in zip(environment.bodies, world.along, strict=True)]
 
 
 def _springs(V: Lti, contacts: Sequence[Contact]) -> list[Array]:

@@ -5,32 +5,33 @@ from scipy.linalg import expm
 
 
 class Hands:
-    """Two devices in random passive hands, integrated by the matrix exponential; the energy is the textbook's."""
+    """Devices in random passive hands, integrated by the matrix exponential; the energy is the textbook's."""
 
-    def __init__(self, rng, nsim, lossless, start=0.0, masses=4, T=1.2e-3, delta=(1.37, 0.9)):
-        n = self.n = masses
+    def __init__(self, rng, nsim, lossless, start=0.0, masses=None, T=1.2e-3, delta=(1.37, 0.9)):
+        m = self.m = len(delta)  # channels
+        n = self.n = masses or m + 2
         root = rng.normal(size=(nsim, n, n))
         self.M = np.zeros((nsim, n, n))
         self.M[:, range(n), range(n)] = np.exp(rng.uniform(np.log(0.02), np.log(2.0), (nsim, n)))
         self.K = root @ root.transpose(0, 2, 1) * np.exp(rng.uniform(0, np.log(2000), (nsim, 1, 1)))
         loss = rng.normal(size=(nsim, n, n)) * (0 if lossless else 1)
         damping = loss @ loss.transpose(0, 2, 1)
-        damping[:, [0, 1], [0, 1]] += delta
+        damping[:, range(m), range(m)] += delta
         inverse = np.linalg.inv(self.M)
-        generator = np.zeros((nsim, 2 * n + 2, 2 * n + 2))
+        generator = np.zeros((nsim, 2 * n + m, 2 * n + m))
         generator[:, :n, n : 2 * n] = np.eye(n)
         generator[:, n : 2 * n, :n], generator[:, n : 2 * n, n : 2 * n] = -inverse @ self.K, -inverse @ damping
-        generator[:, n : 2 * n, 2 * n :] = -inverse[:, :, :2]
+        generator[:, n : 2 * n, 2 * n :] = -inverse[:, :, :m]
         self.step = expm(generator * T)[:, : 2 * n]
         self.s = np.concatenate([np.zeros((nsim, n)), start * rng.normal(size=(nsim, n))], axis=1)
 
     @property
     def x(self):
-        return self.s[:, :2].T.copy()
+        return self.s[:, : self.m].T.copy()
 
     @property
     def v(self):
-        return self.s[:, self.n : self.n + 2].T
+        return self.s[:, self.n : self.n + self.m].T
 
     def energy(self):
         q, v = self.s[:, : self.n], self.s[:, self.n :]

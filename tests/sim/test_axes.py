@@ -22,7 +22,7 @@ from haptic_loop.models.human import Cross, Human, Link, Person, Population, Vol
 from haptic_loop.models.scene import Scene, build, draw, variants
 from haptic_loop.sim.crowds import Validation
 from haptic_loop.sim.run import assemble, outside_forces, run
-from haptic_loop.sim.scenario import SCENARIOS, Scenario, held_by, parse, save_humans
+from haptic_loop.sim.scenario import Scenario, held_by, parse, save_humans
 from haptic_loop.sim.stability import dominant_mode, exact_loops, mujoco_loops
 
 TEXT = """
@@ -105,16 +105,6 @@ def test_refuses_impossible_axes_in_one_line(first: str, more: str, words: tuple
     assert "\n" not in str(refused.value)
     for word in words:
         assert word in str(refused.value)
-
-
-def test_world_devices_slide_along_one_axis() -> None:
-    text = (SCENARIOS / "world-cube.toml").read_text()
-    several = text.replace('kind = "rigid"', 'kind = "rigid", axes = 3')
-    assert several != text
-    with pytest.raises(InputError, match="leaves 3 free axes: a contact of a world slides along one direction"):
-        parse(several, folder=SCENARIOS)
-    clamped = text.replace('kind = "rigid"', 'kind = "rigid", axes = 3, clamped = ["y", "z"]')
-    assert parse(clamped, folder=SCENARIOS).loop("I").axes is None
 
 
 def test_delays_are_one_for_each_device() -> None:

@@ -16,11 +16,11 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.sim.couplings import read_coupling
-from haptic_loop.sim.scenario import InputError, Scenario, load, parse
+from haptic_loop.sim.scenario import SCENARIOS, InputError, Scenario, load, parse
 from haptic_loop.sim.world import START_J, contacts_of, linearise, scene_of
 
 T = 1e-3
-NAMES = ("cube", "ball", "peg", "door", "stack")
+NAMES = ("cube", "ball", "peg", "door", "stack", "space")
 LIMIT = (12.0, 12.0)
 TIP = '<geom type="sphere" size="0.01"/>'
 
@@ -54,9 +54,9 @@ class Touch:
     def __init__(self, loop: Scenario, hands: Hands, start: float = START_J, gravity: bool = True, credit: bool = True):
         coupling = certified(loop).coupling
         self.V, self.theta, self.hands, self.credit = coupling.compliance(T), loop.theta, hands, credit
-        self.port = scene_of(loop, coupling, gravity).port(LIMIT)
+        self.port = scene_of(loop, coupling, gravity).port([12.0] * loop.channels, loop.balls)
         self.shell = Shell(self.V, start=start)
-        self.line = [np.zeros((2, 1))] * (max(loop.theta) + 1)
+        self.line = [np.zeros((loop.channels, 1))] * (max(loop.theta) + 1)
         self.start = float(hands.energy()[0])
 
     def tick(self) -> float:
@@ -130,6 +130,40 @@ def test_the_plate_lifts_the_cube():
         shell.limit(force[:, None])
     height = port.data.body("cube").xpos[2]
     assert 0.04 < height < 0.061
+
+
+def test_contacts_have_the_axes_of_their_devices(tmp_path):
+    """A smooth oblique plate pushes along its normal, less what clamped axes hold; a device off it feels nothing."""
+    plate = '<geom type="box" pos="0 0 -.05" size=".2 .2 .05" condim="1" solimp=".9 .9"/>'
+    (tmp_path / "scene.xml").write_text(
+        f"""<mujoco><compiler angle="degree"/><option gravity="0 0 0"/><worldbody>
+        <body name="one" pos="0 0 0" euler="10 40 70">{TIP}</body><body name="two" pos="0 0 5">{TIP}</body>
+        <body name="plate" euler="0 30 0">{plate}</body></worldbody></mujoco>"""
+    )
+    normal = np.array([0.5, 0.0, np.sqrt(0.75)])
+    for clamped, free in (("", [0, 1, 2]), ('clamped = ["y"]', [0, 2]), ('clamped = ["x", "y"]', [2])):
+        (tmp_path / "loop.toml").write_text(
+            f"""name = "space"\nT = 1e-3\ntheta = [0, 0]\n[environment]\nworld = "scene.xml"
+            contacts = ["one", "two"]\n[[device]]\nkind = "rigid"\naxes = 3\n{clamped}\n
+            [[device]]\nkind = "rigid"\naxes = 3\n{clamped}\n"""
+        )
+        loop, n = load(tmp_path / "loop.toml"), len(free)
+        assert loop.channel_names == tuple(f"{body}.{'xyz'[axis]}" for body in ("one", "two") for axis in free)
+        port = scene_of(loop, SpringDamper([900.0] * 2 * n, [5.0] * 2 * n)).port()
+        goal = np.array([0.01, -0.02, -0.01])[free]  # of the tip of 10 mm radius, in the plate from the start
+        for _ in range(400):
+            force = port.step(np.concatenate([goal, goal]))
+        assert np.abs(force[:n]).max() > 1.0
+        np.testing.assert_allclose(
+            force[:n] @ normal[free] * normal[free] / (normal[free] @ normal[free]), force[:n], atol=1e-5
+        )
+        np.testing.assert_allclose(force[n:], 0.0, atol=1e-9)
+
+
+def test_along_is_for_devices_with_one_axis():
+    text = (SCENARIOS / "world-space.toml").read_text()
+    with pytest.raises(InputError, match=r"environment\.along is \[\[0, 0, 1\]\]: .* leave it out"):
+        parse(text.replace('"finger 2"]', '"finger 2"]\nalong = [[0, 0, 1]]'), folder=SCENARIOS)
 
 
 # ---- gravity and active scenes
