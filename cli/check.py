@@ -78,7 +78,7 @@ def main(argv: list[str]) -> int:
     if searched and not suffices(searched.worst[0].ratio):
         verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
     checked = _checked(stored, own, verdict, searched, time.perf_counter() - begin)
-    if own and verdict.proved and own.name not in (*CONDITIONS, *KNOWN_CONDITIONS):
+    if own and verdict.proved and own.name not in CONDITIONS:
         checked = replace(checked, claim=own.claim)
     assessment = _assessed(stored, own, searched) if verdict.proved else None
     checked = replace(checked, anew=anew, assessment=assessment)

@@ -18,7 +18,7 @@ from haptic_loop.cli import options, render
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.compare import FEEL_HZ
 from haptic_loop.design.conditions import Condition
-from haptic_loop.design.result import CONDITIONS, Chosen, DesignFailed, finite
+from haptic_loop.design.result import PLAIN_CONDITIONS, Chosen, DesignFailed, finite
 from haptic_loop.design.robustness import Nearby, Robustness
 from haptic_loop.sim.alternatives import Alternative, alternatives
 from haptic_loop.sim.compare_report import ComparedCoupling, Comparison, ConditionCurve
@@ -79,7 +79,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _beside(made: Sequence[Alternative], own: Condition | None) -> render.Table:
-    names, cells = [*CONDITIONS, *([own.name] if own else [])], []
+    names, cells = [*PLAIN_CONDITIONS, *([own.name] if own else [])], []
     for each in made:
         if each.reason:
             cells.append((each.name, *[""] * len(names), f"not possible: {each.reason}", "", ""))

@@ -23,7 +23,7 @@ from haptic_loop.controller.delay import LOST, Periods, VaryingDelay
 from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.design.files import check_file, folder, read_text
 from haptic_loop.design.own import called, named, place_of
-from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, DesignFailed
+from haptic_loop.design.result import CONDITIONS, DesignFailed
 from haptic_loop.models.device import MOST_DAMPING, Device, Guaranteed
 from haptic_loop.sim.scenario import (
     CASES,
@@ -162,8 +162,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_condition(self, what: str = "the condition of the certificate", to: _Group | None = None) -> None:
         """--condition."""
-        names = ", ".join((*CONDITIONS, *KNOWN_CONDITIONS))
-        help_ = f"{what}: {names} or FILE.py:NAME of your own (default: the coupling's)"
+        help_ = f"{what}: {', '.join(CONDITIONS)} or FILE.py:NAME of your own (default: the coupling's)"
         (to or self).add_argument("--condition", type=condition, metavar="NAME|FILE.py:NAME", help=help_)
 
     def add_limiter(self, what: str = "clip forces at the devices' limits", to: _Group | None = None) -> None:
@@ -337,9 +336,8 @@ def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 def condition(text: str) -> str:
     """The name of a condition, or FILE.py:NAME of a user's own."""
-    names = (*CONDITIONS, *KNOWN_CONDITIONS)
-    if text not in names and ":" not in text:
-        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(names)} and FILE.py:NAME")
+    if text not in CONDITIONS and ":" not in text:
+        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)} and FILE.py:NAME")
     return text
 
 

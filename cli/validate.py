@@ -20,7 +20,7 @@ from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import ANY, RANGES
 from haptic_loop.design.known_device import KNOWN_DEVICE
-from haptic_loop.design.result import CONDITIONS, Chosen
+from haptic_loop.design.result import PLAIN_CONDITIONS, Chosen
 from haptic_loop.models.human import Human, Population
 from haptic_loop.models.scene import MIXED
 from haptic_loop.sim import verdicts
@@ -233,7 +233,7 @@ class _Own:
 
 
 def _assessment_rows(assessment: Assessment) -> render.Rows:
-    if assessment.condition not in CONDITIONS:
+    if assessment.condition not in PLAIN_CONDITIONS:
         yield from render.certificate_rows({assessment.condition: assessment.decisive}, 5)
     yield "force limits", assessment.force_limits.words
 

@@ -468,7 +468,7 @@ def assess(
     asked = named(condition or (KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT))
     network = loop.environment if environment is None or callable(environment) else environment
     here = loop.at(network).switching(None)
-    own = None if asked.name in (*CONDITIONS, *KNOWN_CONDITIONS) else asked
+    own = None if asked.name in CONDITIONS else asked
     by = own if own and certificate and own.name == certificate.condition else None
     known = certificate if certificate and proves(loop, coupling, certificate, by) else None
     requirements = requirements_of(here, coupling, known, own=own)

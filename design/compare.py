@@ -20,7 +20,7 @@ from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.frequency import Response, frequencies, on_circle
-from haptic_loop.design.result import CONDITIONS, Requirement
+from haptic_loop.design.result import PLAIN_CONDITIONS, Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling over frequency: singular values, the demand for damping, and what a hand perceives.
@@ -68,7 +68,7 @@ def judge(
     here = loop.at(loop.environment).switching(None)
     requirements: dict[str, Requirement] = {}
     demands: dict[str, Response | None] = {}
-    for each in (*map(named, CONDITIONS), *own):
+    for each in (*map(named, PLAIN_CONDITIONS), *own):
         needs = requirements[each.name] = known.get(each.name) or each.judge(here, coupling)
         curve = each.over_frequency(here, coupling, needs.multiplier) if np.isfinite(needs.ratio) else None
         demands[each.name] = curve

@@ -32,7 +32,7 @@ _Part = TypeVar("_Part", bound=msgspec.Struct)
 class Certificate(Strict, frozen=True):
     """The claim about a coupling in its loop, and its proof: a base condition, the facts it holds with, multipliers."""
 
-    condition: str  # the base: a name of design.result.CONDITIONS, or that of one's own condition
+    condition: str  # the base: a name of design.result.CONDITIONS, or the name of a condition of the user's own
     facts: tuple[str, ...]  # what it covers beyond one linear network with constant delays (design.conditions.FACTS)
     required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep with these multipliers
     available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, Literal, TypeVar, overload
+from typing import Any, Generic, Literal, TypeVar, get_args, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +18,12 @@ ConditionName = Literal["this-environment", "any-environment", "known-device", "
 #: for which environments a certificate holds
 Environments = Literal["any passive environment", "these ranges", "this environment"]
 
-#: the conditions in the order of tables, each with the environments for which it holds
-CONDITIONS: dict[str, str] = {
-    "this-environment": "this environment",
-    "any-environment": "any passive environment",
-}
-#: the conditions that also need guaranteed bounds of the devices' motors and transmissions
-KNOWN_CONDITIONS: dict[str, str] = {
-    "known-device": "this environment",
-    "known-device-any": "any passive environment",
-}
+#: the names of all conditions, in the order of tables
+CONDITIONS: tuple[ConditionName, ...] = get_args(ConditionName)
+#: the conditions that need guaranteed bounds of the devices' motors and transmissions
+KNOWN_CONDITIONS = tuple(name for name in CONDITIONS if name.startswith("known-device"))
+#: the conditions for every device
+PLAIN_CONDITIONS = tuple(name for name in CONDITIONS if name not in KNOWN_CONDITIONS)
 
 
 #: what this-environment holds for before walls

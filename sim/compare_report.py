@@ -13,7 +13,7 @@ from haptic_loop.design import compare
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table
 from haptic_loop.design.optimal import nearby as nearby_with_price
-from haptic_loop.design.result import CONDITIONS, Chosen, Requirement
+from haptic_loop.design.result import PLAIN_CONDITIONS, Chosen, Requirement
 from haptic_loop.design.robustness import Nearby, robustness_nearby
 from haptic_loop.sim.couplings import assessed
 from haptic_loop.sim.scenario import Scenario
@@ -114,7 +114,7 @@ class Comparison:
             *failed,
         ]
         for c in couplings:
-            reasons = {name: c.conditions[name].reason for name in (*CONDITIONS, *own)}
+            reasons = {name: c.conditions[name].reason for name in (*PLAIN_CONDITIONS, *own)}
             notes += [f"{c.name}, {condition}: {reason}" for condition, reason in reasons.items() if reason]
         about = case, scenario.name, seed, loop.T, loop.theta, loop.psi, loop.lam, loop.delta
         return cls(*about, hz, *compare.ideal(loop, hz), couplings, notes)

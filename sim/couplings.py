@@ -21,7 +21,6 @@ from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.own import called, place_of
 from haptic_loop.design.result import (
     CONDITIONS,
-    KNOWN_CONDITIONS,
     Chosen,
     Design,
     DesignFailed,
@@ -149,8 +148,8 @@ def from_file(
         The choice. Its `certificate` holds for the loop of the file, which may be another one: `assess` compares them.
     """
     claim, coupling = stored.certificate, coupling or stored.built()
-    named = (*CONDITIONS, *KNOWN_CONDITIONS)  # a condition of the user's own has to be given again
-    made_for = claim.condition if claim and claim.condition in named else THIS_ENVIRONMENT.name
+    # A condition of the user's own has to be given again.
+    made_for = claim.condition if claim and claim.condition in CONDITIONS else THIS_ENVIRONMENT.name
     asked = own if claim and own and claim.condition == own.name else None
     try:
         reason = verify(stored, asked).reason if claim else None

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.files import InputError, printable, write
 from haptic_loop.design.guarantees import ANY
-from haptic_loop.design.result import CONDITIONS
 
 Row = Comparison = Any  # sim.accuracy.Row, sim.compare_report.Comparison: they import traces, which import this file
 
@@ -44,6 +43,8 @@ class Run(Protocol):
 # ----------------------------------------------------------------------------------------------------
 # The style.
 
+#: titles of pictures for the conditions for every device; other conditions are titled by their names
+TITLES = {"this-environment": "this environment", "any-environment": ANY}
 #: Okabe and Ito's palette, with a line style each
 STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#0072B2", "linestyle": "-"},
@@ -534,7 +535,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
             at = max(part.requirement.frequency_hz or 0.0, hz[0]), min(binds, top)
             axis.plot(*at, "o" if binds <= top else "^", color=style["color"])
         axis.axhspan(scale, 1.12 * top, color="black", alpha=0.06, linewidth=0)
-        words, holds = CONDITIONS.get(str(condition), str(condition)), parts[0].requirement.guarantee
+        words, holds = TITLES.get(str(condition), str(condition)), parts[0].requirement.guarantee
         words += " (with a multiplier of this one)" if words == ANY != holds else ""
         axis.set(xscale="log", title=words, xlabel="frequency [Hz]", ylim=(-0.5 * scale, 1.12 * top))
         axis.legend(fontsize=8)

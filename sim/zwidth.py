@@ -38,7 +38,7 @@ from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.guarantees import ANY
-from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Requirement, refusal, suffices
+from haptic_loop.design.result import CONDITIONS, PLAIN_CONDITIONS, Requirement, refusal, suffices
 from haptic_loop.models.device import Device
 from haptic_loop.models.human import Population
 from haptic_loop.sim import limit_cycles
@@ -69,8 +69,8 @@ class _Sweep(ABC):
     @cached_property
     def asked(self) -> dict[str, Condition]:
         """The conditions by their names."""
-        known = KNOWN_CONDITIONS if self.loop.known_devices else ()
-        return {each.name: each for each in (*map(named, (*CONDITIONS, *known)), *([self.own] if self.own else []))}
+        names = CONDITIONS if self.loop.known_devices else PLAIN_CONDITIONS
+        return {each.name: each for each in (*map(named, names), *([self.own] if self.own else []))}
 
     @property
     def walls(self) -> bool:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from haptic_loop.design.files import InputError
-from haptic_loop.design.result import CONDITIONS
 from haptic_loop.sim import map_plot, plots
 from haptic_loop.sim.trace import Trace
 
@@ -162,7 +161,7 @@ HZ = np.array([1.0, 10.0, 100.0])
 def coupling(name, ratio, at, delayed):
     demand = np.array([0.1, ratio / 2, ratio])
     part = SimpleNamespace(ratio=ratio, demand=demand, requirement=SimpleNamespace(frequency_hz=at, guarantee="here"))
-    met = SimpleNamespace(guarantee="with a multiplier" if delayed else CONDITIONS["any-environment"])
+    met = SimpleNamespace(guarantee="with a multiplier" if delayed else plots.TITLES["any-environment"])
     none = SimpleNamespace(ratio=np.inf, demand=None, requirement=met)
     felt = SimpleNamespace(
         stiffness=np.array([[1.0, 9.0], [-5.0, 9.0], [7.0, 9.0]]), damping=np.array([[0.1, 2.0]] * 3)
