@@ -236,7 +236,11 @@ class Condition(ABC):
     covers: tuple[str, ...] = ()  # of `BEYOND`, what the block is about; a subclass states its own
     source: str | None = None  # where it is from, for a report
     separable: bool = False  # whether it judges the channels of a coupling without cross terms one by one
-    extensible: bool = False  # whether limited forces and delays that switch have blocks beside it, in the same file
+
+    @property
+    def extensible(self) -> bool:
+        """Whether limited forces and delays that switch have blocks beside it, in the same file."""
+        return False
 
     @abstractmethod
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:

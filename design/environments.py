@@ -273,7 +273,12 @@ class ThisEnvironment(Multiplied):
     Walls may touch or not, delays may switch within the loop's range, and it may be any member of its ranges.
     """
 
-    name, covers, extensible = "this-environment", BEYOND, True
+    name, covers = "this-environment", BEYOND
+
+    @property
+    def extensible(self) -> bool:
+        """A subclass has facts of its own, which neither the block for limited forces nor fast sweeps know."""
+        return type(self) is ThisEnvironment
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
         """How the forces of this loop come about, beyond a linear network with constant delays."""
@@ -378,9 +383,11 @@ class ThisEnvironment(Multiplied):
         return None
 
     def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
-        return ratio_in(loop, coupling, thin)
+        return ratio_in(loop, coupling, thin) if self.extensible else super().ratio(loop, coupling, thin)
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
+        if not self.extensible:
+            return None
         poles = loop.F(coupling).poles()
         return this_environment_ratios(lambda z: loop.late(loop.sent_at(coupling, z)), poles, loop)
 

@@ -58,8 +58,6 @@ def longest(loop: Loop, T: Number) -> Any:
 class HandsSide(ABC):
     """A bound from below on what devices and hands take per tick, as a quadratic form of some inputs."""
 
-    name: str
-
     @abstractmethod
     def inputs(self, loop: Loop, T: Number) -> list[Input]:
         """Its inputs: their shares of the displacement that a force multiplies, and whether the environment follows."""
@@ -92,8 +90,6 @@ class HandsSide(ABC):
 class EvenPeriods(HandsSide):
     """Periods that are even, or vary up to T_max: dx' Delta dx/T_max."""
 
-    name = "even"
-
     def inputs(self, loop: Loop, T: Number) -> list[Input]:
         return [Input("dx", i) for i in range(loop.channels)]
 
@@ -108,8 +104,6 @@ class Latency(HandsSide):
     period must be longer than t2. Where t1 < t2 the multiplier Q weighs the squares of both parts together: any
     symmetric Q <= diag(1/tau, 1/(T_max - tau)) for all tau in [t1, t2].
     """
-
-    name = "latency"
 
     def inputs(self, loop: Loop, T: Number) -> list[Input]:
         late = [i for i, (_, last) in enumerate(loop.latency or ()) if last]
@@ -240,8 +234,6 @@ class PeriodCost(NamedTuple):
 class KnownMotor(HandsSide):
     """Motors and transmissions within known bounds (Theorem B): f'(dx + beta dv) + L, of the speed v at a tick."""
 
-    name = "known-device"
-
     def __init__(self, cost: PeriodCost, beta: Any) -> None:
         self.cost, self.beta = cost, beta
 
@@ -270,21 +262,18 @@ def hands_side(loop: Loop) -> HandsSide:
 
 
 class Fact(ABC):
-    """How the forces of the environment's side come about, beyond one linear network with constant delays."""
+    """How the forces of the environment's side come about, beyond one linear network with constant delays.
 
-    name: str  # in reports and files
-
-    @abstractmethod
-    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
-        """Its multipliers."""
+    A fact of the user's own needs `enter` alone; docs/extending.md shows one.
+    """
 
     @abstractmethod
     def enter(self, block: Collected[Any], loop: Loop, values: Values) -> None:
-        """Enter its inputs, rows and multipliers."""
+        """Enter the inputs, rows and multipliers of this fact into the block; `values` are its multipliers, by name."""
 
-    def beyond(self, loop: Loop) -> str | None:
-        """Why it says nothing of this loop, or None."""
-        return None
+    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
+        """Return the multipliers that a search finds; none by default."""
+        return ()
 
 
 class Walls(Fact):
@@ -294,8 +283,6 @@ class Walls(Fact):
     where the damper would pull. The step of the wall's force is W u + (W - k) s with W = k + b (1 - 1/z). With `stiff`
     the block is that of a wall of k + 2b without a damper, and covers every wall up to it.
     """
-
-    name = "walls"
 
     def __init__(self, stiff: bool = False) -> None:
         self.stiff = stiff
@@ -350,8 +337,6 @@ class Switching(Fact):
     steps in between; the multiplier weighs that error w against the displacement that the force multiplies.
     """
 
-    name = "switching"
-
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
         moves = np.array(loop.delays.hi) > np.array(loop.delays.lo)
         units = tuple(loop.per_device(even_damping(loop) / loop.T * moves).tolist())
@@ -392,8 +377,6 @@ class Limiter(Fact):
 
     One rho and one multiplier c per lag for all axes of a device: that covers a ball and a box of forces.
     """
-
-    name = "limiter"
 
     def __init__(self, rho: Sequence[float], lags: int = 1) -> None:
         self.rho, self.lags = tuple(rho), lags

@@ -1,6 +1,8 @@
 """A condition and a coupling of one's own: what they do not say is not taken for said."""
 
+import re
 from dataclasses import dataclass
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -16,8 +18,10 @@ from haptic_loop.design.certificate import lag, prove, required_damping, require
 from haptic_loop.design.conditions import BEYOND, Condition, Demand
 from haptic_loop.design.coupling_file import Stored, filed, sealed
 from haptic_loop.design.environments import SWITCHING, SwitchingDelays
+from haptic_loop.design.facts import Fact
 from haptic_loop.design.files import InputError
 from haptic_loop.design.result import NotProved
+from haptic_loop.design.robustness import robustness
 from haptic_loop.sim.zwidth import CouplingSweep, EnvironmentSweep
 
 PAIR = load("omega-pair").loop("I")
@@ -143,6 +147,54 @@ def test_own_multipliers_are_searched_stored_and_checked():
     for other in ({}, {"alpha": (1.0, 1.0)}, {"alpha": (-1.0, 1.0)}):
         forged = change(stored.certificate, multipliers=other)
         assert not verify(change(stored, certificate=sealed(forged)), own).proved
+
+
+@pytest.fixture(scope="module")
+def repeats():
+    """The fact that docs/extending.md shows, and the condition that takes it."""
+    page = (Path(__file__).parents[2] / "docs/extending.md").read_text()
+    text = re.search(r"```python\n# repeats.py\n(.*?)```", page, re.DOTALL)[1]
+    assert sum(bool(line.strip()) and "import" not in line for line in text.splitlines()) <= 15
+    names: dict = {}
+    exec(text, names)
+    return names
+
+
+def test_facts_and_conditions_need_one_method_each():
+    assert (Fact.__abstractmethods__, Condition.__abstractmethods__) == ({"enter"}, {"demand"})
+
+
+def test_an_own_fact_is_its_bound(repeats):
+    """The dense sweep of He[F/(z-1)] - F*F/(2 a) >= -(s delta/T - a/2), at the multiplier found and at others."""
+    own = repeats["RepeatedForces"]()
+    found = required_damping(PAIR, SOFT, own)
+    F, z = PAIR.F(SOFT), np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
+    G, per_damping = F.at(z), np.sqrt(PAIR.T / np.array(PAIR.delta))
+
+    def dense(a):
+        step = G / (z - 1)[:, None, None]
+        here = -(step + np.conj(np.swapaxes(step, 1, 2))) / 2 + np.diag(a) / 2
+        here = here + np.conj(np.swapaxes(G, 1, 2)) @ np.diag(1 / (2 * a)) @ G
+        return np.linalg.eigvalsh(per_damping[:, None] * here * per_damping).max()
+
+    best = np.array(found.multiplier)
+    assert found.ratio == pytest.approx(dense(best), rel=1e-6)
+    assert found.ratio > required_damping(PAIR, SOFT, "this-environment").ratio
+    others = np.random.default_rng(0).uniform(0.5, 2.0, (20, 2)) * best
+    assert min(dense(a) for a in others) > found.ratio * (1 - 1e-6)
+
+
+def test_an_own_fact_is_proved_and_mapped(repeats):
+    own, scenario = repeats["RepeatedForces"](), load("omega-pair")
+    certificate = prove(PAIR, SOFT, own)
+    assert verify(Stored.of(PAIR, SOFT, certificate), own).proved
+    assert not own.extensible
+    sweep = CouplingSweep(scenario.device, scenario.population, PAIR, own=own)
+    gain = np.array([400.0]), np.array([0.1])
+    needs = required_damping(PAIR, SpringDamper([400.0] * 2, [0.1] * 2), own)
+    assert sweep.ratios(own.name, *gain)[0] == pytest.approx(needs.ratio, rel=1e-6)
+    nearby, plain = robustness(PAIR, SOFT, condition=own), robustness(PAIR, SOFT)
+    assert nearby.required_over_available > plain.required_over_available
 
 
 def test_limited_forces_are_not_covered_by_ones_own():
