@@ -198,10 +198,11 @@ def _save(
         if not isinstance(crowd.humans(0)[0], Human):  # a user's own class, which draws this hand again
             continue
         remark = f"seed {question.seed}, index {i}"
-        files.append(save_humans(out / name, crowd.humans(0), remark, crowd.persons(0)))
+        mechanics = crowd.mechanics[0] if crowd.mechanics else ()
+        files.append(save_humans(out / name, crowd.humans(0), remark, crowd.persons(0), mechanics))
     if worst:
         remark = f"found by the adversary, seed {question.seed}: growth {worst.growth:+.6g} 1/s"
-        files.append(save_humans(out / "adversary.toml", worst.humans, remark, worst.persons))
+        files.append(save_humans(out / "adversary.toml", worst.humans, remark, worst.persons, worst.mechanics))
     if render.is_drawn(args, out / "population.png", bool(findings.index.size)):
         from haptic_loop.sim.plots import plot_population
 
@@ -249,6 +250,7 @@ class _Report:
     seed: int
     engine: str
     humans: int = render.figure("humans", "{} (links {r.links}, seed {r.seed})")
+    devices: str | None = render.figure("devices", json="if given")
     environments: verdicts.EnvironmentsMet = render.figure("environments")
     unstable: verdicts.Unstable = render.figure("unstable")
     disagreements: int = render.figure("disagreements", "{r.disagreement_words}")
@@ -332,6 +334,7 @@ def _reported(
         seed=question.seed,
         engine=engine_name(question.engine),
         humans=findings.index.size,
+        devices="drawn within their guaranteed bounds, for every set of hands" if scenario.known_devices else None,
         environments=verdicts.EnvironmentsMet.met(question, findings),
         unstable=verdicts.Unstable.of(question, int(bad.sum()), int(grows.sum())),
         disagreements=disagreements,

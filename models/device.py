@@ -226,6 +226,38 @@ class RigidDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="rigid",
 Device = CompliantDevice | RigidDevice
 
 
+class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Bodies and transmission of one device with guaranteed bounds, drawn within them."""
+
+    motor_mass: float  # [kg]
+    handle_mass: float  # [kg]
+    transmission_stiffness: float  # [N/m]
+    transmission_damping: float  # [N s/m]
+
+    @classmethod
+    def within(cls, device: Device, u: NDArray[np.float64]) -> Mechanics:
+        """Return the mechanics at u (4,) in [-1, 1] of a device with guaranteed bounds.
+
+        A negative entry of u stands for the bound itself, near which the worst device is. Positive ones reach, evenly
+        in logarithms, ten times the least motor mass, a hundredth of the handle mass (of which nothing is guaranteed),
+        a tenth of the largest stiffness, and the largest damping.
+        """
+        known = device.guaranteed
+        assert known is not None  # the caller draws only where every device has bounds
+        assert isinstance(device, CompliantDevice)  # a rigid one is refused with bounds
+        least, most = known.transmission_damping_min, known.transmission_damping_max
+        ends = np.array([10.0, 0.01, 0.1, most / least])
+        starts = known.motor_mass_min, device.handle_mass, known.transmission_stiffness_max, least
+        motor, handle, stiffness, damping = (np.array(starts) * ends ** np.maximum(u, 0.0)).tolist()
+        return cls(motor, handle, stiffness, min(damping, most))
+
+    def of(self, device: Device) -> Device:
+        """Return the device with these mechanics. Raises ValueError where they leave its guaranteed bounds."""
+        if isinstance(device, RigidDevice):
+            raise ValueError("a rigid device has no transmission that could be drawn")
+        return msgspec.structs.replace(device, **msgspec.structs.asdict(self))
+
+
 def _check_common(device: Device, masses: tuple[str, ...]) -> None:
     for name in masses:
         require(name, getattr(device, name), 1e-6, 1e3, "kg")

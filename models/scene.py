@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from haptic_loop.models.device import AXES, Device
+from haptic_loop.models.device import AXES, Device, Mechanics
 from haptic_loop.models.human import (
     Cross,
     Hand,
@@ -367,7 +367,20 @@ class _Amounts(NamedTuple):
     stiffness: dict[str, Any]
 
 
-def _amounts(devices: Sequence[Device], placed: Sequence[_Placed]) -> _Amounts:
+#: the mechanics of every device in every set of humans; () where the devices are those of the scenario
+_Drawn = tuple[tuple[Mechanics, ...], ...]
+
+
+def _mechanics(device: Device, drawn: Sequence[Mechanics]) -> tuple[dict[str, Any], tuple[Any, Any] | None]:
+    """Return bodies and transmission of a device, as arrays over the sets where they are drawn."""
+    if not drawn:
+        return dict(device.bodies), device.transmission
+    rows = [(d.motor_mass, d.handle_mass, d.transmission_damping, d.transmission_stiffness) for d in drawn]
+    motor, handle, damping, stiffness = np.array(rows).T
+    return {"motor": motor, "handle": handle}, (damping, stiffness)
+
+
+def _amounts(devices: Sequence[Device], placed: Sequence[_Placed], drawn: _Drawn = ()) -> _Amounts:
     """Sum the masses, dampings and stiffnesses of devices and humans per joint and tendon."""
     mass: dict[str, Any] = {}
     damping: dict[str, Any] = {}
@@ -375,13 +388,14 @@ def _amounts(devices: Sequence[Device], placed: Sequence[_Placed]) -> _Amounts:
     for i, device in enumerate(devices, start=1):
         own, _ = _dampers(device)
         for motor, amount in zip(_joints(f"device_{i}/motor", device), own, strict=True):
-            mass[motor], damping[motor], stiffness[motor] = device.bodies["motor"], amount, 0.0
+            mass[motor], damping[motor], stiffness[motor] = 0.0, amount, 0.0
     for i, device in enumerate(devices, start=1):
-        for name, amount in device.bodies.items():
+        bodies, transmission = _mechanics(device, [row[i - 1] for row in drawn])
+        for name, amount in bodies.items():
             mass |= dict.fromkeys(_joints(f"device_{i}/{name}", device), amount)
-        if device.transmission:
+        if transmission:
             for between in _joints(f"device_{i}/transmission", device):
-                damping[between], stiffness[between] = device.transmission
+                damping[between], stiffness[between] = transmission
     for port, joints, _, springs in placed:
         for k, joint in enumerate(joints):
             mass[joint] = mass.get(joint, 0.0) + port.mass[..., k // port.axes]
@@ -589,6 +603,7 @@ class Crowd:
     bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (nsim, persons, 5): mass, damping and stiffness of the body, damping and stiffness between the hands
     axes: tuple[int, ...] = ()  # (devices,) of links with amounts along directions; a link has 1 + 2 axes^2 numbers
+    mechanics: _Drawn = ()  # (nsim, devices) where the devices are drawn within their guaranteed bounds
 
     def __post_init__(self) -> None:
         links = np.array(self.links, dtype=float)
@@ -675,16 +690,30 @@ def crowds(
     links: int,
     holds: tuple[tuple[int, ...], ...] = (),
     axes: tuple[int, ...] = (),
+    known: Sequence[Device] = (),
 ) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
     """Yield the humans of these indices, grouped by their number of links, as (indices of the group, crowd).
 
-    `holds` lists the devices of each person with several, and `axes` their numbers of axes, as in Crowd.
+    `holds` lists the devices of each person with several, and `axes` their numbers of axes, as in Crowd. `known` are
+    the devices, to be drawn within their guaranteed bounds (`draw_mechanics`).
     """
     drawn = {i: draw(population, devices, seed, i, links, axes) for i in indices}
     for count in sorted({values.shape[1] for values in drawn.values()}):
         group = [i for i, values in drawn.items() if values.shape[1] == count]
         bodies = np.stack([_draw_bodies(population, len(holds), seed, i) for i in group])
-        yield np.array(group), Crowd(np.stack([drawn[i] for i in group]), holds, bodies, axes)
+        mechanics = draw_mechanics(known, seed, group)
+        yield np.array(group), Crowd(np.stack([drawn[i] for i in group]), holds, bodies, axes, mechanics)
+
+
+def draw_mechanics(devices: Sequence[Device], seed: int, indices: Iterable[int]) -> _Drawn:
+    """Draw devices within their guaranteed bounds for the humans of these indices; () unless all devices have some.
+
+    They come from a random stream of their own, so that the humans do not depend on them.
+    """
+    if not (devices and all(device.guaranteed for device in devices)):
+        return ()
+    streams = (np.random.default_rng(np.random.SeedSequence((seed, i, 2))) for i in indices)
+    return tuple(tuple(Mechanics.within(device, rng.uniform(-1, 1, 4)) for device in devices) for rng in streams)
 
 
 def _draw_bodies(population: Population, persons: int, seed: int, index: int) -> _Array:
@@ -704,6 +733,7 @@ class HumanSets:
 
     sets: tuple[tuple[Hand, ...], ...]  # (nsim, m)
     people: tuple[Person, ...] = ()
+    mechanics: _Drawn = ()  # (nsim, devices) as of Crowd
 
     def __len__(self) -> int:
         return len(self.sets)
@@ -775,7 +805,7 @@ def variants(devices: Sequence[Device], crowd: Crowd | HumanSets) -> Variants:
     model = scene.model
     names = ("body_mass", "jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping")
     fields = {name: np.tile(getattr(model, name).astype(float), (len(crowd), 1)) for name in names}
-    mass, damping, stiffness = _amounts(devices, placed)
+    mass, damping, stiffness = _amounts(devices, placed, crowd.mechanics)
     for name, amount in mass.items():
         fields["body_mass"][:, model.body(_body(name)).id] = amount
     for name, amount in damping.items():

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.models.device import Device, Mechanics
 from haptic_loop.models.human import Hand, Person
 from haptic_loop.models.scene import Crowd, HumanSets, variants
 from haptic_loop.sim.run import Progress
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
 _MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
+_WITHIN = 4  # numbers of a device with guaranteed bounds, each in [-1, 1] (models.device.Mechanics)
 _DESTABILISED = 1e-6  # [1/s] least growth that counts as destabilising; rounding gives up to 1e-9
 
 
@@ -55,6 +57,7 @@ class Worst:
     growth: float  # [1/s]
     frequency_hz: float
     evaluated: int  # sets of humans
+    mechanics: Sequence[Mechanics] = ()  # of devices with guaranteed bounds, within which they are searched, too
 
     @property
     def destabilises(self) -> bool:
@@ -86,10 +89,12 @@ def search(
 
     best, evaluated = None, 0
     for trial, kind in enumerate(passes):
-        ranges = [_MASS, _STIFFNESS] * (m * kind.links) + [_MASS, _STIFFNESS, _STIFFNESS] * kind.held
+        logarithms = [_MASS, _STIFFNESS] * (m * kind.links) + [_MASS, _STIFFNESS, _STIFFNESS] * kind.held
+        known = all(device.guaranteed for device in scenario.device)
+        ranges = [*np.log(logarithms), *[(-1.0, 1.0)] * (_WITHIN * m * known)]
         found = differential_evolution(
             partial(_losses, scenario=scenario, F=F, kind=kind),
-            np.log(ranges),
+            ranges,
             rng=np.random.default_rng(np.random.SeedSequence((seed, trial))),
             popsize=_CANDIDATES // len(ranges),
             maxiter=generations,
@@ -101,7 +106,7 @@ def search(
         )
         done = (trial + 1) * generations
         evaluated += (found.nit + 1) * (_CANDIDATES // len(ranges)) * len(ranges)
-        worst = _worst(scenario, F, _ladders(found.x[:, None], m, kind), evaluated)
+        worst = _worst(scenario, F, _ladders(found.x[:, None], scenario.device, kind), evaluated)
         best = worst if best is None or worst.growth > best.growth else best
         if first and best.destabilises:
             break
@@ -150,19 +155,23 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
     return ranked
 
 
-def _ladders(x: Array, devices: int, kind: _Pass) -> Crowd:
+def _ladders(x: Array, devices: Sequence[Device], kind: _Pass) -> Crowd:
     """Turn logarithms of masses and stiffnesses, (2 devices links, nsim), into lossless humans.
 
-    Where one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness.
+    Where one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness. The
+    last rows, _WITHIN for each device where all have guaranteed bounds, place their mechanics within them.
     """
-    arms = 2 * devices * kind.links
-    values = np.exp(x[:arms].T).reshape(-1, devices, kind.links, 2)
+    arms = 2 * len(devices) * kind.links
+    x, within = np.split(x, [arms + 3 * kind.held])
+    values = np.exp(x[:arms].T).reshape(-1, len(devices), kind.links, 2)
     links = np.stack([values[..., 0], np.zeros_like(values[..., 0]), values[..., 1]], axis=-1)
+    places = within.T.reshape(len(links), -1, _WITHIN)
+    mechanics = tuple(tuple(map(Mechanics.within, devices, row)) for row in places) if len(within) else ()
     if not kind.held:
-        return Crowd(links)
+        return Crowd(links, mechanics=mechanics)
     mass, stiffness, cross = np.exp(x[arms:])
     bodies = np.stack([mass, 0 * mass, stiffness, 0 * mass, cross], axis=-1)[:, None]
-    return Crowd(links, (tuple(range(1, devices + 1)),), bodies)
+    return Crowd(links, (tuple(range(1, len(devices) + 1)),), bodies, mechanics=mechanics)
 
 
 def _loops(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets) -> ClosedLoop:
@@ -173,7 +182,7 @@ def _loops(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets) -> ClosedLoop:
 
 def _losses(x: Array, scenario: Scenario, F: Lti, kind: _Pass) -> Array:
     """Return minus the largest growth [1/s] among the modes of the pass, for every column of x."""
-    loops = _loops(scenario, F, _ladders(x.reshape(x.shape[0], -1), len(scenario.device), kind))
+    loops = _loops(scenario, F, _ladders(x.reshape(x.shape[0], -1), scenario.device, kind))
     (growth,) = loops.growths(kind.min_frequency_hz)
     return -growth
 
@@ -181,4 +190,5 @@ def _losses(x: Array, scenario: Scenario, F: Lti, kind: _Pass) -> Array:
 def _worst(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets, evaluated: int) -> Worst:
     mode = dominant_mode(_loops(scenario, F, crowd))
     radius, growth, frequency = (float(a[0]) for a in (mode.spectral_radius, mode.growth, mode.frequency_hz))
-    return Worst(crowd.humans(0), crowd.persons(0), radius, growth, frequency, evaluated)
+    mechanics = crowd.mechanics[0] if crowd.mechanics else ()
+    return Worst(crowd.humans(0), crowd.persons(0), radius, growth, frequency, evaluated, mechanics)

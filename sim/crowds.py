@@ -41,7 +41,7 @@ from haptic_loop.controller.ranges import Member
 from haptic_loop.design.files import InputError
 from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Population
-from haptic_loop.models.scene import Crowd, HumanSets, Variants, crowds, variants
+from haptic_loop.models.scene import Crowd, HumanSets, Variants, crowds, draw_mechanics, variants
 from haptic_loop.sim.accuracy import simulated_growth
 from haptic_loop.sim.engines import EXPONENTIAL, LEAST, Engine, ExactEngine, MujocoBatchEngine, OneByOne
 from haptic_loop.sim.run import Progress, Simulation, assemble, engine_name, make_engine
@@ -81,7 +81,8 @@ def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterat
         layouts[i] = tuple(human.port().layout for human in drawn[i])
     for layout in dict.fromkeys(layouts.values()):
         group = [i for i in drawn if layouts[i] == layout]
-        yield np.array(group), HumanSets(tuple(drawn[i] for i in group), scenario.person)
+        mechanics = draw_mechanics(scenario.device, seed, group)
+        yield np.array(group), HumanSets(tuple(drawn[i] for i in group), scenario.person, mechanics)
 
 
 # ---- what is asked, and what is found
@@ -144,7 +145,7 @@ class Validation:
         holds = tuple(person.holds for person in scenario.person)
         counts = tuple(len(device.free) for device in scenario.device)
         axes = counts if max(counts) > 1 else ()
-        return crowds(scenario.population, len(counts), self.seed, indices, self.links, holds, axes)
+        return crowds(scenario.population, len(counts), self.seed, indices, self.links, holds, axes, scenario.device)
 
     def crowd(self, index: int) -> Crowd | HumanSets:
         """Draw the set of humans with this index."""
@@ -263,7 +264,8 @@ def _group(
     lossless = np.stack([port.damping.max(axis=1) for port in crowd.ports], axis=1).min(axis=1) == 0
     other: _Other | None = None
     if not isinstance(validation.engine, str):
-        each = [simulation.held_by(crowd.humans(i), crowd.persons(i)) for i in range(len(crowd))]
+        drawn = crowd.mechanics or ((),) * len(crowd)
+        each = [simulation.held_by(crowd.humans(i), crowd.persons(i), own) for i, own in enumerate(drawn)]
         make = validation.engine
         mujoco = np.array([simulated_growth(one, None, None, make) for one in each])
 

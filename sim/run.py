@@ -32,6 +32,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import Net, Process, StepBuffer
 from haptic_loop.design.own import called
+from haptic_loop.models.device import Mechanics
 from haptic_loop.models.hold import HeldPlant, hold
 from haptic_loop.models.human import Hand, Person
 from haptic_loop.models.scene import Scene, build
@@ -114,10 +115,15 @@ class Simulation:
         scenario = self.scenario.replace(device=devices)
         return replace(self, scenario=scenario, scene=build(devices, scenario.human, scenario.person))
 
-    def held_by(self, humans: tuple[Hand, ...], persons: tuple[Person, ...]) -> Simulation:
-        """The same in the hands of others, who do not move by themselves."""
-        scene = build(self.scenario.device, humans, persons)
-        scenario = msgspec.structs.replace(self.scenario, human=humans, person=persons)
+    def held_by(
+        self, humans: tuple[Hand, ...], persons: tuple[Person, ...], mechanics: Sequence[Mechanics] = ()
+    ) -> Simulation:
+        """The same in the hands of others, who do not move by themselves; `mechanics` are those of drawn devices."""
+        devices = self.scenario.device
+        if mechanics:
+            devices = tuple(map(Mechanics.of, mechanics, devices))
+        scene = build(devices, humans, persons)
+        scenario = msgspec.structs.replace(self.scenario, device=devices, human=humans, person=persons)
         return replace(
             self, scenario=scenario, scene=scene, plant=hold(scene.plant, scenario.T, scenario.usual_latency)
         )

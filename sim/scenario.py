@@ -32,7 +32,7 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.design.files import InputError, counted, read_text, toml, write
 from haptic_loop.design.own import called, named, place_of
-from haptic_loop.models.device import AXES, MOST_DAMPING, Device, fields_of, require, symmetric
+from haptic_loop.models.device import AXES, MOST_DAMPING, Device, Mechanics, fields_of, require, symmetric
 from haptic_loop.models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
 CASES = ("none", "I", "II")
@@ -474,6 +474,7 @@ class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     human: tuple[Any, ...]  # Human, MeasuredHand, or a user's own
     person: tuple[Person, ...] = ()
     population: Any = None  # of a user's own: it has draw(rng, n)
+    device: tuple[Mechanics, ...] = ()  # which sim.validate drew within the guaranteed bounds, or none
 
 
 def held_by(scenario: Scenario, text: str) -> Scenario:
@@ -482,6 +483,14 @@ def held_by(scenario: Scenario, text: str) -> Scenario:
     who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
     if people.population is not None:
         who["population"] = people.population
+    if people.device:
+        if len(people.device) != len(scenario.device):
+            has, expected = len(people.device), len(scenario.device)
+            raise InputError(f"--human {text} has {has} [[device]] tables, expected {expected} or none")
+        try:
+            who["device"] = tuple(map(Mechanics.of, people.device, scenario.device))
+        except ValueError as error:
+            raise InputError(f"--human {text}: device: {error}") from None
     return scenario.replace(**who)
 
 
@@ -522,7 +531,7 @@ def _humans_of(text: str, source: str) -> _HumanFile:
             raise InputError(f"{source}: human #{i}{joint}{place}") from None
         except ValueError as error:
             raise InputError(f"{source}: human #{i}: {error}") from None
-    return _HumanFile(tuple(made), people.person)
+    return _HumanFile(tuple(made), people.person, None, people.device)
 
 
 def _own_humans(text: str) -> _HumanFile:
@@ -547,10 +556,16 @@ def _toml(value: Any) -> str:
     return f"[{', '.join(map(_toml, value))}]" if isinstance(value, tuple) else repr(value)
 
 
-def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
+def save_humans(
+    path: Path,
+    humans: tuple[Any, ...],
+    remark: str,
+    persons: tuple[Person, ...] = (),
+    mechanics: Sequence[Mechanics] = (),
+) -> Path:
     """Write humans and persons without voluntary motion so that reading gives the same numbers.
 
-    `remark` becomes a comment.
+    `remark` becomes a comment. `mechanics` are those of the devices, where they were drawn.
     """
     lines = [f"# {line}" for line in remark.splitlines()]
     for human in humans:
@@ -563,6 +578,8 @@ def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple
         body = [f"{name} = {getattr(person, name)!r}" for name in ("mass", "damping", "stiffness")]
         cross = f"cross = {{ damping = {person.cross.damping!r}, stiffness = {person.cross.stiffness!r} }}"
         lines += ["", "[[person]]", f"holds = {list(person.holds)}", *body, cross]
+    for own in mechanics:
+        lines += ["", "[[device]]", *(f"{name} = {value!r}" for name, value in msgspec.structs.asdict(own).items())]
     return write(path, "\n".join(lines) + "\n")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -12,6 +12,7 @@ from haptic_loop.controller.environment import Network
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.files import off_table
 from haptic_loop.design.result import finite
+from haptic_loop.models.device import Mechanics
 from haptic_loop.models.human import Hand, Human, Link, Person
 from haptic_loop.sim.adversary import Worst
 from haptic_loop.sim.crowds import Findings, Validation
@@ -109,12 +110,14 @@ class DrawnHumans:
     person: tuple[Person, ...]
     environment: str | None = off_table("if given", None)
     network: Network | None = off_table("if given", None)
+    device: Sequence[Mechanics] | None = off_table("if given", None)  # drawn within the guaranteed bounds
 
     @classmethod
     def of(cls, question: Validation, index: int) -> DrawnHumans:
         crowd, member = question.crowd(index), question.environment(index)
         where = (member.name, member.network) if member else (None, None)
-        return cls(question.seed, index, _held(crowd.humans(0)), crowd.persons(0), *where)
+        drawn = crowd.mechanics[0] if crowd.mechanics else None
+        return cls(question.seed, index, _held(crowd.humans(0)), crowd.persons(0), *where, drawn)
 
 
 @dataclass(frozen=True)
@@ -260,12 +263,14 @@ class Attacked:
     human: list[_Held]
     person: tuple[Person, ...]
     holds: bool
+    device: Sequence[Mechanics] | None = off_table("if given", None)  # found within the guaranteed bounds
 
     @classmethod
     def of(cls, worst: Worst, ratio: float, certified: bool) -> Attacked:
         figures = worst.spectral_radius, worst.growth, worst.frequency_hz, worst.evaluated
         held = _held(worst.humans), worst.persons
-        return cls(worst.destabilises, *figures, finite(ratio), *held, not (certified and worst.destabilises))
+        holds = not (certified and worst.destabilises)
+        return cls(worst.destabilises, *figures, finite(ratio), *held, holds, worst.mechanics or None)
 
     def __str__(self) -> str:
         grows = f"a human that grows at {self.growth_rate_per_s:+.4g} 1/s"

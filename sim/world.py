@@ -288,7 +288,7 @@ def thrown(
         hands, kind = crowd.humans(0), LOSSLESS if i % 2 else RANDOM
         if i % 2:
             hands = tuple(_lossless(hand) for hand in hands)
-        simulation = netted(nobody.held_by(hands, crowd.persons(0)), Touched(start))
+        simulation = netted(nobody.held_by(hands, crowd.persons(0), sum(crowd.mechanics, ())), Touched(start))
         states, n = len(simulation.plant.A), simulation.scene.model.nq
         first = np.zeros((states, 1))
         first[n : 2 * n, 0] = _THROWN * rng.normal(size=n)

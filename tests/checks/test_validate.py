@@ -10,12 +10,13 @@ from tests.checks.endurance import endurance
 from tests.checks.faults import rehearse_faults
 from tests.checks.hard import hard_loops
 from tests.checks.random_loops import proofs, traces
-from tests.checks.tightness import delayed, usual
+from tests.checks.tightness import delayed, known, usual
 from tests.checks.uneven import uneven_ticks
 
 pytestmark = pytest.mark.validate
 
 _HANDS = "--humans 300 --links mixed --duration 1 --adversary --generations 60"
+_KNOWN = "--scenario omega-pair-known --humans 10000 --links mixed --engine exact --duration 0 --adversary"
 COMMANDS = {
     "no coupling": f"sim.validate --case none {_HANDS}",
     "any environment, case I": f"sim.validate --case I --condition any-environment {_HANDS}",
@@ -24,12 +25,17 @@ COMMANDS = {
     "optimal": f"sim.validate --case I --coupling optimal {_HANDS}",
     "published gains": f"sim.validate --case I --coupling published {_HANDS}",
     "three rigid devices": f"sim.validate --scenario three-rigid --case I {_HANDS}",
+    "known devices, no coupling": f"sim.validate --case none {_KNOWN}",
+    "known devices, published gains": f"sim.validate --case I --coupling published {_KNOWN}",
+    "known devices, designed": f"sim.validate --case I --condition known-device {_KNOWN}",
+    "known devices, any environment": f"sim.validate --case I --condition known-device-any {_KNOWN}",
     "Z-width map": "sim.zwidth --rigid --T 1e-3 --theta 0 --grid 30 --points 8",
     "engines": "sim.accuracy --duration 6",
 }
 MEASURED = {
     "tightness": usual,
     "tightness with long delays": delayed,
+    "tightness on known devices": known,
     "numerically hard loops": hard_loops,
     "random networks": proofs,
     "traces and eigenvalues": traces,

@@ -14,9 +14,10 @@ import numpy as np
 from haptic_loop.controller.coupling import Coupling, NoCoupling
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.sim.adversary import Worst, search
 from haptic_loop.sim.couplings import choose
-from haptic_loop.sim.scenario import Scenario, load
+from haptic_loop.sim.scenario import DEFAULT, Scenario, load
 
 
 @dataclass(frozen=True)
@@ -34,14 +35,16 @@ def attempts(
     seed: int = 0,
     generations: int = 150,
 ) -> list[_Attack]:
-    """Every loop at every shortage: devices get (1 - short) times the damping that `this_environment` requires.
+    """Every loop at every shortage: devices get (1 - short) times the damping that their condition requires.
 
-    A negative shortage gives the devices more than required: there the search must fail.
+    That is known-device where the devices have guaranteed bounds, and this-environment elsewhere. A negative shortage
+    gives the devices more than required: there the search must fail.
     """
     rows = []
     for name, (scenario, coupling) in loops.items():
         loop = scenario.loop("I")  # the reference does not matter
-        F, required = loop.F(coupling), np.array(THIS_ENVIRONMENT.required(loop, coupling).required)
+        condition = KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT
+        F, required = loop.F(coupling), np.array(condition.required(loop, coupling).required)
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
             rows.append(_Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))
@@ -67,16 +70,21 @@ class Shortage:
 
 
 def shortages(
-    seed: int, couplings: Sequence[str], short: Sequence[float], generations: int, theta: tuple[int, int] | None = None
+    seed: int,
+    couplings: Sequence[str],
+    short: Sequence[float],
+    generations: int,
+    theta: tuple[int, int] | None = None,
+    name: str = DEFAULT,
 ) -> Iterator[Shortage]:
-    """The search against the default loop with these couplings, by name, at these shortages.
+    """The search against the loop of a scenario with these couplings, by name, at these shortages.
 
     Where it succeeds close to the required damping, the condition is tight.
     """
-    scenario = load().replace(theta=theta) if theta else load()
-    for name in couplings:
-        coupling = NoCoupling() if name == "none" else choose(scenario, "I", name).coupling
-        loop = {"no coupling" if name == "none" else f"{name}, case I": (scenario, coupling)}
+    scenario = load(name).replace(theta=theta) if theta else load(name)
+    for kind in couplings:
+        coupling = NoCoupling() if kind == "none" else choose(scenario, "I", kind).coupling
+        loop = {"no coupling" if kind == "none" else f"{kind}, case I": (scenario, coupling)}
         for share in short:
             (attempt,) = attempts(loop, np.array([share]), seed, generations)
             worst, found = attempt.worst, (attempt.worst.destabilises, attempt.worst.growth)
@@ -86,4 +94,11 @@ def shortages(
 
 #: from a seed: at short delays, and at long ones
 usual = partial(shortages, couplings=("none", "spring-damper"), short=(0, 0.01, 0.02, 0.05, 0.1, 0.2), generations=25)
+known = partial(
+    shortages,
+    couplings=("none", "published"),
+    short=(0, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02),
+    generations=40,
+    name="omega-pair-known",
+)
 delayed = partial(shortages, couplings=("none",), short=(0, 0.002, 0.005, 0.01, 0.02), generations=40, theta=(4, 9))

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace as change
 
 from haptic_loop.cli import run as run_command
 from haptic_loop.cli.validate import main
@@ -16,7 +17,7 @@ from haptic_loop.models.scene import build, plant
 from haptic_loop.sim import adversary
 from haptic_loop.sim.adversary import _DESTABILISED, search
 from haptic_loop.sim.run import assemble
-from haptic_loop.sim.scenario import load
+from haptic_loop.sim.scenario import InputError, held_by, load, save_humans
 from haptic_loop.sim.stability import close, dominant_mode
 from tests.checks.tightness import attempts, shortages
 
@@ -45,6 +46,23 @@ def test_where_the_condition_binds_slowly_it_is_tight():
     print([(row.short, row.worst.growth) for row in rows])
     assert [row.worst.destabilises for row in rows] == [False, True, True]
     assert all(6 < row.worst.frequency_hz < 10 for row in rows[1:])
+
+
+def test_known_devices_are_searched_within_their_bounds(tmp_path):
+    """Heavy motors on soft transmissions hide what a device at its bounds does; the search finds that device."""
+    heavy = {"motor_mass": 1.0, "transmission_stiffness": 3000.0}
+    known = load("omega-pair-known")
+    devices = tuple(change(device, **heavy) for device in known.device)
+    rows = attempts({"known": (known.replace(device=devices), NoCoupling())}, np.array([-1e-3, 0.002]), 0, 8)
+    assert [row.worst.destabilises for row in rows] == [False, True]
+    drawn = rows[-1].worst.mechanics
+    assert min(one.motor_mass for one in drawn) == 0.06
+    file = save_humans(tmp_path / "worst.toml", rows[-1].worst.humans, "", rows[-1].worst.persons, drawn)
+    again = held_by(known, str(file))
+    assert [one.motor_mass for one in again.device] == [one.motor_mass for one in drawn]
+    file.write_text(file.read_text().replace(f"motor_mass = {drawn[0].motor_mass!r}", "motor_mass = 0.01", 1))
+    with pytest.raises(InputError, match=r"motor_mass is 0\.01"):
+        held_by(known, str(file))
 
 
 def both_hands(monkeypatch):

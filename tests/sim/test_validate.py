@@ -27,7 +27,7 @@ from haptic_loop.sim.couplings import choose
 from haptic_loop.sim.crowds import _BATCH, Findings, Validation, validate
 from haptic_loop.sim.engines import ExactEngine
 from haptic_loop.sim.run import assemble, run
-from haptic_loop.sim.scenario import InputError, load
+from haptic_loop.sim.scenario import InputError, held_by, load
 from haptic_loop.sim.stability import (
     close,
     disagree,
@@ -67,6 +67,40 @@ def test_stacked_plants_are_those_of_each_model(devices, links):
         np.testing.assert_allclose(stacked.A[i], alone.A, rtol=1e-13, atol=0)
         np.testing.assert_allclose(stacked.B[i], alone.B, rtol=1e-13, atol=0)
         np.testing.assert_array_equal(stacked.C, alone.C)
+
+
+KNOWN = load("omega-pair-known")
+
+
+@pytest.mark.parametrize("engine", ["exact", "mujoco"])
+def test_drawn_devices_are_within_their_bounds(engine):
+    """Every drawn pair is the scene of its own devices, and validation judges that scene."""
+    question = Validation(KNOWN, NoCoupling(), 5, 40, MIXED, engine, 0.0)
+    found, F = validate(question), assemble(KNOWN, NoCoupling()).F
+    for index, people in question.crowds(range(8)):
+        for i, own in enumerate(people.mechanics):
+            devices = [drawn.of(device) for drawn, device in zip(own, KNOWN.device, strict=True)]  # checks the bounds
+            alone = dominant_mode(close(hold(plant(build(devices, people.humans(i)).model), KNOWN.T), F))
+            growth = found.exact if engine == "exact" else found.mujoco
+            assert growth[index[i]] == pytest.approx(alone.growth, abs=1e-9 if engine == "exact" else 1e-3)
+    masses = np.array([one.motor_mass for i in range(40) for one in question.crowd(i).mechanics[0]])
+    assert masses.min() == 0.06 < np.median(masses[masses > 0.06]) < masses.max() < 0.6
+    assert 0.3 < (masses == 0.06).mean() < 0.7  # the worst device is at its bounds
+
+
+def test_hundreds_of_hands_pass_on_known_devices(tmp_path):
+    """At 1.001 of what known-device asks none of 400 grows, on no device of the bounds; the worst one replays."""
+    file, out = tmp_path / "r.json", tmp_path / "out"
+    base = ["--scenario", "omega-pair-known", "--delta", "1.3134", "--case", "none", "--condition", "known-device"]
+    base += ["--duration", "0", "--engine", "exact", "--humans", "400", "--links", "mixed"]
+    assert main([*base, "--no-plot", "--out", str(out), "--json", str(file)]) == 0
+    report = json.loads(file.read_text())
+    assert report["certified"]
+    assert report["unstable"]["exact"] == 0
+    assert report["worst"]["device"][0]["transmission_damping"] == 0.5
+    again = assemble(held_by(KNOWN.replace(delta=(1.3134,) * 2), str(out / "worst-human.toml")), NoCoupling())
+    radius = dominant_mode(close(again.plant, again.F)).spectral_radius
+    assert radius == pytest.approx(report["worst"]["spectral_radius"], abs=1e-12)
 
 
 def asked(scenario):
