@@ -310,6 +310,8 @@ def _remarks(report: _Report) -> Iterator[str]:
         yield from _proposed(found.helps)
     if found.switching:
         yield from _switching_remarks(found.switching)
+    if torques := found.assessment.held_torques:
+        yield f"Held torques: {torques}."
     if left := found.left_over:
         yield f"{left.words[0].upper()}{left.words[1:]}."
     if part := report.encoder:

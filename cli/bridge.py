@@ -121,9 +121,13 @@ def _print_certificate(
     heads = ("coupling", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee")
     title = "certified for the delay measured, and in reserve for longer ones"
     console.print(render.grid(title, heads, [_certified(program) for program in programs], left=range(6)))
-    for program in programs:
-        for remark in (program.assessment.force_limits.within(caps).words, *program.remarks()):
+    remarks = [(program.assessment.force_limits.within(caps).words, *program.remarks()) for program in programs]
+    shared = set(remarks[0]).intersection(*remarks) if len(programs) > 1 else set()
+    for program, own in zip(programs, remarks, strict=True):
+        for remark in (each for each in own if each not in shared):
             console.print(f"[dim]·[/] theta = {list(program.scenario.theta)}: {remark}", highlight=False)
+    for remark in (each for each in remarks[0] if each in shared):
+        console.print(f"[dim]·[/] {remark}", highlight=False)
     if len(programs) == 1:
         console.print(
             "no reserve: nothing that is no stiffer is certified for a longer delay, so late answers end the session"

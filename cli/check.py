@@ -171,6 +171,8 @@ def _table(checked: _Checked) -> render.Table:
         anew = "proved anew, not from the file" if checked.anew else "proved"
         title = f"{anew}, in exact arithmetic{between}"
     rows = [*render.rows_of(checked), *(render.rows_of(checked.switching) if checked.switching else [])]
+    if checked.assessment:
+        rows.append(("held torques", checked.assessment.held_torques))
     if not checked.proved:  # what a file says that was refused
         claims = ("required", "margin", "switching, required", "switching, margin")
         rows = [(f"{name}, claimed" if name.startswith(claims) else name, text) for name, text in rows]

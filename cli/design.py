@@ -321,6 +321,7 @@ def _assessment_rows(assessment: Assessment) -> render.Rows:
     guarantee, felt = assessment.guarantee, assessment.transparency
     yield "guarantee", guarantee.words if guarantee else f"none ({assessment.reason})"
     yield "guarantee, forces", assessment.force_limits.words
+    yield "held torques", assessment.held_torques
     yield "transparency error", felt and render.transparency_error(felt)
 
 

@@ -81,6 +81,8 @@ def main(argv: list[str]) -> int:
     forces = "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
     if block.limiter:
         forces = f"limited to {listed(block.limiter.limit)} N by the limiter"
+        if stored.loop.axes:
+            forces += ", axis by axis: a limit L of the length of n axes is L/sqrt(n) here"
     exported = _Exported(
         block.name,
         block.system.order,

@@ -245,6 +245,8 @@ def _rows(report: RunReport) -> render.Rows:
             yield f"growth, {name if state.touching else 'no wall'} touching", _growth(state)
     yield "simulated in", run.environment if assessment.ranges else None
     yield "limited ticks", f"{stability.clipped_ticks} of {run.samples}"
+    lost = f"[red]{run.unsolved} forces were set to 0[/], which no proof covers: a tick found no limited ones"
+    yield "unsolved limits", lost if run.unsolved else None
     yield "cross-check", run.cross_check and _crossed(run.cross_check)
 
 

@@ -237,6 +237,7 @@ def _assessment_rows(assessment: Assessment) -> render.Rows:
     if assessment.condition not in PLAIN_CONDITIONS:
         yield from render.certificate_rows({assessment.condition: assessment.decisive}, 5)
     yield "force limits", assessment.force_limits.words
+    yield "held torques", assessment.held_torques
 
 
 @dataclass(frozen=True, kw_only=True)

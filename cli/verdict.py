@@ -142,6 +142,7 @@ def rows(assessment: Assessment) -> render.Rows:
     guarantee = assessment.guarantee
     yield "guarantee", guarantee.words if guarantee else f"none ({assessment.reason})"
     yield "force limits", assessment.force_limits.words
+    yield "held torques", assessment.held_torques
 
 
 def gain_rows(assessment: Assessment) -> render.Rows:

@@ -111,6 +111,7 @@ def _common_rows(report: _Report) -> Iterator[tuple[str, str | None]]:
         if isinstance(values, list) and values:
             yield f"coupling, {name}", f"{listed(values, 5)} {unit}"
     yield "any environment", f"{render.needs(needs)}: {render.certified(needs)}"
+    yield "held torques", report.assessment.held_torques
 
 
 def _energy(joules: float) -> str:

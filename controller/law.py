@@ -67,6 +67,11 @@ class Law(ReadOnly):
         return len(self.theta)
 
     @property
+    def unsolved(self) -> int:
+        """How many vectors of limited forces were set to 0 so far because no solution was found."""
+        return 0
+
+    @property
     def without_theta(self) -> Self:
         """The same with forces that are not delayed."""
         return replace(self, theta=(0,) * self.channels)
@@ -282,6 +287,10 @@ class Limiter(Law):
             sizes.append(end - at)
             at = end
         return tuple(sizes)
+
+    @property
+    def unsolved(self) -> int:
+        return self.problem.unsolved[0] if isinstance(self.problem, BallProblem) else 0
 
     @property
     def unlimited(self) -> Self:

@@ -393,6 +393,11 @@ class Assessment:
         """Order and gains of the coupling (Coupling.figures)."""
         return self.coupling.figures(self.loop.T)
 
+    @property
+    def held_torques(self) -> str | None:
+        """What the conditions do not charge on devices with several axes; None where each device has one."""
+        return "not charged: forces count as held in space while the pose moves on" if self.loop.axes else None
+
     def without_guarantee(self, reason: str) -> Assessment:
         """Return the record without its guarantee, because of something that runs and that no loop describes."""
         return replace(self, guarantee=None, reason=reason)

@@ -410,6 +410,10 @@ class CertifiedCoupling:
     def remarks(self) -> list[str]:
         """Return remarks on the coupling's file, on the user's own condition and on the clock."""
         said = [*self.chosen.remarks(self.assessment.requirements)]
+        if torques := self.assessment.held_torques:
+            said.append(f"held torques: {torques}")
+        if self.scenario.balls:
+            said.append("forces are limited axis by axis, to the box inside the limit of each force vector")
         if self.scenario.latency:
             least, most = (1e6 * t for t in self.scenario.latency[0])
             kept = f"periods up to {1e6 * (self.scenario.T_max or self.scenario.T):.0f} us"

@@ -56,6 +56,7 @@ class ScenarioRun:
     trace: Trace
     wall_s: float
     seed: int
+    unsolved: int  # vectors of forces for which a tick's limiter found no solution
 
     @cached_property
     def exact(self) -> Trace | None:
@@ -92,10 +93,10 @@ def run_scenario(
         integrator, substeps, remarks = settle(simulation, settings.engine, settings.integrator, settings.substeps)
     settled = EngineSettings(settings.engine, integrator, substeps)
     stepped = make_engine(simulation, settings.engine, integrator, substeps)
-    begin = time.perf_counter()
+    begin, unsolved = time.perf_counter(), ran.process.law.unsolved
     trace = run(ran, stepped, progress=progress)
-    wall = time.perf_counter() - begin
-    return ScenarioRun(simulation, ran, period, choices, settled, remarks, trace, wall, seed)
+    wall, unsolved = time.perf_counter() - begin, ran.process.law.unsolved - unsolved
+    return ScenarioRun(simulation, ran, period, choices, settled, remarks, trace, wall, seed, unsolved)
 
 
 def _chosen(scenario: Scenario, coupling: Coupling | Design | str | Path | None) -> Chosen:

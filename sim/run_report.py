@@ -52,6 +52,7 @@ class Ran:
     encoder_step_m: Array
     steady_ticks: list[list[int]]
     environment: str
+    unsolved: int  # vectors of limited forces that were set to 0 because a tick found no solution
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -179,4 +180,5 @@ def _ran(run: ScenarioRun, lam: tuple[int, ...], environment: str, check: bool) 
         encoder_step_m=process.encoder_step,
         steady_ticks=[[0, trace.ticks_before_clipping(process.force_limit, process.balls)]],
         environment=environment,
+        unsolved=run.unsolved,
     )

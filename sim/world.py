@@ -167,7 +167,7 @@ class Touched:
             shell = Shell(V, start=self.start, nsim=nsim)
         except ValueError as error:
             raise InputError(f"energy budget: {error}") from None
-        damping = np.array(simulation.loop.delta)[:, None] / (simulation.loop.T_max or simulation.loop.T)
+        damping = simulation.loop.Delta() / (simulation.loop.T_max or simulation.loop.T)
         return InWorld(shell, [scene.port(process.force_limit, process.balls) for _ in range(nsim)], damping)
 
 
@@ -206,7 +206,7 @@ class InWorld:
     """A world, its shell, and what hands and devices were given."""
 
     def __init__(self, shell: Shell, ports: list[Port], damping: Array) -> None:
-        """`damping` (m, 1) [N s/m / s]: delta/T, what a device dissipates per squared displacement."""
+        """`damping` (m, m) [N/m]: Delta/T, so that devices dissipate dx' Delta dx/T in a period."""
         self.ports, self._shell, self._damping = ports, shell, damping
         m, nsim = len(damping), len(ports)
         self._x: Array | None = None
@@ -217,7 +217,7 @@ class InWorld:
     def send(self, x: Array, force: Array, /) -> None:
         if self._x is not None:
             dx = x - self._x
-            self._given += (-self._acting * dx - self._damping * dx**2).sum(axis=0)
+            self._given -= (dx * (self._acting + self._damping @ dx)).sum(axis=0)
             np.maximum(self._most, self._given, out=self._most)
         self._x = x.copy()
         free = self._shell.free(x)

@@ -9,17 +9,21 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from haptic_loop.cli import verdict
+from haptic_loop.controller import complementarity
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.environment import Network, Wall
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.tick import at_limit
+from haptic_loop.design.assessment import assess
 from haptic_loop.design.files import InputError
 from haptic_loop.design.gain_search import LimiterLoop
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Cross, Human, Link, Person, Population, Voluntary, directions
 from haptic_loop.models.scene import Scene, build, draw, variants
+from haptic_loop.sim.api import run_scenario
 from haptic_loop.sim.crowds import Validation
 from haptic_loop.sim.run import assemble, outside_forces, run
 from haptic_loop.sim.scenario import Scenario, held_by, parse, save_humans
@@ -301,6 +305,25 @@ def test_clipped_runs_stay_within_the_ball() -> None:
     assert lengths.max() <= 0.05 * (1 + 1e-14)
     assert traces[0].clipped(simulation.process.force_limit, simulation.process.balls).mean() > 0.1
     assert np.abs(traces[0].x - traces[1].x).max() < 1e-9
+
+
+def test_reports_count_forces_without_a_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    space = scenario("force_limit = 0.01", "force_limit = 0.01").replace(duration=0.1)
+    lag = (5.0,) * 6
+    assert run_scenario(space, COUPLING, lag).unsolved == 0
+    for name in ("_NEWTON", "_HALVINGS", "_SPLIT"):
+        monkeypatch.setattr(complementarity, name, 0)
+    blocked = run_scenario(space, COUPLING, lag)
+    zero = (blocked.trace.f.reshape(-1, 2, 3) == 0).all(axis=2).sum()  # before the first force, too
+    assert 10 < blocked.unsolved <= zero
+    assert run_scenario(space, COUPLING, lag).unsolved == blocked.unsolved
+
+
+def test_reports_say_that_held_torques_are_free() -> None:
+    rows = [dict(verdict.rows(assess(each.loop("I"), SpringDamper([3000.0] * m, [0.3] * m)))).get("held torques")
+        for each, m in ((scenario(), 6), (line(), 2))]  # fmt: skip
+    assert "not charged" in str(rows[0])
+    assert rows[1] is None
 
 
 def test_search_shares_a_multiplier_within_a_device() -> None:

@@ -16,8 +16,9 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.sim.couplings import read_coupling
+from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import SCENARIOS, InputError, Scenario, load, parse
-from haptic_loop.sim.world import START_J, contacts_of, linearise, scene_of
+from haptic_loop.sim.world import START_J, Touched, contacts_of, linearise, scene_of
 
 T = 1e-3
 NAMES = ("cube", "ball", "peg", "door", "stack", "space")
@@ -158,6 +159,19 @@ def test_contacts_have_the_axes_of_their_devices(tmp_path):
             force[:n] @ normal[free] * normal[free] / (normal[free] @ normal[free]), force[:n], atol=1e-5
         )
         np.testing.assert_allclose(force[n:], 0.0, atol=1e-9)
+
+
+def test_full_levels_dissipate_by_their_matrices():
+    """Given is -f'dx - dx' Delta dx/T: -(1 - 2 + 6) mJ - 7.6 mJ, worked out by hand."""
+    damping = [[1.5, 0.4, 0.1], [0.4, 0.9, -0.2], [0.1, -0.2, 1.2]]
+    loop = load("world-space").replace(device=[{"kind": "rigid", "axes": 3, "damping": damping}] * 2)
+    simulation = assemble(loop, certified(loop).coupling)
+    world, x = Touched().net(simulation, simulation.process, 1), np.zeros((6, 1))
+    world.send(x, np.zeros((6, 1)))
+    world.apply(0, np.arange(1.0, 7.0)[:, None])
+    x[:3, 0] = 1e-3, -1e-3, 2e-3
+    world.send(x, np.zeros((6, 1)))
+    assert world._given[0] == pytest.approx(-5e-3 - 7.6e-3, rel=1e-12)
 
 
 def test_along_is_for_devices_with_one_axis():
