@@ -188,6 +188,8 @@ def _print_session(report: SessionReport, console: render.Screen, details: bool)
     for i, part in enumerate(report.world or [], start=1):
         claim = Claim.of(report.assessment).words if report.assessment else "No guarantee."
         console.print(f"world, arming {i}: {claim} The shell acted on {part.ticks_acted} of {part.ticks} ticks.")
+        if part.unsettled_ticks:
+            console.print(f"  {part.unsettled_ticks} ticks whose limited channels did not settle")
         if part.step_us:
             took = f"{part.step_us['p50']:.0f} us at the median, {part.step_us['p99']:.0f} at 99 %"
             console.print(f"  a step of the scene took {took} of the processor, of {1e6 * report.run.T_s:.0f} us")

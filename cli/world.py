@@ -73,7 +73,7 @@ def _reported(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, star
         assessment = assessed(
             scenario, args.case, chosen, energy_budget=start, limiter=False, seed=getattr(args, "seed", 0)
         )
-    claim, scene = Claim.of(assessment), scene_of(scenario, chosen.coupling)
+    claim, scene = Claim.of(assessment, chosen.certified_for), scene_of(scenario, chosen.coupling)
     parts: list[dict[str, object]] = [
         {"part": p.what, "count": p.count, "at_the_port": p.at_the_port} for p in scene.parts()
     ]
@@ -121,6 +121,8 @@ def _energy(joules: float) -> str:
 # ----------------------------------------------------------------------------------------------------
 # sim.run
 
+_WRITTEN = ("scene.xml", "world.xml")  # the devices, and the scene with its springs
+
 
 def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
     """Run a scenario with a world and report it; 0, or 130 where it was interrupted."""
@@ -128,6 +130,13 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
         if getattr(args, name, None):
             shown = name.replace("_", "-")
             raise InputError(f"--{shown}: with environment.world there is no linear loop to compare with; leave it out")
+    from haptic_loop.models.world import files_of  # loads MuJoCo
+
+    assert scenario.environment.world is not None
+    scene = {file.resolve() for file in files_of(Path(scenario.environment.world.file))}
+    for name in _WRITTEN:
+        if (out / name).resolve() in scene:
+            raise InputError(f"--out {out}: {name} is a file of the scene, which the run would overwrite")
     start, chosen = world_start(args), _chosen(args, scenario)
     report = _reported(args, scenario, chosen, start)
     settings = EngineSettings(args.engine, args.integrator, args.substeps)
@@ -145,8 +154,8 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
     )
     kept = replace(trace, meta=render.plain(report))
     files = [kept.save_npz(out / "trace.npz"), kept.save_csv(out / "trace.csv")]
-    files.append(write(out / "scene.xml", finished.simulation.scene.xml))
-    files.append(write(out / "world.xml", scene_of(scenario, chosen.coupling).xml))
+    written = finished.simulation.scene.xml, scene_of(scenario, chosen.coupling).xml
+    files += [write(out / name, xml) for name, xml in zip(_WRITTEN, written, strict=True)]
     if not args.no_plot and trace.t.size > 1:
         from haptic_loop.sim.plots import Contacts, draw_run, save
 

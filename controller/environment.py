@@ -316,6 +316,7 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
     elements: tuple[Any, ...] = ()  # of one's own: their parts are put among springs and walls
     world: World | None = None  # in place of everything else
     points: dict[str, tuple[str, ...]] = {}  # the coordinates of each point in space, nodes or ground where it is held
+    linear_model_of: str = ""  # the scene and the pose of which `block` is the linear model
 
     def __post_init__(self) -> None:
         if self.world:

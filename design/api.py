@@ -68,7 +68,14 @@ def design_coupling(
     one_of("kind", kind, KINDS)
     named(condition or usual_condition(loop, kind))  # refuses a taken name
     known(options, KINDS[kind].options, f"kind {kind!r}")
-    return design_by_kind(loop, kind, condition, **options)
+    made = design_by_kind(loop, kind, condition, **options)
+    return replace(made, certified_for=certified_for(loop, made.requirement.certified))
+
+
+def certified_for(loop: Loop, certified: bool) -> str:
+    """Name the linear network of a MuJoCo scene for which a coupling of this loop is certified, or "" for none."""
+    scene = getattr(loop.environment, "linear_model_of", "")
+    return f"the linear network of {scene}" if scene and certified else ""
 
 
 #: kinds and conditions that are quick to try in the place of something else; of the optimal coupling the first rung

@@ -191,6 +191,7 @@ class Chosen:
         own: The condition of the user's own (design.conditions.Condition), if it is one.
         switching: The delays [samples] within which its file proves any switching.
         notes: What a reader should know of its origin.
+        certified_for: The linear network of a MuJoCo scene for which it is certified, in words.
     """
 
     coupling: Coupling
@@ -202,6 +203,7 @@ class Chosen:
     own: Any = field(kw_only=True, default=None)
     switching: DelayRange | None = field(kw_only=True, default=None)
     notes: tuple[str, ...] = field(kw_only=True, default=())
+    certified_for: str = field(kw_only=True, default="")
 
     @property
     def asked(self) -> Any:
@@ -239,6 +241,7 @@ class Design(Chosen):
         own: The condition of the user's own (design.conditions.Condition), if it is one.
         switching: The delays [samples] within which any switching is proved.
         notes: What a reader should know of its origin.
+        certified_for: The linear network of a MuJoCo scene for which it is certified, in words.
     """
 
     figure: str

@@ -150,6 +150,7 @@ class WorldSession(WorldRecord):
                     port_least_J=world.least,
                     released_J=world.port.released,
                     created_J=world.port.created,
+                    unsettled_ticks=world.port.unsettled,
                     step_us=_percentiles(1e6 * np.array(world.seconds)),
                 )
             )

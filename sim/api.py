@@ -182,7 +182,7 @@ def simulate(
         "energy_budget": plain(trace.net.figures()) if trace.net else None,
     }
     if trace.net and (figures := trace.net.figures()) and isinstance(figures, WorldFigures):
-        said = Claim.of(assessment)
+        said = Claim.of(assessment, chosen.certified_for)
         meta |= {"world": plain(WorldRecord.of(figures)), "guarantee": said.words, "guaranteed": said.guaranteed}
     return replace(trace, meta=meta)
 

@@ -10,7 +10,7 @@ from typing import Any
 from haptic_loop.controller.coupling import PUBLISHED, Coupling, NoCoupling
 from haptic_loop.controller.environment import Environment
 from haptic_loop.controller.loop import Loop
-from haptic_loop.design.api import COUPLING, bare, fitting
+from haptic_loop.design.api import COUPLING, bare, certified_for, fitting
 from haptic_loop.design.assessment import Assessment, PluggedEnvironment, assess, shelled
 from haptic_loop.design.certificate import verify
 from haptic_loop.design.conditions import Condition
@@ -183,6 +183,7 @@ def from_file(
         limiter=(claim and claim.limiter) or None,
         switching=switching,
         notes=tuple(notes),
+        certified_for=certified_for(stored.loop, proved),
     )
 
 

@@ -26,6 +26,7 @@ from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import Net, Process
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import InputError
+from haptic_loop.design.result import listed
 from haptic_loop.models.human import Human
 from haptic_loop.sim.passivity_layer import netted
 from haptic_loop.sim.run import Simulation, assemble, outside_forces, run
@@ -60,6 +61,7 @@ class WorldRecord:
     port_least_J: float
     released_J: float
     created_J: float
+    unsettled_ticks: int
 
     @classmethod
     def of(cls, figures: WorldFigures) -> WorldRecord:
@@ -75,11 +77,15 @@ class Claim:
     words: str
 
     @classmethod
-    def of(cls, assessment: Assessment) -> Claim:
-        """The claim of a run in a world, from the assessment of exactly this run."""
+    def of(cls, assessment: Assessment, certified_for: str = "") -> Claim:
+        """The claim of a run in a world, from the assessment of exactly this run.
+
+        Without a guarantee it names the linear network that the coupling is `certified_for`, if it is for one.
+        """
         guarantee = assessment.guarantee
         if guarantee is None or guarantee.energy_J is None:
-            return cls(False, f"No guarantee: {assessment.reason}.")
+            elsewhere = f" The coupling is certified for {certified_for} only." if certified_for else ""
+            return cls(False, f"No guarantee: {assessment.reason}.{elsewhere}")
         energy = f"W0 = {_energy(guarantee.energy_J)}"
         return cls(
             True,
@@ -105,8 +111,7 @@ def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> Wo
     assert world is not None
     V = coupling.compliance(scenario.T)
     if V is None or not V.D.any():
-        why = f"coupling {coupling.kind} has no compliance V with a direct part"
-        raise InputError(f"environment.world needs a coupling: {why}, so there is no spring to the devices")
+        raise InputError(f"environment.world needs a coupling: {_no_spring(coupling)}")
     from haptic_loop.models.world import World
 
     contacts = contacts_of(scenario.environment)
@@ -114,6 +119,15 @@ def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> Wo
         return World(world.file, contacts, _springs(V, contacts), scenario.T, world.every, gravity)
     except ValueError as error:
         raise InputError(f"environment.world: {error}") from None
+
+
+def _no_spring(coupling: Coupling) -> str:
+    """Say why a coupling without a direct part of V gives no spring between scene and devices."""
+    if coupling.holds_model:
+        return (
+            "an optimal coupling filters the forces of its linear model and has no V; take a spring-damper or another V"
+        )
+    return f"coupling {coupling.kind} has no compliance V with a direct part, so there is no spring to the devices"
 
 
 def contacts_of(environment: Network) -> list[Contact]:
@@ -159,7 +173,7 @@ class Touched:
         """A fresh one. Raises InputError."""
         V = simulation.coupling.compliance(simulation.loop.T)
         if V is None or not V.D.any():
-            raise InputError("environment.world needs a coupling: with --coupling none the devices touch nothing")
+            raise InputError(f"environment.world needs a coupling: {_no_spring(simulation.coupling)}")
         if any(simulation.scenario.psi):
             raise InputError("psi: a world answers within the tick, so psi must be 0")
         scene = scene_of(simulation.scenario, simulation.coupling, self.gravity)
@@ -367,9 +381,16 @@ def linearise(world: Scenario | str | Path, pose: Any = None, contacts: Sequence
     unit = [np.eye(len(contact.along)) for contact in touched]
     try:
         E = _joined(Lti(*World(path, touched, unit, T).linear(pose), T)).inverse()
-        return Network(tuple(contact.body for contact in touched), block=Block.of(E))
+        model = f"{Path(path).name} near {_pose_words(pose)}"
+        return Network(tuple(contact.body for contact in touched), block=Block.of(E), linear_model_of=model)
     except ValueError as error:
         raise InputError(f"linearise: {error}") from None
+
+
+def _pose_words(pose: Any) -> str:
+    if pose is None:
+        return "its initial pose"
+    return f"its keyframe {pose!r}" if isinstance(pose, str) else f"the pose [{listed(pose, 5)}]"
 
 
 def _joined(G: Lti) -> Lti:

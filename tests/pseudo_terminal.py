@@ -155,15 +155,16 @@ def emulated(*options: str) -> Iterator[str]:
 
 
 def main() -> None:
-    """Emulate the built-in pair until a signal comes, the time is over or the cable is pulled; print the path first."""
-    parser = argparse.ArgumentParser(description="The built-in devices behind a pseudo-terminal.")
+    """Print the path and emulate until a signal comes, the time is over or the cable is pulled."""
+    parser = argparse.ArgumentParser(description="The devices of a scenario behind a pseudo-terminal.")
+    parser.add_argument("--scenario", default="omega-pair")
     parser.add_argument("--fault", action="append", default=[])
     parser.add_argument("--duration", type=float, default=660.0)
     parser.add_argument("--pace", type=float, default=1.0)
     parser.add_argument("--parent", type=int, default=0)
     parser.add_argument("--nobody", action="store_true")
     args = parser.parse_args()
-    scenario, faults = load(), tuple(FaultInjection.parse(text) for text in args.fault)
+    scenario, faults = load(args.scenario), tuple(FaultInjection.parse(text) for text in args.fault)
     emulator, terminal, stops = Emulator(nobody(scenario) if args.nobody else scenario, faults), Terminal(), []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, frame: stops.append(received))

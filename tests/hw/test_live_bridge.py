@@ -30,6 +30,7 @@ from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.limits import ENDED, SafetyLimits, Stage
 from haptic_loop.hw.monitor import LinkSettings
+from haptic_loop.hw.recording import load as read
 from haptic_loop.hw.session import Session
 from haptic_loop.hw.session_report import IncidentLog
 from haptic_loop.hw.transport import Live, SerialPort
@@ -84,36 +85,44 @@ def run(emulator, scenario, plan, watch=lambda session: None, pace=PACE):
     return session, live
 
 
-def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
-    """A session over a serial line, a report, a trace that replays bit by bit."""
-    monkeypatch.chdir(tmp_path)
+def commanded(capsys, scenario):
+    """The report of a short session of the command, in slower and slower motion until it is armed."""
     for pace in PACES:
-        options = [
-            "--arm",
-            "--no-dead-man",
-            "--held",
-            "--case",
-            "I",
-            "--duration",
-            "0.1",
-            "--measure",
-            "60",
-            "--pace",
-            str(pace),
-        ]
-        with emulated(f"--pace={pace}") as path:
-            code = bridge.main([*options, "--port", path, "--no-preflight", "--json", "-"])
+        options = ["--arm", "--no-dead-man", "--held", "--scenario", scenario, "--measure", "60", "--duration", "0.1"]
+        with emulated(f"--pace={pace}", f"--scenario={scenario}") as path:
+            live = ["--pace", str(pace), "--port", path, "--no-preflight", "--no-plot", "--json", "-"]
+            code = bridge.main([*options, *live])
         report = json.loads(capsys.readouterr().out)
         stage = report["session"]["stage"]
         assert Stage(stage) in ENDED
         assert report["session"]["cause"]
         assert code == (0 if stage == "finished" else 1)
         if report["session"]["armed"]:
-            break
-    else:
-        pytest.fail(f"never armed, at last {stage}: {report['session']['cause']}")
+            return report
+    pytest.fail(f"never armed, at last {stage}: {report['session']['cause']}")
+
+
+def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
+    """A session over a serial line, a report, a trace that replays bit by bit."""
+    monkeypatch.chdir(tmp_path)
+    report = commanded(capsys, "omega-pair")
     assert decisive(report)["certified"]
     assert replay.main(["out/bridge-I/trace.npz"]) == 0
+
+
+def test_a_world_runs_over_the_serial_line(tmp_path, capsys, monkeypatch):
+    """The scene steps in the session's own loop, behind its shell, and its report keeps the account."""
+    monkeypatch.chdir(tmp_path)
+    report = commanded(capsys, "world-ball")
+    (world,) = report["world"]
+    assert report["assessment"]["guarantee"]["energy_J"] == 2e-3
+    assert world["ticks"] > 0
+    assert world["unsettled_ticks"] == 0
+    assert world["step_us"]["p50"] > 0
+    trace, link = read(next(file for file in report["files"] if file.endswith("trace.npz")))
+    assert 0 < link["received"].sum() <= len(trace.x) == report["run"]["samples"]
+    assert world["port_least_J"] >= -2e-3 - world["released_J"]
+    assert world["given_J"] <= 2e-3 + world["released_J"]
 
 
 def test_interrupts_ramp_out_and_exit_130(tmp_path, capsys, monkeypatch):

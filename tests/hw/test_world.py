@@ -12,6 +12,7 @@ from haptic_loop.controller.lti import Lti
 from haptic_loop.hw.control import WorldController
 from haptic_loop.hw.recording import load as read
 from haptic_loop.hw.rehearsal import rehearse
+from haptic_loop.models import world as world_of
 from haptic_loop.sim.scenario import InputError, load
 
 DRIVEN = """<mujoco><option gravity="0 0 0"/><worldbody>
@@ -70,6 +71,19 @@ def test_a_world_is_rehearsed_behind_its_shell(tmp_path, capsys):
     assert world["ticks_acted"] == 0
     assert world["step_us"]["p50"] > 0
     assert world["given_J"] <= 2e-3 + world["released_J"]
+
+
+def test_ticks_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeypatch):
+    """Without a repetition of the step, these are the ticks on which the scene's force is at the cap."""
+    monkeypatch.setattr(world_of, "MOST_REPETITIONS", 0)
+    words = ("--scenario", str(driven(tmp_path)), "--duration", "0.5", "--force-cap", "1")
+    _, report, shown = session(tmp_path, capsys, *words)
+    _, link = read(tmp_path / "out" / "trace.npz")
+    (world,) = report["world"]
+    limited = int((np.abs(link["asked"]) >= 1.0).any(axis=1).sum())
+    assert limited > 20
+    assert world["unsettled_ticks"] == limited
+    assert f"{limited} ticks whose limited channels did not settle" in shown
 
 
 @pytest.mark.parametrize("budget", [0.002, 0.02])

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from hands import Hands
 
-from haptic_loop import simulate
+from haptic_loop import design_coupling, simulate
 from haptic_loop.controller.budget import Shell
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.lti import Lti
+from haptic_loop.design.api import store
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import THIS_ENVIRONMENT
+from haptic_loop.models import world as world_of
 from haptic_loop.sim.couplings import read_coupling
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import SCENARIOS, InputError, Scenario, load, parse
@@ -112,8 +114,9 @@ def test_a_packaged_world_runs_and_is_guaranteed(name):
         "no passive hand is given more than W0 = 2 mJ beyond what gravity and springs released"
         in (trace.meta["guarantee"])
     )
-    assert set(world) == {"ticks", "ticks_acted", "given_J", "port_least_J", "released_J", "created_J"}
-    assert (world["ticks"], world["ticks_acted"]) == (500, 0)
+    energies = {"given_J", "port_least_J", "released_J", "created_J"}
+    assert set(world) == {"ticks", "ticks_acted", "unsettled_ticks"} | energies
+    assert (world["ticks"], world["ticks_acted"], world["unsettled_ticks"]) == (500, 0, 0)
     np.testing.assert_array_equal(trace.f, again.f)
     dx, delta = np.diff(trace.x, axis=0), np.array(loop.delta)
     given = np.cumsum((-trace.f[:-1] * dx - delta / T * dx**2).sum(axis=1)).max()
@@ -275,6 +278,26 @@ def test_only_a_certified_coupling_is_guaranteed(tmp_path):
     assert "encoder steps" in simulate(coarse, certified(coarse), engine="exact").meta["guarantee"]
 
 
+def test_ticks_whose_limits_do_not_settle_are_counted(tmp_path, capsys, monkeypatch):
+    """Without a repetition of the step, these are the ticks on which a force is at its limit."""
+    monkeypatch.setattr(world_of, "MOST_REPETITIONS", 0)
+    scenario(tmp_path, TRAY, more=UP)
+    text = (tmp_path / "loop.toml").read_text().replace("12.0", "0.5").replace("[1, 2]", "[0, 0]")
+    hand = "\n[[human]]\nlinks = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]\n"
+    (tmp_path / "loop.toml").write_text(text + hand + "voluntary = { amplitude = 0.03, frequency = 2.0 }" + hand)
+    words = ("run", "--scenario", str(tmp_path / "loop.toml"), "--duration", "0.5", "--no-plot", "--out")
+    with pytest.raises(InputError, match=r"scene\.xml is a file of the scene"):
+        command(capsys, *words, str(tmp_path))
+    out = tmp_path / "out"
+    _, shown = command(capsys, *words, str(out))
+    report = json.loads((out / "report.json").read_text())
+    with np.load(out / "trace.npz") as trace:
+        limited = int((np.abs(trace["f"]) >= 0.5).any(axis=1).sum())
+    assert 20 < limited < 500
+    assert report["world"]["unsettled_ticks"] == limited
+    assert f"{limited} ticks whose limited channels did not settle" in " ".join(shown.split())
+
+
 def test_this_environment_says_nothing_of_a_world():
     loop = load("world-ball").loop("I")
     needs = THIS_ENVIRONMENT.judge(loop, certified(load("world-ball")).coupling)
@@ -404,6 +427,17 @@ def test_a_world_becomes_a_network_for_a_design(tmp_path):
     theirs = expected.E(T).at(z[None])[0]
     assert np.abs(network.E(T).at(z[None])[0] - theirs).max() < 1e-7 * np.abs(theirs).max()
     linear = loop.replace(environment=network)
+    design = design_coupling(linear.loop("I"), "spring-damper", "this-environment")
+    where = "The coupling is certified for the linear network of scene.xml near its initial pose only."
+    store(linear.loop("I"), design, tmp_path / "design.json")
+    for coupling in (design, tmp_path / "design.json"):
+        said = simulate(loop.replace(duration=0.05), coupling).meta["guarantee"]
+        assert said.startswith("No guarantee: the coupling is not certified for any environment: needs ")
+        assert said.endswith(where)
+    assert "linear network" not in simulate(loop.replace(duration=0.05), certified(linear)).meta["guarantee"]
+    assert linearise(loop, [0.0, 0.01]).linear_model_of == "scene.xml near the pose [0, 0.01]"
+    with pytest.raises(InputError, match="filters the forces of its linear model and has no V"):
+        simulate(loop, design_coupling(linear.loop("I"), "optimal", seconds=0.0))
     assert THIS_ENVIRONMENT.judge(linear.loop("I"), certified(linear).coupling).reason is None
     assert [contact.body for contact in contacts_of(loop.environment)] == ["left", "right"]
 
