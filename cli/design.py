@@ -288,7 +288,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
         switching=switching,
         delays=stored.switching.guarantee if stored.switching and stored.switching.proof else None,
         nearby=nearby,
-        best=best and _Best(limit, best.g, best.ladder, best.hurried),
+        best=best and _Best(limit, best.g, best.bases, best.hurried),
         sdps=design.sdps,
         stored=stored,
         interrupted=interrupted,
@@ -340,23 +340,23 @@ class _Best:
 
     bound: BoundBeside | None
     rendered_stiffness: float
-    ladder: Sequence[Any]
+    bases: Sequence[Any]
     ended_by_seconds: bool
 
     def rows(self) -> render.Rows:
         yield "bound", self.bound and self.bound.words
         share = finite(self.rendered_stiffness)  # a free mass has no static stiffness to render
         yield "rendered stiffness", None if share is None else f"{share:.3f} of the environment's"
-        rungs = (f"{rung.mismatch_db:.2f}{_why_left(rung)}" for rung in self.ladder)
-        yield "ladder [dB]", ", ".join(rungs) or None
+        tried = (f"{basis.mismatch_db:.2f}{_why_rejected(basis)}" for basis in self.bases)
+        yield "bases [dB]", ", ".join(tried) or None
         yield "ended by --seconds", "a larger basis may be better" if self.ended_by_seconds else None
-        yield "last not taken", next((rung.left for rung in reversed(self.ladder) if rung.left), None)
-        if missed := [rung.reason for rung in self.ladder if not (rung.proved or rung.left)]:
+        yield "last not taken", next((basis.rejected for basis in reversed(self.bases) if basis.rejected), None)
+        if missed := [basis.reason for basis in self.bases if not (basis.proved or basis.rejected)]:
             yield "last not proved", missed[-1]
 
 
-def _why_left(rung: Any) -> str:
-    return "" if rung.taken else " (not taken)" if rung.left else " (not proved)"
+def _why_rejected(basis: Any) -> str:
+    return "" if basis.taken else " (not taken)" if basis.rejected else " (not proved)"
 
 
 def _switching_words(proof: coverage.Switching) -> str:

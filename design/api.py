@@ -41,7 +41,7 @@ class DesignOptions(TypedDict, total=False):
     objective: Literal["rms", "sup"]  # optimal: of the mismatch relative to the environment
     band_hz: tuple[float, float]  # optimal, spring-damper for this environment: where the mismatch counts
     high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: kept low, not limited
-    seconds: float  # optimal: no further rung of the ladder is begun later than this
+    seconds: float  # optimal: no larger basis is tried later than this
 
 
 def design_coupling(
@@ -78,7 +78,7 @@ def certified_for(loop: Loop, certified: bool) -> str:
     return f"the linear network of {scene}" if scene and certified else ""
 
 
-#: kinds and conditions that are quick to try in the place of something else; of the optimal coupling the first rung
+#: kinds and conditions that are quick to try in the place of something else; the smallest basis of the optimal coupling
 _QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
     ("optimal", "this-environment", {"seconds": 0.0}),
     ("spring-damper", "this-environment", {}),

@@ -18,7 +18,7 @@ EXACT = 60.0
 #: A sweep, or a search by many of them. A sweep takes 0.006 for two devices and 0.008 for three.
 SWEEPS = 60.0
 #: Growing the basis of an optimal coupling. The longest of the 23 take 19 (o11), 17 (o08) and 15 (n6, n7).
-CLIMB = 60.0
+GROWTH = 60.0
 #: The search between the vertices of ranges, for one coupling: some 500 sweeps for each set of contacts.
 RANGES = 60.0
 #: The price of 10 %, by the most devices. It takes up to 2.2 (two devices), 6.6 (three, four) and 16.4 (more).

@@ -33,7 +33,7 @@ class _Settings:
 _TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
 _LOOSE = {"tol_gap_abs": 1e-6, "tol_gap_rel": 1e-6, "tol_feas": 1e-6}
 
-LADDER = (
+SETTINGS = (
     _Settings("default"),
     _Settings("tight", {**_TIGHT, "max_step_fraction": 0.95}),
     _Settings("as given", {"equilibrate_enable": False, "chordal_decomposition_enable": False}),
@@ -112,19 +112,19 @@ class ConeProgram:
     blocks: Sequence[Inequality]
 
     def solve(
-        self, what: str, accept: Callable[[Array], bool] | None = None, ladder: Sequence[_Settings] | None = None
+        self, problem: str, accept: Callable[[Array], bool] | None = None, settings: Sequence[_Settings] | None = None
     ) -> Array:
-        """Return the optimal x (p,), verified. `what` names the problem in error messages.
+        """Return the optimal x (p,), verified. `problem` names the problem in error messages.
 
         Raises:
             Infeasible: two settings report that there is no solution, and none finds one.
             DesignFailed: no setting gives a result that can be verified.
         """
         attempts: list[_Attempt] = []
-        if ladder is None:
-            ladder = (INTERIOR,) if any(block.large for block in self.blocks) else LADDER
-        for settings in ladder:
-            x, attempt = self._attempt(settings, accept)
+        if settings is None:
+            settings = (INTERIOR,) if any(block.large for block in self.blocks) else SETTINGS
+        for each in settings:
+            x, attempt = self._attempt(each, accept)
             if attempt.reason is None:
                 return x
             attempts.append(attempt)
@@ -132,9 +132,9 @@ class ConeProgram:
                 break
         statuses = ", ".join(f"{a.settings}: {a.status}" for a in attempts)
         if sum(a.status == "PrimalInfeasible" for a in attempts) >= 2:
-            raise Infeasible(self, attempts, f"{what} has no solution ({statuses})")
+            raise Infeasible(self, attempts, f"{problem} has no solution ({statuses})")
         advice = "try fewer delays, a larger damping or a lower order; the error carries the problem"
-        raise DesignFailed(self, attempts, f"{what} could not be solved ({statuses}); {advice}")
+        raise DesignFailed(self, attempts, f"{problem} could not be solved ({statuses}); {advice}")
 
     def violation(self, x: Array) -> float:
         """Return minus the least eigenvalue of all blocks; a positive number is a violation."""
@@ -188,8 +188,8 @@ def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, 
         setattr(settings, name, value)
     p = len(problem.cost)
     nothing, rows = scipy.sparse.csc_matrix((p, p)), scipy.sparse.vstack(slopes, format="csc")
-    found = clarabel.DefaultSolver(nothing, problem.cost, -rows, np.concatenate(constants), cones, settings).solve()
-    return np.array(found.x), str(found.status)
+    solution = clarabel.DefaultSolver(nothing, problem.cost, -rows, np.concatenate(constants), cones, settings).solve()
+    return np.array(solution.x), str(solution.status)
 
 
 # ----------------------------------------------------------------------------------------------------

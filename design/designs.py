@@ -136,7 +136,7 @@ def design_by_kind(
         reason = f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls"
         raise ValueError(f"{reason}{_before_walls(loop)}")
     if chosen.model and options.get("limiter") and (reason := LIMITER.not_designed(loop)):
-        with_less = {**options, "limiter": False, "ladder": ((4, 3),)}
+        with_less = {**options, "limiter": False, "bases": ((4, 3),)}
         raise ValueError(f"{reason}{_instead(loop, 'without --limiter', kind, **with_less)}")
     further = {"condition": made_for.name, "progress": progress}
     further = {name: value for name, value in further.items() if name in chosen.takes}

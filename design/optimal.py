@@ -49,7 +49,7 @@ _SEARCHED = 0.2  # least share of --seconds for the search between the vertices 
 
 
 @dataclass(frozen=True)
-class _Rung:
+class _BasisResult:
     """Result of the design over one basis."""
 
     taps: int
@@ -59,7 +59,7 @@ class _Rung:
     g: float  # rendered share of the static stiffness
     reason: str | None  # reason why the coupling is not certified and proved, or None
     seconds: float  # time since the design began
-    left: str | None = None  # reason why the coupling is rejected although it is proved, or None
+    rejected: str | None = None  # reason why the coupling is rejected although it is proved, or None
 
     @property
     def proved(self) -> bool:
@@ -67,7 +67,7 @@ class _Rung:
 
     @property
     def taken(self) -> bool:
-        return self.proved and self.left is None
+        return self.proved and self.rejected is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class Optimal(Design):
     g: float = field(kw_only=True)  # F(1) = g E(1); for a coupling that is no force filter the ratio of the norms
     states: int = field(kw_only=True)  # order of the loop
     certificate: Certificate | None = field(kw_only=True)  # It covers the loop's ranges and switching delays.
-    ladder: tuple[_Rung, ...] = field(kw_only=True, default=())
+    bases: tuple[_BasisResult, ...] = field(kw_only=True, default=())
     reason: str | None = field(kw_only=True, default=None)  # reason why there is no proof, or None
     searched: Searched | None = field(kw_only=True, default=None)  # result of the search between the vertices of ranges
 
@@ -95,23 +95,23 @@ def design_with(
 ) -> Optimal:
     """Design the optimal coupling for Options(**options); it is also safe while delays vary within `switching`.
 
-    `switching` is (lo, hi) [samples]. `progress` is called after each basis of the ladder.
+    `switching` is (lo, hi) [samples]. `progress` is called after each basis.
     """
-    asked, done = program.Options(**options), 0
+    chosen, done = program.Options(**options), 0
 
-    def reached(rung: _Rung) -> None:
+    def reached(result: _BasisResult) -> None:
         nonlocal done
         done += 1
-        progress(f"{rung.mismatch_db:.2f} dB after {rung.seconds:.1f} s", done, len(asked.ladder))
+        progress(f"{result.mismatch_db:.2f} dB after {result.seconds:.1f} s", done, len(chosen.bases))
 
     span = None if switching is None else DelayRange(*(tuple(map(int, end)) for end in switching))
-    return design(loop.switching(span), asked, progress=reached)
+    return design(loop.switching(span), chosen, progress=reached)
 
 
 def design(
     loop: Loop,
     options: program.Options = program.DEFAULT,
-    progress: Callable[[_Rung], None] = lambda rung: None,
+    progress: Callable[[_BasisResult], None] = lambda result: None,
 ) -> Optimal:
     """Return the coupling of least mismatch in the loop's environment, with its certificate and proof.
 
@@ -125,52 +125,54 @@ def design(
     """
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
-    climb = _Search.of(loop, options)
-    if exactly := climb.nothing():
+    search = _Search.of(loop, options)
+    if exactly := search.nothing():
         return exactly
     best: Optimal | None = None
     better: list[Optimal] = []  # each than the one before
-    rungs: list[_Rung] = []
-    hurried, floor, gained = False, _felt(min(climb.simple, 1.0)), np.inf
-    for taps, poles in options.ladder:
+    results: list[_BasisResult] = []
+    hurried, floor, gained = False, _felt(min(search.simple, 1.0)), np.inf
+    for taps, poles in options.bases:
         if taps > _LARGE and gained < _PROMISING_DB:
             break
-        if rungs and not climb.room(taps, poles, max((r.states for r in rungs if r.reason is None), default=0)):
+        if results and not search.room(taps, poles, max((r.states for r in results if r.reason is None), default=0)):
             continue
         try:
-            with within(climb.left if rungs else np.inf, "a larger basis", clock=climb.over if rungs else None):
+            with within(search.left if results else np.inf, "a larger basis", clock=search.over if results else None):
                 least = _SETTLED_DB if taps > _LARGE else -np.inf
-                found, rung = climb.rung(taps, poles, best, floor, least)
+                candidate, result = search.over_basis(taps, poles, best, floor, least)
         except TooLong:
-            hurried = climb.over()
+            hurried = search.over()
             break
-        gained = np.inf if rung.reason else climb.gained(best, found)
-        if best and found.g < floor and rung.proved:
-            rung = replace(rung, left=f"it renders {found.g:.3f} of the stiffness, less than half of another's")
-        elif gained <= 0 or rung.reason == _SETTLED:
-            rung = replace(rung, left=f"{_SETTLED}, the stiffness counted")
-        rungs.append(rung)
-        progress(rung)
-        settled = rung.reason == _SETTLED or (gained < _SETTLED_DB and taps >= _FEWEST_TAPS[climb.simply])
-        if rung.taken:
-            best, floor = found, max(floor if best else 0.0, _felt(_KEPT_STIFFNESS * found.g))
-            better.append(found)
-        hurried = not settled and climb.over()
-        hopeless = len(rungs) >= budgets.UNPROVED_BASES and not any(
-            each.proved for each in rungs[-budgets.UNPROVED_BASES :]
+        gained = np.inf if result.reason else search.gained(best, candidate)
+        if best and candidate.g < floor and result.proved:
+            result = replace(
+                result, rejected=f"it renders {candidate.g:.3f} of the stiffness, less than half of another's"
+            )
+        elif gained <= 0 or result.reason == _SETTLED:
+            result = replace(result, rejected=f"{_SETTLED}, the stiffness counted")
+        results.append(result)
+        progress(result)
+        settled = result.reason == _SETTLED or (gained < _SETTLED_DB and taps >= _FEWEST_TAPS[search.simply])
+        if result.taken:
+            best, floor = candidate, max(floor if best else 0.0, _felt(_KEPT_STIFFNESS * candidate.g))
+            better.append(candidate)
+        hurried = not settled and search.over()
+        hopeless = len(results) >= budgets.UNPROVED_BASES and not any(
+            each.proved for each in results[-budgets.UNPROVED_BASES :]
         )
         if settled or hurried or (hopeless and not loop.ranges):
             break
     if loop.ranges:
-        for found in better[: -budgets.RANGED_BASES - 1 : -1]:
-            best = climb.between(found)
-            hurried |= best.searched is not None and best.searched.ended and climb.over()
+        for candidate in better[: -budgets.RANGED_BASES - 1 : -1]:
+            best = search.between(candidate)
+            hurried |= best.searched is not None and best.searched.ended and search.over()
             if best.proved:
                 break
-    if best is None or not best.proved or climb.mismatch(best) > _HOPELESS:
-        rivals = [one for one in (best, climb.scaled(), climb.spring_damper()) if one is not None]
-        best = min(rivals, key=lambda one: (not one.proved, climb.merit(one)))
-    return replace(best, ladder=tuple(rungs), sdps=len(rungs), wall_s=climb.elapsed, hurried=hurried)
+    if best is None or not best.proved or search.mismatch(best) > _HOPELESS:
+        rivals = [one for one in (best, search.scaled(), search.spring_damper()) if one is not None]
+        best = min(rivals, key=lambda one: (not one.proved, search.merit(one)))
+    return replace(best, bases=tuple(results), sdps=len(results), wall_s=search.elapsed, hurried=hurried)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,15 +196,15 @@ class _Search:
         cases: list[program.Case] = []
         for member in loop.members():
             there = at(loop, member.network)
-            asked = [
+            constraints = [
                 program.this_environment(there),
                 *([program.switching(there, loop.varying_delay)] if loop.varying_delay else []),
             ]
             if options.high_gain is not None and 2 * program.HIGH_HZ * loop.T < 1 and there.E().D.any():
-                asked.append(program.most_gain(there, options.high_gain))
+                constraints.append(program.most_gain(there, options.high_gain))
             if options.objective == "sup" and not cases:
-                asked.append(program.worst_mismatch(there, options.band_hz))
-            cases.append(program.Case(there, there.E(), tuple(asked), weight=0.0 if cases else 1.0))
+                constraints.append(program.worst_mismatch(there, options.band_hz))
+            cases.append(program.Case(there, there.E(), tuple(constraints), weight=0.0 if cases else 1.0))
         if options.limiter and (reason := LIMITER.not_designed(loop)):
             raise ValueError(reason)
         needs = in_each(loop, NoCoupling(), loop.members())
@@ -221,7 +223,7 @@ class _Search:
     @property
     def left(self) -> float:
         """Counted work that is left for larger bases."""
-        return max(budgets.CLIMB - units_since(self.spent), 0.0)
+        return max(budgets.GROWTH - units_since(self.spent), 0.0)
 
     @property
     def constrained(self) -> bool:
@@ -256,29 +258,29 @@ class _Search:
         slip, need = min(zip(slips, needs, strict=True), key=lambda pair: pair[1].ratio)
         return replace(slip, c=slip.condition.rows(self.loop, need.multiplier)) if need.multiplier else slip
 
-    def asked(self, slip: program.Slip | None) -> tuple[program.Case, ...]:
+    def cases_with(self, slip: program.Slip | None) -> tuple[program.Case, ...]:
         """Return the environments with their constraints, including the limiter's block for `slip`."""
         if slip is None:
             return self.cases
         here = program.limiter(self.loop, slip)
         return tuple(replace(case, constraints=(*case.constraints, here)) for case in self.cases)
 
-    def mismatch(self, found: Optimal) -> float:
+    def mismatch(self, candidate: Optimal) -> float:
         """Return the objective: the rms or largest mismatch relative to the environment, as a ratio."""
-        figures = found.figures
+        figures = candidate.figures
         return figures.rms_mismatch if self.options.objective == "rms" else figures.relative_mismatch
 
-    def decibels(self, found: Optimal) -> float:
-        return decibels(self.mismatch(found))
+    def decibels(self, candidate: Optimal) -> float:
+        return decibels(self.mismatch(candidate))
 
-    def merit(self, found: Optimal) -> float:
+    def merit(self, candidate: Optimal) -> float:
         """Return the objective that ranks solutions: mismatch combined with lost static stiffness, as a ratio."""
-        static = program.static_weight(self.loop) * (found.g - 1) if np.isfinite(found.g) else 0.0
-        return float(np.hypot(self.mismatch(found), static))
+        static = program.static_weight(self.loop) * (candidate.g - 1) if np.isfinite(candidate.g) else 0.0
+        return float(np.hypot(self.mismatch(candidate), static))
 
-    def gained(self, before: Optimal | None, found: Optimal) -> float:
+    def gained(self, before: Optimal | None, candidate: Optimal) -> float:
         """Return the improvement of the merit over the solution `before` [dB]; infinity if `before` is None."""
-        return np.inf if before is None else decibels(self.merit(before)) - decibels(self.merit(found))
+        return np.inf if before is None else decibels(self.merit(before)) - decibels(self.merit(candidate))
 
     @property
     def simple(self) -> float:
@@ -292,8 +294,8 @@ class _Search:
         more = any(len(case.constraints) > 1 for case in self.cases)
         if more or not exact_delay or self.bare > 1 - program.MARGIN:
             return None
-        found = self._proved(self._assessed(NoCoupling(), 1.0), self.slips(None)[0])
-        return found if found.proved or not self.options.limiter else None
+        candidate = self._proved(self._assessed(NoCoupling(), 1.0), self.slips(None)[0])
+        return candidate if candidate.proved or not self.options.limiter else None
 
     def span(self, taps: int, poles: int) -> program.Span:
         full = program.FULL if self.simply else program.FULL_BESIDE
@@ -314,7 +316,9 @@ class _Search:
         solved = span.unknowns <= budgets.BASIS_UNKNOWNS if full and self.simply else beside
         return before < states <= budgets.BASIS_STATES and solved and proofs <= budgets.BASIS_PROOFS
 
-    def rung(self, taps: int, poles: int, before: Optimal | None, floor: float, least: float) -> tuple[Optimal, _Rung]:
+    def over_basis(
+        self, taps: int, poles: int, before: Optimal | None, floor: float, least: float
+    ) -> tuple[Optimal, _BasisResult]:
         """Return the optimum over a basis, scaled until every sweep passes, and proved if it gains `least` dB.
 
         If the optimum renders less than the share `floor` of the static stiffness, it is solved again with a larger
@@ -322,10 +326,12 @@ class _Search:
         """
         for heavier in (1.0, 2.5, 6.0):
             tried = [self.solved(taps, poles, before, slip, heavier, least) for slip in self.slips(before)]
-            found = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
-            if found.g >= floor or found.reason:
+            candidate = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
+            if candidate.g >= floor or candidate.reason:
                 break
-        return found, _Rung(taps, poles, found.states, self.decibels(found), found.g, found.reason, self.elapsed)
+        return candidate, _BasisResult(
+            taps, poles, candidate.states, self.decibels(candidate), candidate.g, candidate.reason, self.elapsed
+        )
 
     def solved(
         self,
@@ -338,7 +344,7 @@ class _Search:
     ) -> Optimal:
         error = self.mismatch(before) if before else 1.0
         soft = program.SOFT[0] * min(error, program.SOFT[1])
-        problem = program.Problem(self.span(taps, poles), self.asked(slip), self.options, soft, heavier=heavier)
+        problem = program.Problem(self.span(taps, poles), self.cases_with(slip), self.options, soft, heavier=heavier)
         coupling, needs = self.kept_in_all(problem, [0])
         if slip:
             needs.append(min(required_damping(self.loop, coupling, LimitedForces(slip.beta)).ratio, 1 + _TOLERATED))
@@ -346,12 +352,12 @@ class _Search:
             limit = 1 - share * program.MARGIN
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
-            found = self._assessed(scaled, scaled.g)
-            if self.gained(before, found) < least:
-                return replace(found, reason=_SETTLED)
-            if self.loop.ranges or (found := self._proved(found, slip)).proved:
+            candidate = self._assessed(scaled, scaled.g)
+            if self.gained(before, candidate) < least:
+                return replace(candidate, reason=_SETTLED)
+            if self.loop.ranges or (candidate := self._proved(candidate, slip)).proved:
                 break
-        return found
+        return candidate
 
     def kept_in_all(
         self, problem: program.Problem, active: list[int], until: float = np.inf, **how: Any
@@ -383,40 +389,40 @@ class _Search:
         return self._assessed(scaled, scaled.g), [scale * need for need in needs]
 
     def proofs(
-        self, found: Optimal, needs: Sequence[float], slip: program.Slip | None, work: float
+        self, candidate: Optimal, needs: Sequence[float], slip: program.Slip | None, work: float
     ) -> tuple[int, str | None]:
         """Prove the coupling in one environment after another, the worst first.
 
         The proofs stop before their work, estimated from the number of states, exceeds `work`.
         Returns (number of environments with a proof, reason why the next proof failed or None).
         """
-        here = self._proved(found, slip)
+        here = self._proved(candidate, slip)
         if not here.proved:
             return 0, str(here.reason)
         worst_first = sorted(range(1, len(needs)), key=lambda i: -needs[i])
         for done, i in enumerate(worst_first, start=1):
-            if done * _PROOF * found.states**2.7 > work:
+            if done * _PROOF * candidate.states**2.7 > work:
                 return done, None
             swept = from_ratio("this-environment", needs[i], self.loop.delta, 0.0)
             try:
-                prove(self.cases[i].loop, found.coupling, "this-environment", swept=swept)
+                prove(self.cases[i].loop, candidate.coupling, "this-environment", swept=swept)
             except NotProved as error:
                 return done, str(error)
         return len(needs), None
 
-    def between(self, found: Optimal) -> Optimal:
+    def between(self, candidate: Optimal) -> Optimal:
         """Return the coupling for ranges after the search between the vertices, with a proof at each vertex.
 
         If the worst environment of the search needs more damping than the devices have, the forces are scaled down.
         """
-        whole = found.coupling
-        assert isinstance(whole, ForceFilter)
+        unscaled = candidate.coupling
+        assert isinstance(unscaled, ForceFilter)
         begun = self.elapsed / self.options.seconds if self.options.seconds else 0.0
-        searched = search_ranges(self.loop, whole, over=lambda: self.over(max(1.0, begun + _SEARCHED)))
-        ratio, last = searched.worst[0].ratio, found
+        searched = search_ranges(self.loop, unscaled, over=lambda: self.over(max(1.0, begun + _SEARCHED)))
+        ratio, last = searched.worst[0].ratio, candidate
         for limit in (1 - program.MARGIN / 2, 1 - 2.5 * program.MARGIN):
             share = min(1.0, limit / ratio)
-            coupling = _scaled(whole, share)
+            coupling = _scaled(unscaled, share)
             lower = tuple(replace(one, ratio=one.ratio * share) for one in searched.worst)  # Needs scale with forces.
             last = self._proved(self._assessed(coupling, coupling.g), None)
             last = replace(last, searched=replace(searched, worst=lower))
@@ -428,14 +434,14 @@ class _Search:
         """Return the environment itself as a coupling R = kappa I, scaled down until it is proved."""
         span = program.Span(np.zeros(0), NO_PAIRS, np.zeros((0, self.loop.channels, self.loop.channels), dtype=bool))
         (slip, *_) = self.slips(None)
-        problem = program.Problem(span, self.asked(slip), self.options, 0.0)
+        problem = program.Problem(span, self.cases_with(slip), self.options, 0.0)
         kappa = self._start(problem)[0] if self.constrained else min(1.0, self.simple)
         for share in (1.0, 0.97, 0.9, 0.7, 0.5):
             part = np.floor(share * kappa * 1e6) / 1e6
-            found = self._proved(self._assessed(span.filter(np.array([part])), part), slip)
-            if found.proved:
+            candidate = self._proved(self._assessed(span.filter(np.array([part])), part), slip)
+            if candidate.proved:
                 break
-        return found
+        return candidate
 
     def spring_damper(self) -> Optimal | None:
         """Return the best spring-damper under this-environment, or None with other constraints or without a result."""
@@ -481,20 +487,20 @@ class _Search:
             reason=None if requirement.certified else requirement.reason or "the sweep does not certify it",
         )
 
-    def _proved(self, found: Optimal, slip: program.Slip | None) -> Optimal:
-        """Return `found` with its certificate, or with the reason why the proof failed."""
-        loop, coupling = self.loop, found.coupling
+    def _proved(self, candidate: Optimal, slip: program.Slip | None) -> Optimal:
+        """Return `candidate` with its certificate, or with the reason why the proof failed."""
+        loop, coupling = self.loop, candidate.coupling
         try:
             if slip:
                 certificate = prove(loop, coupling, LimitedForces(slip.beta))
             else:
                 certificate = prove(
-                    loop, coupling, THIS_ENVIRONMENT, swept=None if loop.varying_delay else found.requirement
+                    loop, coupling, THIS_ENVIRONMENT, swept=None if loop.varying_delay else candidate.requirement
                 )
         except NotProved as error:
-            return replace(found, wall_s=self.elapsed, reason=str(error))
-        requirement = replace(found.requirement, proof="rational")
-        return replace(found, requirement=requirement, certificate=certificate, wall_s=self.elapsed, reason=None)
+            return replace(candidate, wall_s=self.elapsed, reason=str(error))
+        requirement = replace(candidate.requirement, proof="rational")
+        return replace(candidate, requirement=requirement, certificate=certificate, wall_s=self.elapsed, reason=None)
 
 
 def _felt(g: float) -> float:
@@ -529,27 +535,29 @@ def spread(
     """
     work = work or budgets.of_channels(budgets.PRICE, loop.channels)
     until = spent_after(work * (1 - _PROVING))
-    climb = _Search.of(loop.at(loop.environment), options)
+    search = _Search.of(loop.at(loop.environment), options)
     if isinstance(nominal, NoCoupling):
         nominal = ForceFilter([], [], [np.eye(loop.channels).tolist()])
-    before = climb.decibels(climb._assessed(nominal, nominal.g))
+    before = search.decibels(search._assessed(nominal, nominal.g))
     others = [at(loop, network) for network in vertices(loop.network, percent).values()]
     more = tuple(program.Case(there, there.E(), (program.this_environment(there),), 0.0) for there in others)
-    climb, slip = replace(climb, cases=climb.cases + more), climb.slip_of(nominal)
+    search, slip = replace(search, cases=search.cases + more), search.slip_of(nominal)
     taps, poles = budgets.of_channels(_PRICED_BY, loop.channels)
     problem = program.Problem(
-        climb.span(taps, poles), climb.asked(slip), options, program.SOFT[0] * program.SOFT[1], sparse=True
+        search.span(taps, poles), search.cases_with(slip), options, program.SOFT[0] * program.SOFT[1], sparse=True
     )
-    hardest = np.argsort([-ratio_in(case.loop, nominal) for case in climb.cases])
+    hardest = np.argsort([-ratio_in(case.loop, nominal) for case in search.cases])
     active = [0, *(int(i) for i in hardest if i)][: _FIRST + 1]
-    tried = [nominal, climb.kept_in_all(problem, active, until, forgiven=_TOLERATED)[0]]
+    tried = [nominal, search.kept_in_all(problem, active, until, forgiven=_TOLERATED)[0]]
     for limit in (1 - program.MARGIN, 1 - 2.5 * program.MARGIN):
-        found, needs = min((climb.fitted(one, slip, limit) for one in tried), key=lambda one: climb.merit(one[0]))
-        proved, reason = climb.proofs(found, needs, slip, work * _PROVING)
+        candidate, needs = min((search.fitted(one, slip, limit) for one in tried), key=lambda one: search.merit(one[0]))
+        proved, reason = search.proofs(candidate, needs, slip, work * _PROVING)
         if reason is None:
             break
-    db = climb.decibels(found)
-    return Spread(db, db - before, found.g, max(needs[1:], default=needs[0]), found.states, len(needs), proved, reason)
+    db = search.decibels(candidate)
+    return Spread(
+        db, db - before, candidate.g, max(needs[1:], default=needs[0]), candidate.states, len(needs), proved, reason
+    )
 
 
 def nearby(

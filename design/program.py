@@ -31,7 +31,7 @@ from haptic_loop.design.transparency import BAND_HZ
 
 OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # unused share of the damping, which the exact proof needs for rounding
-LADDER = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10), (32, 24), (48, 34))  # (taps, real poles) of the bases
+BASES = ((4, 3), (8, 6), (14, 10), (22, 16), (26, 10), (32, 24), (48, 34))  # (taps, real poles) of the bases
 _FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # range of the real poles' distances to 1
 _FASTER = 0.25  # Modes of smaller radius are only in the filter of the sum of all forces.
 _NEAR = 0.3  # A real pole is dropped if a real mode is nearer than this share of the pole's distance to 1.
@@ -66,7 +66,7 @@ class Options:
     high_gain: float | None = None  # largest |F|/|E| above 100 Hz; None: a soft row keeps the force low instead
     limiter: bool = False  # whether the coupling is also safe while forces are limited
     seconds: float | None = None  # time [s] after which no larger basis is tried; None: no time limit
-    ladder: tuple[tuple[int, int], ...] = LADDER  # (taps, real poles)
+    bases: tuple[tuple[int, int], ...] = BASES  # (taps, real poles)
 
     def __post_init__(self) -> None:
         one_of("objective", self.objective, OBJECTIVES)
@@ -76,8 +76,8 @@ class Options:
             raise ValueError(f"high_gain is {self.high_gain}, expected a factor of at least 1")
         if not 0 < self.band_hz[0] < self.band_hz[1]:
             raise ValueError(f"band_hz is {self.band_hz}, expected two rising frequencies in Hz")
-        if not self.ladder or any(taps < 1 or poles < 0 for taps, poles in self.ladder):
-            raise ValueError(f"ladder is {self.ladder}, expected pairs of taps (1 or more) and poles (0 or more)")
+        if not self.bases or any(taps < 1 or poles < 0 for taps, poles in self.bases):
+            raise ValueError(f"bases is {self.bases}, expected pairs of taps (1 or more) and poles (0 or more)")
 
 
 DEFAULT = Options()
@@ -301,7 +301,7 @@ def _distinct(modes: Complex) -> list[complex]:
     return kept
 
 
-_Asked = list[tuple["Case", _Constraint]]
+_Pairs = list[tuple["Case", _Constraint]]
 _Posed = tuple[Program, Array, Callable[[Array], Array]]
 
 # the problem -----------------------------------------------------------------------------------------------------
@@ -441,7 +441,7 @@ class Problem:
         return MatrixInequality.of(np.zeros((1, 1, 1), dtype=complex), slope)
 
     def _dense(
-        self, A: Array, b: Array, c: Array, asked: _Asked, imposed: list[Array], start: Array, x: Array
+        self, A: Array, b: Array, c: Array, pairs: _Pairs, imposed: list[Array], start: Array, x: Array
     ) -> _Posed:
         """Return (program in well-conditioned coordinates y, feasible start y, map from y to x).
 
@@ -449,7 +449,7 @@ class Problem:
         """
         import scipy
 
-        parts = [self.block(*one, own, w) for one, own, w in zip(asked, self.own, imposed, strict=True)]
+        parts = [self.block(*one, own, w) for one, own, w in zip(pairs, self.own, imposed, strict=True)]
         program = Program(A, b, c, joined([*parts, self._positive(0)]))
         x = towards(start, x, program)
         program, U = program.conditioned(x)
@@ -462,7 +462,7 @@ class Problem:
         return bool(full) and all(constraint.through for case in self.cases for constraint in case.constraints)
 
     def _by_entries(
-        self, A: Array, b: Array, c: Array, asked: _Asked, imposed: list[Array], start: Array, x: Array
+        self, A: Array, b: Array, c: Array, pairs: _Pairs, imposed: list[Array], start: Array, x: Array
     ) -> _Posed:
         """Return (program, feasible start y, map from y to x) like `_dense`, with y ordered by entries of R, then g.
 
@@ -484,7 +484,7 @@ class Problem:
             return np.append(y[-1], scipy.linalg.solve_triangular(U, y[:-1].reshape(-1, n).T).ravel())
 
         blocks: list[MatrixInequality | EntryInequality] = [self._positive(self.unknowns - 1)]
-        for (case, constraint), w in zip(asked, imposed, strict=True):
+        for (case, constraint), w in zip(pairs, imposed, strict=True):
             delayed = case.delayed(on_circle(w))
             one = Sampled(delayed.z, np.tile(np.eye(m, dtype=complex), (1, w.size, 1, 1)), delayed.T)
             none = np.zeros(0)
@@ -553,8 +553,8 @@ class Problem:
 
         Violations may be larger if the search ends because the work counted so far (`spent`) exceeds `until`.
         """
-        asked = [(case, constraint) for case in self.cases for constraint in case.constraints]
-        imposed = [self.grid(case, constraint) for case, constraint in asked]
+        pairs = [(case, constraint) for case in self.cases for constraint in case.constraints]
+        imposed = [self.grid(case, constraint) for case, constraint in pairs]
         A, b, c = self.objective()
         posed = self._by_entries if self._entries else self._dense
         _, R = np.linalg.qr(np.column_stack([A, b]))
@@ -567,7 +567,7 @@ class Problem:
         )  # Otherwise exact scaling ensures feasibility.
         lower = _STEEPER**4 if demanding else _STEEPER
         for _ in range(budgets.PROGRAM_SWEEPS):
-            program, y, back = posed(A, b, c, asked, imposed, start, x)
+            program, y, back = posed(A, b, c, pairs, imposed, start, x)
             t = program.degree / max(program.value(y), 1e-12) if t is None else t / lower
             y = centre(program, y, t)
             inner = back(y)

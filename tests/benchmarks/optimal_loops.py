@@ -26,7 +26,7 @@ from haptic_loop.design.robustness import robustness
 from haptic_loop.sim.scenario import load
 
 T = TypeVar("T")
-PATIENT = Options(seconds=600)  # so that a busy machine climbs as far as an idle one
+PATIENT = Options(seconds=600)  # so that a busy machine tries as many bases as an idle one
 LOOPS = Path(__file__).parents[2] / "benchmarks" / "loops"
 
 #: by loop: rms mismatch [dB] of version 0.1 (or why there was none), figure [dB] and stiffness to beat

@@ -9,7 +9,7 @@ import pytest
 from analysis import solve
 
 from haptic_loop.design import cone
-from haptic_loop.design.cone import INTERIOR, LADDER, ConeProgram, Inequality
+from haptic_loop.design.cone import INTERIOR, SETTINGS, ConeProgram, Inequality
 from haptic_loop.design.lmi import symmetric_from
 from haptic_loop.design.result import DesignFailed, Infeasible
 
@@ -44,13 +44,13 @@ def with_known_optimum(rng, p, shapes):
     return ConeProgram(cost, blocks), x
 
 
-@pytest.mark.parametrize("ladder", [LADDER, (INTERIOR,)], ids=["Clarabel", "interior"])
+@pytest.mark.parametrize("settings", [SETTINGS, (INTERIOR,)], ids=["Clarabel", "interior"])
 @pytest.mark.parametrize("seed", range(4))
-def test_a_known_optimum_is_found(seed, ladder):
+def test_a_known_optimum_is_found(seed, settings):
     """Complementary S(x) and Z, with Z in the dual's set, prove x optimal; cvxpy finds the same value."""
     rng = np.random.default_rng(seed)
     problem, x = with_known_optimum(rng, 7, [(3, 4, True), (1, 5, False), (4, 1, False), (2, 2, True)])
-    found = problem.solve("it", ladder=ladder)
+    found = problem.solve("it", settings=settings)
     assert problem.cost @ found == pytest.approx(problem.cost @ x, rel=1e-6, abs=1e-6)
     assert problem.violation(found) < 1e-7
     v = cp.Variable(7)
@@ -92,7 +92,7 @@ class PanicException(BaseException):
     """What pyo3 raises when Rust panics."""
 
 
-def test_an_easy_problem_takes_one_rung(monkeypatch):
+def test_an_easy_problem_takes_one_setting(monkeypatch):
     calls = answering(monkeypatch)
     assert LEAST_TRACE.solve("it") == pytest.approx([2.0, 1.0, 2.0], abs=1e-6)
     assert len(calls) == 1
@@ -107,7 +107,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("answer", WRONG.values(), ids=WRONG)
-def test_a_broken_rung_is_skipped(answer, monkeypatch):
+def test_a_broken_setting_is_skipped(answer, monkeypatch):
     calls = answering(monkeypatch, answer, answer)
     assert LEAST_TRACE.solve("it") == pytest.approx([2.0, 1.0, 2.0], abs=1e-6)
     assert len({tuple(sorted(options)) for options in calls}) == 3
@@ -121,11 +121,11 @@ def test_what_is_not_the_solvers_fault_passes_through(error, monkeypatch):
 
 
 def test_a_failure_carries_problem_and_attempts(monkeypatch):
-    answering(monkeypatch, *[WRONG["lie"]] * len(LADDER))
+    answering(monkeypatch, *[WRONG["lie"]] * len(SETTINGS))
     with pytest.raises(DesignFailed, match="the thing could not be solved") as caught:
         LEAST_TRACE.solve("the thing")
     assert caught.value.problem is LEAST_TRACE
-    assert len(caught.value.results) == len(LADDER)
+    assert len(caught.value.results) == len(SETTINGS)
     assert "violated by" in caught.value.results[0].reason
     assert "\n" not in str(caught.value)
 

@@ -9,13 +9,13 @@ from haptic_loop.controller.coupling import PUBLISHED, NoCoupling
 from haptic_loop.controller.environment import environment
 from haptic_loop.design.bound import bound
 from haptic_loop.design.designs import design_by_kind
-from haptic_loop.design.program import LADDER
+from haptic_loop.design.program import BASES
 
 LOOP = load().loop("I")
 
 
-def optimum(loop, rungs):
-    return design_by_kind(loop, "optimal", ladder=LADDER[:rungs])
+def optimum(loop, bases):
+    return design_by_kind(loop, "optimal", bases=BASES[:bases])
 
 
 def test_more_damping_is_never_worse():
@@ -28,8 +28,8 @@ def test_more_damping_is_never_worse():
         assert max(certify(loop, design)["this-environment"].required) < loop.delta[0]
 
 
-def test_more_rungs_are_never_worse_than_the_bound():
-    rms = [transparency_of(LOOP, optimum(LOOP, rungs)).rms_mismatch_db for rungs in (1, 2, 3)]
+def test_more_bases_are_never_worse_than_the_bound():
+    rms = [transparency_of(LOOP, optimum(LOOP, bases)).rms_mismatch_db for bases in (1, 2, 3)]
     assert rms == sorted(rms, reverse=True)
     assert rms[-1] - 1 < bound(LOOP).rms_db < rms[-1]
 

@@ -27,7 +27,7 @@ from haptic_loop.design.conditions import ratio_in
 from haptic_loop.design.coupling_file import Stored, save
 from haptic_loop.design.coupling_file import load as load_file
 from haptic_loop.design.frequency import hermitian, on_circle
-from haptic_loop.design.optimal import _SETTLED, _Rung, design, spread
+from haptic_loop.design.optimal import _SETTLED, _BasisResult, design, spread
 from haptic_loop.design.program import MARGIN, Options, Problem, Span, span_of, static_weight
 from haptic_loop.design.robustness import ranges_around, robustness, vertices
 from haptic_loop.design.transparency import transparency
@@ -35,7 +35,7 @@ from haptic_loop.sim.scenario import load
 from tests.benchmarks.hostile_loops import hostile
 
 LOOPS = Path(__file__).parents[2] / "benchmarks" / "loops"
-SHORT = Options(ladder=((4, 3), (8, 6)))
+SHORT = Options(bases=((4, 3), (8, 6)))
 
 
 @cache
@@ -66,7 +66,7 @@ def dense() -> np.ndarray:
 
 # what is returned ----------------------------------------------------------------------------------------------------
 
-#: name, rms mismatch [dB] that is reached with the two smallest rungs, share of the static stiffness
+#: name, rms mismatch [dB] that is reached with the two smallest bases, share of the static stiffness
 REACHED = [("n0", -33.7, 0.99), ("n1", -12.6, 0.9), ("n2", -9.2, 0.75), ("n3", -4.9, 0.5), ("n4", -22.9, 0.9)]
 
 
@@ -158,18 +158,18 @@ def test_safe_environments_get_no_coupling():
     assert isinstance(found.coupling, NoCoupling)
     assert found.proved
     assert found.figures.rms_mismatch == 0
-    assert found.ladder == ()
-    late = replace(SHORT, ladder=((4, 3),))
+    assert found.bases == ()
+    late = replace(SHORT, bases=((4, 3),))
     asked = msgspec.structs.replace(loop_of("o05"), lam=(0, 0))  # safe, but its delays are not the reference's
     assert isinstance(design(asked, late).coupling, ForceFilter)
 
 
-def test_every_rung_is_reported_as_it_is_finished():
+def test_every_basis_is_reported_as_it_is_finished():
     heard = []
     found = design(loop_of("n3"), SHORT, progress=heard.append)
-    assert tuple(heard) == found.ladder
-    assert [rung.taps for rung in heard] == [4, 8]
-    assert all(rung.proved for rung in heard)
+    assert tuple(heard) == found.bases
+    assert [basis.taps for basis in heard] == [4, 8]
+    assert all(basis.proved for basis in heard)
     assert heard[0].seconds < heard[1].seconds <= found.wall_s
 
 
@@ -184,20 +184,20 @@ def test_every_rung_is_reported_as_it_is_finished():
 def test_a_search_continues_over_small_gains(monkeypatch, script, taken):
     one, steps = best("n3"), iter(script)
 
-    def rung(climb, taps, poles, before, floor, least):
+    def over_basis(search, taps, poles, before, floor, least):
         error, g = next(steps)
         found = replace(one, g=g, figures=replace(one.figures, rms_mismatch=error))
-        reason = _SETTLED if climb.gained(before, found) < least else None
-        return found, _Rung(taps, poles, taps, climb.decibels(found), g, reason, 0.0)
+        reason = _SETTLED if search.gained(before, found) < least else None
+        return found, _BasisResult(taps, poles, taps, search.decibels(found), g, reason, 0.0)
 
-    monkeypatch.setattr("haptic_loop.design.optimal._Search.rung", rung)
-    found = design(loop_of("n3"), Options(ladder=program.LADDER[: len(script)]))
+    monkeypatch.setattr("haptic_loop.design.optimal._Search.over_basis", over_basis)
+    found = design(loop_of("n3"), Options(bases=program.BASES[: len(script)]))
     assert (found.figures.rms_mismatch, found.g) == script[taken]
-    assert [i for i, each in enumerate(found.ladder) if each.taken][-1] == taken
-    for each in found.ladder[taken + 1 :]:
-        assert each.left
+    assert [i for i, each in enumerate(found.bases) if each.taken][-1] == taken
+    for each in found.bases[taken + 1 :]:
+        assert each.rejected
     if taken == 1:
-        assert "renders 0.200 of the stiffness" in found.ladder[2].left
+        assert "renders 0.200 of the stiffness" in found.bases[2].rejected
 
 
 def test_sixteen_samples_beside_slow_poles_are_proved():
@@ -205,7 +205,7 @@ def test_sixteen_samples_beside_slow_poles_are_proved():
     springs = [Spring(("a", "m"), 600.0, 0.3), Spring(("b", "m"), 600.0, 0.3), Spring(("m", "ground"), 300.0, 0.5)]
     network = Network(contacts=("a", "b"), springs=tuple(springs), masses={"m": 0.4})
     loop = Loop(0.0012, (16, 0), (0, 0), (16, 0), (0.5, 2.0), network)
-    found = design(loop, Options(ladder=((4, 3),)))
+    found = design(loop, Options(bases=((4, 3),)))
     assert isinstance(found.coupling, ForceFilter)
     assert found.proved
     bare = this_environment(force(loop, NoCoupling()), loop.delta).ratio
@@ -235,7 +235,7 @@ def random_loop(seed: int) -> Loop:
 @pytest.mark.parametrize("seed", range(12))
 def test_there_is_always_an_answer(seed):
     loop = random_loop(seed)
-    found = design(loop, Options(ladder=((4, 3),)))
+    found = design(loop, Options(bases=((4, 3),)))
     assert found.proved
     assert this_environment(force(loop, found.coupling), loop.delta).certified
     assert found.figures.rms_mismatch < 1.001
@@ -274,7 +274,7 @@ def test_no_wall_is_stiffer_than_the_moments_allow(theta):
     A plain spring reaches delta/(2 theta + 1); a designed filter more, and never more than that.
     """
     loop = wall(5000.0, theta, 1.0)
-    found = design(loop, Options(ladder=((4, 3), (8, 6), (14, 10))))
+    found = design(loop, Options(bases=((4, 3), (8, 6), (14, 10))))
     stiffness = found.g * 5000 * loop.T / 2
     assert 1.05 / (2 * theta + 1) < stiffness < 1 / (theta + 1)
 
@@ -285,7 +285,7 @@ def test_no_wall_is_stiffer_than_the_moments_allow(theta):
 def test_switching_delays_match_a_separate_formula():
     """[[He F/(z-1) + (delta - alpha T/2)/T, .], [(hi - lo)/2 G, 2 alpha]] > 0 for some alpha, F of the mean delay."""
     loop = loop_of("n3")
-    found = design(loop.switching(DelayRange((4,), (6,))), Options(ladder=((4, 3),)))
+    found = design(loop.switching(DelayRange((4,), (6,))), Options(bases=((4, 3),)))
     assert found.proved
     assert found.certificate.facts == ("switching",)
     assert found.certificate.margin > 1
@@ -305,10 +305,10 @@ def test_switching_delays_match_a_separate_formula():
 def test_the_supremum_and_the_cap_are_kept():
     loop = loop_of("n2")
     short = ((8, 6),)
-    rms, sup = best("n2"), design(loop, Options(ladder=short, objective="sup"))
+    rms, sup = best("n2"), design(loop, Options(bases=short, objective="sup"))
     assert sup.figures.relative_mismatch < rms.figures.relative_mismatch
     assert rms.figures.rms_mismatch < sup.figures.rms_mismatch
-    capped = design(loop, Options(ladder=short, high_gain=1.2))
+    capped = design(loop, Options(bases=short, high_gain=1.2))
     assert capped.figures.high_frequency_gain <= 1.2 + 1e-6
     assert capped.figures.rms_mismatch > rms.figures.rms_mismatch
 
@@ -326,19 +326,19 @@ def test_the_supremum_and_the_cap_are_kept():
 def test_demands_are_kept_together(further, asked):
     """The own unknowns of each demand have their own place in the program, however many there are."""
     loop = msgspec.structs.replace(loop_of("n3"), **asked)
-    found = design(loop, Options(ladder=((4, 3),), **further))
+    found = design(loop, Options(bases=((4, 3),), **further))
     assert found.proved
     assert found.figures.high_frequency_gain <= further.get("high_gain", np.inf) + 1e-6
     assert bool(found.certificate.limiter) == further.get("limiter", False)
 
 
 def test_ranges_fall_back_to_a_proved_basis():
-    """A ton on a soft spring: at a vertex the exact proof needs more room than the rungs leave at first."""
+    """A ton on a soft spring: at a vertex the exact proof needs more room than the bases leave at first."""
     contact = Spring(("a", "m"), 1000.0)
     network = Network(contacts=("a",), springs=(contact, Spring(("m", "ground"), 1.0)), masses={"m": 1000.0})
     loop = Loop(1e-3, (2,), (0,), (2,), (1.0,), network)
     ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
-    found = design(ranged, Options(ladder=((4, 3),), seconds=5.0))
+    found = design(ranged, Options(bases=((4, 3),), seconds=5.0))
     assert found.proved
     assert found.figures.rms_mismatch < 10 ** (-4 / 20)  # the environment scaled down reaches -3.05 dB
 
@@ -510,7 +510,7 @@ def test_basis_optimum_equals_the_cone_program(name, monkeypatch):
     loop = ORDINARY[name]()
     m, E = loop.channels, loop.E()
     span = span_of(E, 4, 3)
-    found = design(loop, Options(ladder=((4, 3),)))
+    found = design(loop, Options(bases=((4, 3),)))
     many = 400 if m == 1 else 160
     z = on_circle(np.union1d(np.geomspace(2e-4, np.pi, many), np.linspace(0.01, np.pi, many // 2)))
 
@@ -640,7 +640,7 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     assert found["bound"]["rms_mismatch_db"] < found["assessment"]["transparency"]["rms_mismatch_db"]
     assert found["rendered_stiffness"] > 0.5
     assert found["robustness"]["required_over_available"] > 1
-    assert found["ladder"][-1]["mismatch_db"] <= found["ladder"][0]["mismatch_db"]
+    assert found["bases"][-1]["mismatch_db"] <= found["bases"][0]["mismatch_db"]
     assert "no linear coupling can be better than" in text
     assert verify(load_file(tmp_path / "c.json")).proved
     options = ["--coupling", str(tmp_path / "c.json"), "--scenario", str(scenario), "--no-plot", "--out", str(tmp_path)]
@@ -685,7 +685,7 @@ def test_late_walls_match_their_closed_form():
     K = 1000 * delta / 0.841354  # switching in [0, t2]: this wall needs all of delta
     loop = msgspec.structs.replace(wall(2 * K, 0, delta, T), latency=((0.0, t2),))
     assert ratio_in(loop, ForceFilter([], [], [[[0.5]]])) == pytest.approx(1.0, rel=1e-5)
-    found = design(loop, Options(ladder=((4, 3),)))
+    found = design(loop, Options(bases=((4, 3),)))
     assert found.proved
     assert found.g >= 0.49
 
@@ -724,7 +724,7 @@ def test_limited_forces_are_not_proved_for_ranges():
 @pytest.mark.parametrize("seed", [11, 12, 14])
 def test_every_loop_gets_an_answer_and_proof(seed):
     """Drawn at the ends of what devices and objects are: 15 samples, 54 kg on .08 N/m, dampings of .04 N s/m."""
-    found = design(hostile(np.random.default_rng(seed)), Options(ladder=((4, 3),)))
+    found = design(hostile(np.random.default_rng(seed)), Options(bases=((4, 3),)))
     assert found.proved
     assert isinstance(found.coupling, ForceFilter)
-    assert found.ladder[0].proved
+    assert found.bases[0].proved

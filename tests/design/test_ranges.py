@@ -40,7 +40,7 @@ stiffness = [640.0, 840.0]
 absent = true
 """
 change = msgspec.structs.replace
-SHORT = Options(ladder=((4, 3), (8, 6)))
+SHORT = Options(bases=((4, 3), (8, 6)))
 
 
 @pytest.fixture(scope="module")
@@ -327,7 +327,7 @@ def test_all_commands_report_the_ranges(scenario_file, tmp_path, capsys):
     alone, whole = design["price"]
     assert (alone["coupling"], whole["coupling"], whole["violated"]) == ("nominal only", "whole ranges", 0)
     assert alone["violated"] >= 1
-    # of nearly equal couplings the one right in every direction is taken: .014 dB where a slow machine has one rung
+    # of nearly equal couplings the one right in every direction is taken: .014 dB where a slow machine has one basis
     assert alone["rms_mismatch_db"]["nominal"] < whole["rms_mismatch_db"]["nominal"] + 0.05
     assert load(file).certificate.guarantee == "these ranges"
 

@@ -230,7 +230,7 @@ def test_failed_searches_claim_no_impossibility():
 
 
 def test_proposed_changes_hold_when_made():
-    """Each proposal, designed with all its rungs, passes the sweep; best first, and never what was asked for."""
+    """Each proposal, designed with all its bases, passes the sweep; best first, and never what was asked for."""
     loop = asked((0, 0), psi=(1, 1))
     words = instead(loop, "spring-damper", "any-environment")
     proposed = re.findall(r"--coupling (\S+) --condition (\S+) \((\S+) dB rms\)", words)

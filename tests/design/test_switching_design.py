@@ -87,7 +87,7 @@ def test_any_environment_designs_refuse_varying_delays():
 def test_an_optimal_coupling_for_switching_delays():
     """Swept, proved, and met by lossless hands under the worst switching."""
     asked = load().loop("I")
-    made = design_with(asked, switching=RANGE, ladder=((14, 10),))
+    made = design_with(asked, switching=RANGE, bases=((14, 10),))
     assert made.proved
     swept = switching_sweep(asked.sent(made.coupling), *RANGE, asked.delta)
     assert swept.ratio == pytest.approx(0.998, abs=1e-3)  # the margin, nearly all else is spent

@@ -208,7 +208,7 @@ def test_design_check_repeats_the_search(tmp_path, capsys):
 
 
 def test_range_designs_hold_between_their_ends():
-    found = optimal.design(MASS, Options(ladder=((4, 3), (8, 6))))
+    found = optimal.design(MASS, Options(bases=((4, 3), (8, 6))))
     assert found.proved
     E = np.array([needed_by_filter(with_mass(mass), found.coupling) for mass in np.geomspace(0.25, 4.0, 120)])
     assert E.max() < 1

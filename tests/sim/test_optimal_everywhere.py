@@ -50,7 +50,7 @@ def files(tmp_path_factory):
         if form == "pair":
             save(Stored.of(loop, VERTICES_ONLY, prove(loop, VERTICES_ONLY, "this-environment")), path)
         else:
-            found = design(loop, Options(ladder=SMALL, limiter=form == "filter"))
+            found = design(loop, Options(bases=SMALL, limiter=form == "filter"))
             save(Stored.of(loop, found.coupling, found.certificate), path)
         made[form] = scenario, name, path
     return made
@@ -138,9 +138,9 @@ def test_the_live_window_equals_the_simulator(files, form):
 @pytest.mark.parametrize("form", ["filter", "pair"])
 def test_the_bridge_rehearses_it(files, form):
     scenario, _, path = files[form]
-    rungs = certified_couplings(scenario, "I", str(path), None, 1, spare=0)
+    couplings = certified_couplings(scenario, "I", str(path), None, 1, spare=0)
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
-    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs)
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: couplings)
     assert rehearsal.run_until_armed(0.4).stage == Stage.ARMED
     assert any(np.any(moment.applied) for moment in rehearsal.moments[-100:])
     assert choose(scenario, "I", str(path)).notes == ()
