@@ -34,7 +34,7 @@ check: .venv/ready build/typed
 validate: .venv/ready
 	$(PY) -m pytest -m validate tests/checks
 	$(PY) -m tests.checks.faults
-	$(PY) tests/cli/hostile.py --signals
+	$(PY) tests/tools/hostile.py --signals
 	$(PY) docs/regenerate.py --check
 	$(MAKE) installed
 
@@ -42,7 +42,7 @@ firmware: .venv/ready
 	$(PY) -m pytest -m firmware tests/hw/test_boards.py
 
 mutate: .venv/ready
-	$(PY) tests/mutate.py
+	$(PY) tests/tools/mutate.py
 
 kernels: .venv/ready
 	$(PY) tests/tools/same_designs.py

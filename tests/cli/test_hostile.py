@@ -1,4 +1,4 @@
-"""A thousand command lines and files that nobody should write; hostile.py says how each must end."""
+"""A thousand command lines and files that nobody should write; tests/tools/hostile.py says how each must end."""
 
 import os
 import re
@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 def driven(*options: str) -> int:
     """The number of cases that the driver runs, in one process, forked for each; all are answered well."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
-    words = [sys.executable, str(Path(__file__).with_name("hostile.py")), *options]
+    words = [sys.executable, str(ROOT / "tests/tools/hostile.py"), *options]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-1000:]
     number = re.match(r"(\d+) cases, 0 answered badly", done.stdout.splitlines()[-1])

@@ -1,7 +1,7 @@
 """Every way of bad input that we know of, through the commands as a user runs them, in forks of one process.
 
-    python tests/cli/hostile.py [WORD]     the cases whose name holds WORD; 0: none is answered badly
-    python tests/cli/hostile.py --signals  Ctrl-C and SIGTERM at random moments of a run in their place
+    python tests/tools/hostile.py [WORD]     the cases whose name holds WORD; 0: none is answered badly
+    python tests/tools/hostile.py --signals  Ctrl-C and SIGTERM at random moments of a run in their place
 
 A case is answered well where the command ends in time with the expected code and, unless it succeeded, one line on
 standard error in which no character steers the terminal; where every file that was there is as it was; where no half
@@ -20,6 +20,7 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -53,15 +54,14 @@ def streams() -> Iterator[Case]:
         sys.stdout = io.TextIOWrapper(os.fdopen(1, "wb", closefd=False), encoding="ascii", write_through=True)
 
     def full() -> None:
-        handle = os.open("/dev/full", os.O_WRONLY)
-        os.dup2(handle, 1)
+        os.dup2(os.open("/dev/full", os.O_WRONLY), 1)
 
     def little() -> None:
         now = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
         resource.setrlimit(resource.RLIMIT_AS, (now + 300_000_000,) * 2)
 
-    rigid = shlex.split("audit --rigid --K 1000 --B 0 --T 1e-3 --theta 0 --delta 1.37")  # the least work
-    quick = [tuple(rigid), ("check", "c.json"), ("trace", "t.npz"), ("export", "c.json")]
+    rigid = tuple(shlex.split("audit --rigid --K 1000 --B 0 --T 1e-3 --theta 0 --delta 1.37"))  # the least work
+    quick = [rigid, ("check", "c.json"), ("trace", "t.npz"), ("export", "c.json")]
     for words in quick:
         for name, numbers in (("in", (0,)), ("out", (1,)), ("err", (2,)), ("all", (0, 1, 2))):
             yield Case(f"{words[0]}: std{name} closed", words, (0, 1), before=closed(*numbers))
@@ -69,8 +69,7 @@ def streams() -> Iterator[Case]:
         yield Case(f"{words[0]}: ASCII", words, (0, 1), before=ascii_only)
         yield Case(f"{words[0]}: full", words, says="No space left", before=full)
         yield Case(f"{words[0]} --json -: full", (*words, "--json", "-"), says="No space left", before=full)
-    words = ("audit", "--K", "1", "--B", "1", "--scenario", "n\udcff")
-    yield Case("bad input, stderr closed", words, before=closed(2))
+    yield Case("bad input, stderr closed", ("audit", "--scenario", "n\udcff"), before=closed(2))
     huge = lambda: (npz("t.npz", x=np.zeros((30_000_000, 1)), t=np.zeros(3)), little())  # noqa: E731
     yield Case("trace: little memory", ("trace", "t.npz"), (3,), "memory", before=huge)
 
@@ -109,7 +108,6 @@ def answered(cases: list[Case], folder: Path, model: Path) -> Iterator[tuple[str
 
 
 def furnished(model: Path, place: Path) -> None:
-    """The good files, once more."""
     shutil.copytree(model, place, symlinks=True, ignore=shutil.ignore_patterns("fifo"))
     os.mkfifo(place / "fifo")
 
@@ -123,7 +121,7 @@ def judged(case: Case, place: Path, code: int, good: dict[str, str]) -> list[str
     wrong = []
     if code not in case.codes:
         wrong.append(f"code {code}, expected {case.codes}: {err[-300:]!r}")
-    if "Traceback" in err or "Warning" in err or "Exception ignored" in err:
+    if any(word in err for word in ("Traceback", "Warning", "Exception ignored")):
         wrong.append(f"no answer: {err[-400:]!r}")
     one_line = err.count("\n") == 1 and not STEERS.search(err[:-1]) and len(err) <= 1200
     if code in (2, 3) and not closed and not full and not one_line:
@@ -135,7 +133,6 @@ def judged(case: Case, place: Path, code: int, good: dict[str, str]) -> list[str
 
 
 def content(path: Path) -> str:
-    """A file's, short; anything else by its kind."""
     if path.is_symlink():
         return os.readlink(path)
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else str(path.is_dir())
@@ -147,8 +144,7 @@ def run(case: Case, place: Path) -> int:
     try:
         os.chdir(files)
         for number, name in ((1, "out"), (2, "err")):
-            handle = os.open(place / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            os.dup2(handle, number)
+            os.dup2(handle := os.open(place / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
             os.close(handle)
             stream = os.fdopen(number, "w", encoding="utf-8", buffering=1, closefd=False)
             setattr(sys, ("stdout", "stderr")[number - 1], stream)
@@ -169,8 +165,6 @@ def run(case: Case, place: Path) -> int:
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 0
     except BaseException:
-        import traceback
-
         with suppress(Exception):
             traceback.print_exc()
     finally:
@@ -209,12 +203,8 @@ def signalled(folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         whole = whole or time.perf_counter() - begin
         err = (place / "err").read_text()
-        expected = {
-            0: (0, ("",)),
-            signal.SIGINT: (130, ("", "interrupted\n")),
-            signal.SIGTERM: (143, ("terminated\n",)),
-        }
-        right, lines = expected[sent]
+        ends = {0: (0, ("",)), signal.SIGINT: (130, ("", "interrupted\n")), signal.SIGTERM: (143, ("terminated\n",))}
+        right, lines = ends[sent]
         late = sent and code == 0 and (place / "files" / "new" / "report.json").exists()  # it came after the end
         missed += bool(late)
         wrong = [] if late or (code == right and err in lines) else [f"code {code}, {err[-400:]!r}"]
@@ -234,7 +224,6 @@ def chosen(word: str, folder: Path, model: Path) -> Iterator[tuple[str, list[str
 
 
 def main() -> int:
-    """Run every case whose name holds the word of the command line."""
     word = sys.argv[1] if len(sys.argv) > 1 else ""
     for command in COMMANDS:
         import_module(f"haptic_loop.cli.{command}")
@@ -248,13 +237,12 @@ def main() -> int:
         model.mkdir()
         furnish(model)
         ends = signalled(Path(folder), model) if word == "--signals" else chosen(word, Path(folder), model)
-        bad = []
-        for name, wrong in ends:
-            bad.append(bool(wrong))
-            for line in wrong:
-                print(f"{name}: {line}", flush=True)
-    print(f"{len(bad)} cases, {sum(bad)} answered badly, {time.perf_counter() - begin:.0f} s")
-    return int(any(bad))
+        count = bad = 0
+        for count, (name, wrong) in enumerate(ends, start=1):  # noqa: B007
+            bad += bool(wrong)
+            print(*(f"{name}: {line}\n" for line in wrong), sep="", end="", flush=True)
+    print(f"{count} cases, {bad} answered badly, {time.perf_counter() - begin:.0f} s")
+    return int(bad > 0)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,349 @@
+"""make mutate: report small mistakes in the code that verdicts rest on which no test notices.
+
+The command makes small mistakes, one at a time, in the functions of the modules of TABLE: it turns a comparison or a
+sign, changes a number, leaves out a refusal, writes `max` for `min`. Then it runs the tests that call the changed
+function, the fastest first, until one fails: the mutant is killed. A process that has collected the tests is forked for
+each mutant. The seed alone decides which mistakes are drawn. mutate.survivors.md explains mutants that may survive; any
+other survivor, or a score below GOAL, fails the run.
+
+    python tests/tools/mutate.py [--only design/exact.py] [--count 40] [--seed 0] [--jobs 2]
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import hashlib
+import importlib
+import itertools
+import os
+import pickle
+import resource
+import signal
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from types import CodeType, FrameType, FunctionType
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+JUDGED = Path(__file__).with_name("mutate.survivors.md")
+GOAL = 0.95
+#: module -> the files of tests that are about it
+TABLE = {
+    "design/exact.py": "design/test_exact design/test_exact_blocks",
+    "design/certificate.py": "design/test_certificate design/test_exact_blocks design/test_switching_file "
+    "design/test_limiter design/test_walls_making",
+    "design/conditions.py": "design/test_exact_blocks design/test_margin design/test_latency design/test_encoder_steps "
+    "design/test_moving_average",
+    "controller/tick.py": "controller/test_tick controller/test_walls controller/test_varying_delay "
+    "controller/test_limiter controller/test_budget sim/test_switched sim/test_passivity_layer sim/test_engines "
+    "sim/test_limited",
+    "controller/complementarity.py": "controller/test_tick controller/test_walls controller/test_limiter",
+    "controller/law.py": "controller/test_limiter controller/test_tick controller/test_walls",
+    "hw/limits.py": "hw/test_limits",
+    "hw/device_state.py": "hw/test_device hw/test_latch_on_arrival",
+}
+_ENOUGH = 6.0  # CPU seconds that the tests of one mutant may take without the mistake; the fastest tests are taken
+_TIMEOUT = 3.0  # A mutant is ended after this many times the usual time of its tests, and 15 s.
+
+_COMPARISONS = {
+    ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE), ast.GtE: (ast.Gt, ast.Lt),
+    ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,),
+    ast.In: (ast.NotIn,), ast.NotIn: (ast.In,),
+}  # fmt: skip
+_OPERATORS = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult,
+    ast.Pow: ast.Mult, ast.LShift: ast.RShift, ast.RShift: ast.LShift, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
+}  # fmt: skip
+_NAMES = {"min": "max", "any": "all", "argmin": "argmax", "minimum": "maximum", "floor": "ceil", "zeros": "ones"}
+_NAMES |= {other: one for one, other in _NAMES.items()}
+_DROPPED = {"abs", "conj", "sqrt", "frozen", "reduced"}  # calls that may be left out around their argument
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One small mistake. `place` is the number of its node in the module's tree."""
+
+    module: str
+    function: str  # qualified name
+    place: int
+    kind: int  # number of the mistake, of those that the node allows
+    line: int
+    was: str
+    now: str
+
+    @property
+    def key(self) -> str:
+        """The name of the mutant in mutate.survivors.md, without a line number."""
+        return f"{self.module} {self.function}: `{self.was}` -> `{self.now}`"
+
+
+def _changed(node: ast.AST, returns: str | None) -> Iterator[ast.AST | None]:
+    """Yield the nodes that replace a node, one for each mistake; None leaves the statement out."""
+    new = copy.copy(node)
+    match node:
+        case ast.Compare(ops=[op]):
+            for other in _COMPARISONS[type(op)]:
+                yield ast.Compare(node.left, [other()], node.comparators)
+        case ast.BinOp(op=op) if type(op) in _OPERATORS:
+            yield ast.BinOp(node.left, _OPERATORS[type(op)](), node.right)
+        case ast.AugAssign(op=op) if type(op) in _OPERATORS:
+            yield ast.AugAssign(node.target, _OPERATORS[type(op)](), node.value)
+            yield None
+        case ast.BoolOp(op=op):
+            yield ast.BoolOp(ast.Or() if isinstance(op, ast.And) else ast.And(), node.values)
+        case ast.UnaryOp(op=ast.Not() | ast.USub()):
+            yield node.operand
+        case ast.Constant(value=bool(value)):
+            yield ast.Constant(not value)
+        case ast.Constant(value=int(value)):
+            yield ast.Constant(value + 1)
+        case ast.Constant(value=float(value)) if 0 < value < float("inf"):  # most small ones are tolerances
+            yield ast.Constant(1000 * value if value < 1e-2 else 2 * value)
+        case ast.Name(id=name) | ast.Attribute(attr=name) if name in _NAMES:
+            setattr(new, "id" if isinstance(node, ast.Name) else "attr", _NAMES[name])
+            yield new
+        case ast.Attribute(attr="T"):
+            yield node.value
+        case ast.Call(func=ast.Name(id=name) | ast.Attribute(attr=name), args=[one]) if name in _DROPPED:
+            yield one
+        case ast.If() | ast.While():
+            for value in (True, False):
+                new = copy.copy(node)
+                new.test = ast.Constant(value)
+                yield new
+        case ast.IfExp():
+            yield node.body
+            yield node.orelse
+        case ast.Raise() | ast.Continue() | ast.Break() | ast.Expr(value=ast.Call()):
+            yield None
+        case ast.Return(value=ast.expr()) if returns == "bool":
+            yield ast.Return(ast.Constant(True))
+            yield ast.Return(ast.Constant(False))
+        case ast.Return(value=ast.expr()) if returns == "str | None" and ast.unparse(node.value) != "None":
+            yield ast.Return(ast.Constant(None))
+
+
+def _functions(body: Sequence[ast.stmt], prefix: str = "") -> Iterator[tuple[str, ast.FunctionDef]]:
+    """Yield the functions and methods of a module, with their qualified names."""
+    for node in body:
+        if isinstance(node, ast.ClassDef):
+            yield from _functions(node.body, f"{prefix}{node.name}.")
+        elif isinstance(node, ast.FunctionDef):
+            yield prefix + node.name, node
+
+
+def _parts(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield a node and the nodes below it that run: no annotations, defaults, messages and assertions."""
+    if isinstance(node, ast.JoinedStr | ast.Assert):
+        return
+    yield node
+    children: Any = ast.iter_child_nodes(node)
+    if isinstance(node, ast.FunctionDef):
+        children = node.body
+    elif isinstance(node, ast.AnnAssign):
+        children = [part for part in (node.target, node.value) if part]
+    for child in children:
+        yield from _parts(child)
+
+
+def _shown(node: ast.AST | None) -> str:
+    text = "nothing" if node is None else ast.unparse(node).partition("\n")[0]
+    return " ".join(text.split())[:100]
+
+
+def _mistakes(module: str) -> Iterator[tuple[Mutant, ast.Module, ast.AST, ast.AST | None]]:
+    """Yield every mutant of a module with the module's tree, the node and its replacement."""
+    tree = ast.parse((ROOT / module).read_text())
+    number = {id(node): i for i, node in enumerate(ast.walk(tree))}
+    for name, function in _functions(tree.body):
+        returns = ast.unparse(function.returns) if function.returns else None
+        for node in (part for statement in function.body for part in _parts(statement)):
+            for kind, new in enumerate(_changed(node, returns)):
+                place = number[id(node)], kind, getattr(node, "lineno", 0)
+                yield Mutant(module, name, *place, _shown(node), _shown(new)), tree, node, new
+
+
+class _Replace(ast.NodeTransformer):
+    def __init__(self, old: ast.AST, new: ast.AST | None) -> None:
+        self.old, self.new = old, new
+
+    def visit(self, node: ast.AST) -> Any:
+        return ast.copy_location(self.new or ast.Pass(), node) if node is self.old else self.generic_visit(node)
+
+
+def _install(mutant: Mutant) -> None:
+    """Give the function of this process the code with the mistake."""
+    tree, node, new = next(rest for other, *rest in _mistakes(mutant.module) if other == mutant)
+    code = compile(ast.fix_missing_locations(_Replace(node, new).visit(tree)), str(ROOT / mutant.module), "exec")
+    found: Any = importlib.import_module("haptic_loop." + mutant.module.removesuffix(".py").replace("/", "."))
+    for part in mutant.function.split("."):
+        found = vars(found)[part]
+    if isinstance(found, property | cached_property):
+        found = found.fget if isinstance(found, property) else found.func
+    found = getattr(found, "__func__", found)
+    while hasattr(found, "__wrapped__"):
+        found = found.__wrapped__
+    assert isinstance(found, FunctionType)
+    found.__code__ = next(part for part in _codes(code) if part.co_qualname == mutant.function)
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    for part in code.co_consts:
+        if isinstance(part, CodeType):
+            yield part
+            yield from _codes(part)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Running the tests in forks of a process that has collected them.
+
+
+class _Runner:
+    """A pytest plugin that replaces pytest's loop over the tests."""
+
+    def __init__(self, module: str, drawn: Sequence[Mutant], jobs: int) -> None:
+        self.module, self.drawn, self.jobs = module, drawn, jobs
+        self.ends: list[tuple[Mutant, str]] = []  # killed, timeout, survived or broken
+        self.trouble, self.calling = "its tests did not run", False
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        seconds, calls, failed = _forked(lambda: self._learn(session))()
+        self.trouble = f"fails without any mutant: {failed}" if failed else ""
+        waiting: list[tuple[Mutant, Callable[[], Any]]] = []
+        for mutant in () if failed else self.drawn:
+            chosen, total = [], 0.0
+            for item in sorted(session.items, key=lambda item: seconds[item.nodeid]):
+                if mutant.function in calls[item.nodeid] and total + seconds[item.nodeid] < _ENOUGH:
+                    chosen.append(item)
+                    total += seconds[item.nodeid]
+            if len(waiting) >= self.jobs:
+                self._take(*waiting.pop(0))
+            waiting.append((mutant, _forked(partial(self._try, mutant, chosen, total))))
+        for each in waiting:
+            self._take(*each)
+        return True
+
+    def _take(self, mutant: Mutant, result: Callable[[], Any]) -> None:
+        end, by = result() or ("timeout", "")
+        self.ends.append((mutant, end))
+        print(f"{end:9} {mutant.key}  [{mutant.line}] {by}", flush=True)
+
+    def _learn(self, session: pytest.Session) -> tuple[dict[str, float], dict[str, set[str]], str]:
+        """Return each test's CPU seconds, the functions of the module that it calls, and the first test that fails."""
+        calls: dict[str, set[str]] = defaultdict(set)
+        seconds: dict[str, float] = {}
+        place, item = str(ROOT / self.module), None
+
+        def called(frame: FrameType, event: str, argument: Any) -> None:
+            if event == "call" and frame.f_code.co_filename == place and item is not None:
+                node = item.nodeid if self.calling else item.nodeid.partition("::")[0]
+                calls[node].add(frame.f_code.co_qualname.partition(".<locals>")[0])
+
+        sys.setprofile(called)
+        for item, after in itertools.pairwise([*session.items, None]):
+            begin = time.process_time()
+            if failed := _fails(item, after):
+                return {}, {}, failed
+            seconds[item.nodeid] = time.process_time() - begin
+        # The first test of a file makes the fixtures for all tests of the file.
+        return seconds, {node: calls[node] | calls[node.partition("::")[0]] for node in seconds}, ""
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
+        self.calling = True
+        try:
+            return (yield)
+        finally:
+            self.calling = False
+
+    def _try(self, mutant: Mutant, chosen: list[Any], seconds: float) -> tuple[str, str]:
+        resource.setrlimit(resource.RLIMIT_CPU, (int(_TIMEOUT * seconds + 15), resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_AS, (4 << 30, resource.RLIM_INFINITY))
+        _install(mutant)
+        for item, after in itertools.pairwise([*chosen, None]):
+            if name := _fails(item, after):
+                return "killed", name
+        return "survived", f"{len(chosen)} tests"
+
+
+def _fails(item: pytest.Item, after: pytest.Item | None) -> str:
+    """Return the name of a test that fails, and '' for one that passes or is skipped."""
+    from _pytest.runner import runtestprotocol
+
+    reports = runtestprotocol(item, nextitem=after, log=False)
+    return item.nodeid.removeprefix("tests/") if any(report.failed for report in reports) else ""
+
+
+def _forked(work: Callable[[], Any]) -> Callable[[], Any]:
+    """Begin the work in a fork; the function that is returned waits for its result, None if the fork was ended."""
+    read, write = os.pipe()
+    if not (pid := os.fork()):
+        os.close(read)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        try:
+            result = work()
+        except BaseException as error:  # a mutant may do anything
+            result = ("killed", f"{type(error).__name__}: {error}")
+        with os.fdopen(write, "wb") as out:
+            pickle.dump(result, out)
+        os._exit(0)
+    os.close(write)
+
+    def wait() -> Any:
+        with os.fdopen(read, "rb") as source:
+            data = source.read()
+        os.waitpid(pid, 0)
+        return pickle.loads(data) if data else None
+
+    return wait
+
+
+def ends_of(module: str, count: int, seed: int, jobs: int) -> list[tuple[Mutant, str]]:
+    """Return `count` mutants of a module, each with its end."""
+    every = [mutant for mutant, *_ in _mistakes(module)]
+    # The draw depends on the mutants' keys, so that a change of one line leaves the other mutants drawn.
+    drawn = sorted(every, key=lambda m: hashlib.sha256(f"{seed} {m.key}".encode()).digest())[:count]
+    runner = _Runner(module, sorted(drawn, key=lambda m: (m.place, m.kind)), jobs)
+    files = [str(ROOT / "tests" / f"{name}.py") for name in TABLE[module].split()]
+    pytest.main([*files, "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--no-header", "--no-summary"], [runner])
+    if runner.trouble:
+        sys.exit(f"{module}: {runner.trouble}")
+    return runner.ends
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Do the tests notice small mistakes in what verdicts rest on?")
+    parser.add_argument("--only", default=",".join(TABLE), help="modules, separated by commas")
+    parser.add_argument("--count", type=int, default=40, help="mutants of each module (default 40)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    args = parser.parse_args()
+    lines = (line[2:] for line in JUDGED.read_text().splitlines() if line.startswith("- "))
+    known, unexplained, scored, killed = {line.partition("  ")[0].strip() for line in lines}, [], 0, 0
+    for module in args.only.split(","):
+        ends = ends_of(module, args.count, args.seed, args.jobs)
+        unexplained += [m for m, end in ends if end == "survived" and m.key not in known]
+        counted = [end for m, end in ends if not (end == "survived" and m.key in known)]
+        scored, killed = scored + len(counted), killed + len(counted) - counted.count("survived")
+        print(f"{module}: {len(ends)} mutants, {len(counted) - counted.count('survived')} of {len(counted)} killed")
+    for mutant in unexplained:
+        print(f"survived without an explanation: {mutant.key}  [line {mutant.line}]")
+    print(f"score {killed / max(scored, 1):.1%}, seed {args.seed}")
+    return 0 if not unexplained and killed >= GOAL * scored else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
