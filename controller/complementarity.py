@@ -210,7 +210,7 @@ def magnitudes(force: Array, balls: Sequence[int]) -> Array:
     return np.repeat(np.sqrt(np.add.reduceat(force**2, starts, axis=-2)), balls, axis=-2)
 
 
-def within_balls(force: Array, limit: Array, balls: Sequence[int]) -> Array:
+def _within_balls(force: Array, limit: Array, balls: Sequence[int]) -> Array:
     """Return forces (.., m, nsim) with every vector scaled to its limit (m, 1) where it is longer."""
     size = magnitudes(force, balls)
     over = size > limit
@@ -224,7 +224,7 @@ class BallProblem(_Problem):
     There is one solution for every q where M is block triangular over the vectors, in some order, and its diagonal
     blocks have a positive definite symmetric part. Blocks are solved one after the other: a semismooth Newton iteration
     in u = f + v tau, which begins with the radial scaling of q, and behind it a bisection for a single vector or an
-    iteration of Douglas and Rachford for several. What these do not solve to `RESIDUAL` gets f = 0 and is counted.
+    iteration of Douglas and Rachford for several. What these do not solve to `_RESIDUAL` gets f = 0 and is counted.
 
     Raises:
         SingularLoop: A block's symmetric part has a negative eigenvalue.
@@ -267,7 +267,7 @@ class BallProblem(_Problem):
         return v, f
 
 
-RESIDUAL = 1e-12  # of the limit
+_RESIDUAL = 1e-12  # of the limit
 _NEWTON, _SPLIT, _HALVINGS = 40, 4000, 80  # iterations
 _FULL, _SHARES = 10, (1.0, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01)  # full Newton steps; shares of later ones that are tried
 _ROUNDED = 16 * np.finfo(float).eps  # rounding of f + M v - q, relative to its terms
@@ -295,11 +295,11 @@ class _BallBlock:
         """Where f + M v - q is beyond its tolerance, (nsim,)."""
         terms = np.abs(f) + np.abs(self.M) @ np.abs(v) + np.abs(q)
         finite = np.where(np.isfinite(self.limit), self.limit, np.abs(q))
-        allowed = np.maximum(RESIDUAL * finite, _ROUNDED * terms.max(axis=0))
+        allowed = np.maximum(_RESIDUAL * finite, _ROUNDED * terms.max(axis=0))
         return ~(np.abs(f + self.M @ v - q) <= allowed).all(axis=0)
 
     def _of(self, u: Array) -> tuple[Array, Array]:
-        f = within_balls(u, self.limit, self.balls)
+        f = _within_balls(u, self.limit, self.balls)
         return (u - f) / self._tau, f
 
     def solve(self, q: Array) -> tuple[Array, Array, int]:
@@ -357,7 +357,7 @@ class _BallBlock:
             between = np.sqrt(low * high)
             longer = np.linalg.norm(force(between), axis=0) > limit
             low, high = np.where(longer, between, low), np.where(longer, high, between)
-        f = within_balls(force(high), self.limit, self.balls)
+        f = _within_balls(force(high), self.limit, self.balls)
         return high * f, f
 
     def _split(self, q: Array) -> tuple[Array, Array]:
@@ -365,7 +365,7 @@ class _BallBlock:
         v, f = self._of(q)
         u, resolvent = q.copy(), np.linalg.inv(self._by_tau + np.eye(len(q)))
         for turn in range(_SPLIT):
-            f = within_balls(u, self.limit, self.balls)
+            f = _within_balls(u, self.limit, self.balls)
             u = u + resolvent @ (self._by_tau @ (2 * f - u) + q) - f
             if turn % 500 == 499:
                 v, f = self._of(self._newton(u.copy(), q))

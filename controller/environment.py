@@ -25,7 +25,7 @@ from haptic_loop.controller.lti import Array, Complex, Lti, Sampled, as_like
 from haptic_loop.controller.passivity import hermitian_floor
 
 GROUND = "ground"
-NO_MODEL = "a MuJoCo world has no linear model E(z): any-environment needs none; linearise(world, pose) gives one"
+_NO_MODEL = "a MuJoCo world has no linear model E(z): any-environment needs none; linearise(world, pose) gives one"
 
 
 #: largest amounts, far from where arithmetic ends and beyond what anybody renders
@@ -285,11 +285,11 @@ class RigidWall(Environment, enum.Enum):
 RIGID_WALL = RigidWall.RIGID_WALL
 
 
-class NoModel(SingularLoop):
+class _NoModel(SingularLoop):
     """An environment of which no E(z) is known, so that no condition on this environment says anything."""
 
     def __init__(self) -> None:
-        super().__init__(NO_MODEL)
+        super().__init__(_NO_MODEL)
 
 
 class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -370,7 +370,7 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
 
     def as_network(self) -> Network:
         if self.world:
-            raise NoModel
+            raise _NoModel
         return self
 
     def check(self, psi: Sequence[int], T: float) -> None:
@@ -385,7 +385,7 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
 
     def E(self, T: Number) -> Lti:
         if self.world:
-            raise NoModel
+            raise _NoModel
         return environment(held(self), T)
 
     def frozen(self) -> Sequence[Network]:

@@ -165,7 +165,7 @@ class Law(ReadOnly):
     def together(self, laws: Sequence[Law]) -> Transition:
         """One tick of one simulation each, of laws of this kind with as many states and walls."""
         if not self.walls:
-            return side_by_side(laws)
+            return _side_by_side(laws)
         return _one_by_one(laws) if len(self.walls) > 1 else _one_wall(laws)
 
     def depths(self, z: Array) -> Array:
@@ -173,7 +173,7 @@ class Law(ReadOnly):
         return z[1:, z.shape[1] - len(self.walls) :]
 
 
-def side_by_side(laws: Sequence[Law]) -> Transition:
+def _side_by_side(laws: Sequence[Law]) -> Transition:
     """While all of them are linear."""
     blocks = _last_axis([law.linear for law in laws])
     return lambda before, after: np.einsum("oin,in->on", blocks, before, out=after)
@@ -195,7 +195,7 @@ def _one_by_one(laws: Sequence[Law]) -> Transition:
 def _one_wall(laws: Sequence[Law]) -> Transition:
     """The complementarity problem of one wall is p = max(0, q)/M."""
     m, blocks = laws[0].channels, [law._block for law in laws]
-    linear, order = side_by_side(laws), blocks[0].order
+    linear, order = _side_by_side(laws), blocks[0].order
     reach = _last_axis([np.concatenate([G.C[m], [0.0], G.D[m, :m]]) for G in blocks])
     kick = _last_axis([np.concatenate([G.D[:m, m], G.B[:, m], [0.0]]) for G in blocks])
     give, M = np.array([G.D[m, m] for G in blocks]), np.array([law._problem.M[0, 0] for law in laws])
@@ -230,7 +230,7 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 # together with the walls, whose forces are the same kind of unknown over the box (-inf, 0]: a box problem.
 
 
-def inner_box(limit: Array, sizes: Sequence[int]) -> Array:
+def _inner_box(limit: Array, sizes: Sequence[int]) -> Array:
     """Return (m,) [N] a limit of each channel that implies those of the vectors."""
     return limit / np.sqrt(np.repeat(sizes, sizes)) if sizes else limit
 
@@ -298,7 +298,7 @@ class Limiter(Law):
 
     @property
     def bounds(self) -> list[tuple[int, float]]:
-        return list(zip(self.sent_rows.tolist(), inner_box(self.limit, self._sizes).tolist(), strict=True))
+        return list(zip(self.sent_rows.tolist(), _inner_box(self.limit, self._sizes).tolist(), strict=True))
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
         """Where the contact slipped, which is before the force arrives."""
@@ -392,7 +392,7 @@ class Limiter(Law):
         if self.walls:
             return _one_by_one(laws)
         limiters = cast("Sequence[Limiter]", laws)
-        linear, sent, limit = side_by_side(laws), self.sent_rows, _last_axis([each.limit for each in limiters])
+        linear, sent, limit = _side_by_side(laws), self.sent_rows, _last_axis([each.limit for each in limiters])
 
         def together(before: Array, after: Array) -> None:
             linear(before, after)

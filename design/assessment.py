@@ -374,7 +374,7 @@ class Assessment:
     @property
     def facts(self) -> tuple[str, ...]:
         """What the loop has beyond constant delays, even periods and one linear environment."""
-        return facts_of(self.loop, self.environment, self.force_limits)
+        return _facts_of(self.loop, self.environment, self.force_limits)
 
     @property
     def decisive(self) -> Requirement:
@@ -545,7 +545,7 @@ def shelled(environment: Environment | PluggedEnvironment) -> bool:
     return callable(environment) or getattr(environment, "world", None) is not None
 
 
-def facts_of(
+def _facts_of(
     loop: Loop, environment: Environment | PluggedEnvironment | None = None, limits: ForceLimits | None = None
 ) -> tuple[str, ...]:
     """Name what a loop has beyond constant delays, even periods and one linear environment, in a fixed order."""

@@ -23,7 +23,7 @@ from haptic_loop.design.own import called, named
 from haptic_loop.design.result import Design, DesignFailed
 
 
-class Kind(NamedTuple):
+class _Kind(NamedTuple):
     """One design: what it promises, where it is made, and what can be asked of it."""
 
     conditions: tuple[Condition, ...]  # that it can be made for, its own first
@@ -37,7 +37,7 @@ class Kind(NamedTuple):
 
 
 KINDS = {
-    "spring-damper": Kind(
+    "spring-damper": _Kind(
         (THIS_ENVIRONMENT, KNOWN_DEVICE, KNOWN_DEVICE_ANY, ANY_ENVIRONMENT),
         "spring_damper",
         "design_with",
@@ -46,11 +46,11 @@ KINDS = {
         limited=True,
         softened=True,
     ),
-    "moving-average": Kind(
+    "moving-average": _Kind(
         (ANY_ENVIRONMENT, KNOWN_DEVICE_ANY), "spring_damper", "moving_average", ("condition",), softened=True
     ),
-    "ccl": Kind((ANY_ENVIRONMENT,), "fixed_order", "design", options=("order", "method", "diagonal")),
-    "optimal": Kind(
+    "ccl": _Kind((ANY_ENVIRONMENT,), "fixed_order", "design", options=("order", "method", "diagonal")),
+    "optimal": _Kind(
         (THIS_ENVIRONMENT,),
         "optimal",
         "design_with",
@@ -61,10 +61,10 @@ KINDS = {
 }
 
 
-_OWN = Kind((THIS_ENVIRONMENT, ANY_ENVIRONMENT), "", "")  # a function of a user's own, which takes a loop alone
+_OWN = _Kind((THIS_ENVIRONMENT, ANY_ENVIRONMENT), "", "")  # a function of a user's own, which takes a loop alone
 
 
-def kind_of(name: str) -> Kind:
+def kind_of(name: str) -> _Kind:
     """The kind of that name, or that of a user's own functions."""
     return KINDS.get(name, _OWN)
 

@@ -36,13 +36,13 @@ _FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # range of the real 
 _FASTER = 0.25  # Modes of smaller radius are only in the filter of the sum of all forces.
 _NEAR = 0.3  # A real pole is dropped if a real mode is nearer than this share of the pole's distance to 1.
 _SLOWER = 0.999  # Modes of larger radius get no section.
-RICH = 8  # largest number of channels for which the basis has sections at the band's end
+_RICH = 8  # largest number of channels for which the basis has sections at the band's end
 _EDGED = {1: 20, 2: 20}  # number of channels: least number of taps for these sections
 _EDGED_OF_MANY = 6  # least number of taps for these sections with more than two channels
 _EDGES = (0.2, 0.07, 0.02)  # damping ratios of these sections; they are small because the error may jump at the end
 # Up to FULL channels every force has a filter to every device. With further constraints the limit is FULL_BESIDE.
 FULL, FULL_BESIDE = 8, 5
-_STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weight of g - 1 beside the relative mismatch; for more than RICH channels
+_STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weight of g - 1 beside the relative mismatch; for more than _RICH channels
 HIGH_HZ = 100.0  # Above this frequency a soft row or a cap keeps the force low.
 SOFT = 0.05, 0.3  # The soft row's weight is SOFT[0] min(mismatch so far, SOFT[1]).
 _EVEN = 0.002  # weight of the error relative to the force of each motion, which may be small
@@ -251,13 +251,13 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1], full: int
     """Return a basis of taps, real poles, and the modes of E and of its inverse.
 
     The real poles are evenly spaced in the logarithm of the time constant. All poles are decimals. Large bases for at
-    most RICH channels also have slower poles, and sections at the band's end. With more than `full` channels every
+    most _RICH channels also have slower poles, and sections at the band's end. With more than `full` channels every
     device has a filter of its own force and one of the sum of all forces, and only the latter has the fast modes.
     """
     m = E.inputs
     modes = np.concatenate([E.poles(), _zeros(E)])
     modes = modes[(np.abs(modes) < _SLOWER) & (np.abs(modes) > 0.02) & (modes.imag >= 0)]
-    large = m <= RICH and taps >= _EDGED.get(m, _EDGED_OF_MANY)
+    large = m <= _RICH and taps >= _EDGED.get(m, _EDGED_OF_MANY)
     slowest = _SLOWEST_OF_LARGE if large else _SLOWEST
     slow = np.round(1 - np.geomspace(_FASTEST, slowest, poles), 4) if poles else np.zeros(0)
     own_real = modes[np.abs(modes.imag) <= 1e-6].real
@@ -609,7 +609,7 @@ def _evened(E: Complex, size: Array) -> Complex:
 
 
 def static_weight(loop: Loop) -> float:
-    return _STATIC if loop.channels <= RICH else _STATIC_OF_MANY
+    return _STATIC if loop.channels <= _RICH else _STATIC_OF_MANY
 
 
 def _band(loop: Loop, band_hz: tuple[float, float]) -> tuple[float, float]:

@@ -217,7 +217,7 @@ def design(
     if named(condition) in (KNOWN_DEVICE, KNOWN_DEVICE_ANY):
         if switching or limiter:
             raise ValueError(f"{condition}: neither limited forces nor delays that vary are covered")
-        return _for_known_devices(loop, starts, band_hz) if condition == KNOWN_DEVICE.name else stiffest_known(loop)
+        return _for_known_devices(loop, starts, band_hz) if condition == KNOWN_DEVICE.name else _stiffest_known(loop)
     if named(condition).extensible:
         if switching and limiter:
             raise ValueError("limiter and switching: limited forces are proved for constant delays, ask for one")
@@ -374,7 +374,7 @@ _ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4,
 _ON_CIRCLE = 721  # frequencies at which the set of gains is imposed, from 0 to pi
 
 
-def stiffest_known(loop: Loop) -> Design:
+def _stiffest_known(loop: Loop) -> Design:
     """The stiffest spring-damper that known-device-any certifies, channel by channel; objective in N/m, all together.
 
     He[V/(1-z)] > chi is Re W > chi |W|^2 |1 - 1/z|^2/T with W = K/D + B and Re W = K T/2 + B: a convex set of (K, B)
@@ -438,7 +438,7 @@ _TAPS = 4096  # frequencies from which the Fourier coefficients of chi are taken
 _SLACK = 2e-4  # of the largest chi: what a coupling has above it, half of which may be lost to the truncation
 
 
-def stiffest_linear(loop: Loop) -> Design:
+def _stiffest_linear(loop: Loop) -> Design:
     """The stiffest linear coupling that known-device-any certifies, channel by channel; objective in N/m, all together.
 
     V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k has He[V/(1-z)] = chi, with the Fourier coefficients chi_k of chi and
@@ -503,13 +503,13 @@ def _default_starts(loop: Loop) -> list[SpringDamper]:
 def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
     """The stiffest linear coupling that Theorem 4 admits; objective in N/m, of all channels together.
 
-    With the condition known-device-any the stiffest that it admits, `stiffest_linear`.
+    With the condition known-device-any the stiffest that it admits, `_stiffest_linear`.
 
     V = T/(2 delta) (1 + ... + z^-theta) needs exactly delta at every frequency. With the constant e n^2 T/(2 delta)
     beside it, n = theta + 1, it needs delta/(1 + e) where the sum is largest, and less elsewhere.
     """
     if condition == KNOWN_DEVICE_ANY.name:
-        return stiffest_linear(loop)
+        return _stiffest_linear(loop)
     if (loop.latency or loop.varying_delay) and not ANY_ENVIRONMENT.beyond(loop):
         return _stiffest_in_frame(loop)
     started = time.perf_counter()
