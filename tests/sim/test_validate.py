@@ -244,9 +244,10 @@ def test_sampled_traces_are_those_of_all_hands():
     assert every.witnessed.all()
     assert not exact.witnessed.any()
     for name in ("trace", "trace_error", "clipped"):
-        given = getattr(some, name)
-        np.testing.assert_array_equal(given[chosen], getattr(every, name)[chosen])
-        np.testing.assert_array_equal(given[~chosen], getattr(exact, name)[~chosen])
+        # how many hands are computed at once decides the order of sums: rounding moves a rate by some 1e-13 of its size
+        values = getattr(some, name)
+        np.testing.assert_allclose(values[chosen], getattr(every, name)[chosen], rtol=1e-9)
+        np.testing.assert_allclose(values[~chosen], getattr(exact, name)[~chosen], rtol=1e-9)
     np.testing.assert_array_equal(some.mujoco, every.mujoco)  # growth rates are both engines', of every hand
     assert np.isfinite(some.mujoco).all()
     lossless = some.damping == 0
