@@ -5,10 +5,10 @@ as free + s gain, where s multiplies the damping Delta_D that the devices guaran
 `over_z_minus_one`. The same expression is evaluated in floating point (a sweep: the required damping), over Fractions
 (an exact proof), over stacks and over sampled responses (maps and designs). docs/theory.md derives them.
 
-How a condition is composed. design.facts has the lists: **hands' sides** (`HandsSide`: periods that are even or vary,
-a latency) and **facts** of the environment's side (`Fact`: walls, delays that switch, the limiter). `compose` stacks
-their inputs and adds their forms (design.frame says how). design.environments makes conditions of them, with one
-search for all multipliers; design.certificate has one exact proof and one file format.
+A condition is composed of one **hands' side** (`HandsSide` in design.facts: periods that are even or vary, a latency)
+and of **facts** of the environment's side (`Fact`: walls, delays that switch, the limiter). `compose` stacks their
+inputs and adds their forms, as design.frame describes. design.environments searches the multipliers of all conditions;
+design.certificate has one exact proof and one file format.
 
 How a hands' side is added. Derive from `HandsSide` and state
   `inputs`   one `Input` per scalar input: `moved`, the weights of its share of the displacement that f[k] multiplies,
@@ -60,7 +60,7 @@ from haptic_loop.design.result import Environments, Requirement, from_ratio, ref
 
 
 def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
-    """He[F/(z-1)] > -s Delta_D/T_max. F displaces devices to forces (6), in any arithmetic.
+    """Return He[F/(z-1)] > -s Delta_D/T_max for the map F (6) from displacements to forces, in any arithmetic.
 
     The energy that a device with a passive human can give back in a tick is at most the damping's, Delta_D dx^2/T, and
     what the force map gives is -F dx; with F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T. Forces that
@@ -70,13 +70,13 @@ def this_environment_demand(F: Block, loop: Loop) -> Demand[Block]:
 
 
 def theta_hat(theta: Sequence[int], damping: Any, T: Number) -> Lti:
-    """Theta-hat (12), T/2 Delta^-1 (1 + 1/z + ... + z^-theta_i): what delays take of Delta (m, m) or its diagonal."""
+    """Return Theta-hat (12), T/2 Delta^-1 (1 + 1/z + ... + z^-theta_i); `damping` is Delta (m, m) or its diagonal."""
     weight: Any = np.diag(T / (2 * damping)) if np.ndim(damping) == 1 else inverse(2 * damping / T)
     return weight @ moving_sum(theta, T)
 
 
 def v_hat(H: Block) -> tuple[Array, Block]:
-    """H(1), symmetric, and H(1)/2 - (H - H(1))/(z - 1), which has the Hermitian part of T V-hat/|1 - 1/z|^2.
+    """Return H(1), symmetric, and H(1)/2 - (H - H(1))/(z - 1), with the Hermitian part of T V-hat/|1 - 1/z|^2.
 
     V-hat = (1 - 1/z) H/T with H = V - Theta-hat (11) carries the compliance V and what the delays add. It vanishes at
     z = 1, where nothing can be strict, so it is divided by |1 - 1/z|^2: (1 - 1/z) becomes 1/(1 - z), whose pole has
@@ -86,12 +86,12 @@ def v_hat(H: Block) -> tuple[Array, Block]:
     return H1, -regular
 
 
-#: Why a condition says nothing of devices whose levels Delta_i are not diagonal.
+#: reason for which a condition is refused for devices whose levels Delta_i are not diagonal
 FULL_LEVELS = "levels: it is derived for devices whose Delta_i is diagonal"
 
 
 def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | None = None) -> Demand[Block]:
-    """Theorem 4 for the damping s Delta_D, times s; with the multiplier phi (m,) [N s/m] that psi >= 1 needs.
+    """Return the block of Theorem 4 for the damping s Delta_D, times s; psi >= 1 needs the multiplier phi (m,) [N s/m].
 
     V-hat must be Delta_V-OSP with Delta_V^-1 = Phi^-1 - Delta_D^-1 (14), and with Delta_V = 0 where phi is 0. Divided
     by |1 - 1/z|^2, as `v_hat` is, T He v_hat(H) >= H* Delta_V H for H = V - Theta-hat: by a Schur complement
@@ -121,7 +121,7 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
 
 
 def delayed_environment_demand(delayed: Lti, phi: Sequence[Any] | Array) -> Demand[Lti]:
-    """E-hat + Phi without its pole must be positive real; `delayed` is Psi E.
+    """Return E-hat + Phi without its pole, which must be positive real; `delayed` is Psi E.
 
     E-hat = T z/(z-1) Psi E = T E(1) z/(z-1) + T z R(z), and the Hermitian part of z/(z-1) on the circle is 1/2:
     T (z R + E(1)/2) + Phi. Delay makes the environment lose passivity; Phi (14) covers the loss.
@@ -131,7 +131,10 @@ def delayed_environment_demand(delayed: Lti, phi: Sequence[Any] | Array) -> Dema
 
 
 def uncovered(environment: Lti, psi: Sequence[int], phi: Sequence[float] | Array) -> tuple[float, float]:
-    """The most that E-hat + Phi lacks of being passive [N s/m], > 0 where phi (m,) is too small, and at which w."""
+    """Return the largest shortage of passivity of E-hat + Phi [N s/m] and its frequency w [rad/sample].
+
+    The shortage is positive where phi (m,) is too small.
+    """
     demand = delayed_environment_demand(delay(psi, environment.T) @ environment, phi)
     block = demand.free + demand.gain
 
@@ -141,13 +144,13 @@ def uncovered(environment: Lti, psi: Sequence[int], phi: Sequence[float] | Array
     return supremum(short, np.concatenate([[0.0], frequencies(block)]))
 
 
-#: The determinant beside the diagonal's product below which a pair is singular; a diagonal entry that is rounding.
+#: A pair is singular if its determinant is below _SINGULAR times the diagonal's product; smaller entries are rounding.
 _SINGULAR, _NOTHING = 1e-12, 1e-15
 _CELLS = 2**19  # entries of a response that are looked at together
 
 
 def least_scale(demand: Demand[Any], w: Array) -> Array:
-    """The least s with He[free + s gain] >= 0 at each frequency w (k,) [rad/sample]; inf where no s is enough."""
+    """Return the least s (k,) with He[free + s gain] >= 0 at each frequency w (k,) [rad/sample], or inf."""
     step = max(_CELLS // demand.gain.outputs**2, 64)
     if w.size > step:  # in pieces that stay near the processor
         return np.concatenate([least_scale(demand, w[i : i + step]) for i in range(0, w.size, step)])
@@ -157,7 +160,7 @@ def least_scale(demand: Demand[Any], w: Array) -> Array:
 
 
 def least_multiple(free: Complex, gain: Complex) -> Array:
-    """The least s with free + s gain >= 0, (...,), of Hermitian (..., p, p) with gain >= 0; inf where no s is enough.
+    """Return the least s (...,) with free + s gain >= 0 for Hermitian (..., p, p) with gain >= 0, or inf.
 
     Where gain is singular, free must be positive on its null space; the rest is a Schur complement.
     """
@@ -194,7 +197,7 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
 
 
 def _of_pairs(free: Complex, gain: Complex, room: Array) -> Array:
-    """`least_multiple` of pairs with det(gain) = room: a root of the determinant, 20 times as fast as LAPACK."""
+    """Return `least_multiple` of 2 x 2 matrices with det(gain) = room, by a root; 20 times as fast as LAPACK."""
     (a, b, d), (p, q, r) = ((M[..., 0, 0].real, M[..., 0, 1], M[..., 1, 1].real) for M in (free, gain))
     twice, last = a * r + d * p - 2 * (b.real * q.real + b.imag * q.imag), a * d - b.real**2 - b.imag**2
     root = np.sqrt(np.maximum(twice**2 - 4 * room * last, 0.0))
@@ -204,7 +207,7 @@ def _of_pairs(free: Complex, gain: Complex, room: Array) -> Array:
 
 
 def _beyond_the_null_space(H: Complex, r: int) -> Array:
-    """The least s with H + s diag(0, I) >= 0, where 0 has r rows; (n,)."""
+    """Return the least s (n,) with H + s diag(0, I) >= 0, where the zero block has r rows."""
     null, cross, rest = H[:, :r, :r], H[:, :r, r:], H[:, r:, r:]
     size = np.abs(np.diagonal(H, axis1=1, axis2=2)).max(axis=1, initial=0.0)
     positive = largest_eigenvalue(-null) < -1e-13 * size
@@ -217,7 +220,7 @@ def _beyond_the_null_space(H: Complex, r: int) -> Array:
     return needed
 
 
-#: What a loop may have beyond even ticks, constant delays of its forces and one linear environment, by its field.
+#: fields of a loop that go beyond even ticks, constant delays of its forces and one linear environment
 BEYOND = ("psi", "T_max", "latency", "varying_delay", "walls", "ranges")
 
 
@@ -226,37 +229,37 @@ FACTS = ("latency", "walls", "limiter", "switching", "ranges")
 
 
 class Condition(ABC):
-    """What must hold of a coupling in a loop, as a block. One of your own is a class with a name and `demand`.
+    """A block that must be strictly positive real. A condition of the user's own needs a name and `demand`.
 
-    `design.certificate` proves and verifies it as it does those that it knows by name. That the block keeps a loop safe
-    is the claim of who wrote it; a loop that has something of `BEYOND` which its class does not name is refused.
+    `design.certificate` proves and verifies it like every condition. That the block keeps a loop safe is the claim of
+    its author. A loop that has an item of `BEYOND` is refused unless the class names the item in `covers`.
     """
 
     name: str  # in requirements, certificates and reports
-    covers: tuple[str, ...] = ()  # of `BEYOND`, what the block is about; a subclass states its own
-    source: str | None = None  # where it is from, for a report
+    covers: tuple[str, ...] = ()  # items of `BEYOND` that the block covers; a subclass does not inherit them
+    source: str | None = None  # reference for a report
     separable: bool = False  # whether it judges the channels of a coupling without cross terms one by one
 
     @property
     def extensible(self) -> bool:
-        """Whether limited forces and delays that switch have blocks beside it, in the same file."""
+        """Whether limited forces and switching delays may be proved together with this condition."""
         return False
 
     @abstractmethod
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """The block of this coupling in this loop, over Fractions where `exact`. Raises SingularLoop.
+        """Return the block of this coupling in this loop, over Fractions if `exact`. Raises SingularLoop.
 
-        Only a condition that has `multiplier_sizes` is given a multiplier.
+        `multiplier` is passed only to a condition that has `multiplier_sizes`.
         """
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """The damping that it asks of the devices, from a refined sweep. Raises SingularLoop."""
+        """Return the damping that the devices need, from a refined sweep. Raises SingularLoop."""
         demands = [self.is_demand(self.demand(each, coupling)) for each in self._loops(loop)]
         found = [_least_damping(self.name, demand.free, lambda d=demand: d, loop.delta) for demand in demands]
         return max(found, key=lambda requirement: requirement.ratio)
 
     def judge(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """`required`, and for whom that is; a loop that it says nothing of, or without a solution, is refused."""
+        """Return `required` with its guarantee; a loop that is not covered or has no solution gets an infinite one."""
         reason = self.beyond(loop)
         try:
             found = refusal(self.name, loop.delta, reason) if reason else self.required(loop, coupling, multiplier)
@@ -265,26 +268,26 @@ class Condition(ABC):
         return replace(found, guarantee=self.words(loop), lag=self.lag(loop))
 
     def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
-        """Required over available damping; with `thin` it may be by every thin-th frequency alone."""
+        """Return required over available damping; `thin` allows a sweep over every thin-th frequency only."""
         return self.judge(loop, coupling).ratio
 
     def over_frequency(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Response | None:
-        """w (k,) [rad/sample] -> required over available damping there; None for a coupling without such a curve."""
+        """Return the function w (k,) [rad/sample] -> required over available damping (k,), or None if there is none."""
         more = {} if multiplier is None else {"multiplier": multiplier}
         return partial(least_scale, self.demand(loop, coupling, **more))
 
     def ratios(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Array | None:
-        """Required over available damping, (n,), where loop or coupling is a stack; None: ask them one by one."""
+        """Return required over available damping (n,) for a stack; None if the condition judges one loop at a time."""
         return None
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
-        """What is to be proved over the rationals, by the name of the matrix that proves it. Raises NotProved."""
+        """Return the blocks to prove over the rationals, by the names of their matrices. Raises NotProved."""
         more = {} if multiplier is None else {"multiplier": multiplier}
         loops = enumerate(self._loops(loop))
         return {f"P{i or ''}": self.is_demand(self.demand(each, coupling, exact=True, **more)) for i, each in loops}
 
     def is_demand(self, found: Demand[Block]) -> Demand[Block]:
-        """What a user's own code has made, if it is one. Raises InputError."""
+        """Return `found`, the result of a user's own code. Raises InputError unless it is a Demand."""
         if not isinstance(found, Demand):
             raise InputError(f"the demand of condition {self.name} is {shown(found)}, expected a Demand")
         return found
@@ -293,7 +296,7 @@ class Condition(ABC):
         return [loop.at(member.network) for member in self.members(loop)] or [loop]
 
     def beyond(self, loop: Loop) -> str | None:
-        """Why it says nothing of this loop, whatever the coupling: what its class does not cover."""
+        """Return the reason why this loop is not covered, whatever the coupling, or None."""
         changes = loop.T_max not in (None, loop.T)
         walls = loop.environment.walls
         has = (any(loop.psi), changes, loop.latency, loop.varying_delay, walls, loop.ranges)
@@ -304,29 +307,29 @@ class Condition(ABC):
 
     @property
     def base(self) -> str:
-        """The name by which a certificate calls the condition; its facts stand beside it."""
+        """The condition's name in a certificate, which lists the facts separately."""
         return self.name
 
     def fact_names(self, loop: Loop) -> tuple[str, ...]:
-        """What holds of this loop, of `FACTS`."""
+        """Return the names of `FACTS` that this loop has."""
         walls, limited = loop.environment.walls, self.parameters(loop)
         there = loop.latency, walls, limited, loop.varying_delay, loop.ranges
         return tuple(name for name, has in zip(FACTS, there, strict=True) if has)
 
     def parameters(self, loop: Loop) -> dict[str, tuple[float, ...]]:
-        """Numbers that a certificate keeps beside the multipliers, because what runs must use them: rho [N/m]."""
+        """Return the numbers that a run must use and a certificate keeps with the multipliers: rho [N/m]."""
         return {}
 
     def lag(self, loop: Loop) -> tuple[float, ...] | None:
-        """rho (m,) [N/m] of a limiter that needs no further proof; None where limited forces are not covered."""
+        """Return rho (m,) [N/m] of a limiter that needs no further proof; None if limited forces are not covered."""
         return None
 
     def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
-        """What a file calls the multipliers, and how many numbers each has; {} for a condition without any."""
+        """Return the length of every multiplier by its name in files; {} for a condition without multipliers."""
         return {}
 
     def by_name(self, loop: Loop, multiplier: Sequence[Any]) -> dict[str, tuple[float, ...]]:
-        """The numbers of the multipliers, which come one after the other, by name."""
+        """Return the concatenated multipliers as one tuple for each name."""
         found, start = dict[str, tuple[float, ...]](), 0
         for name, count in self.multiplier_sizes(loop).items():
             found[name] = tuple(float(v) for v in multiplier[start : start + count])
@@ -334,50 +337,50 @@ class Condition(ABC):
         return found
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
-        """The one for every coupling, None where none is needed; and why it says nothing of the loop, if so."""
+        """Return (the multiplier that serves every coupling or None, the reason why the loop is not covered)."""
         return None, self.beyond(loop)
 
     def not_varied(self, loop: Loop) -> str | None:
-        """Why it is not asked again and again of a loop that is varied; None where it is."""
+        """Return the reason why sweeps over varied loops skip this condition, or None."""
         return None
 
     def members(self, loop: Loop) -> tuple[Member, ...]:
-        """The environments in which it is proved one by one; P, P1, P2, .. are of these."""
+        """Return the environments that are proved one by one, with the matrices P, P1, P2, .."""
         return loop.members()
 
     def guarantee(self, loop: Loop) -> Environments:
-        """For which environments it holds."""
-        # proved at every vertex; whether it is kept between them is searched by check_ranges and design.check
+        """Return the environments for which the condition holds."""
+        # Ranges are proved at every vertex; check_ranges and design.check search between the vertices.
         return "these ranges" if loop.ranges else "this environment"
 
     def place(self, loop: Loop, matrix: str = "P") -> str:
-        """What a matrix is about, as the beginning of a message: which member of the ranges, where there are some."""
+        """Return the member of the ranges that a matrix belongs to, as the beginning of a message, or ""."""
         members = self.members(loop)
         return f"{members[int(matrix[1:] or 0)].name}: " if len(members) > 1 else ""
 
     @property
     def claim(self) -> str:
-        """What is said of one of the user's own where it holds."""
+        """The sentence of reports for a condition of the user's own that holds."""
         return f"the block of {self.name} is what is proved; that it keeps this loop safe is yours to show"
 
     def said(self, needs: Requirement) -> str:
-        """The same, or that it does not hold."""
+        """Return `claim`, or the shortfall."""
         return self.claim if needs.certified else f"fails the condition {self.name}: {needs.shortfall}"
 
     def words(self, loop: Loop) -> str:
-        """The same in the words of a report."""
+        """Return the environments for which the condition holds, in the words of a report."""
         held = self.guarantee(loop)
         return loop.environment.here if held == "this environment" else held
 
 
 def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], delta: Sequence[float]) -> Requirement:
-    """The damping that a demand asks of devices with `delta` [N s/m], by a refined sweep; `system` as in `unsound`."""
+    """Return the damping that a demand requires of devices with `delta` [N s/m]; `system` is as in `unsound`."""
     available = tuple(delta)
     if reason := unsound(system, available):
         return refusal(name, available, reason)
     try:
         asked = demand()
-    except SingularLoop as error:  # a radius that rounding has kept below one
+    except SingularLoop as error:  # rounding has kept the largest pole inside the unit circle
         return refusal(name, available, f"the force map is singular in floating point: {error}")
     if reason := unsound_static(system, asked, available):
         return refusal(name, available, reason)
@@ -386,7 +389,7 @@ def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], de
 
 
 def unsound(system: Lti, delta: Sequence[float]) -> str | None:
-    """Why no sweep says anything of a block that has the poles of this system, whose size says what is rounding."""
+    """Return the reason why a block with the poles of this system cannot be swept, or None."""
     if min(delta) == 0:
         return "a device guarantees no damping, so no coupling is safe for every passive human"
     if reason := too_long(system):
@@ -396,12 +399,12 @@ def unsound(system: Lti, delta: Sequence[float]) -> str | None:
 
 
 def unsound_static(system: Lti, asked: Demand[Lti], delta: Sequence[float]) -> str | None:
-    """Why what the demand says of z = 1 does not hold, beyond rounding."""
+    """Return the reason why the demand's static matrices violate it by more than rounding, or None."""
     end = system.at(-1.0)
     for matrix, value in asked.static.items():
         skew, least = _static_errors(value, system.D, end)
         slack = _STATIC
-        if max(skew, -least) > slack:  # of a map that is nothing but rounding
+        if max(skew, -least) > slack:  # The map may consist of rounding errors only.
             size = max(float(np.abs(part).max()) for part in (value, system.D, end))
             allowed = min(rounding(system, on_circle(frequencies(system))), _STATIC * min(delta) / system.T)
             slack = max(slack, allowed / max(size, 1e-12))
@@ -413,16 +416,16 @@ def unsound_static(system: Lti, asked: Demand[Lti], delta: Sequence[float]) -> s
 
 
 def this_environment(F: Lti, loop: Loop) -> Requirement:
-    """The damping that this-environment asks for the force map F, whatever the loop's own environment."""
+    """Return the damping that this-environment requires for the force map F; the loop's environment is not used."""
     dampings(loop.delta, F.inputs)
     return _least_damping("this-environment", F, lambda: this_environment_demand(F, loop), loop.delta)
 
 
 def ratio_in(loop: Loop, coupling: Coupling, thin: int = 1) -> float:
-    """The damping that this-environment requires over the available damping, by a refined sweep of a stable coupling.
+    """Return required over available damping of this-environment for a stable coupling, by a refined sweep.
 
-    With `thin` by every `thin`-th frequency of its grid alone. Of one in series, a force filter, the responses of
-    environment and filter are multiplied: the poles of their series are defective and cost digits, and time.
+    With `thin` the sweep uses every `thin`-th frequency of its grid. For a force filter the responses of environment
+    and filter are multiplied, because the poles of their series are defective and cost digits and time.
     """
     if (chain := coupling.in_series(loop.T)) is None:
         return _of_whole(loop, coupling, thin)
@@ -449,16 +452,16 @@ def _of_whole(loop: Loop, coupling: Coupling, thin: int) -> float:
     return float(least_scale(demand, frequencies(F)[::thin]).max()) if F.is_stable() else np.inf
 
 
-_LOWEST = 1e-6  # [rad/sample]: below it nothing changes
-_W_ZERO = 1e-10  # [rad/sample] stands for F(1) of many, whose real part is even: sampled, a network may be 0/0 there
-#: rounding that F(1) may miss of symmetry and of positive semidefiniteness
+_LOWEST = 1e-6  # [rad/sample] responses are constant below it
+_W_ZERO = 1e-10  # [rad/sample] replaces w = 0 in stacks, where the response of a network may be 0/0
+#: allowed relative asymmetry and negativity of F(1)
 _STATIC = 1e-9
 
 
 def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array]:
-    """How far F(1) is from symmetric, and its least eigenvalue; relatively to what F is elsewhere, (...,) each.
+    """Return the asymmetry of F(1) and its least eigenvalue, (...,) each, relative to the largest of all matrices.
 
-    A free mass has F(1) = 0 out of large numbers.
+    A free mass has F(1) = 0 as a difference of large numbers.
     """
     scale = np.max([np.abs(part).max(axis=(-2, -1)) for part in (F1, *elsewhere)], axis=0, initial=1e-12)
     turned = np.swapaxes(F1, -1, -2)
@@ -467,9 +470,9 @@ def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array
 
 
 def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement:
-    """The damping that any-environment asks for V, whatever passive environment is behind it.
+    """Return the damping that any-environment requires for V before any passive environment.
 
-    With phi (m,) [N s/m], as `any_environment_demand` has it, behind the loop's own environment and its delay psi.
+    With phi (m,) [N s/m] of `any_environment_demand` V stands before the loop's own environment and its delay psi.
     """
     available = dampings(loop.delta, V.inputs)
 
@@ -494,23 +497,22 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
     return from_ratio("any-environment", ratio, available, w / (2 * np.pi * V.T))
 
 
-#: What a sweep may find uncovered, relative to the damping: a lossless E has 2e-13 by rounding. Such a shortage would
-#: raise Phi by as much, a hundredth of the guard band of verdicts.
+#: allowed shortage of E-hat + Phi, relative to the damping; rounding makes 2e-13 of it for a lossless E
 _ROUNDING = 1e-9
-#: V is taken to vanish in a direction in which it is smaller than this, beside V(1): nearer to a zero is rounding.
+#: relative size of V below which a direction counts as one in which V vanishes
 _VANISHES = 1e-5
-#: What stands there in place of its passivity, beside V(1), and the ratio from which on nothing else does.
+#: relative passivity that replaces that of V in these directions; ratio from which V counts as not passive there
 _SOFTENED, _NEVER = 1e-12, 1e6
 
 
 def asymmetric(V1: Array) -> str | None:
-    """Why a static compliance is refused: it is not symmetric, beyond rounding."""
+    """Return the reason why a static compliance is refused, or None if it is symmetric to rounding."""
     skew, size = np.abs(V1 - V1.T).max(), max(float(np.abs(V1).max()), 1e-300)
     return "the static compliance V(1) is not symmetric" if skew > 1e-9 * size else None
 
 
 def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
-    """As `least_scale`, (k,), but a direction in which V vanishes needs no passivity of its own.
+    """Return `least_scale` (k,), without a demand in directions in which V vanishes.
 
     Where V and the delays' window vanish together, so does V-hat, and He V-hat >= Delta_V |V-hat|^2 is 0 >= 0: the
     moving average does it at every zero of its window. Where only V does, the ratio is large.
@@ -525,7 +527,7 @@ def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
 
 
 def any_environment_per_channel(V: Sequence[Lti], loop: Loop) -> Requirement:
-    """any-environment for a diagonal coupling, given its channels: each device's own figure."""
+    """Return any-environment for a diagonal coupling from its channels, with each device's own figure."""
     each = [any_environment(v, loop.channel(i)) for i, v in enumerate(V)]
     worst = max(each, key=lambda r: r.ratio)
     required = tuple(r.required[0] for r in each)
@@ -534,7 +536,7 @@ def any_environment_per_channel(V: Sequence[Lti], loop: Loop) -> Requirement:
 
 
 def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
-    """`delta` as floats, one positive damping per channel [N s/m]."""
+    """Return `delta` as floats, one for each channel [N s/m]. Raises ValueError for a wrong or negative one."""
     values = tuple(float(d) for d in delta)
     if len(values) != channels:
         raise ValueError(f"delta has {len(values)} entries for {channels} channels")
@@ -550,14 +552,14 @@ def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
 # Coulomb friction of at least W_i at the encoder's coordinate dissipates that.
 
 
-_SMALL_TAIL = 1e-9  # of the bound
-_CHUNK, _MOST_CHUNKS = 256, 20_000  # ticks summed at once; where the sum ends at the latest
+_SMALL_TAIL = 1e-9  # bound of the remaining sum, relative to the sum, at which the summation ends
+_CHUNK, _MOST_CHUNKS = 256, 20_000  # number of ticks summed at once; largest number of chunks
 
 
 def l1_gain(F: Lti) -> Array:
-    """The sum over all ticks of |impulse response| of every entry, (p, m), from above; inf for an unstable F.
+    """Return an upper bound of the sum over all ticks of |impulse response|, (p, m); inf for an unstable F.
 
-    Ticks are summed until what is left is small, and the rest is bounded: with A'PA <= r^2 P, r < 1,
+    Ticks are summed until the bound of the rest is small: with A'PA <= r^2 P, r < 1,
     |c A^k b| <= r^k sqrt(c P^-1 c' b'P b).
     """
     import scipy
@@ -588,11 +590,11 @@ def l1_gain(F: Lti) -> Array:
 
 
 def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -> Array:
-    """(p,) [N] Coulomb friction at each device that pays for encoder steps (m,) [m], whatever condition F satisfies.
+    """Return the Coulomb friction (p,) [N] that dissipates the work of encoder steps (m,) [m] for any condition.
 
-    It is the friction at the encoder's own coordinate, beside the damping delta. Not behind a limiter or walls.
-    Friction of a device with several `axes` opposes its velocity in space, and needs |W|_2 of these axes: the errors
-    work at most sum W_i |v_i| <= |W|_2 |v|_2.
+    It acts at the encoder's own coordinate, besides the damping delta. It does not hold behind a limiter or walls.
+    Friction of a device with several `axes` opposes its velocity in space, and needs |W|_2 of these axes: the work of
+    the errors is at most sum W_i |v_i| <= |W|_2 |v|_2.
     """
     q = np.asarray(steps, dtype=float)
     if q.shape != (F.inputs,) or not (q >= 0).all():
@@ -601,16 +603,15 @@ def encoder_friction(F: Lti, steps: Sequence[float], axes: Sequence[int] = ()) -
     return magnitudes(W[:, None], axes)[:, 0] if axes else W
 
 
-# Many couplings or environments at once: a row for each, as a map asks for them.
+# Stacks of couplings or environments, for maps.
 
-_Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses there, a row for each system
+_Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses at z, one row for each system
 
 
 def this_environment_ratios(at: _Responses, poles: Complex, loop: Loop) -> Array:
-    """Required over available damping, (n,), of n loops; inf where no damping is enough.
+    """Return required over available damping (n,) of n loops; inf where no damping is enough.
 
-    `at` gives the responses of their force maps, `poles` (n, p) are these maps' own; the longest way through the loop
-    makes so many lobes.
+    `at` returns the responses of their force maps, and `poles` (n, p) are the poles of these maps.
     """
     here, opposite = (np.full((len(poles), 1), w) for w in (_W_ZERO, np.pi))
     skew, least = _static_errors(at(on_circle(here)).G[:, 0].real, at(on_circle(opposite)).G[:, 0])
@@ -626,7 +627,7 @@ def this_environment_ratios(at: _Responses, poles: Complex, loop: Loop) -> Array
 def any_environment_ratios(
     V: _Responses, count: int, loop: Loop, demand: Callable[[Sampled], Demand[Sampled]]
 ) -> Array:
-    """The same of any-environment for `count` couplings, by the block of their responses."""
+    """Return required over available damping (count,) of any-environment, from the block of their responses."""
 
     def needed(w: Array) -> Array:
         return _least_scales(demand(V(on_circle(w))))
@@ -639,6 +640,6 @@ def _least_scales(demand: Demand[Sampled]) -> Array:
 
 
 def regular_part(E: Lti) -> Lti:
-    """Stable where E is, with the Hermitian part of E z/(z-1) = E + E/(z-1) on the circle but at z = 1."""
+    """Return a block with the Hermitian part of E z/(z-1) = E + E/(z-1) on the circle except z = 1; stable if E is."""
     _, regular = E.over_z_minus_one()
     return Lti(E.A, E.B, E.C + regular.C, E.D + regular.D, E.T)

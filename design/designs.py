@@ -29,11 +29,11 @@ class _Kind(NamedTuple):
     conditions: tuple[Condition, ...]  # that it can be made for, its own first
     module: str  # of design/, imported on first use
     function: str  # from a loop to a Design
-    takes: tuple[str, ...] = ()  # besides the loop and its options: condition, progress
-    options: tuple[str, ...] = ()  # in words of design.api.DesignOptions
-    model: bool = False  # of the environment, in the coupling: made for late forces and whole ranges, not for walls
-    limited: bool = False  # made for limited forces, too, unless it is asked not to be
-    softened: bool = False  # quick enough to be made for less and less damping, until another condition holds as well
+    takes: tuple[str, ...] = ()  # further arguments: condition, progress
+    options: tuple[str, ...] = ()  # names of design.api.DesignOptions that the function takes
+    model: bool = False  # whether the coupling contains a model of the environment, which admits ranges and no walls
+    limited: bool = False  # whether limited forces are covered by default
+    softened: bool = False  # whether it may be redesigned for less damping until a second condition holds
 
 
 KINDS = {
@@ -61,30 +61,30 @@ KINDS = {
 }
 
 
-_OWN = _Kind((THIS_ENVIRONMENT, ANY_ENVIRONMENT), "", "")  # a function of a user's own, which takes a loop alone
+_OWN = _Kind((THIS_ENVIRONMENT, ANY_ENVIRONMENT), "", "")  # of a function of the user's own
 
 
 def kind_of(name: str) -> _Kind:
-    """The kind of that name, or that of a user's own functions."""
+    """Return the kind of that name, or the kind of the user's own functions."""
     return KINDS.get(name, _OWN)
 
 
 def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
-    """The default condition of a design: a spring-damper is designed for this environment, which feels best.
+    """Return the name of the default condition of a design.
 
-    For any environment where this-environment covers less than the loop: limited forces before walls, worlds, ranges,
-    delays that vary. Other kinds for their own condition.
+    A spring-damper is designed for this environment, which feels best, and for any environment before walls and worlds,
+    for ranges and for delays that vary. Other kinds have one condition.
     """
     less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
     conditions = kind_of(kind).conditions
     if loop.known_devices and KNOWN_DEVICE in conditions and not (less or loop.latency):
-        return KNOWN_DEVICE.name  # it is never worse than this-environment, which it falls back on
+        return KNOWN_DEVICE.name  # never worse than this-environment
     plain = [each for each in conditions if not isinstance(each, KnownDevice)]
-    return (plain[-1] if less and not loop.latency else plain[0]).name  # the last is for more environments
+    return (plain[-1] if less and not loop.latency else plain[0]).name  # The last one covers more environments.
 
 
 def name_and_own(condition: str | Condition | None) -> tuple[str | None, Condition | None]:
-    """The condition's name, and itself where it is one of the user's own."""
+    """Return (the condition's name or None, the condition if it is the user's own)."""
     if condition is None or isinstance(condition, str):
         return condition, None
     ours = (*_OWN.conditions, KNOWN_DEVICE, KNOWN_DEVICE_ANY)
@@ -98,14 +98,20 @@ def design_by_kind(
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
     **options: Any,
 ) -> Design:
-    """Design and verify a coupling; `options` are those of the design's own function: order, method, diagonal for ccl,
-    those of design.program.Options for optimal. `progress` hears what takes long: (what, steps done, of how many).
-    Without a condition it is the usual one. A spring-damper for this environment is covered also while forces are
-    limited, unless `limiter` is False or no such one is found; with `limiter` True it is that or none. For a condition
-    of the user's own a coupling is made for the kind's usual one, with as much of the damping as lets both hold.
+    """Design and verify a coupling.
 
-    Raises ValueError for a kind or condition that does not exist, Infeasible or DesignFailed (design.result) where
-    there is nothing to return.
+    Args:
+        loop: The loop.
+        kind: A name of KINDS, or FILE.py:NAME of a function of the user's own.
+        condition: The condition; None for `usual_condition`. For a condition of the user's own the coupling is designed
+            for the kind's usual condition, with as much of the damping as lets both conditions hold.
+        progress: Called during long searches with (task, steps done, number of steps).
+        **options: Those of the kind's function: order, method and diagonal for ccl, design.program.Options for optimal.
+            A spring-damper covers limited forces if such a coupling is found; `limiter` True requires it.
+
+    Raises:
+        ValueError: The kind or condition does not exist, or does not suit the loop.
+        Infeasible, DesignFailed: No coupling was found (design.result).
     """
     name, own = name_and_own(condition)
     if kind not in KINDS and ":" in kind:
@@ -155,7 +161,7 @@ def design_by_kind(
 
 
 def _instead(loop: Loop, words: str, kind: str, **options: Any) -> str:
-    """What else gives a coupling for this loop, as the end of a refusal: nothing where it does not when it is run."""
+    """Return an error suffix that names a design that succeeds for this loop, or ""."""
     with suppress(ValueError, DesignFailed):
         found = design_by_kind(loop, kind, **options)
         if found.requirement.certified:
@@ -164,7 +170,7 @@ def _instead(loop: Loop, words: str, kind: str, **options: Any) -> str:
 
 
 def _before_walls(loop: Loop) -> str:
-    """The first coupling that is certified before walls, as `_instead` has it, or which were tried."""
+    """Return an error suffix that names the first design certified before walls, or those that were tried."""
     others = {
         f"--coupling {kind} --condition {ANY_ENVIRONMENT.name}": kind for kind in ("spring-damper", "moving-average")
     }
@@ -177,19 +183,18 @@ def _before_walls(loop: Loop) -> str:
 
 
 def own_coupling(name: str, loop: Loop) -> Any:
-    """What a user's own function, named as FILE.py:NAME, makes of a loop. Raises InputError."""
+    """Return the result of the user's own function FILE.py:NAME for a loop. Raises InputError."""
     return called(f"--coupling {name}", named("--coupling", name), loop)
 
 
-#: A design for late forces, walls or another condition leaves at most this share of the damping; is sought so often.
+#: largest unused share of the damping at which `_with_less_damping` ends
 _UNUSED = 0.005
 
 
 def _with_less_damping(loop: Loop, made: Callable[[Loop], Design], condition: Condition) -> Design:
-    """The design for less damping, so that the condition asks for no more than is available.
+    """Return the design for the largest share of the damping whose coupling satisfies the condition in this loop.
 
-    It is made for forces that latch at the tick, and walls that all touch; for any environment for the longest delay,
-    where delays switch. The condition is about the loop as it is.
+    The designs neglect the latency and take all walls as touching; for any environment they have the longest delay.
     """
     share, best, shortfall = 1.0, None, ""
     for _ in range(budgets.LESS_DAMPING_ROUNDS):

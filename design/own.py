@@ -47,7 +47,7 @@ _LOADED: dict[Path, ModuleType] = {}
 
 
 def _loaded(option: str, text: str, file: Path) -> ModuleType:
-    """Run the file once, as the module of its name, by which worker processes find its classes again."""
+    """Run the file once, as the module of its name, so that worker processes find its classes."""
     if file in _LOADED:
         return _LOADED[file]
     other = sys.modules.get(file.stem)
@@ -80,7 +80,7 @@ def reach(folder: str) -> None:
 
 
 def called(what: str, make: Callable[..., _Made], *given: Any, **named: Any) -> _Made:
-    """What a user's own class or function makes of these arguments. Raises InputError where it cannot take them."""
+    """Call a user's own class or function. Raises InputError if it does not accept the arguments."""
     try:
         return make(*given, **named)
     except Exception as error:
@@ -91,15 +91,15 @@ def called(what: str, make: Callable[..., _Made], *given: Any, **named: Any) -> 
 
 
 def is_refusal(error: BaseException) -> bool:
-    """Whether a statement of ours refused what a user's own code gave it: then its traceback says nothing more."""
+    """Return whether our validation raised the error, so that a traceback adds nothing."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     return last.filename.startswith(_OURS) and (last.line or "").startswith("raise ")
 
 
 def place_of(error: BaseException) -> str | None:
-    """The innermost place in a user's own code that an error came through, `FILE, line N`; None where there is none.
+    """Return the innermost line of the user's own code in the traceback, as `FILE, line N`, or None.
 
-    That is every file but ours and what is installed.
+    User's own code is every file that belongs neither to this package nor to the Python installation.
     """
     frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(_OTHERS)]
     return f"{frames[-1].filename}, line {frames[-1].lineno}" if frames else None

@@ -1,4 +1,4 @@
-"""What a condition asks of the devices, and what a design returns or raises."""
+"""Records of requirements and designs, and the errors of designs."""
 
 from __future__ import annotations
 
@@ -26,17 +26,14 @@ KNOWN_CONDITIONS = tuple(name for name in CONDITIONS if name.startswith("known-d
 PLAIN_CONDITIONS = tuple(name for name in CONDITIONS if name not in KNOWN_CONDITIONS)
 
 
-#: what this-environment holds for before walls
+#: environments for which this-environment holds before walls
 MAKING = "this environment, with its walls, at any gap, or softer ones in proportion, that make and break contact"
 
 C = TypeVar("C", bound=str)  # a ConditionName, "switching" or "limiter"
 
 
-# How much damping a condition asks: sweeps, without a solver.
-
-
-#: Share of the available damping that no verdict counts on. Figures of a sweep differ by up to 1e-10 between kernels of
-#: linear algebra, with a multiplier that a solver finds by up to 2e-8: within the band the answer is "not certified".
+#: Share of the available damping that no verdict uses. Figures of a sweep differ by up to 1e-10 between kernels of
+#: linear algebra, and by up to 2e-8 with a solver's multiplier: within the band the answer is "not certified".
 GUARD = 1e-7
 
 
@@ -45,13 +42,13 @@ def suffices(ratio: float) -> bool: ...
 @overload
 def suffices(ratio: Array) -> NDArray[np.bool_]: ...
 def suffices(ratio: float | Array) -> bool | NDArray[np.bool_]:
-    """Return whether devices have enough damping, which required over available damping tells."""
+    """Return whether devices have enough damping; `ratio` is required over available damping."""
     return ratio < 1 - GUARD
 
 
 @dataclass(frozen=True)
 class Requirement(Generic[C]):
-    """The damping that a condition asks of the m devices, against what they have.
+    """The damping that a condition requires of the m devices, and the damping that they guarantee.
 
     Attributes:
         condition: The name of the condition.
@@ -60,9 +57,9 @@ class Requirement(Generic[C]):
         frequency_hz: The frequency [Hz] at which the condition binds; None where there is none.
         reason: Why `required` is infinite.
         proof: "rational" where exact arithmetic confirms it, "sampled" where a refined sweep says so.
-        multiplier: The multiplier at which so much is required, of a condition that has one.
-        bound: No multiplier asks a smaller ratio, on the frequencies that the search has looked at; no unit.
-        guarantee: For which environments the condition is, in words, where it has judged a loop.
+        multiplier: The multiplier that the figure belongs to, for a condition that has one.
+        bound: Lower bound of the ratio over all multipliers, at the frequencies of the search.
+        guarantee: The environments for which the condition holds, in words.
         lag: (m,) rho [N/m] of a limiter that the condition covers without further proof.
     """
 
@@ -84,7 +81,7 @@ class Requirement(Generic[C]):
 
     @property
     def ratio(self) -> float:
-        """s: required / available on the worst channel."""
+        """Required over available damping on the worst channel."""
         pairs = zip(self.required, self.available, strict=True)
         return max(need / have if have > 0 else np.inf for need, have in pairs)
 
@@ -93,7 +90,7 @@ class Requirement(Generic[C]):
         return suffices(self.ratio)
 
     def part(self) -> dict[str, Any]:
-        """As JSON has it; `reason` only where there is one."""
+        """Return the requirement for JSON, with `reason` only if there is one."""
         part = {
             "condition": self.condition,
             "required_damping": self.required,
@@ -107,40 +104,40 @@ class Requirement(Generic[C]):
 
     @property
     def margin(self) -> float | None:
-        """Available over required damping; None where none or infinitely much is required."""
+        """Available over required damping; None if no damping is required or none is enough."""
         return finite(1 / self.ratio) if self.ratio > 0 else None
 
     @property
     def shortfall(self) -> str:
-        """Why it is not certified."""
+        """The reason why the condition is not certified."""
         have = listed(self.available)
         return self.reason or f"needs {listed(self.required)} N s/m of damping, has {have}"
 
 
 def from_ratio(condition: C, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement[C]:
-    """The requirement of `ratio` times what is available, on every channel."""
+    """Return the requirement of `ratio` times the available damping on every channel."""
     return Requirement(condition, tuple(ratio * delta for delta in available), available, frequency_hz)
 
 
 def refusal(condition: C, available: tuple[float, ...], reason: str) -> Requirement[C]:
-    """The requirement that no damping satisfies."""
+    """Return an infinite requirement with its reason."""
     return Requirement(condition, (np.inf,) * len(available), available, None, reason)
 
 
 def finite(value: float) -> float | None:
-    """JSON knows neither infinity nor not-a-number."""
+    """Return the value, or None for infinity and nan, which JSON has not."""
     return float(value) if math.isfinite(value) else None
 
 
 def switching_guarantee(span: DelayRange) -> str:
-    """Which delays of the forces a coupling is certified for that bears switching, in the environment of its loop."""
+    """Return the words for the delays within which any switching is certified."""
     return f"delays switching within {span}"
 
 
 class NotProved(ValueError):
-    """No proof of the condition was found; carries the requirement that the sweep found, if there is one.
+    """No proof of the condition was found. `requirement` is that of the sweep, if there is one.
 
-    `refuted` where there is none: exact arithmetic contradicts the sweep.
+    `refuted` says that exact arithmetic contradicts the sweep, so that there is no proof.
     """
 
     def __init__(self, reason: str, requirement: Requirement | None = None, refuted: bool = False) -> None:
@@ -149,11 +146,11 @@ class NotProved(ValueError):
 
 
 # ----------------------------------------------------------------------------------------------------
-# What a design raises when it has nothing to return.
+# Errors of designs.
 
 
 class DesignFailed(ValueError):
-    """No result could be verified. `problem` is the convex problem, if there is one, `results` what was tried."""
+    """No result could be verified. `problem` is the convex problem or None; `results` are the attempts."""
 
     def __init__(self, problem: Any, results: Sequence[Any], advice: str) -> None:
         self.problem, self.results, self.advice = problem, tuple(results), advice
@@ -161,7 +158,7 @@ class DesignFailed(ValueError):
 
 
 class Infeasible(DesignFailed):
-    """What was asked for does not exist."""
+    """The problem has no solution."""
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -169,28 +166,28 @@ class Infeasible(DesignFailed):
 
 
 def listed(values: Iterable[float | None], digits: int = 6) -> str:
-    """1.37, 0.5 with so many significant digits; None, as JSON has infinity, is inf."""
+    """Return the values as "1.37, 0.5", with `digits` significant digits; None is printed as inf."""
     return ", ".join("inf" if v is None else f"{v:.{digits}g}" for v in values)
 
 
 # ----------------------------------------------------------------------------------------------------
-# What a design returns.
+# Couplings with their conditions.
 
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """A coupling, the condition that it was made for or is judged by, and how it came about.
+    """A coupling, the condition that it was designed for or is judged by, and its origin.
 
     Attributes:
         coupling: The coupling; a SpringDamper has K (m,) [N/m] and B (m,) [N s/m].
         condition: The name of the condition.
         kind: The kind of the coupling in reports.
-        phi: (m,) multiplier Phi_E of Theorem 4 [N s/m], if it needs one.
-        certificate: The Certificate of the file, where it was proved in this process.
-        limiter: The Certificate for limited forces that comes with it.
-        own: The condition of the user's own (design.conditions.Condition), if it is one.
-        switching: The delays [samples] within which its file proves any switching.
-        notes: What a reader should know of its origin.
+        phi: (m,) multiplier Phi_E of Theorem 4 [N s/m], or None.
+        certificate: The Certificate of the file, if it was proved in this process.
+        limiter: The Certificate for limited forces, or None.
+        own: The condition of the user's own (design.conditions.Condition), or None.
+        switching: The delays [samples] within which its file proves any switching, or None.
+        notes: Remarks on its origin, for reports.
         certified_for: The linear network of a MuJoCo scene for which it is certified, in words.
     """
 
@@ -207,40 +204,33 @@ class Chosen:
 
     @property
     def asked(self) -> Any:
-        """The condition as design.certificate takes it: the user's own, or a name."""
+        """The condition of the user's own, or the name of the condition."""
         return self.own or self.condition
 
     def remarks(self, requirements: Mapping[str, Requirement]) -> tuple[str, ...]:
-        """Its notes, and whether the user's own condition holds."""
+        """Return the notes, and whether the user's own condition holds."""
         return (*self.notes, self.own.said(requirements[self.own.name])) if self.own else self.notes
 
     def fails(self, requirements: Mapping[str, Requirement]) -> bool:
-        """Whether the user's own condition does not hold."""
+        """Return whether there is a condition of the user's own that does not hold."""
         return bool(self.own) and not requirements[self.own.name].certified
 
 
 @dataclass(frozen=True, eq=False)
 class Design(Chosen):
-    """A coupling, what it was designed for and what was verified from the coupling alone.
+    """A coupling with its objective, and the requirement that was computed from the coupling alone.
 
     Attributes:
-        coupling: The coupling; a SpringDamper has K (m,) [N/m] and B (m,) [N s/m].
-        condition: The name of the condition that it was designed for.
-        figure: What was optimised: "loop-norm" (23) and "rms" (mismatch) are minimised, "stiffness" is maximised.
+        figure: The objective: "loop-norm" (23) and "rms" (mismatch) are minimised, "stiffness" is maximised.
         objective: Its value for the coupling as returned; a ratio, or [N/m] for "stiffness".
-        requirement: What `condition` requires, on a refined sweep.
-        sdps: The number of convex problems that were solved; local searches count their runs.
+        requirement: The requirement of `condition`, from a refined sweep.
+        sdps: The number of convex problems that were solved, or of runs of a local search.
         wall_s: The duration of the design [s].
-        c: The multiplier of the limiter, one row per channel, where its search is long.
+        c: The multiplier of the limiter, one row per channel, if its search took long.
         searched: The search between the vertices of ranges (design.worst_member.Searched).
         hurried: Whether `seconds` ended the search, so that more time may find a better coupling.
-        kind: The kind of the coupling in reports.
-        phi: (m,) multiplier Phi_E of Theorem 4 [N s/m], if it needs one.
-        certificate: The Certificate, where it was proved in this process.
-        limiter: The Certificate for limited forces that comes with it.
-        own: The condition of the user's own (design.conditions.Condition), if it is one.
-        switching: The delays [samples] within which any switching is proved.
-        notes: What a reader should know of its origin.
+
+    The other attributes are those of `Chosen`.
         certified_for: The linear network of a MuJoCo scene for which it is certified, in words.
     """
 
