@@ -29,18 +29,16 @@ _LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
 class DesignOptions(TypedDict, total=False):
-    """What else can be asked of a kind, see design.designs.KINDS."""
+    """Options of the kinds in design.designs.KINDS."""
 
     order: int  # ccl: states per channel
     method: str  # ccl: complementarity, inner or fixed-poles
     diagonal: bool  # ccl: no gain across channels
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of delays that vary
-    limiter: (
-        bool  # spring-damper and optimal for this-environment: covered also while forces are limited (usual) or not
-    )
-    objective: Literal["rms", "sup"]  # optimal: of the mismatch relative to the environment
-    band_hz: tuple[float, float]  # optimal, spring-damper for this environment: where the mismatch counts
-    high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: kept low, not limited
+    limiter: bool  # spring-damper and optimal for this-environment: whether limited forces are covered (the default)
+    objective: Literal["rms", "sup"]  # optimal: norm of the mismatch relative to the environment
+    band_hz: tuple[float, float]  # optimal, spring-damper for this environment: band of the mismatch
+    high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: no limit, but a small gain
     seconds: float  # optimal: no larger basis is tried later than this
 
 
@@ -78,7 +76,7 @@ def certified_for(loop: Loop, certified: bool) -> str:
     return f"the linear network of {scene}" if scene and certified else ""
 
 
-#: kinds and conditions that are quick to try in the place of something else; the smallest basis of the optimal coupling
+#: alternatives that are designed quickly; of the optimal coupling the smallest basis
 _QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
     ("optimal", "this-environment", {"seconds": 0.0}),
     ("spring-damper", "this-environment", {}),
@@ -88,9 +86,9 @@ _QUICK: tuple[tuple[_Kind, ConditionName, DesignOptions], ...] = (
 
 
 def instead(loop: Loop, kind: str, condition: str | Condition | None = None) -> str:
-    """What can be had in the place of a design that failed, in words, least rms mismatch first; "" where nothing is.
+    """Return the alternatives to a design that failed, in words, least rms mismatch first, or "".
 
-    Every other kind and condition is designed here and certified. Nothing is tried for delays that vary.
+    Every other kind and condition is designed and certified here. For delays that vary nothing is tried.
     """
     failed, found = (kind, condition or usual_condition(loop, kind)), []
     for other, target, options in _QUICK:
@@ -140,11 +138,10 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
 
 
 def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
-    """How close what the devices feel comes to the environment: figures of the mismatch (8), M = F - Lambda E.
+    """Return figures of the mismatch (8), M = F - Lambda E, in the loop's environment with all walls touching.
 
-    `mismatch_db` is its largest share of the environment over `band_hz`, `rms_mismatch_db` the mean one: 0 dB
-    is as wrong as feeling nothing. `dc_ratio` is the share of the static stiffness that is felt. In the loop's own
-    environment; of one with walls, touching them all.
+    `mismatch_db` is the largest share of M in the environment over `band_hz`, `rms_mismatch_db` the mean one; 0 dB is
+    as wrong as no force. `dc_ratio` is the rendered share of the static stiffness.
 
     Raises TypeError and ValueError as `certify` does.
     """
@@ -154,7 +151,7 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
 
 @dataclass(frozen=True)
 class _SwitchingFiled:
-    """The guarantee for delays that vary, with its proof or why there is none."""
+    """The guarantee for delays that vary, with its proof or the reason why there is none."""
 
     guarantee: str = off_table()
     proof: str | None = off_table()
@@ -163,7 +160,7 @@ class _SwitchingFiled:
 
 @dataclass(frozen=True)
 class Filed:
-    """What was stored of a design, and what is proved of it; `reason` says why a proof is missing."""
+    """The file of a design and its proof; `reason` says why a proof is missing."""
 
     file: Path
     proof: str | None
@@ -173,7 +170,7 @@ class Filed:
 
 
 def proved(loop: Loop, design: Design) -> Design:
-    """The design with its certificate, for judging and storing it; unchanged over ranges, which are searched first."""
+    """Return the design with its certificate; over ranges unchanged, because they have to be searched first."""
     if design.certificate or loop.ranges or loop.varying_delay:
         return design
     try:
@@ -188,10 +185,10 @@ def store(
     path: Path,
     assessment: Assessment | None = None,
 ) -> Filed:
-    """Save the coupling with the proof of its condition, and that of limited forces in `assessment`, or without one.
+    """Save the coupling with the proof of its condition and of limited forces in `assessment`, if they are proved.
 
-    What is not proved for whole ranges, or for switching delays, is kept as what it is: a coupling for the nominal
-    environment, or for constant delays. Raises InputError where the file cannot be written.
+    Without a proof for the ranges or for switching delays the file is for the nominal environment or for constant
+    delays. Raises InputError if the file cannot be written.
     """
     whole = assessment and assessment.ranges
     limiter = assessment and assessment.force_limits.certificate
@@ -214,7 +211,7 @@ def store(
 
 
 def _proved(loop: Loop, design: Design, limiter: Certificate | None) -> tuple[Certificate | None, str | None]:
-    """The certificate of all that the loop claims, or why there is none."""
+    """Return (the certificate of the design in this loop or None, the reason why there is none)."""
     held = design.certificate
     limited = limiter if named(design.asked).extensible else None
     for certificate in (limited, held):
@@ -227,7 +224,7 @@ def _proved(loop: Loop, design: Design, limiter: Certificate | None) -> tuple[Ce
 
 
 def _certificate(loop: Loop, design: Design) -> Certificate:
-    """The proof of a design, of limited forces too where its search has found their multiplier. Raises NotProved."""
+    """Return the proof of a design, for limited forces if the design has their multiplier. Raises NotProved."""
     if design.c:
         limiter = LimitedForces(lags=len(design.c[0]))
         return prove(loop, design.coupling, limiter, [v for row in design.c for v in row])
@@ -242,7 +239,7 @@ COUPLING = "a coupling (controller.coupling), or a Design"
 
 
 def bare(coupling: Coupling | Design, expected: str = COUPLING) -> Coupling:
-    """The coupling of a design, or the one given. Raises TypeError for anything else."""
+    """Return the coupling of a design, or the coupling itself. Raises TypeError for anything else."""
     found = coupling.coupling if isinstance(coupling, Design) else coupling
     if isinstance(found, Lti):
         raise TypeError("coupling is an Lti, expected a coupling: wrap it in Compliance(...) (controller.coupling)")
@@ -256,7 +253,7 @@ def bare(coupling: Coupling | Design, expected: str = COUPLING) -> Coupling:
 
 
 def fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:
-    """The coupling alone. Raises ValueError where it is one of another number of channels."""
+    """Return the coupling of a design, or the coupling itself. Raises ValueError for a wrong number of channels."""
     alone = bare(coupling)
     Stored.of(loop, alone)
     return alone

@@ -194,7 +194,7 @@ _OWN_PROOF = "by a proof of its own, for this environment"
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """How forces are limited, and whether a condition holds while they are."""
+    """How forces are limited, and whether a condition holds while they are limited."""
 
     rho: tuple[float, ...] | None  # (m,) [N/m] of the limiter; None: no condition covers it, so the tick clips
     reason: str  # why a condition covers limited forces, or why none does
@@ -242,10 +242,10 @@ def covered_limits(
     proof: Certificate | None = None,
     known: Certificate | None = None,
 ) -> ForceLimits:
-    """Find the limiter that a condition covers: of no lag under any-environment, else that of this-environment.
+    """Find the limiter that a condition covers: without lag under any-environment, else that of this-environment.
 
-    `proof` belongs to the coupling: its limiter is taken where the proof holds in this loop; where it does not, one of
-    the same beta is searched. What `known` contains is not proved again (design.certificate.recheck).
+    The limiter of `proof` is used if the proof holds in this loop; otherwise one of the same beta is searched. The
+    proof of `known` is not repeated (design.certificate.recheck).
     """
     for each in requirements.values():
         if each.certified and each.lag is not None:
@@ -288,13 +288,13 @@ def _by_its_own_block(
 
 @dataclass(frozen=True)
 class Guarantee:
-    """For whom, and while what, a coupling keeps its loop safe.
+    """The hands, environments and forces for which a coupling keeps its loop safe.
 
     Attributes:
         condition: The condition by which it holds, or "energy-budget".
         proof: "rational": exact arithmetic; "sampled": a refined sweep; "account": an energy account at every tick.
         facts: What the condition covers beside a linear environment (Assessment.facts).
-        hands: For which hands it holds, in words.
+        hands: The hands for which it holds, in words.
         environments: "any passive environment", "these ranges", "this environment", ..
         forces: "also while they are limited", or the restriction.
         delays: The delays of the forces [samples], lo and hi (m,); any of them at every tick.
@@ -340,20 +340,20 @@ class Guarantee:
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """A coupling in a loop: every report of a coupling, and every run, begins with this record.
+    """A coupling in a loop, assessed. Every report of a coupling and every run begins with this record.
 
     Attributes:
-        loop: All that the conditions know of devices, delays and environment.
+        loop: Devices, delays and environment of the conditions.
         coupling: The coupling as it runs.
         requirements: Per condition the required and the available damping (m,) [N s/m], and where it binds [Hz].
-        environment: What really runs: a network, or a function that is plugged in.
+        environment: The environment that runs: a network, or a function that is plugged in.
         ranges: Every vertex of the ranges, and the search between them; None without ranges.
         force_limits: The limiter (rho (m,) [N/m], with its proof) or clipping, and the energy budget [J].
         transparency: The mismatch; None where the environment has no E(z), or the loop no solution.
         certificate: The exact proof, if one was given or made for the ranges.
-        guarantee: For whom the loop is safe; None where nothing is guaranteed.
+        guarantee: The guarantee, or None.
         reason: Why there is no guarantee.
-        condition: The name of the condition that must hold, beside which the others are reported.
+        condition: The name of the condition that must hold; the others are reported only.
     """
 
     loop: Loop
@@ -373,7 +373,7 @@ class Assessment:
 
     @property
     def facts(self) -> tuple[str, ...]:
-        """What the loop has beyond constant delays, even periods and one linear environment."""
+        """The loop's properties beyond constant delays, even periods and one linear environment."""
         return _facts_of(self.loop, self.environment, self.force_limits)
 
     @property
@@ -383,7 +383,7 @@ class Assessment:
 
     @property
     def holds(self) -> bool:
-        """Whether the condition that must hold does, with a guarantee for all that the loop may be."""
+        """Whether the condition that must hold is certified, with a guarantee for all of the loop's properties."""
         if self.guarantee is None or not self.decisive.certified:
             return False
         return self.loop.ranges is None or self.guarantee.environments in (ANY, RANGES)
@@ -395,11 +395,11 @@ class Assessment:
 
     @property
     def held_torques(self) -> str | None:
-        """What the conditions do not charge on devices with several axes; None where each device has one."""
+        """A remark on held torques of devices with several axes, which conditions do not charge, or None."""
         return "not charged: forces count as held in space while the pose moves on" if self.loop.axes else None
 
     def without_guarantee(self, reason: str) -> Assessment:
-        """Return the record without its guarantee, because of something that runs and that no loop describes."""
+        """Return the record without its guarantee, for a reason that the loop does not describe."""
         return replace(self, guarantee=None, reason=reason)
 
     def part(self) -> dict[str, Any]:
@@ -439,32 +439,31 @@ def assess(
     band_hz: tuple[float, float] = BAND_HZ,
     progress: Progress = lambda done, total: None,
 ) -> Assessment:
-    """Assess a coupling in its loop, for what really runs.
+    """Assess a coupling in its loop, for the environment, limits and delays that run.
 
     Args:
-        loop: With its ranges, delays that switch, latency and longest period: all of them must be covered.
-        coupling: The coupling as it runs; of a design also its condition, its proof and its search.
-        environment: What is simulated or driven, where that is not the loop's own environment: one network, or a
-            function that is plugged in behind the coupling and a shell that makes it passive.
-        energy_budget: W0 [J]; of the shell before a function, else of an energy budget before the delays.
-        certificate: A proof on file. It counts only if it is of exactly this loop and coupling and is verified here,
-            unless this process has made it.
+        loop: The loop; ranges, switching delays, latency and longest period must all be covered.
+        coupling: The coupling as it runs; a Design also brings its condition, proof and search.
+        environment: The environment that runs, if it is not the loop's: a network, or a function that is plugged in
+            behind the coupling and a shell that makes it passive.
+        energy_budget: W0 [J] of the shell before a function, else of an energy budget before the delays.
+        certificate: A proof on file. It counts only if it belongs to exactly this loop and coupling and was verified
+            here or made in this process.
         condition: The condition that must hold, by name or of the user's own; by default this-environment, and
             known-device where the loop has bounds of its devices.
         ranges_seed: Seed of the `ranges_samples` environments that are drawn from inside the ranges.
         searched: A search between the vertices that a design has already made for this loop and coupling.
-        limiter: False where forces are clipped whatever a condition covers.
+        limiter: False to clip forces even if a condition covers a limiter.
         limiter_proof: A proof for limited forces that belongs to the coupling; it is checked in this loop.
         force_limit: (m,) [N], for reports; no proof depends on it.
-        band_hz: Where the mismatch of the transparency counts.
-        progress: Called with (points done, points in all) of the search over ranges.
+        band_hz: Frequency band [Hz] of the mismatch.
+        progress: Called with (points done, number of points) of the search over ranges.
 
     Returns:
-        The assessment. Its guarantee is about the environment that runs: over ranges it may be less than the loop asks
-        for, see `holds`.
+        The assessment. Its guarantee is for the environment that runs; `holds` says whether it covers the ranges.
 
     Raises:
-        ValueError: Where coupling and loop do not fit each other, or for an unknown condition.
+        ValueError: The numbers of channels of coupling and loop differ, or the condition is unknown.
     """
     of_kind("loop", loop, Loop, 'a Loop, as scenario.loop("I") gives it')
     if isinstance(coupling, Design):
@@ -505,7 +504,7 @@ def assess(
         asked.name,
     )
     guarantee, reason = _guarantee(assessment)
-    by_itself = limits.requirement is not None and limits.rho is not None  # proved in the environment that runs
+    by_itself = limits.requirement is not None and limits.rho is not None  # The limiter is proved where it runs.
     if guarantee and guarantee.environments == RANGES and by_itself and environment is not None:
         assessment = replace(assessment, force_limits=replace(assessment.force_limits, less=True))
         guarantee, reason = _guarantee(assessment)
@@ -527,7 +526,7 @@ def _force_limits(
 
 
 def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) -> Transparency | None:
-    """Measure the mismatch, before walls while all of them touch."""
+    """Return the mismatch, with all walls touching, or None if the environment has no E(z)."""
     try:
         F, E = loop.F(coupling), loop.E()
     except ValueError:  # a rigid wall has no E(z), and a singular loop no F
@@ -541,7 +540,7 @@ def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) 
 
 
 def shelled(environment: Environment | PluggedEnvironment) -> bool:
-    """Whether an environment runs behind the energy shell: a function that is plugged in, or a MuJoCo scene."""
+    """Return whether an environment runs behind the energy shell: a plugged-in function or a MuJoCo scene."""
     return callable(environment) or getattr(environment, "world", None) is not None
 
 
@@ -571,7 +570,7 @@ _BELOW = "while they stay below their limits"
 
 
 def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
-    """The guarantee for what runs, or the reason why there is none."""
+    """Return (the guarantee for the loop that runs or None, the reason why there is none)."""
     loop, requirements, limits = assessment.loop, assessment.requirements, assessment.force_limits
     own = requirements[assessment.condition]
     if shelled(assessment.environment):
@@ -597,12 +596,12 @@ def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
 
 
 def _within(assessment: Assessment) -> bool:
-    """Whether what runs is the nominal environment of the ranges or one of their vertices."""
+    """Return whether the environment that runs is the nominal one of the ranges or one of their vertices."""
     return any(assessment.environment == member.network for member in assessment.loop.members())
 
 
 def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guarantee:
-    """The guarantee that a certified requirement gives in these environments."""
+    """Return the guarantee of a certified requirement in these environments."""
     loop, limits = assessment.loop, assessment.force_limits
     forces = _BELOW if limits.rho is None else _LIMITED_HERE if limits.less else _LIMITED
     longest = loop.T_max or loop.T
@@ -614,7 +613,7 @@ def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guara
 
 
 def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
-    """The shell's guarantee, which needs a coupling that is certified for any environment without delay in it."""
+    """Return the shell's guarantee, which needs a coupling certified for any environment with psi = 0."""
     loop, needs = assessment.loop, assessment.requirements[ANY_ENVIRONMENT.name]
     if any(loop.psi):
         return None, f"psi is {', '.join(map(str, loop.psi))}: a shell needs an environment without delay"
@@ -628,7 +627,7 @@ def _shell(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
 
 
 def _account(assessment: Assessment, whatever: str) -> Guarantee:
-    """What an energy account guarantees: behind a certified coupling (the shell), or at the devices (the budget)."""
+    """Return the guarantee of an energy account, behind a certified coupling (shell) or at the devices (budget)."""
     loop, plugged = assessment.loop, shelled(assessment.environment)
     condition = ANY_ENVIRONMENT.name if plugged else "energy-budget"
     proof = assessment.requirements[ANY_ENVIRONMENT.name].proof if plugged else "account"

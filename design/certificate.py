@@ -46,12 +46,12 @@ from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import NotProved, Requirement, refusal
 
-_CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
+_CLAIM_TOLERANCE = 1e-6  # allowed error of the required damping on file; sweeps repeat to 1e-9
 
 
 @contextmanager
 def _in_time() -> Iterator[None]:
-    """Raise NotProved if exact arithmetic takes too much work, however few states and digits there seem to be."""
+    """Raise NotProved if exact arithmetic exceeds its budget of counted work."""
     forget_exact()
     try:
         with within(budgets.EXACT):
@@ -63,14 +63,13 @@ def _in_time() -> Iterator[None]:
 # ----------------------------------------------------------------------------------------------------
 # Certificates of couplings: proved once, stored, and proved again from the file alone without a solver.
 #
-# The blocks are those of the condition (design.conditions, design.environments), over the rationals: what is static
-# is exactly symmetric, and positive semidefinite where it must be, and each block at the available damping is
-# strictly positive real (design.exact). Then F, or V-hat, is stable, too. Of any-environment with psi = 0 the
-# environment is passive because every parameter of the network is non-negative (the Network type refuses others), so
-# Phi = 0 satisfies Lemma 4, whatever the environment. A multiplier that the blocks need is stored with them.
+# The blocks are those of the condition (design.conditions, design.environments), over the rationals. The proof shows
+# that static matrices are symmetric, and positive semidefinite where required, and that each block at the available
+# damping is strictly positive real (design.exact); then F, or V-hat, is stable, too. For any-environment with psi = 0
+# Phi = 0 satisfies Lemma 4, because the parameters of a Network are non-negative. The multipliers are stored.
 #
-# With ranges around the environment this-environment is proved for the environment (P) and for every vertex
-# (P1, P2, ..); nothing is proved of the environments in between, or of one that changes.
+# With ranges this-environment is proved for the nominal environment (P) and for every vertex (P1, P2, ..), not for the
+# environments in between or for one that changes.
 #
 # A certificate names its base condition and the facts that are part of its block: latency, walls, limiter, switching.
 
@@ -91,13 +90,18 @@ def prove(
     multiplier: Sequence[float] | None = None,
     swept: Requirement | None = None,
 ) -> Certificate:
-    """A certificate with an exact proof of the condition, one of your own or that of a name.
+    """Prove a condition in exact arithmetic and return the certificate.
 
-    `multiplier` are the numbers of its multipliers, one after the other (Phi in N s/m for Theorem 4 with psi >= 1);
-    the best ones where it is not given. The facts of the loop, such as walls or delays that switch, are part of the
-    condition; design.environments.LimitedForces covers limited forces, too. Under any-environment without delay in the
-    environment the limiter has no lag and needs no further proof. `swept` is what `required_damping` gives, of a caller
-    who has just asked. Raises NotProved with the reason.
+    Args:
+        loop: The loop. Its facts, such as walls or delays that switch, are part of the condition.
+        coupling: The coupling.
+        condition: A name or a condition. design.environments.LimitedForces covers limited forces, too; under
+            any-environment without delay in the environment the limiter has no lag and needs no further proof.
+        multiplier: The multipliers in one sequence (Phi in N s/m for Theorem 4 with psi >= 1); None for the best ones.
+        swept: The result of `required_damping` for these arguments, if the caller has it.
+
+    Raises:
+        NotProved: With the reason.
     """
     import scipy
 
@@ -123,7 +127,7 @@ def prove(
     return certificate
 
 
-_made: set[str] = set()  # seals of the certificates that this process has proved, by conditions that have a name
+_made: set[str] = set()  # seals of the certificates that this process has proved for conditions of the package
 
 
 def _proof(
@@ -133,7 +137,7 @@ def _proof(
     multiplier: Sequence[Any] | None = None,
     swept: Requirement | None = None,
 ) -> tuple[Requirement, dict[str, Rows]]:
-    """What a condition asks, and the matrices that prove it. Raises NotProved."""
+    """Return the requirement of a condition and the matrices that prove it. Raises NotProved."""
     _require_limits(loop, coupling, condition)
     numbers = sum(condition.multiplier_sizes(loop).values())
     complete = swept is not None and len(swept.multiplier or ()) == numbers  # quick sweeps search no multipliers
@@ -158,23 +162,23 @@ def _proof(
 
 
 def _placed(place: str, reason: str) -> str:
-    """The reason with its place before it, once."""
+    """Return the reason with its place before it, unless it begins with the place."""
     return f"{place}{reason.removeprefix(place)}"
 
 
 def judged(
     loop: Loop, coupling: Coupling, condition: str | Condition, multiplier: Sequence[Any] | None = None
 ) -> Requirement:
-    """What a condition asks; `proof` is "rational" where it is proved exactly."""
+    """Return the requirement of a condition; its `proof` is "rational" if it is proved exactly."""
     asked, coupling = named(condition), filed(loop, coupling)
     needs = required_damping(loop, coupling, asked, multiplier)
     return _with_proof(loop, coupling, asked, needs)
 
 
 def _with_proof(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> Requirement:
-    """The requirement with `proof` = 'rational' where an exact proof was found, as it is where not.
+    """Return the requirement, with `proof` = "rational" if an exact proof was found.
 
-    One that exact arithmetic contradicts is refused, whatever the sweep said.
+    If exact arithmetic contradicts the sweep, the requirement becomes infinite.
     """
     if not needs.certified:
         return needs
@@ -188,13 +192,13 @@ def _with_proof(loop: Loop, coupling: Coupling, condition: Condition, needs: Req
     return replace(needs, proof="rational")
 
 
-#: More delays, states or digits than these are not looked at: a proof would take minutes.
-_MOST_BITS = 400  # of the denominator of a coefficient: a decimal of 120 places
-_MOST_COST = 2  # environments of ranges, each as many as PROOF_STATES are
+# Larger problems are refused at once: a proof would take minutes.
+_MOST_BITS = 400  # of the denominator of a coefficient, which is a decimal of 120 places
+_MOST_COST = 2  # total cost of the members of ranges, in units of one proof with PROOF_STATES states
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
-    """Raises NotProved, in a moment, where the condition says nothing of the loop or a proof would take minutes."""
+    """Raise NotProved where the condition does not cover the loop or a proof would take minutes."""
     if reason := condition.beyond(loop):
         raise NotProved(reason)
     late = sum(loop.delays.hi) + sum(loop.psi)
@@ -207,14 +211,14 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
     except SingularLoop:
         return  # the sweep says where
     members = len(condition.members(loop))
-    states += sum(loop.theta) if members else 0  # what holds in any environment has V's states alone
+    states += sum(loop.theta) if members else 0  # The block of any-environment has the states of V only.
     require_size(states)
     if members * states**3 > _MOST_COST * budgets.PROOF_STATES**3:
         raise NotProved(f"a proof in {members} environments over {states} states each takes long")
 
 
 def _coefficients(value: Any) -> Iterator[float]:
-    """Every number in plain data."""
+    """Yield every number in plain data."""
     if isinstance(value, float):
         yield value
     elif isinstance(value, dict | list | tuple):
@@ -222,14 +226,14 @@ def _coefficients(value: Any) -> Iterator[float]:
             yield from _coefficients(part)
 
 
-_MOST_LOST = 1e-4  # of the largest force, or of Delta_D/T: a twentieth of what the designs of least margin leave unused
+_MOST_LOST = 1e-4  # largest difference of float and exact response, relative to the largest force or Delta_D/T
 
 
 def _another_system(loop: Loop, coupling: Coupling) -> str | None:
-    """Why the block that a tick runs in floating point is not the system that is proved over the rationals, or None.
+    """Return the reason why the floating-point block of a tick differs from the system that is proved, or None.
 
-    Their responses may differ, and rounding move them, by MOST_LOST on the whole circle: more where terms cancel that
-    are far larger than the forces, and more yet where they cancel in decimals only.
+    Responses and rounding errors may differ by _MOST_LOST on the circle. They differ by more where terms cancel that
+    are far larger than the forces.
     """
     try:
         if loop.environment.world:  # a tick computes V alone, the scene is solved with its direct part
@@ -244,7 +248,7 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     response = running.at(z)
     if running.A.shape == meant.A.shape:
         lost = rounding(running, z, meant)
-    else:  # rounding has kept a state that cancels
+    else:  # Rounding has kept a state that cancels.
         lost = rounding(running, z) + float(np.abs(response - meant.at(z)).max())
     scale = max(float(np.abs(response).max()), 0.0 if loop.environment.world else min(loop.delta) / loop.T)
     if lost <= _MOST_LOST * scale:
@@ -256,7 +260,7 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
 
 
 def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None:
-    """rho (m,) [N/m] of the limiter that the certificate covers, or None where limited forces are not covered."""
+    """Return rho (m,) [N/m] of the limiter that the certificate covers, or None."""
     if certificate is None:
         return None
     if certificate.limiter:
@@ -266,9 +270,9 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
 
 
 def proves(loop: Loop, coupling: Coupling, certificate: Certificate, condition: Condition | None = None) -> bool:
-    """Whether the certificate is one of exactly this loop and coupling and holds.
+    """Return whether the certificate belongs to exactly this loop and coupling and holds.
 
-    It is verified, unless this process has made it. `condition` is the user's own, if the certificate is of one.
+    It is verified unless this process has made it. `condition` is the user's own condition, if it certifies one.
     """
     if certificate.scenario != digest(loop, coupling.form()):
         return False
@@ -278,7 +282,7 @@ def proves(loop: Loop, coupling: Coupling, certificate: Certificate, condition: 
 
 
 def condition_of(certificate: Certificate, own: Condition | None = None) -> Condition:
-    """The condition that a certificate proves. Raises ValueError for an unknown name or impossible multipliers."""
+    """Return the condition that a certificate proves. Raises ValueError for an unknown name or wrong multipliers."""
     base = named(own or certificate.condition)
     if not certificate.limiter:
         return base
@@ -291,10 +295,10 @@ def condition_of(certificate: Certificate, own: Condition | None = None) -> Cond
 
 
 def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
-    """Prove the stored certificate again: its bookkeeping, its figures, then its matrices in exact arithmetic.
+    """Check the stored certificate's digest, seal and figures, and prove its matrices again in exact arithmetic.
 
-    `condition` is the certificate's own, where its name is not one of design.result.CONDITIONS. Of one's own condition
-    its block is proved again; that the block keeps the loop safe is the claim of who wrote it.
+    `condition` is needed for a certificate of a condition of the user's own. Its block is proved again; that the block
+    keeps the loop safe is the claim of its author.
     """
     certificate, loop = stored.certificate, stored.loop
     if certificate is None:
@@ -318,7 +322,7 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
 
 
 def _check(loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate) -> None:
-    """Raises NotProved where the certificate does not prove all that it claims."""
+    """Raise NotProved unless the certificate proves all its claims."""
     if certificate.proof != "rational":
         raise NotProved(f"the certificate is {certificate.proof}: it carries no exact proof")
     if certificate.guarantee != condition.guarantee(loop):
@@ -331,10 +335,10 @@ def _check(loop: Loop, coupling: Coupling, condition: Condition, certificate: Ce
 
 
 def recheck(loop: Loop, coupling: Coupling, certificate: Certificate, known: Certificate | None = None) -> Requirement:
-    """The damping that a certificate's condition and multipliers ask in this loop, proved again with its matrices.
+    """Return the requirement of a certificate's condition and multipliers in this loop, proved with its matrices.
 
     `known` is a certificate that was proved in this process for this loop and coupling: it is only swept. Raises
-    NotProved where the certificate does not hold in the loop.
+    NotProved if the certificate does not hold in the loop.
     """
     shown = known is certificate and certificate.scenario == digest(loop, coupling.form())
     try:
@@ -351,9 +355,9 @@ def _check_part(
     claim: Certificate,
     matrices: Mapping[str, Rows] | None,
 ) -> Requirement:
-    """The damping that the condition asks with the multipliers on file: swept, and proved with the matrices if given.
+    """Return the requirement with the multipliers on file, and prove it with `matrices` unless they are None.
 
-    Raises NotProved where the figures are not those on file, or the matrices prove nothing.
+    Raises NotProved if the figures differ from those on file, or the matrices are no proof.
     """
     _require_limits(loop, coupling, condition)
     multiplier = _on_file(condition, loop, claim.multipliers)
@@ -375,7 +379,7 @@ def _check_part(
 
 
 def _other_figures(claim: Certificate, found: Requirement) -> str | None:
-    """Where the figures on file are not those of the sweep, or None."""
+    """Return a message if the figures on file differ from those of the sweep, or None."""
     required = found.required
     if len(claim.required) != len(required) or not np.allclose(claim.required, required, rtol=_CLAIM_TOLERANCE):
         return f"required is {list(claim.required)}, the sweep finds {list(required)}"
@@ -389,7 +393,7 @@ def _margin(requirement: Requirement) -> float:
 
 
 def _on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[float]]) -> Sequence[float] | None:
-    """The numbers of the condition's multipliers, one after the other; None where it has none. Raises NotProved."""
+    """Return the condition's multipliers in one sequence, or None if it has none. Raises NotProved."""
     sizes = condition.multiplier_sizes(loop)
     expected = sizes | {name: len(values) for name, values in condition.parameters(loop).items()}
     if {name: len(values) for name, values in stored.items()} != expected:
@@ -402,7 +406,7 @@ def _on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[flo
 _NAMED: dict[str, Condition] = {
     each.name: each for each in (ANY_ENVIRONMENT, THIS_ENVIRONMENT, KNOWN_DEVICE, KNOWN_DEVICE_ANY)
 }
-_PARTS = SwitchingDelays, LimitedForces  # of a certificate, beside its condition
+_PARTS = SwitchingDelays, LimitedForces  # conditions that are facts of a certificate of this-environment
 
 
 def _is_ours(condition: Condition) -> bool:
@@ -410,7 +414,7 @@ def _is_ours(condition: Condition) -> bool:
 
 
 def named(condition: str | Condition) -> Condition:
-    """The condition of that name; one that comes itself is itself. Raises ValueError for an unknown or a taken name."""
+    """Return the condition of a name, or the condition itself. Raises ValueError for an unknown or a taken name."""
     if not isinstance(condition, str):
         name, taken = getattr(condition, "name", None), {*_NAMED, *(each.name for each in _PARTS)}
         free = isinstance(name, str) and name.strip() and name not in taken
@@ -428,16 +432,17 @@ def named(condition: str | Condition) -> Condition:
 def required_damping(
     loop: Loop, coupling: Coupling, condition: str | Condition, multiplier: Sequence[Any] | None = None
 ) -> Requirement:
-    """The damping that the condition asks, the same share of each device's, from a refined sweep.
+    """Return the damping that the condition requires, the same share of each device's, from a refined sweep.
 
-    this-environment: the most over all members. A loop that has no solution is refused.
+    With ranges this-environment returns the largest requirement of all members. It is infinite for a loop without a
+    solution.
     """
     found = named(condition).judge(loop, coupling, multiplier)
     return found if found.reason else replace(found, required=tuple(found.ratio * d for d in found.available))
 
 
 def _blocks(loop: Loop, coupling: Coupling, condition: Condition, multiplier: Any) -> dict[str, Lti]:
-    """The exact blocks to be strictly positive real, by the name of the matrix that proves it. Raises NotProved."""
+    """Return the exact blocks that must be strictly positive real, by the names of their matrices. Raises NotProved."""
     try:
         demands = condition.exact_demands(loop, coupling, multiplier)
         return {name: _block(demand) for name, demand in demands.items()}
@@ -449,7 +454,10 @@ def _blocks(loop: Loop, coupling: Coupling, condition: Condition, multiplier: An
 
 
 def _block(demand: Demand[Lti]) -> Lti:
-    """The block of a demand at the devices' damping, after the exact tests of what is static. Raises NotProved."""
+    """Return the block of a demand at the available damping, after exact tests of the static matrices.
+
+    Raises NotProved.
+    """
     for name, value in demand.static.items():
         if not (value == value.T).all():
             raise NotProved(f"{name} is not exactly symmetric")
@@ -465,11 +473,10 @@ def requirements_of(
     more: bool = True,
     own: Condition | None = None,
 ) -> dict[str, Requirement]:
-    """Required damping by each condition that has a name, and by the user's `own`, if there is one.
+    """Return the requirement of each named condition, and of the user's `own` condition if there is one.
 
-    this-environment is about the nominal environment alone and the constant theta; design.assessment asks for
-    the rest. What `known`, a certificate that is known to hold, proves is not proved again; without `more` nothing else
-    is proved beside it.
+    this-environment is for the nominal environment and the constant theta; design.assessment adds ranges and switching.
+    The proof of `known`, a certificate that holds, is not repeated; without `more` nothing else is proved.
     """
     loop = loop.at(loop.environment).switching(None)
     known_only = () if loop.known_devices else (KNOWN_DEVICE, KNOWN_DEVICE_ANY)
@@ -483,5 +490,5 @@ def requirements_of(
             return replace(needs, proof="rational")
         return _with_proof(loop, filed(loop, coupling), each, needs) if more or not proved else needs
 
-    with within(budgets.EXACT):  # all proofs together
+    with within(budgets.EXACT):  # one budget for all proofs
         return {each.name: judged(each, needs) for each, needs in asked}

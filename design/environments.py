@@ -1,7 +1,7 @@
-"""What this-environment asks of a coupling: around walls, over ranges, under delays that switch, with limited forces.
+"""Conditions with multipliers: this-environment with walls, ranges, switching delays and limited forces.
 
-Walls, delays that switch and limited forces weigh an error with a multiplier, in which the block is affine:
-`Multiplied` finds the best one. Ranges are environments that are proved one by one.
+Walls, switching delays and limited forces weigh an error with a multiplier, in which the block is affine; `Multiplied`
+searches the best multiplier. The members of ranges are proved one by one.
 """
 
 from __future__ import annotations
@@ -43,42 +43,42 @@ from haptic_loop.design.result import MAKING, DesignFailed, Requirement, from_ra
 
 # ----------------------------------------------------------------------------------------------------
 # The best multiplier. The block is affine in (s, multiplier), so the least s over all multipliers at some frequencies
-# is a matrix inequality (design.cone). It bounds s from below; where a sweep of the multiplier found needs more, these
-# frequencies join, until it attains the bound.
+# is a matrix inequality (design.cone). Its solution bounds s from below. Frequencies at which a sweep with the solution
+# needs more are added, until the sweep attains the bound.
 
 
 class Multiplied(Condition):
-    """A condition whose block is affine in its multipliers. One of your own has `unknowns`, `map` and `block`."""
+    """A condition whose block is affine in its multipliers. A subclass defines `unknowns`, `map` and `block`."""
 
     @abstractmethod
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
-        """The multipliers, in the order in which `block` takes their numbers; () where the block needs none."""
+        """Return the multipliers, in the order in which `block` takes their numbers; () if the block needs none."""
 
     @abstractmethod
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
-        """The map that the block is about. Raises SingularLoop, and NotProved for one too large to be proved."""
+        """Return the map that `block` takes. Raises SingularLoop, and NotProved if it is too large to be proved."""
 
     @abstractmethod
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
-        """The block of such a map, in any arithmetic."""
+        """Return the block of a map G, in any arithmetic."""
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         return self.block(self.map(loop, coupling, exact), loop, multiplier)
 
     def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
-        """The multiplier that a search begins with; the one of a block of many rows, whose search would take long."""
+        """Return the multiplier that a search starts with, which is also used for blocks too large for a search."""
         return tuple(v for each in self.unknowns(loop) for v in (each.units if each.start is None else each.start))
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
-        """`block` in the unknowns of a search, in which s and they are affine: the same, unless `hands` has some."""
+        """Return `block` as an affine function of s and the search's unknowns, which are s times those of `hands`."""
         return self.block(G, loop, multiplier)
 
     def hands(self, loop: Loop) -> HandsSide | None:
-        """The hands' side whose multipliers are among the unknowns."""
+        """Return the hands' side whose multipliers are among the unknowns, or None."""
         return None
 
     def named(self, loop: Loop, multiplier: Sequence[Any]) -> dict[str, Sequence[Any]]:
-        """The numbers of the multipliers by name. Raises ValueError where there are too few or too many."""
+        """Return the multipliers by name. Raises ValueError for a wrong number of values."""
         return named_parts(self.unknowns(loop), multiplier)
 
     def check(self, loop: Loop, multiplier: Sequence[Any]) -> None:
@@ -90,7 +90,7 @@ class Multiplied(Condition):
             raise ValueError(reason)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """At this multiplier, or at the best one: `multiplier` and `bound` of the requirement say which."""
+        """Return the requirement at this multiplier, or at the best one with the `bound` of the search."""
         if reason := self.beyond(loop):
             return refusal(self.name, loop.delta, reason)
         if not self.unknowns(loop):
@@ -100,11 +100,11 @@ class Multiplied(Condition):
                 return self.required_of(self.map(loop, coupling), loop, multiplier)
         except InputError:
             raise
-        except ValueError as error:  # SingularLoop, TooLong, or a multiplier that is none
+        except ValueError as error:  # SingularLoop, TooLong, or a wrong multiplier
             return refusal(self.name, loop.delta, str(error))
 
     def required_of(self, G: Lti, loop: Loop, multiplier: Any = None) -> Requirement:
-        """The same of a map."""
+        """Return `required` for the map G."""
         unknowns, delta = self.unknowns(loop), loop.delta
         values = tuple(float(v) for v in (self.usual(G, loop) if multiplier is None else multiplier))
         self.check(loop, values)
@@ -123,7 +123,7 @@ class Multiplied(Condition):
         return replace(found, multiplier=values, bound=bound and min(bound, ratio))
 
     def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
-        """Why what the block says of z = 1 does not hold, beyond rounding."""
+        """Return the reason why the block's static matrices violate it by more than rounding, or None."""
         return unsound_static(asked.free, asked, loop.delta)
 
     def exact_demands(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> dict[str, Demand[Lti]]:
@@ -136,12 +136,12 @@ class Multiplied(Condition):
 
 
 def named_parts(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> dict[str, Sequence[Any]]:
-    """The values of each multiplier by name. Raises ValueError where there are too few or too many."""
+    """Return the values of each multiplier by name. Raises ValueError for a wrong number of values."""
     return {each.name: part for each, part in zip(unknowns, _parted(unknowns, values), strict=True)}
 
 
 def _parted(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> list[Sequence[Any]]:
-    """The values of each multiplier. Raises ValueError where there are too few or too many."""
+    """Return the values of each multiplier. Raises ValueError for a wrong number of values."""
     ends = np.cumsum([0, *(len(each.units) for each in unknowns)]).tolist()
     if ends[-1] != len(values):
         expected = "; ".join(f"{each.name}: {each.expected}" for each in unknowns)
@@ -149,14 +149,14 @@ def _parted(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> list[Sequenc
     return [values[a:b] for a, b in pairwise(ends)]
 
 
-_MOST_PEAKS = 3  # frequencies that join at once
-_NEAR = 0.1  # of the highest peak, relatively: lower ones do not join
-_SETTLED = 5e-7  # relative gap between what the multiplier asks and the bound
-_DIGITS, _NOTHING = 8, 1e-6  # of a number of the multiplier; what counts as 0, in units
+_MOST_PEAKS = 3  # largest number of frequencies that are added in a round
+_NEAR = 0.1  # Peaks that are lower than the highest by more than this share are not added.
+_SETTLED = 5e-7  # relative gap between the sweep and the bound at which the search ends
+_DIGITS, _NOTHING = 8, 1e-6  # significant digits of a multiplier; smaller ones are 0, in units
 
 
 class _Search:
-    """The multiplier at which a block asks least, by cutting planes."""
+    """Search for the multiplier with the least required damping, by cutting planes."""
 
     def __init__(self, condition: Multiplied, G: Lti, loop: Loop, asked: Demand[Lti]) -> None:
         system, self._block, unknowns = asked.free, partial(condition.block, G, loop), condition.unknowns(loop)
@@ -167,29 +167,29 @@ class _Search:
         self._searched = np.flatnonzero(self._units)
         bounds = [(each.least, each.most) for each in unknowns for _ in each.units]
         self._least, self._most = np.array(bounds).reshape(-1, 2)[self._searched].T
-        self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # what was swept last
+        self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # last values and result of `swept`
         self._grid = np.concatenate([[0.0], frequencies(system)])
         self._spare = np.diag(np.zeros(system.outputs) if asked.spare is None else asked.spare)
-        self._plain: list[Demand[Lti]] = []  # the blocks of no multiplier, and of each unknown alone
-        self._root = np.ones(system.outputs)  # what makes the rows of an inequality about one
+        self._plain: list[Demand[Lti]] = []  # the block for zero multipliers, then for each unknown alone
+        self._root = np.ones(system.outputs)  # scales the rows of an inequality to about one
         self.pays = system.outputs <= budgets.MULTIPLIER_ROWS and self._searched.size > 0
 
     def swept(self, values: Sequence[float]) -> tuple[float, float]:
-        """(the ratio that the block asks at these values, where [rad/sample]), by a refined sweep."""
+        """Return (required over available damping at these values, its frequency [rad/sample]), by a refined sweep."""
         if self._last is None or self._last[0] != values:
             asked = self._block(values)
             self._last = values, supremum(lambda w: least_scale(asked, w), self._grid)
         return self._last[1]
 
     def best(self, values: Sequence[float]) -> tuple[float, tuple[float, ...]]:
-        """(a ratio that no multiplier is below, the best one), beginning with these values."""
+        """Return (lower bound of the ratio over all multipliers, best multiplier), starting with these values."""
         count, bound = self._searched.size, 0.0
         units = np.eye(self._units.size)[self._searched] * self._units
         self._plain = [self._scaled(tuple(x)) for x in (0 * self._units, *units)]
         constant, by = (
             np.abs(np.diagonal(part, axis1=-2, axis2=-1)).max(axis=-2) for part in self._parts(self._grid[[0, -1]])
         )
-        sizes = [by[-1], by.max(axis=0), constant, np.ones_like(constant)]  # of rows: the first that is not 0
+        sizes = [by[-1], by.max(axis=0), constant, np.ones_like(constant)]  # The first nonzero size scales a row.
         self._root = 1 / np.sqrt(np.select([size > 0 for size in sizes], sizes))
         low = [Inequality.least([i], float(v)) for i, v in enumerate(self._least)]
         high = [Inequality.most([i], float(v)) for i, v in enumerate(self._most)]
@@ -202,7 +202,7 @@ class _Search:
             blocks.append(self._inequality(w))
             try:
                 found = ConeProgram(np.eye(count + 1)[-1], blocks).solve(f"the multiplier {self._names}")
-            except DesignFailed:  # none within the bounds makes the block positive, however large the damping
+            except DesignFailed:  # No multiplier within the bounds makes the block positive.
                 break
             stalled = 0 if found[-1] > bound + _SETTLED * max(bound, 1.0) else stalled + 1
             bound, values = max(bound, float(found[-1])), self._values(found)
@@ -211,7 +211,7 @@ class _Search:
         return bound, tuple(best)
 
     def _rooms(self, count: int) -> list[Inequality]:
-        """What the multipliers of the hands' side must satisfy, in the unknowns of the search and s."""
+        """Return the inequalities for the multipliers of the hands' side, in the unknowns of the search and s."""
         if self._hands is None:
             return []
         hands, values = self._hands, np.zeros(self._units.size)
@@ -224,7 +224,7 @@ class _Search:
         return [Inequality.of(partial(room, j), range(count + 1)) for j in range(rooms)]
 
     def _values(self, x: Array) -> tuple[float, ...]:
-        """The multiplier of x, in units, in few digits; the last of x is s."""
+        """Return the multiplier of the unknowns x, rounded to _DIGITS digits; the last entry of x is s."""
         values, x, s = np.zeros(self._units.size), x[:-1], float(x[-1])
         x = np.where((self._least == 0) & (x < _NOTHING), 0.0, np.clip(x, self._least, self._most))
         values[self._searched] = [float(f"{v:.{_DIGITS}g}") for v in x * self._units[self._searched]]
@@ -236,7 +236,7 @@ class _Search:
         return tuple(v for part in self._hands.allowed(self._loop, parts).values() for v in part)
 
     def _worst(self, values: Sequence[float], bound: float) -> tuple[float, Array]:
-        """(the most that these values ask, with something to spare, the worst few frequencies): none at the bound."""
+        """Return (largest ratio at these values with the spare kept, frequencies to add); none at the bound."""
         asked = self._block(values)
         asked = replace(asked, free=asked.free - self._spare) if self._spare.any() else asked
 
@@ -253,7 +253,7 @@ class _Search:
         return most, np.array([between] if most > bound + 2 * _SETTLED * max(bound, 1.0) else [])
 
     def _parts(self, w: Array) -> tuple[Any, Any]:
-        """The Hermitian parts of the constant, and of what each unknown and s multiply, at w (k,)."""
+        """Return the Hermitian parts of the constant and of the coefficients of the unknowns and s, at w (k,)."""
         z = on_circle(w)
         free = [hermitian(each.free.at(z)) for each in self._plain]
         return free[0] - self._spare, np.array([*(f - free[0] for f in free[1:]), hermitian(self._plain[0].gain.at(z))])
@@ -268,20 +268,20 @@ class _Search:
 
 
 class ThisEnvironment(Multiplied):
-    """Safe in the environment of the loop, with the facts that hold there (design.facts).
+    """Stability for every passive hand in the environment of the loop, with its facts (design.facts).
 
-    Walls may touch or not, delays may switch within the loop's range, and it may be any member of its ranges.
+    The facts are walls that make and break contact, delays that switch, and the members of ranges.
     """
 
     name, covers = "this-environment", BEYOND
 
     @property
     def extensible(self) -> bool:
-        """A subclass has facts of its own, which neither the block for limited forces nor fast sweeps know."""
+        """False for subclasses: the block for limited forces and the fast sweeps do not contain their facts."""
         return type(self) is ThisEnvironment
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
-        """How the forces of this loop come about, beyond a linear network with constant delays."""
+        """Return the facts of this loop beyond a linear network with constant delays."""
         walls = (Walls(),) if loop.environment.walls else ()
         return (*walls, Switching()) if loop.varying_delay else walls
 
@@ -293,9 +293,10 @@ class ThisEnvironment(Multiplied):
         return hands if hands.unknowns(loop) else None
 
     def usual(self, G: Lti | None, loop: Loop) -> Sequence[float]:
-        """The start of each multiplier; alpha is half the width times a device's largest own force per displacement.
+        """Return the start of each multiplier.
 
-        Of many devices, whose multipliers are not searched, the best share of it is taken.
+        alpha is half the width of the delays times a device's largest own force per displacement. For many devices,
+        whose multipliers are not searched, it is the best share of that.
         """
         unknowns, usual = self.unknowns(loop), super().usual(G, loop)
         if not loop.varying_delay or G is None:
@@ -319,7 +320,7 @@ class ThisEnvironment(Multiplied):
         return G
 
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
-        """The block of a map from [x; p] to [f_e; y], with the numbers of its multipliers one after the other."""
+        """Return the block of a map from [x; p] to [f_e; y], with its multipliers in one sequence."""
         return self._composed(G, loop, multiplier)
 
     def scaled(self, G: Lti, loop: Loop, multiplier: Sequence[Any]) -> Demand[Lti]:
@@ -330,7 +331,7 @@ class ThisEnvironment(Multiplied):
         return compose(G, loop, self.facts(loop), values, scaled=scaled)
 
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
-        """With its multipliers; without them as if all walls touched and delays were constant."""
+        """Return the block; without a multiplier that for touching walls and constant delays."""
         if multiplier is not None:
             return super().demand(loop, coupling, exact, multiplier)
         F = loop.F(coupling, exact)
@@ -339,7 +340,7 @@ class ThisEnvironment(Multiplied):
         return this_environment_demand(F, loop)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """The most that any member asks, all of them with one multiplier."""
+        """Return the largest requirement over all members, with one multiplier for all."""
         if loop.ranges and self.unknowns(loop) and not self.beyond(loop):
             return self._of_members(loop, coupling, multiplier)
         if self.unknowns(loop) or self.beyond(loop):
@@ -350,7 +351,7 @@ class ThisEnvironment(Multiplied):
         return requirements[worst(requirements)]
 
     def _of_members(self, loop: Loop, coupling: Coupling, multiplier: Any) -> Requirement:
-        """With the multiplier given, or the usual one, or the best one where the usual one asks most."""
+        """Return the requirement with `multiplier`, or the usual one or the worst member's best one."""
         loops = [loop.at(member.network) for member in loop.members()]
 
         def most(values: Any) -> tuple[Requirement, Loop]:
@@ -370,7 +371,7 @@ class ThisEnvironment(Multiplied):
         return super().beyond(loop)
 
     def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
-        """Rounding is relative to what each channel and wall is elsewhere: forces and ways have units of their own."""
+        """As in the base class, with rounding relative to each channel's and wall's own size: their units differ."""
         if not loop.environment.walls:
             return super().unsound_static(G, loop, asked)
         m, S1 = loop.channels, G.dc()
@@ -399,11 +400,11 @@ class ThisEnvironment(Multiplied):
 
 
 THIS_ENVIRONMENT = ThisEnvironment()
-_ROUNDING = 1e-9  # that a static map may miss of symmetry and of its signs
+_ROUNDING = 1e-9  # allowed relative asymmetry and negativity of a static map
 
 
 def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
-    """The this-environment condition of this coupling around each of the members, every one frozen."""
+    """Return the requirement of this-environment for each of the members."""
     return [_in_one(loop, coupling, member) for member in members]
 
 
@@ -416,7 +417,7 @@ def _in_one(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
 
 
 def worst(requirements: Sequence[Requirement]) -> int:
-    """The member that requires the most damping."""
+    """Return the index of the requirement with the largest ratio."""
     return max(range(len(requirements)), key=lambda i: requirements[i].ratio)
 
 
@@ -425,7 +426,7 @@ def worst(requirements: Sequence[Requirement]) -> int:
 
 
 class SwitchingDelays(ThisEnvironment):
-    """this-environment of a loop whose delays switch, under a name of its own."""
+    """this-environment of a loop whose delays switch, as the separate requirement "switching"."""
 
     name, covers = "switching", ("psi", "T_max", "latency", "varying_delay", "walls")
 
@@ -438,11 +439,11 @@ class SwitchingDelays(ThisEnvironment):
 
 
 SWITCHING = SwitchingDelays()
-_SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # the best one is taken
+_SHARES = tuple(2.0 ** (-k / 2) for k in range(10))  # shares of alpha that are tried
 
 
 def _half_widths(loop: Loop) -> Array:
-    """h = (hi - lo)/2, (m,)."""
+    """Return h = (hi - lo)/2, (m,)."""
     return (np.array(loop.delays.hi) - np.array(loop.delays.lo)) / 2
 
 
@@ -450,7 +451,7 @@ def _half_widths(loop: Loop) -> Array:
 # Forces that leave through the limiter of controller.law. any-environment without delay in the environment needs no
 # proof of its own: with rho = 0 the limiter and the environment together are a passive environment.
 
-BETA = 0.01  # of a limiter's lag under this-environment unless another is asked for
+BETA = 0.01  # default lag of a limiter under this-environment, relative to Delta/T
 
 
 @dataclass(frozen=True)
@@ -459,7 +460,7 @@ class LimitedForces(ThisEnvironment):
 
     beta: float = BETA
     lags: int = 1  # weights c_ij per device
-    held: tuple[float, ...] | None = None  # rho [N/m] per device where it is given, as by a certificate
+    held: tuple[float, ...] | None = None  # rho [N/m] per device of a certificate; None: computed from beta
     name, covers = "limiter", ("psi", "T_max", "latency", "varying_delay", "walls")
 
     def __post_init__(self) -> None:
@@ -469,7 +470,7 @@ class LimitedForces(ThisEnvironment):
             raise ValueError(f"limiter: rho is {list(self.held)}, expected positive numbers in N/m")
 
     def rho(self, loop: Loop) -> tuple[float, ...]:
-        """Per device [N/m], to six digits, which the damping in a sweep does not scale."""
+        """Return rho [N/m] per device, to six digits; the factor on the damping does not scale it."""
         return self.held or tuple(float(f"{self.beta * d / loop.T:.6g}") for d in loop.least_damping)
 
     @property
@@ -483,7 +484,7 @@ class LimitedForces(ThisEnvironment):
         return (*super().facts(loop), Limiter(self.rho(loop), self.lags))
 
     def rows(self, loop: Loop, multiplier: Sequence[Any]) -> tuple[tuple[Any, ...], ...]:
-        """c as a row per device, of one entry per lag: the last numbers, after those of walls and switching delays."""
+        """Return c with one row per device and one entry per lag; c is at the end of the multipliers."""
         devices = len(loop.devices)
         c = tuple(multiplier)[len(multiplier) - devices * self.lags :] if multiplier else ()
         return tuple(c[i * self.lags : (i + 1) * self.lags] for i in range(devices))
@@ -510,7 +511,7 @@ LIMITER = LimitedForces()
 
 
 def beta_of(loop: Loop, certificate: Certificate) -> float:
-    """beta of the limiter that a certificate covers, for another one like it; the usual one where it has none."""
+    """Return beta of the limiter that a certificate covers, or BETA if it covers none."""
     rho, share = certificate.multipliers.get("rho", ()), loop.least_damping[0] / loop.delta[0]
     beta = float(f"{rho[0] * loop.T / (certificate.available[0] * share):.6g}") if rho else BETA
     return beta if 0 < beta <= 1 else BETA

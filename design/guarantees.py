@@ -1,4 +1,4 @@
-"""For which environments a coupling is guaranteed, by its requirements, and what no guarantee covers. In words."""
+"""Words for guarantees, and the Coulomb friction that encoder steps need."""
 
 from __future__ import annotations
 
@@ -11,14 +11,10 @@ from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design.conditions import encoder_friction
 
-# ----------------------------------------------------------------------------------------------------
-# What may be said of a coupling: required against available damping, for which environments, and what is left out.
-
-
 ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
 
 
-#: What no certificate covers.
+#: limits of every certificate
 CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "
     "or leave through the limiter that a report names, "
@@ -29,11 +25,11 @@ CAVEATS = (
 
 @dataclass(frozen=True)
 class EncoderSteps:
-    """Whether declared Coulomb friction pays for encoder steps."""
+    """Whether declared Coulomb friction dissipates the work of encoder steps."""
 
     encoder_step: tuple[float, ...]  # (m,) [m]
-    friction: tuple[float, ...]  # (m,) [N] that the devices declare, which counts as a lower bound
-    friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which pay for nothing
+    friction: tuple[float, ...]  # (m,) [N] declared by the devices as a lower bound
+    friction_max: tuple[float | None, ...]  # (m,) [N] published upper bounds, which are reported only
     friction_needed: tuple[float, ...] | None  # (m,) [N]; None before walls, where nothing is proved
     covered: bool
     words: str
@@ -47,10 +43,9 @@ class EncoderSteps:
         friction: Sequence[float],
         friction_max: Sequence[float | None] | None = None,
     ) -> EncoderSteps | None:
-        """Compare the friction (m,) [N] that devices declare with what encoder steps (m,) [m] need.
+        """Compare the declared friction (m,) [N] with that needed for encoder steps (m,) [m]; None without steps.
 
-        `friction_max` (m,) [N] are published upper bounds: they are reported, and only `friction` pays for steps.
-        None where encoders are ideal.
+        `friction_max` (m,) [N] are published upper bounds, which are reported only.
         """
         if not any(steps):
             return None

@@ -221,6 +221,8 @@ class Design(Chosen):
     """A coupling with its objective, and the requirement that was computed from the coupling alone.
 
     Attributes:
+        coupling: The coupling; a SpringDamper has K (m,) [N/m] and B (m,) [N s/m].
+        condition: The name of the condition that it was designed for.
         figure: The objective: "loop-norm" (23) and "rms" (mismatch) are minimised, "stiffness" is maximised.
         objective: Its value for the coupling as returned; a ratio, or [N/m] for "stiffness".
         requirement: The requirement of `condition`, from a refined sweep.
@@ -229,8 +231,13 @@ class Design(Chosen):
         c: The multiplier of the limiter, one row per channel, if its search took long.
         searched: The search between the vertices of ranges (design.worst_member.Searched).
         hurried: Whether `seconds` ended the search, so that more time may find a better coupling.
-
-    The other attributes are those of `Chosen`.
+        kind: The kind of the coupling in reports.
+        phi: (m,) multiplier Phi_E of Theorem 4 [N s/m], or None.
+        certificate: The Certificate, if it was proved in this process.
+        limiter: The Certificate for limited forces, or None.
+        own: The condition of the user's own (design.conditions.Condition), or None.
+        switching: The delays [samples] within which any switching is proved, or None.
+        notes: Remarks on its origin, for reports.
         certified_for: The linear network of a MuJoCo scene for which it is certified, in words.
     """
 
