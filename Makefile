@@ -32,7 +32,7 @@ check: .venv/ready build/typed
 	$(PY) -m pytest -rs $(PARALLEL) $$($(PY) tests/touched.py)
 
 validate: .venv/ready
-	$(PY) -m pytest -m validate tests/checks
+	$(PY) -m pytest -m validate tests
 	$(PY) -m tests.checks.faults
 	$(PY) tests/tools/hostile.py --signals
 	$(PY) docs/regenerate.py --check

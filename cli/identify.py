@@ -2,7 +2,8 @@
 
 Nobody holds the device, in two sittings with the handles at other places: a hand that only damps is found out by the
 sitting in which it was not there. The chirp passes through the same session as the bridge, with all its limits, capped
-at its own amplitude.
+at its own amplitude. With --transmission two sittings with clamped handles follow: they bound the mass of the motor and
+the transmission (hw/transmission.py), on which the known-device conditions rest.
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ from haptic_loop.cli import options, render
 from haptic_loop.cli.session_cli import add_link_options, check_link, hold_session, steady_scenario
 from haptic_loop.design.files import off_table, plain, write
 from haptic_loop.hw.emulator import nobody
-from haptic_loop.hw.identify import Estimate, Excitation, Swing, capped, chirp, estimate, held, settled
+from haptic_loop.hw.identify import Estimate, Excitation, Swing, capped, chirp, estimate, held, records_of, settled
 from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.recording import Recorder
 from haptic_loop.hw.session import Session, session_for
 from haptic_loop.hw.session_report import SessionReport, outcome
+from haptic_loop.hw.transmission import TransmissionBounds, transmission_bounds
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim.scenario import InputError, Scenario
 
@@ -38,6 +40,13 @@ _LIMITS = (
     "of delta: it dissipates too, but ever less than a viscous damper as speed grows. Lag of the amplifier is not in "
     "delta: it belongs to the delay. The bound holds up to the speed of the records; hw.bridge stops a handle there."
 )
+_TRANSMISSION_LIMITS = (
+    "The bounds of motor and transmission (95 %, and 0.5 % for the encoder's scale) describe a spring and a damper in "
+    "parallel at these forces. They say nothing of a part on the motor's side that resonates above 250 Hz, of an "
+    "encoder that is not on the motor's shaft, or of a transmission that was tightened or warmed since."
+)
+_LEVELS = 1.0, 0.5  # of the force, in the sittings with clamped handles: play differs between them
+_CLAMPED = 1000.0  # [kg] at the handle of an emulated device
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +57,7 @@ class _Sitting:
     reason: str | None
     report: SessionReport = off_table("left out")
     session: Session = off_table("left out")
+    recorder: Recorder = off_table("left out")
     trace: Path | None = off_table("left out")
     signals: Sequence[int] = off_table("left out")
 
@@ -63,11 +73,16 @@ class _Report:
     warnings: list[str] = off_table()
     reason: str | None = off_table("if given")
     limits: str = off_table(default=_LIMITS)
+    transmissions: list[TransmissionBounds] | None = off_table("if given", None)  # of every axis, by --transmission
+    no_transmissions: str | None = off_table("if given", None)  # why there are none, where they were requested
 
     def lines(self) -> list[str]:
         """What stands below the table."""
         reason = [f"no bound: {self.reason}"] if self.reason else []
-        return [*reason, *(f"[yellow]{warning}[/]" for warning in self.warnings), self.limits]
+        if self.no_transmissions:
+            reason.append(f"no bounds of motor and transmission: {self.no_transmissions}")
+        more = [_TRANSMISSION_LIMITS] if self.transmissions else []
+        return [*reason, *(f"[yellow]{warning}[/]" for warning in self.warnings), self.limits, *more]
 
 
 def main(argv: list[str]) -> int:
@@ -84,13 +99,20 @@ def main(argv: list[str]) -> int:
         last = sittings[-1].session.link.last
         if args.port and not args.same_place and last:
             settings = replace(settings, elsewhere=last.counts)
-    report = _identified(scenario, sittings)
-    files = [sitting.trace for sitting in sittings if sitting.trace]
+    report, clamped = _identified(scenario, sittings), list[_Sitting]()
+    if args.transmission and report.bounded and not sittings[-1].signals:
+        settings = replace(settings, elsewhere=None)
+        for level in _LEVELS:
+            clamped.append(_sitting(args, scenario, settings, out, args.sittings + len(clamped) + 1, level))
+        report = _with_transmissions(report, scenario, sittings, clamped)
+    files = [sitting.trace for sitting in (*sittings, *clamped) if sitting.trace]
     if report.bounded:
-        tables = [_table(e, scenario, i) for i, e in enumerate(report.axes)]
+        tables = [_table(e, scenario, i, report.transmissions) for i, e in enumerate(report.axes)]
         files.append(write(out / "devices.toml", "\n".join(tables)))
-    render.publish(args, report, [_figures(report)], report.lines(), out, files)
-    return options.exit_code(report.bounded, bool(sittings[-1].signals))
+    shown = [_figures(report), *([_bounds(report.transmissions)] if report.transmissions else [])]
+    render.publish(args, report, shown, report.lines(), out, files)
+    right = report.bounded and not report.no_transmissions
+    return options.exit_code(right, bool([*sittings, *clamped][-1].signals))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -119,6 +141,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--sittings", type=options.whole(1, 20), default=2, metavar="N", help=count)
     stay = "leave the handles where they are between sittings (an emulator has nobody to move them)"
     add("--same-place", action="store_true", help=stay)
+    known = "two more sittings with clamped handles bound motor mass and transmission, for known-device"
+    add("--transmission", action="store_true", help=known)
     rests = "with --rehearse, the damping of a hand at every handle in the first sitting (default 0)"
     add("--hand", type=number(0.0, 10.0), default=0.0, metavar="N_S/M", help=rests)
     parser.add_output()
@@ -128,8 +152,18 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _sitting(args: argparse.Namespace, scenario: Scenario, settings: LinkSettings, out: Path, number: int) -> _Sitting:
-    """Play the excitation to every axis, record and estimate."""
+def _sitting(
+    args: argparse.Namespace,
+    scenario: Scenario,
+    settings: LinkSettings,
+    out: Path,
+    number: int,
+    clamped: float | None = None,
+) -> _Sitting:
+    """Play the excitation to every axis, record and estimate.
+
+    With `clamped` handles it is a chirp of this part of the force, and nothing is estimated from it alone.
+    """
     asks_nothing = scenario.replace(delta=(1e-6,) * scenario.channels)  # what the damping is, is the question
     swing = Swing.of(scenario, args.speed, 1e-3 * args.travel)
     fastest = min(2.5, max(1.0, 2 * args.speed))  # a lighter device than declared is stopped there
@@ -137,7 +171,8 @@ def _sitting(args: argparse.Namespace, scenario: Scenario, settings: LinkSetting
     session.record = recorder = Recorder(scenario.channels)
 
     def played(link: int) -> Excitation:
-        return chirp(scenario.channels, scenario.T, link, args.force, args.band, args.seconds, swing)
+        force, motion = (args.force, swing) if clamped is None else (clamped * args.force, None)
+        return chirp(scenario.channels, scenario.T, link, force, args.band, args.seconds, motion)
 
     def plan(ages: Ages) -> Sequence[Excitation]:
         return [played(ages.link_delay(1e6 * scenario.T, args.quantile, 1e6 * args.guard))]
@@ -145,23 +180,26 @@ def _sitting(args: argparse.Namespace, scenario: Scenario, settings: LinkSetting
     if args.port and number > 1:
         told = "let go of every handle" if args.same_place else "take every handle 5 mm or more away and let go"
         told += "; then press a" if not args.arm else "" if args.same_place else ": it begins 5 s later"
-        render.console(args).print(f"sitting {number} of {args.sittings}: {told}")
-    alone = nobody(scenario, args.hand if number == 1 else 0.0)
+        if clamped is not None:
+            told = "clamp every handle to the bench; then press a" if not args.arm else "every handle must be clamped"
+        count = args.sittings + len(_LEVELS) * args.transmission
+        render.console(args).print(f"sitting {number} of {count}: {told}")
+    alone = nobody(scenario, args.hand if number == 1 else 0.0, _CLAMPED if clamped is not None else 0.0)
     seconds = played(1).seconds - 0.2  # the lead has the ramp
     live = hold_session(args, session, plan, seconds, out, alone, args.coulomb)
     report, axes, reason = outcome("identify", session, recorder, live.dropped, args.pace), list[Estimate](), None
-    if session.stage == Stage.FINISHED and len(recorder):
+    if session.stage == Stage.FINISHED and len(recorder) and clamped is None:
         try:
             with render.progress("estimating") as move:
                 axes = estimate(recorder, session, scenario, move)
         except ValueError as error:
             reason = str(error)
-    else:
+    elif session.stage != Stage.FINISHED or not len(recorder):
         reason = f"the session ended in {session.stage}: {session.cause}"
     trace = None
     if len(recorder):
         trace = recorder.trace(session.units, scenario.T, plain(report)).save_npz(out / f"trace-{number}.npz")
-    return _Sitting(axes, reason, report, session, trace, live.signals)
+    return _Sitting(axes, reason, report, session, recorder, trace, live.signals)
 
 
 def _identified(scenario: Scenario, sittings: list[_Sitting]) -> _Report:
@@ -181,7 +219,25 @@ def _identified(scenario: Scenario, sittings: list[_Sitting]) -> _Report:
     return _Report(sittings[-1].report, axes, sittings, bounded, warnings + suspicious, reason or None)
 
 
-def _table(e: Estimate, scenario: Scenario, i: int) -> str:
+def _with_transmissions(
+    report: _Report, scenario: Scenario, sittings: list[_Sitting], clamped: list[_Sitting]
+) -> _Report:
+    """The report with bounds of every motor and transmission, or with the reason why there are none."""
+    if reason := "; ".join(sitting.reason for sitting in clamped if sitting.reason):
+        return replace(report, no_transmissions=reason)
+    found = list[TransmissionBounds]()
+    for i in range(scenario.channels):
+        free = min((s for s in sittings if s.axes), key=lambda s: s.axes[i].viscous)  # the one without a hand
+        try:
+            first, *others = (records_of(s.recorder, s.session)[i] for s in (free, *clamped))
+            step = free.session.units.encoder_step[i]
+            found.append(transmission_bounds(first, others, scenario.T, step, free.axes[i].friction))
+        except ValueError as error:
+            return replace(report, no_transmissions=f"axis {i + 1}: {error}")
+    return replace(report, transmissions=found)
+
+
+def _table(e: Estimate, scenario: Scenario, i: int, bounds: Sequence[TransmissionBounds] | None) -> str:
     """One [[device]] table for a scenario file; a transmission that was not found is the scenario's."""
     device, mass = scenario.axis_devices[i], e.friction.mass
     lines = ["[[device]]", f"damping = {e.viscous:.6g}", f"delta = {np.floor(1e6 * e.delta) / 1e6:.6f}"]
@@ -189,6 +245,15 @@ def _table(e: Estimate, scenario: Scenario, i: int) -> str:
     lines.append(f"credible_speed = {speed:.3f}  # [m/s] of the record: delta is not known beyond it")
     if isinstance(device, RigidDevice):
         return "\n".join([*lines, 'kind = "rigid"', f"mass = {mass:.6g}", ""])
+    if bounds:
+        known = bounds[i]
+        names = "motor_mass", "handle_mass", "transmission_stiffness", "transmission_damping"
+        lines += ['kind = "compliant"', *(f"{name} = {getattr(known, name):.6g}" for name in names)]
+        lines += ["[device.guaranteed]  # with 95 % confidence, at the forces of the record"]
+        least, most = ("motor_mass_min", "transmission_damping_min"), "transmission_damping_max"
+        lines += [f"{name} = {np.floor(1e6 * getattr(known, name)) / 1e6:.6f}" for name in least]
+        lines += [f"{most} = {np.ceil(1e6 * getattr(known, most)) / 1e6:.6f}"]
+        return "\n".join([*lines, f"transmission_stiffness_max = {np.ceil(known.transmission_stiffness_max):.1f}", ""])
     if (found := e.transmission) is not None:
         motor, handle, stiffness = found.motor_mass, found.handle_mass, found.stiffness
     else:
@@ -197,6 +262,17 @@ def _table(e: Estimate, scenario: Scenario, i: int) -> str:
         handle, stiffness = mass - motor, device.transmission_stiffness
     masses = [f"motor_mass = {motor:.6g}", f"handle_mass = {handle:.6g}"]
     return "\n".join([*lines, 'kind = "compliant"', *masses, f"transmission_stiffness = {stiffness:.6g}", ""])
+
+
+def _bounds(known: Sequence[TransmissionBounds]) -> render.Table:
+    """The bounds of motors and transmissions, axis by axis."""
+    cells = []
+    for i, each in enumerate(known, start=1):
+        least, most = each.transmission_damping_min, each.transmission_damping_max
+        mass, stiffness = f"{each.motor_mass_min:.5g}", f"{each.transmission_stiffness_max:.6g}"
+        cells.append((str(i), mass, stiffness, f"{least:.4g} to {most:.4g}", f"{1e6 * each.late:.0f}"))
+    heads = "axis", "motor at least [kg]", "k at most [N/m]", "b [N s/m]", "late at most [us]"
+    return render.grid("motor and transmission, with 95 % confidence", heads, cells, left=())
 
 
 def _figures(report: _Report) -> render.Table:

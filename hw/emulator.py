@@ -241,9 +241,12 @@ class _EmulatedPlant:
         return self._outside[row]
 
 
-def nobody(scenario: Scenario, damping: float = 0.0) -> Scenario:
-    """The scenario's devices without hands, or with a pure damper of `damping` [N s/m] at each, and without the tap."""
-    return scenario.replace(human=(Human((Link(0.0, damping, 0.0),)),) * scenario.channels, tap=None)
+def nobody(scenario: Scenario, damping: float = 0.0, mass: float = 0.0) -> Scenario:
+    """The scenario's devices without hands and without the tap.
+
+    At each handle is a pure damper of `damping` [N s/m] or a `mass` [kg], which clamps it where it is large.
+    """
+    return scenario.replace(human=(Human((Link(mass, damping, 0.0),)),) * scenario.channels, tap=None)
 
 
 def info_of(scenario: Scenario) -> Info:

@@ -337,6 +337,15 @@ def capped(estimates: list[Estimate], scenario: Scenario, session: Session) -> l
     ]
 
 
+def records_of(recorder: Recorder, session: Session) -> list[tuple[Array, Array]]:
+    """Return displacements [m] and forces [N], (N,) each, of every axis. Raises ValueError where ticks are missing."""
+    link, units = recorder.link(), session.units
+    missing = int((~link["received"]).sum())
+    if missing:  # which force acted then is not known for certain, and a wrong one makes a wrong bound
+        raise ValueError(f"{missing} of {len(recorder)} ticks came without a STATE: take another record")
+    return [(link["x"][:, i], link["applied"][:, i] * units.force_step[i]) for i in range(recorder.channels)]
+
+
 def estimate(
     recorder: Recorder,
     session: Session,
@@ -344,17 +353,12 @@ def estimate(
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
 ) -> list[Estimate]:
     """One estimate per axis from a recorded session. Raises ValueError naming the axis that gives none."""
-    link, units = recorder.link(), session.units
-    missing = int((~link["received"]).sum())
-    if missing:  # which force acted then is not known for certain, and a wrong one makes a wrong bound
-        raise ValueError(f"{missing} of {len(recorder)} ticks came without a STATE: take another record")
-    applied = link["applied"]
-    estimates = []
+    estimates, records = [], records_of(recorder, session)
     for i, device in enumerate(scenario.axis_devices):
         progress(i, scenario.channels, f"estimating axis {i + 1}")
-        x, force, step = link["x"][:, i], applied[:, i] * units.force_step[i], units.encoder_step[i]
         try:
-            estimates.append(identify(x, force, scenario.T, step, device.transmission is None))
+            step = session.units.encoder_step[i]
+            estimates.append(identify(*records[i], scenario.T, step, device.transmission is None))
         except ValueError as error:
             raise ValueError(f"axis {i + 1}: {error}") from None
     return estimates

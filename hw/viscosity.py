@@ -116,17 +116,22 @@ def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
 # frequency
 
 
-class _Spectra:
+class Spectra:
     """The spectrum of a motion, and of what a model makes of the force's."""
 
-    def __init__(self, x: Array, force: Array, T: float) -> None:
+    def __init__(
+        self, x: Array, force: Array, T: float, held: bool = False, band: tuple[float, float] = _BAND_HZ
+    ) -> None:
+        """Compare within `band` [Hz]; `held` where the handle is clamped."""
+        self.T, self.ticks, self.held = T, len(x), held
         F, hz = np.fft.rfft(force), np.fft.rfftfreq(len(x), T)
         steps = np.fft.rfft(np.diff(x, append=x[-1]))
-        heard = (hz > _BAND_HZ[0]) & (hz < min(_BAND_HZ[1], 0.35 / T))
+        heard = (hz > band[0]) & (hz < min(band[1], 0.35 / T))
         heard &= np.abs(F) > _LOUD * np.abs(F[heard]).max()
         chosen = np.flatnonzero(heard)
         chosen = chosen[:: max(1, len(chosen) // _POINTS)]
-        w = 2 * np.pi * hz[chosen]
+        self.hz = hz[chosen]
+        w = 2 * np.pi * self.hz
         self.force, self.motion = F[chosen], steps[chosen] / (np.exp(1j * w * T) - 1)
         self._s = 1j * (w + 2 * np.pi / T * np.array(_ALIASES)[:, None])
         self._hold = -np.expm1(-self._s * T) / (self._s * T)
@@ -134,7 +139,8 @@ class _Spectra:
     def model(self, p: Array, tau: float) -> NDArray[np.complex128]:
         """The motion by p = [log m1, log m2, log k, log d, b, lag, delay, c] and a memory of `tau` [s]."""
         (m1, m2, k, d), (b, lag, late, c), s = np.exp(p[:4]), p[4:], self._s
-        handle = m2 * s * (k + d * s) / (m2 * s * s + d * s + k)
+        link = k + d * s
+        handle = link / s if self.held else m2 * s * link / (m2 * s * s + link)
         impedance = m1 * s + b + c / (1 + tau * s) + handle
         return (self._hold * np.exp(-s * late) / (1 + lag * s) / (s * impedance)).sum(axis=0) * self.force
 
@@ -159,7 +165,7 @@ def _memory(x: Array, force: Array, T: float, friction: Friction) -> tuple[float
     """The damping [N s/m] beside the memory that explains a record best, and its time constant; None without one."""
     import scipy
 
-    spectra = _Spectra(x, force - dry_friction(x, T, friction), T)
+    spectra = Spectra(x, force - dry_friction(x, T, friction), T)
     low = np.array([-20.0] * 4 + [0.0] * 4)
     high = np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T, np.inf])
 

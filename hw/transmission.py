@@ -1,0 +1,136 @@
+"""Bounds of a motor's mass and of its transmission from records with the handle free and with the handle clamped.
+
+The known-device conditions rest on them: the mass at the motor at least, the stiffness k of the transmission at most,
+its damping b at least and at most. With a clamped handle motor and transmission are a mass on a spring and a damper.
+With a free handle the motor's own damping slows everything, and b damps only the mode between motor and handle. One
+model is fitted to the spectra of all records together, the clamped ones at two levels of force.
+
+Each bound is the estimate, moved by two standard errors (95 %) and by 0.5 % for the scale of the encoder. The errors
+come from fits that leave out one part of one record's frequencies at a time: what the model does not explain counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from haptic_loop.controller.lti import Array
+from haptic_loop.hw.friction import Friction, dry_friction
+from haptic_loop.hw.viscosity import Spectra
+
+_BAND_HZ = (6.0, 250.0)  # below, cables and dry friction act; above, an encoder of 5 um sees nothing of 1 N
+_TOLD = 0.01  # part of the motion to which the model is held; and the encoder's noise
+_UNEXPLAINED = 2.5  # times both: play and presliding friction leave 3 to 6, ideal rigs 1, dry friction up to 2.1
+_GROUPS = 5  # of a record's frequencies, which are left out in turn
+_SIGMAS, _SCALE = 2.0, 0.005
+_MODES_HZ, _PARTS = np.geomspace(20.0, 250.0, 30), (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mode and the motor's mass
+_WITHIN = (2.0, 0.85)  # times the lowest and the highest frequency heard, between which the clamped mode must lie
+_STEPS = 60  # of a fit
+_LATE = 0.05  # [T] that a force may be late: no proof covers a current loop that is slower
+_FIXED = np.array([-20.0] * 4 + [0.0, 0.0])  # the least of log m1, log m2, log k, log b, delta and lag
+
+
+@dataclass(frozen=True)
+class TransmissionBounds:
+    """What holds with 95 % confidence of one axis, and the estimates."""
+
+    motor_mass_min: float  # [kg]
+    transmission_stiffness_max: float  # [N/m]
+    transmission_damping_min: float  # [N s/m]
+    transmission_damping_max: float  # [N s/m]
+    motor_mass: float  # [kg] estimate
+    handle_mass: float  # [kg] estimate
+    transmission_stiffness: float  # [N/m] estimate
+    transmission_damping: float  # [N s/m] estimate
+    late: float  # [s] lag and delay of the forces, at most
+
+
+class _Joint:
+    """The records of one axis, explained by one p = [log m1, log m2, log k, log b, delta, lag, delay, 0]."""
+
+    def __init__(self, records: Sequence[Spectra], step: float) -> None:
+        self.records = records
+        self._scale = [np.hypot(step * np.sqrt(r.ticks / 12), _TOLD * np.abs(r.motion)) for r in records]
+
+    def errors(self, p: Array) -> list[NDArray[np.complex128]]:
+        """Return motion less model of every record, in units of what it is held to."""
+        p = np.append(p, 0.0)
+        return [(r.motion - r.model(p, 1.0)) / scale for r, scale in zip(self.records, self._scale, strict=True)]
+
+    def fitted(self, start: Array, keep: Sequence[NDArray[np.bool_]]) -> Array:
+        import scipy
+
+        def error(p: Array) -> Array:
+            kept = np.concatenate([e[some] for e, some in zip(self.errors(p), keep, strict=True)])
+            return np.concatenate([kept.real, kept.imag])
+
+        T = self.records[0].T
+        low, high = np.append(_FIXED, -0.2 * T), np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T])
+        how: dict[str, Any] = {"bounds": (low, high), "x_scale": "jac", "loss": "soft_l1", "max_nfev": _STEPS}
+        return scipy.optimize.least_squares(error, np.clip(start, low + 1e-13, high - 1e-13), **how).x
+
+    def start(self, friction: Friction) -> Array:
+        """Return the split of the mass and the clamped mode that explain the spectra's sizes best."""
+        tried = []
+        for part in _PARTS:
+            for hz in _MODES_HZ:
+                m1 = part * friction.mass
+                k = (2 * np.pi * hz) ** 2 * m1
+                masses = np.log([m1, friction.mass - m1, k, 0.05 * np.sqrt(k * m1)])
+                p = np.array([*masses, max(friction.viscous, 1e-3), 1e-5, 0.0])
+                sizes = (np.log(np.abs(r.model(np.append(p, 0.0), 1.0) / r.motion)) for r in self.records)
+                tried.append((float(sum(np.abs(size).mean() for size in sizes)), len(tried), p))
+        return min(tried)[2]
+
+
+def transmission_bounds(
+    free: tuple[Array, Array], clamped: Sequence[tuple[Array, Array]], T: float, step: float, friction: Friction
+) -> TransmissionBounds:
+    """Bound one axis by its records, (displacements [m], forces [N]) (N,) each, of period T [s].
+
+    `step` [m] is the encoder's, `friction` that of the free record.
+
+    Raises:
+        ValueError: No spring and damper in parallel between two masses explain the records, or they do not tell them.
+    """
+    records = []
+    for (x, force), held in ((free, False), *((record, True) for record in clamped)):
+        records.append(Spectra(x, force - dry_friction(x, T, friction), T, held, _BAND_HZ))
+    joint, everything = _Joint(records, step), [np.ones(r.hz.size, dtype=bool) for r in records]
+    p = joint.fitted(joint.start(friction), everything)
+    for r, error in zip(records, joint.errors(p), strict=True):
+        if (rms := float(np.sqrt(np.mean(np.abs(error) ** 2)))) > _UNEXPLAINED:
+            which = "clamped" if r.held else "free"
+            raise ValueError(
+                f"a spring and a damper in parallel leave {rms:.1f} times the error of a record with a {which} handle, "
+                f"allowed is {_UNEXPLAINED:g}: play, presliding friction, or the handle was not {which}"
+            )
+    mode = np.sqrt(np.exp(p[2] - p[0])) / (2 * np.pi)
+    lowest, highest = _WITHIN[0] * records[-1].hz.min(), _WITHIN[1] * records[-1].hz.max()
+    if not lowest < mode < highest:
+        allowed = f"{lowest:.0f} to {highest:.0f} Hz"
+        raise ValueError(f"the clamped mode is at {mode:.0f} Hz, allowed are {allowed}: change --band")
+    others = []
+    for i, r in enumerate(records):
+        group = np.arange(r.hz.size) * _GROUPS // r.hz.size
+        for g in range(_GROUPS):
+            others.append(_figures(joint.fitted(p, [*everything[:i], group != g, *everything[i + 1 :]])))
+    spread = np.array(others) - np.mean(others, axis=0)
+    m1, k, b, late = _figures(p)
+    margin = _SIGMAS * np.sqrt((1 - 1 / len(others)) * (spread**2).sum(axis=0)) + _SCALE * np.array([m1, k, b, 0.0])
+    least, most = np.array([m1, k, b, late]) - margin, np.array([m1, k, b, late]) + margin
+    if most[3] > _LATE * T:
+        raise ValueError(f"forces are up to {1e6 * most[3]:.0f} us late, at most {1e6 * _LATE * T:.0f} us are allowed")
+    if not (least[0] > 0 and least[2] > 0):
+        raise ValueError(f"the transmission's damping, {b:.3g} N s/m, is not told from 0: at least {least[2]:.2g}")
+    return TransmissionBounds(least[0], most[1], least[2], most[2], m1, float(np.exp(p[1])), k, b, max(most[3], 0.0))
+
+
+def _figures(p: Array) -> tuple[float, float, float, float]:
+    """Return motor mass [kg], stiffness [N/m] and damping [N s/m] of the transmission, and lag with delay [s]."""
+    m1, _, k, b = np.exp(p[:4]).tolist()
+    return m1, k, b, float(p[5] + p[6])
