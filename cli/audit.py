@@ -32,7 +32,7 @@ _EXAMPLES = (
 
 @dataclass(frozen=True)
 class _CatalogueDevice:
-    """A device of the catalogue, by its name."""
+    """A device of the catalogue with its name."""
 
     name: str
     listed: Listed = off_table("inlined")
@@ -40,7 +40,7 @@ class _CatalogueDevice:
 
 @dataclass(frozen=True, eq=False)
 class _Report:
-    """An audit and where its numbers come from; SI units, null with a "reason" where a figure does not exist."""
+    """An audit and the sources of its numbers, in SI units; a missing figure is null and has a "reason"."""
 
     case: str
     scenario: str | None
@@ -85,7 +85,7 @@ def main(argv: list[str]) -> int:
         with options.refused():
             found = audit(loop, coupling, asked, args.seed, limits, move)
     notes = ()
-    if args.coupling and not _is_own(args):  # what its file is worth in the loop that is audited
+    if args.coupling and not _is_own(args):  # judge the file in the audited loop
         notes = from_file(read_coupling(args.coupling), loop, own=asked).notes
     _, own = name_and_own(asked)
     notes = (*notes, own.said(found.assessment.requirements[own.name])) if own else notes
@@ -133,7 +133,7 @@ def _parser() -> options.Parser:
 
 
 def _with_device(args: argparse.Namespace) -> argparse.Namespace:
-    """The options, with the catalogue's numbers where none are given; `source` allows its gains. Raises InputError."""
+    """Return the options, completed by the catalogue's numbers; `source` allows its gains. Raises InputError."""
     if not args.device:
         return args
     with options.refused("--"):
@@ -192,7 +192,7 @@ def _audited_world(args: argparse.Namespace, scenario: Scenario) -> int:
 
 
 def _is_own(args: argparse.Namespace) -> bool:
-    """Whether --coupling names a user's own function, not a file."""
+    """Return whether --coupling names a function of the user's own, not a file."""
     return ":" in (args.coupling or "") and not Path(args.coupling).exists()
 
 
@@ -229,7 +229,7 @@ def _coupling(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> Coupl
 
 
 def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
-    """The range of --varying-delay, or that of the scenario; it must contain theta. Raises InputError."""
+    """Return the range of --varying-delay or of the scenario. Raises InputError unless it contains theta."""
     from haptic_loop.design.audit import LONGEST_DELAY
 
     if args.varying_delay is None:
@@ -241,7 +241,7 @@ def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The report as a table, and what it does not cover.
+# The report as a table, and its limits.
 
 
 def _tables(found: Audit) -> list[render.Table]:
@@ -269,19 +269,19 @@ def _stiffest_wall(found: Audit, coupling: SpringDamper) -> str:
 
 
 def _percent(error: float | None) -> str:
-    """A relative error in percent, rounded down, so that the printed one is tolerated."""
+    """Return a relative error in percent, rounded down, so that the printed one is tolerated."""
     return render.optional(error and math.floor(1e4 * error) / 100, "{:.2f} %")
 
 
 def _stiffest(K: Sequence[float | None]) -> str:
-    """Stiffnesses to five digits, rounded down, so that the printed ones are certified."""
+    """Return stiffnesses with five digits, rounded down, so that the printed ones are certified."""
     if None in K:
         return "-"
     units = ((k, 10.0 ** (math.floor(math.log10(k)) - 4)) for k in K if k is not None)
     return ", ".join(f"{math.floor(k / unit) * unit:.5g}" for k, unit in units) + " N/m"
 
 
-#: name of a row -> its cell, of the requirement and the margins of one condition
+#: name of a row -> function from the requirement and the margins of one condition to its cell
 _ROWS: dict[str, Callable[[Requirement, Margins], str]] = {
     "needs damping": lambda r, _: f"{render.needs(r)}: {render.certified(r, proof=False)}",
     "margin": lambda r, _: render.optional(r.margin, "{:.5g}"),
@@ -319,7 +319,7 @@ def _remarks(report: _Report) -> Iterator[str]:
 
 
 def _proposed(helps: Sequence[Help]) -> Iterator[str]:
-    """Changes that certify the coupling; the one that needs the least damping comes first."""
+    """Yield the changes that certify the coupling, the one with the least required damping first."""
     enough = sorted((each for each in helps if each.certified), key=lambda each: max(each.required_damping))
     if not enough:
         yield "What helps: no single change of delay, damper or period was found to; a design finds other gains."

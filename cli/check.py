@@ -33,7 +33,7 @@ from haptic_loop.sim.couplings import read_coupling
 
 @dataclass(frozen=True)
 class _Switching:
-    """The claim for delays that vary; guarantee and proof are null where it fails."""
+    """The claim for delays that vary; guarantee and proof are null if it fails."""
 
     lo: Sequence[int]
     hi: Sequence[int]
@@ -45,7 +45,7 @@ class _Switching:
 
 @dataclass(frozen=True)
 class _Checked:
-    """The machine-readable result; figures are null where the file carries no certificate."""
+    """The report; figures are null if the file has no certificate."""
 
     proved: bool
     reason: str | None = render.figure("reason")
@@ -60,9 +60,9 @@ class _Checked:
     limited_forces: str | None = render.figure("forces")
     wall_s: float = render.figure("seconds", "{:.6g}")
     switching: _Switching | None = field(default=None)
-    claim: str | None = render.figure("claim", default=None, json="if given")  # of a condition of the user's own
-    assessment: Assessment | None = off_table(default=None)  # in the loop of the file, where that is proved
-    anew: bool = off_table(default=False)  # by another condition than the file's, whose certificate says nothing here
+    claim: str | None = render.figure("claim", default=None, json="if given")  # on a condition of the user's own
+    assessment: Assessment | None = off_table(default=None)  # in the loop of the file, if the file is proved
+    anew: bool = off_table(default=False)  # whether --condition is not that of the file
 
 
 def main(argv: list[str]) -> int:
@@ -100,7 +100,7 @@ def _parser() -> options.Parser:
 
 
 def _anew(stored: Stored, condition: Condition) -> tuple[Stored, Verdict]:
-    """The coupling with a certificate by this condition, proved and verified. Raises ValueError for a taken name."""
+    """Return the coupling with a certificate of this condition, proved and verified. Raises ValueError."""
     coupling = stored.built()
     try:
         proved = Stored.of(stored.loop, coupling, prove(stored.loop, coupling, condition))
@@ -120,7 +120,7 @@ def _assessed(stored: Stored, own: Condition | None, searched: Searched | None) 
 
 
 def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
-    """The search between the vertices, again, where the file guarantees ranges of parameters."""
+    """Repeat the search between the vertices if the file guarantees ranges; else return None."""
     if not (stored.certificate and stored.certificate.guarantee == RANGES):
         return None
     loop, coupling = stored.loop, stored.built()
@@ -133,7 +133,7 @@ def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
 
 
 def _guarantee(loop: Loop, condition: Condition) -> str:
-    """The environments of a condition, and the devices where it is about known ones only."""
+    """Return the environments of a condition in words, with the devices if the condition is for known ones only."""
     devices = f"; every passive hand, on {described(loop)}" if condition.name in KNOWN_CONDITIONS else ""
     return f"{condition.words(loop)}{devices}"
 
@@ -173,7 +173,7 @@ def _table(checked: _Checked) -> render.Table:
     rows = [*render.rows_of(checked), *(render.rows_of(checked.switching) if checked.switching else [])]
     if checked.assessment:
         rows.append(("held torques", checked.assessment.held_torques))
-    if not checked.proved:  # what a file says that was refused
+    if not checked.proved:  # the file's own words, although it is refused
         claims = ("required", "margin", "switching, required", "switching, margin")
         rows = [(f"{name}, claimed" if name.startswith(claims) else name, text) for name, text in rows]
     return render.facts(title, rows, left=True)

@@ -57,7 +57,7 @@ def _parser() -> options.Parser:
 
 @dataclass(frozen=True)
 class _Alternatives:
-    """What every coupling costs and gives the same devices and hands."""
+    """Figures of every coupling with the same devices and hands."""
 
     scenario: str
     case: str
@@ -150,7 +150,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _chosen(scenario: Scenario, args: argparse.Namespace, names: Sequence[str]) -> tuple[dict[str, Chosen], list[str]]:
-    """The couplings by name, and why designs failed. Raises DesignFailed where all of them did."""
+    """Return the couplings by name, and why designs failed. Raises DesignFailed if all failed."""
     chosen: dict[str, Chosen] = {}
     failures: dict[str, DesignFailed] = {}
     for name in names:
@@ -166,7 +166,7 @@ def _chosen(scenario: Scenario, args: argparse.Namespace, names: Sequence[str]) 
 
 
 def _named(name: str) -> tuple[str, str | Condition | None]:
-    """NAME:CONDITION as both, the condition None where none is named. Raises InputError."""
+    """Split NAME:CONDITION; the condition is None if it is missing. Raises InputError."""
     kind, _, words = name.partition(":")
     plain, words = (kind, words) if kind in NAMES else name.rpartition(":")[::2]
     try:
@@ -180,7 +180,7 @@ def _named(name: str) -> tuple[str, str | Condition | None]:
 
 
 def _guarantees(report: Comparison) -> render.Table:
-    """Required damping [N s/m] where all devices have the same, else as a multiple of what each has."""
+    """Return the table of required damping [N s/m], or of multiples if the devices' damping differs."""
     available = report.available_damping
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
@@ -211,20 +211,20 @@ def _binds(part: ConditionCurve) -> str:
 
 
 def _needs(part: ConditionCurve, scale: float) -> str:
-    """The worst device's figure, green where it is certified."""
+    """Return the worst device's figure, green if it is certified."""
     need = "infinite" if np.isinf(part.ratio) else f"{scale * part.ratio:.5g}"
     return f"[{'green' if part.requirement.certified else 'red'}]{need}[/]"
 
 
 def _robust(part: Robustness | None, scale: float = 1.0) -> str:
-    """The damping that is needed at the worst stiffness or mass within ten percent."""
+    """Return the damping that is needed at the worst stiffness or mass within ten percent."""
     if part is None:
         return "-"
     return f"{scale * part.required_over_available:.4g}"
 
 
 def _price(name: str, part: Nearby) -> Iterable[str]:
-    """What a design for the environments within ten percent reaches, in a line, where that is known."""
+    """Yield a line on a design for the environments within ten percent, if it was made."""
     if price := part.designed_for_it:
         yield f"{name}, designed for 10 % more or less of every spring and mass: {render.price_words(price)}"
 
@@ -235,7 +235,7 @@ def _feel(report: Comparison) -> render.Table:
     named = {"ideal (E)": report.ideal, **{c.name: c.curves.perceived for c in report.couplings}}
 
     def at(hz: float, curves: Array) -> list[float]:
-        """Each channel's curve at `hz`, which is in the grid; nan above Nyquist's frequency."""
+        """Return each channel's curve at `hz`, which is in the grid; nan above Nyquist's frequency."""
         return [float(np.interp(hz, report.frequency_hz, column, right=np.nan)) for column in curves.T]
 
     rows = [[name, *(_list(at(hz, getattr(felt, what))) for what, _, hz in columns)] for name, felt in named.items()]
@@ -243,6 +243,6 @@ def _feel(report: Comparison) -> render.Table:
 
 
 def _list(values: Iterable[float]) -> str:
-    """The values with commas between them; a single one where all are equal."""
+    """Return the values separated by commas; a single one if all are equal."""
     shown = [format(v, ".0f" if abs(v) >= 1000 else ".3g") for v in values]
     return shown[0] if len(set(shown)) == 1 else ", ".join(shown)

@@ -99,7 +99,7 @@ def _parser() -> options.Parser:
 
 
 def _add_optimal_options(parser: options.Parser, title: str) -> None:
-    """The options of an optimal coupling, as a group of this title; None where not given."""
+    """Add the options of an optimal coupling as a group; their default is None."""
     group = parser.add_argument_group(title)
     group.add_argument("--objective", choices=OBJECTIVES, help="which transparency error is minimised (default rms)")
     parser.add_band(to=group)
@@ -118,7 +118,7 @@ def _percent(text: str) -> float:
 
 
 def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
-    """The scenario's loop with the range of delays that --varying-delay gives. Raises InputError."""
+    """Return the scenario's loop with the range of --varying-delay. Raises InputError."""
     from haptic_loop.design.audit import LONGEST_DELAY
 
     loop = scenario.loop(args.case)
@@ -142,13 +142,13 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 
 
 def _for_switching(args: argparse.Namespace) -> bool:
-    """Whether this design can be made for delays that vary; any other is only judged under them."""
+    """Return whether the design takes varying delays into account; other designs are only judged under them."""
     kind = kind_of(args.coupling)
     return "switching" in kind.options and named(args.condition or kind.conditions[0]).extensible
 
 
 def _asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
-    """The options of a design by the names of its arguments. Raises InputError for options of another coupling."""
+    """Return the options of a design by argument name. Raises InputError for options of another coupling."""
     known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
     given = {name: value for name in known if options.given(value := getattr(args, name, None))}
     if kind_of(kind).limited and args.limiter is not None:
@@ -178,21 +178,21 @@ def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[D
         if not kind_of(args.coupling).softened:
             able = " or ".join(name for name, kind in KINDS.items() if kind.softened)
             raise InputError(f"--decay is for --coupling {able}, not {args.coupling}")
-    with render.progress("designing softer and softer couplings"):  # whose failure names no other coupling
+    with render.progress("designing softer and softer couplings"):  # its failure names no other coupling
         design, dies_away = _that_decays(scenario, loop, made, args.decay)
         return proved(loop, design), dies_away
 
 
-#: Shares of the damping for which designs are made in search of a damping ratio; and bisections between two of them.
+#: shares of the damping that the search for a damping ratio tries; number of bisections between two of them
 _SHARES, _BISECTIONS = (1.0, 0.75, 0.5, 0.35, 0.2, 0.1), 4
 
 
 def _that_decays(
     scenario: Scenario, loop: Loop, made: Callable[[Loop], Design], ratio: float
 ) -> tuple[Design, Ringing | None]:
-    """Design for less damping, which gives a softer coupling, until every mode has this damping ratio.
+    """Design for less and less damping, which gives softer couplings, until every mode has this damping ratio.
 
-    What is certified for less damping is certified for the damping that there is.
+    A coupling that is certified for less damping is certified for the available damping.
     """
     from haptic_loop.sim.run import assemble
     from haptic_loop.sim.stability import ringing
@@ -232,11 +232,11 @@ def _that_decays(
 
 
 # ----------------------------------------------------------------------------------------------------
-# What was designed: its figures, its file.
+# Figures and file of the design.
 
 
 def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Assessment:
-    """Assess the design in its loop, with the search between the vertices and the proof that it has made."""
+    """Assess the design in its loop, with the design's own search between the vertices and proof."""
     with render.progress("searching the ranges" if loop.ranges else "assessing the coupling") as move:
         return assess(
             loop,
@@ -304,7 +304,7 @@ _USELESS = f"useless: {SOFTEST:g} N/m is the softest that the search tries, and 
 
 
 def _is_useless(assessment: Assessment) -> bool:
-    """Whether every spring is as soft as the search goes."""
+    """Return whether every spring is at the soft end of the search."""
     return "K" in assessment.gains and max(assessment.gains["K"]) < 1.001 * SOFTEST
 
 
@@ -325,7 +325,7 @@ def _assessment_rows(assessment: Assessment) -> render.Rows:
     yield "transparency error", felt and render.transparency_error(felt)
 
 
-#: what a design minimised or maximised -> in words
+#: objectives of designs in words
 _OBJECTIVE_WORDS = {
     "loop-norm": "the least norm of W1 L W2, (23) of the paper",
     "rms": "the least rms transparency error, a ratio",
@@ -336,7 +336,7 @@ _OBJECTIVE_WORDS = {
 
 @dataclass(frozen=True)
 class _Best:
-    """What only an optimal coupling is reported with."""
+    """The part of a report that only optimal couplings have."""
 
     bound: BoundBeside | None
     rendered_stiffness: float
@@ -373,14 +373,14 @@ def _stored_rows(stored: Filed) -> render.Rows:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Report:
-    """The design; parts that it does not have are null."""
+    """The report of a design; missing parts are null."""
 
     case: str
     seed: int
     objective: float
     wall_s: float
     price: list[coverage.OverRanges] | None
-    kind: str  # of the coupling
+    kind: str  # kind of the coupling
     assessment: Assessment = render.several(_assessment_rows)
     switching: coverage.Switching | None = render.figure("damping, any switching", _switching_words)
     delays: str | None = render.figure("guarantee, delays", json="left out")
@@ -391,7 +391,7 @@ class _Report:
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
     stored: Filed = render.several(_stored_rows)
     interrupted: bool = off_table()
-    claim: str | None = render.figure("claim", default=None, json="if given")  # of a condition of the user's own
+    claim: str | None = render.figure("claim", default=None, json="if given")  # on a condition of the user's own
 
     @property
     def aim(self) -> str:
@@ -409,7 +409,7 @@ def _tables(scenario: Scenario, report: _Report) -> list[render.Table]:
 
 
 def _both(name: str, form: str) -> Callable[[coverage.OverRanges], str]:
-    """A figure in the nominal environment, and the worst of the ranges."""
+    """Return the cell of a figure: nominal environment / worst of the ranges."""
 
     def cell(row: coverage.OverRanges) -> str:
         found: coverage.NominalWorst = getattr(row, name)

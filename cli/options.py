@@ -1,7 +1,7 @@
-"""What the commands share: options with their types, exit codes, and one line for bad input.
+"""Options of several commands with their types, exit codes, and one line for bad input.
 
-A type reads the words of one option and says what came and what is allowed; `Parser` puts the option's name in front.
-What depends on the scenario, such as one number per channel, is checked by `per_channel` once the scenario is known.
+A type parses the text of one option; its error names the value and the allowed values, and `Parser` adds the option's
+name. Values that depend on the scenario, such as one number per channel, are checked by `per_channel`.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ class Parser(argparse.ArgumentParser):
         self._only: list[tuple[str, Callable[[argparse.Namespace], Any], tuple[str, ...]]] = []
 
     def only(self, where: str, acts: Callable[[argparse.Namespace], Any], *names: str) -> None:
-        """Refuse the options of these destinations where `acts` is false of what is given: they would be ignored."""
+        """Refuse the options `names` if `acts` is false for the parsed arguments, because they would be ignored."""
         self._only.append((where, acts, names))
 
     def format_help(self) -> str:
-        """The usage in one line, the first options, and the others by their groups."""
+        """Return the usage in one line, the first options, and the other options by groups."""
         arguments = [action for action in self._actions if not action.option_strings]
         by_name = {name.removeprefix("--"): action for action in self._actions for name in action.option_strings}
         first = [by_name[name] for name in self._first]
@@ -87,8 +87,8 @@ class Parser(argparse.ArgumentParser):
         text.add_text(self.epilog)
         return text.format_help()
 
-    def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
-        """As argparse's; an empty word is refused for every option, and a --json file that cannot be written."""
+    def parse_known_args(self, *args: Any, **how: Any) -> Any:  # parse_args calls it
+        """Parse as argparse does; refuse empty values, and a --json file that cannot be written."""
         found, rest = super().parse_known_args(*args, **how)
         if rest:
             what = "option" if rest[0].startswith("-") else "word"
@@ -120,7 +120,7 @@ class Parser(argparse.ArgumentParser):
         own = _OWN_WORDS.fullmatch(message)
         raise InputError(f"{own[1]} {own[2]}" if own else f"{message} (--help lists the options)")
 
-    # what several commands take
+    # options of several commands
 
     def add_loop(self) -> None:
         """The options that describe a loop, which every command takes."""
@@ -155,47 +155,47 @@ class Parser(argparse.ArgumentParser):
         loop.add_argument("--latency", type=_latency_ranges, metavar="S", help=late)
 
     def add_coupling(self, names: str) -> None:
-        """Which coupling, and the condition that it is designed for or judged by."""
+        """Add --coupling and --condition."""
         what = f"{names}, FILE.json or FILE.py:NAME of a function of the loop (default spring-damper)"
         self.add_argument("--coupling", metavar="NAME|FILE", help=what)
         self.add_condition()
 
     def add_condition(self, what: str = "the condition of the certificate", to: _Group | None = None) -> None:
-        """--condition."""
+        """Add --condition."""
         help_ = f"{what}: {', '.join(CONDITIONS)} or FILE.py:NAME of your own (default: the coupling's)"
         (to or self).add_argument("--condition", type=condition, metavar="NAME|FILE.py:NAME", help=help_)
 
     def add_limiter(self, what: str = "clip forces at the devices' limits", to: _Group | None = None) -> None:
-        """--no-limiter: `limiter` is None, what is usual, or False."""
+        """Add --no-limiter; `limiter` is None (the default behaviour) or False."""
         help_ = f"{what}, in place of the limiter that a guarantee covers"
         (to or self).add_argument("--no-limiter", dest="limiter", action="store_const", const=False, help=help_)
 
     def add_rigid(self) -> None:
-        """A rigid wall in place of the environment."""
+        """Add --rigid, a rigid wall in place of the environment."""
         wall = "a rigid wall in place of the environment; one channel, the scenario's first"
         self.add_argument("--rigid", action="store_true", help=wall)
 
     def add_human(self, more: str = "") -> None:
-        """--human."""
+        """Add --human."""
         who = f"other humans: [[human]] per channel in a .toml, or a list of hands{more or ' in a .py'}"
         self.add_argument("--human", metavar="FILE.toml|FILE.py:NAME", help=who)
 
     def add_energy_budget(self) -> None:
-        """--energy-budget."""
+        """Add --energy-budget."""
         what = "scale forces so that no passive hand is given more than W0 [J]; save at most CAP of what users put in"
         self.add_argument("--energy-budget", type=_energy_budget, metavar="W0[,CAP]", help=what)
 
     def add_band(self, to: _Group | None = None) -> None:
-        """--band."""
+        """Add --band."""
         band = "frequencies over which the transparency error counts [Hz] (default 0.5,80)"
         (to or self).add_argument("--band", dest="band_hz", type=_band_of, metavar="LOW,HIGH", help=band)
 
     def add_varying_delay(self, what: str, to: _Group | None = None) -> None:
-        """--varying-delay."""
+        """Add --varying-delay."""
         (to or self).add_argument("--varying-delay", type=_delay_ranges, metavar="LO,HI", help=what)
 
     def add_varying_delays(self) -> None:
-        """--period, --varying-delay, --pattern, --loss and --playout."""
+        """Add --period, --varying-delay, --pattern, --loss and --playout."""
         group = self.add_argument_group("delays and periods that vary")
         periods = "periods [s], drawn anew at every tick between two of them, or a file of recorded ones"
         group.add_argument("--period", metavar="MIN,MAX|FILE", help=periods)
@@ -213,7 +213,7 @@ class Parser(argparse.ArgumentParser):
         what: str = "folder for files, made if it is not there (default out/<command>-<case or scenario>[-<coupling>])",
         picture: bool = False,
     ) -> None:
-        """Where results go, and the seed."""
+        """Add the options for the output folder and the seed."""
         output = self.add_argument_group("output", "the folder of a FILE that you name must exist")
         if picture:
             output.add_argument("--no-plot", action="store_true", help="write no picture")
@@ -223,24 +223,24 @@ class Parser(argparse.ArgumentParser):
         output.add_argument("--seed", type=whole(0), metavar="N", default=0, help=seed)
 
     def add_details(self) -> None:
-        """--details."""
+        """Add --details."""
         what = "also print what no certificate covers, and how the computation went"
         self.add_argument("--details", action="store_true", help=what)
 
     def add_json(self, to: _Group | None = None) -> None:
-        """--json."""
+        """Add --json."""
         (to or self).add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """The end of a refusal that names the closest of the known words, or nothing."""
+    """Return an error suffix with the closest of the known words, or ""."""
     bare = {name.lstrip("-"): name for name in known}
     close = difflib.get_close_matches(word.lstrip("-"), list(bare), n=1)
     return f", did you mean {bare[close[0]]}?" if close else ""
 
 
 def _translate(args: argparse.Namespace) -> None:
-    """Make `case` of --reference and of the paper's --case. Raises InputError where both are given and differ."""
+    """Set `case` from --reference or --case. Raises InputError if they contradict each other."""
     if args.reference and args.case and args.reference != args.case:
         raise InputError(f"--reference {args.reference} with --case {args.case}: give one of them")
     args.case = args.case or args.reference or "I"
@@ -253,7 +253,7 @@ def _translate(args: argparse.Namespace) -> None:
 def _one(
     kind: Callable[[str], _Number], least: float = -math.inf, most: float = math.inf, unit: str = ""
 ) -> Callable[[str], _Number]:
-    """A number of this kind within these limits."""
+    """Return a parser of one number within these limits."""
 
     def read(text: str) -> _Number:
         try:
@@ -272,7 +272,7 @@ number, whole = partial(_one, float), partial(_one, int)  # (least, most, unit)
 def several(
     kind: Callable[[str], _Number], least: float = -math.inf, most: float = math.inf, unit: str = ""
 ) -> Callable[[str], tuple[_Number, ...]]:
-    """Numbers within these limits, separated by commas; `per_channel` makes them one for each channel."""
+    """Return a parser of numbers within these limits, separated by commas."""
     expected = f"{'whole numbers' if kind is int else 'numbers'} separated by commas"
 
     def read(text: str) -> tuple[_Number, ...]:
@@ -282,7 +282,7 @@ def several(
 
 
 def _parts(text: str, kind: Callable[[str], _Number], expected: str, within: str = "") -> list[list[_Number]]:
-    """The numbers between commas, and between what stands `within` a part."""
+    """Parse numbers separated by commas, and by `within` inside a part."""
     try:
         return [[kind(word) for word in (part.split(within) if within else [part])] for part in text.split(",")]
     except ValueError:
@@ -290,7 +290,7 @@ def _parts(text: str, kind: Callable[[str], _Number], expected: str, within: str
 
 
 def pair(text: str) -> tuple[float, float]:
-    """Two numbers separated by a comma."""
+    """Parse two numbers separated by a comma."""
     found = _parts(text, float, expected := "two numbers separated by a comma")
     if len(found) != 2:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
@@ -298,7 +298,7 @@ def pair(text: str) -> tuple[float, float]:
 
 
 def _band_of(text: str) -> tuple[float, float]:
-    """Two rising frequencies [Hz]."""
+    """Parse two rising frequencies [Hz]."""
     low, high = pair(text)
     if not 0 < low < high < math.inf:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected two rising frequencies in Hz, the first above 0")
@@ -306,7 +306,7 @@ def _band_of(text: str) -> tuple[float, float]:
 
 
 def _energy_budget(text: str) -> tuple[float, float]:
-    """'W0' or 'W0,CAP' [J]: what a budget starts with and the most that it saves (inf where no cap is given)."""
+    """Parse 'W0' or 'W0,CAP' [J], the initial energy of a budget and its largest value (inf without a cap)."""
     values = several(float, 0, unit="J")(text)
     start, cap = (*values, math.inf)[:2]
     if len(values) > 2 or not start <= cap or start == math.inf:
@@ -315,7 +315,7 @@ def _energy_budget(text: str) -> tuple[float, float]:
 
 
 def _delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
-    """'1,2' as one range for all channels, '1-2,0-3' as one per channel [samples]."""
+    """Parse '1,2' as one range for all channels, '1-2,0-3' as one range for each [samples]."""
     parts = _parts(text, int, expected := "LO,HI or LO-HI,LO-HI,.. in whole samples", "-")
     if [len(part) for part in parts] == [1, 1]:
         parts = [(parts[0][0], parts[1][0])]
@@ -327,7 +327,7 @@ def _delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
 
 
 def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
-    """'130e-6' as 0 to 0.13 ms, '100e-6:130e-6' as a range of its own; one for all, or one per channel [s]."""
+    """Parse '130e-6' as 0 to 0.13 ms, '100e-6:130e-6' as a range; one for all channels or one for each [s]."""
     parts = _parts(text, float, expected := "S or LO:HI in seconds, one or one per channel", ":")
     if any(len(part) > 2 for part in parts):
         raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
@@ -335,14 +335,14 @@ def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 
 def condition(text: str) -> str:
-    """The name of a condition, or FILE.py:NAME of a user's own."""
+    """Parse the name of a condition, or FILE.py:NAME of the user's own."""
     if text not in CONDITIONS and ":" not in text:
         raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(CONDITIONS)} and FILE.py:NAME")
     return text
 
 
 def own_condition(text: str) -> Condition:
-    """The user's own condition that FILE.py:NAME names. Raises InputError."""
+    """Return the user's own condition that FILE.py:NAME names. Raises InputError."""
     from haptic_loop.design.certificate import named as checked
     from haptic_loop.design.conditions import Condition
 
@@ -364,7 +364,7 @@ def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
 
 
 def given(value: Any) -> bool:
-    """Whether an option was given, by its value: neither None nor False."""
+    """Return whether an option was given: its value is neither None nor False."""
     return value is not None and value is not False
 
 
@@ -389,7 +389,7 @@ def refused(name: str = "", args: argparse.Namespace | None = None) -> Iterator[
 
 
 def per_channel(option: str, values: tuple[_Given, ...], channels: int, what: str = "entries") -> tuple[_Given, ...]:
-    """One value for each channel; a single one serves all. Raises InputError."""
+    """Return one value for each channel; a single value is repeated. Raises InputError."""
     values = values * channels if len(values) == 1 else values
     if len(values) != channels:
         expected = "one" if channels == 1 else f"{channels} (one per channel) or 1"
@@ -398,7 +398,7 @@ def per_channel(option: str, values: tuple[_Given, ...], channels: int, what: st
 
 
 def delay_range(pairs: tuple[tuple[int, int], ...], channels: int, most: int) -> DelayRange:
-    """What --varying-delay says, as a range of delays on every channel. Raises InputError."""
+    """Return the range of delays of --varying-delay on every channel. Raises InputError."""
     lo, hi = zip(*per_channel("--varying-delay", pairs, channels, "ranges"), strict=True)
     if any(not 0 <= a <= b <= most for a, b in zip(lo, hi, strict=True)):
         asked = ",".join(f"{a}-{b}" for a, b in pairs)
@@ -407,7 +407,7 @@ def delay_range(pairs: tuple[tuple[int, int], ...], channels: int, most: int) ->
 
 
 def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) -> tuple[_Number, ...]:
-    """Numbers that stand within a longer text, a single one for all. Raises InputError with `option` in front."""
+    """Parse `count` numbers in a longer text; a single number is repeated. Raises InputError."""
     try:
         if count == 1 and "," not in text:
             return (_one(kind)(text),)
@@ -417,11 +417,11 @@ def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) 
 
 
 # ----------------------------------------------------------------------------------------------------
-# Groups of options that several commands have, and what they mean.
+# Scenarios, loops and files from options.
 
 
 def scenario_from(args: argparse.Namespace) -> Scenario:
-    """The scenario that the loop options describe. Raises InputError."""
+    """Return the scenario that the loop options describe. Raises InputError."""
     scenario = load(args.scenario)
     if args.environment is not None:
         scenario = with_environment(scenario, args.environment)
@@ -439,7 +439,7 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
 
 
 def _known_device(text: str) -> Guaranteed:
-    """MASS,K_MAX,B_MIN,B_MAX. Raises ArgumentTypeError."""
+    """Parse MASS,K_MAX,B_MIN,B_MAX. Raises ArgumentTypeError."""
     values = several(float)(text)
     if len(values) != 4:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected MASS,K_MAX,B_MIN,B_MAX")
@@ -454,7 +454,7 @@ def _with_bounds(device: Device, bounds: Guaranteed) -> Device:
 
 
 def in_world(scenario: Scenario, file: str) -> Scenario:
-    """The scenario with a MuJoCo scene as its environment, touched along x. Raises InputError."""
+    """Return the scenario with a MuJoCo scene as its environment, touched along x. Raises InputError."""
     from haptic_loop.models.world import touchable_bodies
 
     with refused("--world: "):
@@ -466,12 +466,12 @@ def in_world(scenario: Scenario, file: str) -> Scenario:
 
 
 def with_humans(args: argparse.Namespace, scenario: Scenario) -> Scenario:
-    """The scenario with the humans of --human. Raises InputError."""
+    """Return the scenario with the humans of --human. Raises InputError."""
     return scenario if args.human is None else held_by(scenario, args.human)
 
 
 def out_folder(args: argparse.Namespace, command: str) -> Path:
-    """The folder for the files of a command, made before any work is done. Raises InputError."""
+    """Create and return the folder for the files of a command. Raises InputError."""
     return folder(Path(args.out or f"out/{command}{f'-{place(args)}' if 'case' in args else ''}"))
 
 
@@ -510,7 +510,7 @@ def _in_file_names(what: str | tuple[str, ...] | Condition) -> str:
 
 
 def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
-    """The loop of one channel before a rigid wall. Raises InputError where options give values for more channels."""
+    """Return the loop of one channel before a rigid wall. Raises InputError for values of several channels."""
     for name in ("theta", "psi", "delta"):
         per_channel(f"--rigid is one channel: --{name}", getattr(args, name) or (0,), 1)
     with refused():
@@ -525,7 +525,7 @@ _DRAWN = ("constant", "random", "bursty", "adversarial")
 
 
 def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenario:
-    """The scenario with periods and delays that the options describe, over those of its file. Raises InputError."""
+    """Return the scenario with the periods and delays of the options. Raises InputError."""
     if args.period is not None:
         scenario = scenario.replace(period=_periods(args.period))
     changes: dict[str, Any] = {}
@@ -550,7 +550,7 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
 
 
 def _periods(text: str) -> Periods:
-    """Of two numbers, or of a file of one column [s]. Raises InputError."""
+    """Parse two numbers, or a file of one column [s]. Raises InputError."""
     with refused("--period: "):
         if "," in text and not Path(text).is_file():
             least, most = numbers("--period", text, float, 2)
@@ -571,7 +571,10 @@ def _pattern(name: str, channels: int) -> dict[str, Any]:
 def _rows(
     option: str, path: str, kind: Callable[[str], _Number], columns: int, hint: str
 ) -> tuple[tuple[_Number, ...], ...]:
-    """Numbers of a file, between commas or blanks; one column serves all; # begins a comment. Raises InputError."""
+    """Read numbers of a file, separated by commas or blanks; one column is repeated; # begins a comment.
+
+    Raises InputError.
+    """
     rows = []
     for n, line in enumerate(read_text(path, f"{option} {path}", hint).splitlines(), start=1):
         if words := line.split("#")[0].replace(",", " ").split():
@@ -586,5 +589,5 @@ def _rows(
 
 
 def exit_code(holds: bool, interrupted: bool = False) -> int:
-    """The exit code of a command that has printed its report."""
+    """Return the exit code of a command that has printed its report."""
     return INTERRUPTED if interrupted else DONE if holds else DOES_NOT_HOLD

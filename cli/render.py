@@ -1,8 +1,7 @@
-"""Reports as tables on the terminal and as JSON: the one place where either is made.
+"""Reports as tables on the terminal and as JSON.
 
-A report is a dataclass of figures in SI units. Its fields are the keys of its JSON, and the rows of its table, pairs of
-a name and a text, come from them by the name and the format that `figure` gives: a new figure is one field. A row whose
-text is None is left out.
+A report is a dataclass of figures in SI units. Its fields are the keys of its JSON. A field made by `figure` has a name
+and a format, and becomes a row (name, text) of the table; a row whose text is None is left out.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.design.files import InJson, plain, remove, write_json
 from haptic_loop.design.result import DesignFailed, Requirement, listed
 
-if TYPE_CHECKING:  # rich, and the reports' parts, which no command without them loads
+if TYPE_CHECKING:  # loaded only by commands that need them
     from rich.table import Table
 
     from haptic_loop.cli.screen import Screen
@@ -28,14 +27,14 @@ if TYPE_CHECKING:  # rich, and the reports' parts, which no command without them
     from haptic_loop.sim.report import UnevenTicks, VaryingDelays
 
 # ----------------------------------------------------------------------------------------------------
-# The terminal, and progress on it. Rich is imported where it prints: --help does without it.
+# The terminal and progress bars. Rich is imported where it prints, because --help does not need it.
 
 
 _SHORT_NAME = 24  # characters of a row's name that are never broken
 
 
 def console(args: argparse.Namespace) -> Screen:
-    """Where tables go: standard error when standard output is taken by --json -."""
+    """Return the screen for tables: standard error with --json -, else standard output."""
     from haptic_loop.cli.screen import Screen
 
     return Screen(stderr=args.json == "-", highlight=False)
@@ -45,14 +44,14 @@ _Progress = Callable[[str, int, int], None]  # (what, steps done, of how many)
 
 
 class Move(Protocol):
-    """Moves a progress bar to `done` of `total`, and may say what is being done."""
+    """A function that moves a progress bar to `done` of `total`, and may name the task."""
 
     def __call__(self, done: int, total: int, what: str = ...) -> None: ...
 
 
 @contextmanager
 def progress(description: str) -> Iterator[Move]:
-    """A bar on standard error that shows only on a terminal; yields the function that moves it."""
+    """Show a progress bar on standard error if that is a terminal; yields the function that moves it."""
     from rich.console import Console
 
     terminal = Console(stderr=True)
@@ -72,15 +71,15 @@ def progress(description: str) -> Iterator[Move]:
 
 @contextmanager
 def designing(loop: Loop | None = None, kind: str | None = None, condition: str | None = None) -> Iterator[_Progress]:
-    """The bar of a design: yields what `choose` and `design_by_kind` take as `progress`.
+    """Show the progress bar of a design; yields the `progress` of `choose` and `design_by_kind`.
 
-    Where the design of this `kind` (by default the spring-damper) fails for a `loop`, the error names what can be had.
+    If the design of this `kind` (by default the spring-damper) fails for `loop`, the error names alternatives.
     """
     with progress("designing the coupling") as move:
         try:
             yield lambda what, done, total: move(done, total, what)
         except DesignFailed as error:
-            from haptic_loop.design.api import instead  # for a failure only
+            from haptic_loop.design.api import instead  # only after a failure
 
             move(0, 1, "trying other designs")
             if loop is None or not (others := instead(loop, kind or "spring-damper", condition)):
@@ -102,9 +101,9 @@ def publish(
     verdict: str | None = None,
     details: Iterable[str] = (),
 ) -> None:
-    """Keep a report as report.json in the folder, print verdict, tables and lines, and write what --json asks for.
+    """Save the report as report.json in the folder, print verdict, tables and lines, and write the file of --json.
 
-    `files` are those written before; the report names them and its own. Lines in `details` are printed with --details.
+    `files` are the files written before, which the report names. `details` are printed with --details.
     """
     outcome = plain(report)
     if folder:
@@ -125,15 +124,15 @@ def publish(
 
 
 def announce(args: argparse.Namespace, verdict: str) -> None:
-    """Print a verdict, before a picture is drawn or the rest of a report is worked out."""
+    """Print a verdict before pictures and the rest of a report are made."""
     console(args).print(verdict, soft_wrap=True)
 
 
 def is_drawn(args: argparse.Namespace, picture: Path, content: bool = True) -> bool:
     """Return whether a picture is to be drawn: not with --no-plot, nor without content.
 
-    A picture that is not drawn is removed: an earlier run drew it, and it would stand beside the results of this one.
-    Raises InputError where that cannot be.
+    An older picture that is not drawn again is removed, so that it does not stand beside new results. Raises InputError
+    if it cannot be removed.
     """
     if args.no_plot or not content:
         remove(picture)
@@ -144,7 +143,7 @@ def is_drawn(args: argparse.Namespace, picture: Path, content: bool = True) -> b
 def pictures(
     args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, str], content: bool = True
 ) -> list[Path]:
-    """Draw a report, by file what of sim.plots draws it; with --no-plot nothing, and matplotlib is not loaded."""
+    """Draw the pictures of a report: file -> function of sim.plots. With --no-plot matplotlib is not loaded."""
     wanted = {folder / file: name for file, name in drawn.items() if is_drawn(args, folder / file, content)}
     if not wanted:
         return []
@@ -162,7 +161,7 @@ _Form = str | Callable[[Any], str | None]
 
 
 def facts(title: str, rows: Rows, left: bool = False) -> Table:
-    """A table of names and texts; a text of None is left out."""
+    """Return a table of names and texts; a row whose text is None is left out."""
     from rich.table import Table
 
     table = Table(title=title, title_justify="left" if left else "center", show_header=False)
@@ -173,7 +172,7 @@ def facts(title: str, rows: Rows, left: bool = False) -> Table:
 
 
 def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (0,)) -> Table:
-    """A table of figures, aligned to the right except in the columns `left`."""
+    """Return a table of figures, aligned to the right except in the columns `left`."""
     from rich.table import Table
 
     table, rows = Table(title=title), list(rows)
@@ -187,9 +186,9 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
 
 
 def columns(title: str, cells: Mapping[str, _Form], records: Iterable[Any], left: Sequence[int] = (0,)) -> Table:
-    """A table of records: under each head a format of the record `r`, or what a function says of it.
+    """Return a table of records. A cell is a format of the record `r`, or a function of it, by its head.
 
-    Two columns of the same head: one of the keys has a blank at its end.
+    For two columns with the same head one key has a blank at its end.
     """
     rows = [[str(form(r)) if callable(form) else form.format(r=r) for form in cells.values()] for r in records]
     return grid(title, [head.strip() for head in cells], rows, left)
@@ -202,7 +201,7 @@ def figure(
     json: InJson = "always",
     absent: str | None = None,
 ) -> Any:
-    """A field that a report's table shows under this name, in this format: of the value, and of the whole report `r`.
+    """Return a dataclass field that the table shows under `name`; the format may use the value and the report `r`.
 
     None is shown as `absent`, or not at all. `json` is as in `off_table` of design/files.py.
     """
@@ -210,12 +209,12 @@ def figure(
 
 
 def several(rows: Callable[[Any], Rows], json: InJson = "always") -> Any:
-    """A field that a report's table shows as these rows."""
+    """Return a dataclass field that the table shows as these rows."""
     return field(metadata={"rows": rows, "json": json})
 
 
 def rows_of(report: Any) -> Rows:
-    """The figures of a report as rows; those that are None are left out."""
+    """Yield the figures of a report as rows; those that are None are left out."""
     for one in fields(report):
         value, form = getattr(report, one.name), one.metadata.get("form")
         if form is not None:
@@ -236,41 +235,41 @@ def rows_of(report: Any) -> Rows:
 
 
 def certified(need: Requirement, proof: bool = True) -> str:
-    """Whether the condition holds; with `proof` also whether that is proved in exact arithmetic."""
+    """Say whether the condition holds, and with `proof` whether exact arithmetic proves it."""
     if not need.certified:
         return "[red]not certified[/]"
     return "[green]certified[/]" + (", proved exactly" if proof and need.proof == "rational" else "")
 
 
 def short(condition: str) -> str:
-    """Its name as the head of a narrow column: this-env., any-env."""
+    """Return the condition's name for a narrow column: this-env., any-env."""
     return condition.replace("environment", "env.")
 
 
 def needs(need: Requirement, digits: int = 6) -> str:
-    """Required of available damping."""
+    """Return the text of required and available damping."""
     return f"{listed(need.required, digits)} of {listed(need.available, digits)} N s/m"
 
 
 def certificate_rows(requirements: Mapping[str, Requirement], digits: int = 6, proof: bool = True) -> Rows:
-    """The damping that each condition needs; with `proof` also whether it is proved in exact arithmetic."""
+    """Yield one row for each condition with its damping, and with `proof` whether exact arithmetic proves it."""
     for name, need in requirements.items():
         asks = f"needs {needs(need, digits)}" if math.isfinite(need.ratio) else "no damping is enough"
         yield f"damping, {name}", f"{asks}: {certified(need, proof)}"
 
 
 def channel_row(contacts: Sequence[str]) -> tuple[str, str | None]:
-    """The names of the contacts, in the order of the numbers of every list; None for a single one."""
+    """Return the row of the contacts' names, in the order of all lists; its text is None for a single contact."""
     return "channels", ", ".join(contacts) if len(contacts) > 1 else None
 
 
 def optional(value: float | None, form: str, absent: str = "-") -> str:
-    """A figure in this format, `absent` where there is none."""
+    """Return a figure in this format, or `absent` for None."""
     return absent if value is None else form.format(value)
 
 
 def transparency_error(figures: Transparency) -> str:
-    """The mismatch M relative to the reference, in decibels."""
+    """Return the mismatch M relative to the reference, in decibels, as a text."""
     shown = (f"{db:.2f} dB" if math.isfinite(db) else "zero" for db in (figures.mismatch_db, figures.rms_mismatch_db))
     return "{} at most, {} rms (0 dB: as wrong as no force)".format(*shown)
 
@@ -319,7 +318,7 @@ def timing_row(part: UnevenTicks | None) -> tuple[str, str | None]:
 
 
 def delay_rows(part: VaryingDelays) -> Rows:
-    """Delays that vary, of a run or of a validation."""
+    """Yield the rows on varying delays of a run or a validation."""
     span, met, proof = part.span, part.met, part.certified.switching
     ranges = ", ".join(f"{lo} to {hi}" for lo, hi in zip(span.lo, span.hi, strict=True))
     played = ", played out at the largest" if span.playout else ""

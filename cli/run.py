@@ -98,7 +98,7 @@ def _parser() -> options.Parser:
 
 
 def _scenario(args: argparse.Namespace) -> Scenario:
-    """The scenario with the delays, the duration and the humans that the options give. Raises InputError."""
+    """Return the scenario with the delays, duration and humans of the options. Raises InputError."""
     scenario = options.with_varying_delays(args, options.scenario_from(args))
     if args.duration is not None:
         scenario = scenario.replace(duration=args.duration)
@@ -106,7 +106,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Scenario]:
-    """The name of the environment that is simulated, and the scenario with it in place of ranges. Raises InputError."""
+    """Return the name of the simulated environment, and the scenario with it. Raises InputError."""
     members = scenario.loop(args.case).members()
     if not 0 <= args.vertex < len(members):
         why = f"allowed are 0 to {len(members) - 1}" if scenario.ranges else "but the scenario has no ranges ([ranges])"
@@ -115,11 +115,11 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
 
 
 # ----------------------------------------------------------------------------------------------------
-# The run and what it came to.
+# The run and its figures.
 
 
 def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -> ScenarioRun:
-    """Close the loop as the options say. Raises InputError for settings that cannot be."""
+    """Run the loop with the options' settings. Raises InputError for impossible settings."""
     from haptic_loop.sim.api import run_scenario
     from haptic_loop.sim.passivity_layer import EnergyNet, claim
 
@@ -131,7 +131,7 @@ def _run(args: argparse.Namespace, scenario: Scenario, assessment: Assessment) -
 
 
 def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> tuple[PaperRow, ...]:
-    """The figures of the paper beside those of this run. Raises InputError for a loop that is not the paper's."""
+    """Return the paper's figures beside those of this run. Raises InputError for another loop."""
     from haptic_loop.sim.report import beside_the_paper
 
     rows = beside_the_paper(scenario, args.case, report.stability, report.assessment.coupling)
@@ -141,7 +141,7 @@ def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> t
 
 
 def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Nearby:
-    """The damping needed where the environment is not as modelled; empty where no guarantee depends on that."""
+    """Return the damping needed in environments near the modelled one; empty if no guarantee depends on it."""
     from haptic_loop.design.optimal import nearby
     from haptic_loop.design.robustness import Nearby
 
@@ -172,7 +172,7 @@ def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunRepo
 
 
 def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
-    """Walls between a contact and ground, (channel, place, name), and in which ticks any wall was touched, (N,)."""
+    """Return the walls between a contact and ground, (channel, place, name), and the ticks with contact, (N,)."""
     law, network = run.simulation.process.law, run.simulation.scenario.environment
     if not network.walls:
         return [], None
@@ -188,7 +188,7 @@ def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
 
 
 def _title(what: str, report: RunReport) -> str:
-    """The title of the picture."""
+    """Return the title of the picture."""
     stability, kind = report.stability, report.kind
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
     guarantee = report.assessment.guarantee
@@ -217,7 +217,7 @@ def _tables(scenario: Scenario, report: RunReport) -> list[Any]:
 
 
 def _rows(report: RunReport) -> render.Rows:
-    """The rows of the table."""
+    """Yield the rows of the table."""
     stability, run, assessment = report.stability, report.run, report.assessment
     felt = assessment.transparency
     ratio = felt and finite(felt.dc_ratio)
@@ -251,7 +251,7 @@ def _rows(report: RunReport) -> render.Rows:
 
 
 def _details(report: RunReport) -> list[str]:
-    """What --details adds: speed and accuracy of the simulation, and what no certificate covers."""
+    """Return the lines of --details: speed and accuracy of the simulation, and the limits of certificates."""
     size = render.optional(report.error.position_max_m, "{:.1e} m at most")
     error = render.optional(report.error.position_relative_rms, "{:.1e} relative rms, " + size)
     return [f"speed: {_speed(report.run)}", f"position error: {error}", CAVEATS]
@@ -263,7 +263,7 @@ def _speed(run: Ran) -> str:
 
 
 def _speed_against_error(run: Ran, engines: Sequence[accuracy.EngineChoice]) -> Any:
-    """Every engine and step on this scene; the one that ran is marked."""
+    """Return a table of every engine and step on this scene; the one that ran is marked."""
     cells: dict[str, Any] = {
         "engine x steps": lambda r: r.name + " *" * ((r.integrator, r.substeps) == (run.integrator, run.substeps)),
         "position error": lambda r: render.optional(finite(r.position_relative_rms), "{:.1e}"),

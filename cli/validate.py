@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from haptic_loop.design.assessment import Assessment, RangesResult
     from haptic_loop.sim.adversary import Worst
 
-_HUMANS, _IN_A_WORLD = 1000, 100  # unless a user asks for others
+_HUMANS, _IN_A_WORLD = 1000, 100  # default numbers of hands
 _ENVIRONMENTS = ("nominal", "ranges")
 _LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
@@ -106,7 +106,7 @@ def _parser() -> options.Parser:
 
 
 def _scenario(args: argparse.Namespace) -> Scenario:
-    """The scenario, which must be linear. Raises InputError."""
+    """Return the scenario of the options. Raises InputError unless it is linear."""
     scenario = options.with_humans(args, options.with_varying_delays(args, options.scenario_from(args)))
     require_linear(scenario, "sim.validate", walls=True)
     if args.dask is not None and args.shards > 1:
@@ -118,9 +118,9 @@ def _scenario(args: argparse.Namespace) -> Scenario:
 
 
 def _environments(args: argparse.Namespace, whole: RangesResult | None) -> tuple[Member, ...]:
-    """The vertices of the ranges, and as many other points of them, the worst one found first. Raises InputError.
+    """Return the vertices of the ranges and as many other points, the worst one first. Raises InputError.
 
-    Without --environments ranges there are none: every loop has the nominal environment.
+    Without `--environments ranges` the result is empty, and every loop has the nominal environment.
     """
     if args.environments == "nominal":
         return ()
@@ -131,15 +131,16 @@ def _environments(args: argparse.Namespace, whole: RangesResult | None) -> tuple
 
 
 def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, assessment: Assessment) -> Validation:
-    """The loop, the humans that are to hold it, and the engines that decide. Raises InputError."""
-    links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
+    """Return the loop, the humans and the engines of the validation. Raises InputError."""
+    # A population of the user's own has no links.
+    links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)
     work, met = (args.humans, links, args.engine, args.duration), _environments(args, assessment.ranges)
     lag, every = assessment.force_limits.rho, args.traces == "all"
     return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=lag, all_traces=every)
 
 
 def _findings(args: argparse.Namespace, question: Validation, table: Table) -> tuple[Findings, float]:
-    """The findings on all humans, and the seconds that they took."""
+    """Return the findings on all humans, and the time that they took [s]."""
     begin = time.perf_counter()
     with render.progress("validating") as move:
         if args.dask is not None:
@@ -151,7 +152,7 @@ def _findings(args: argparse.Namespace, question: Validation, table: Table) -> t
 
 @dataclass(frozen=True)
 class _Searched:
-    """What the adversary found; None where none was asked for, or where Ctrl-C ended its search."""
+    """Results of the adversary; None without --adversary, or if Ctrl-C ended its search."""
 
     worst: Worst | None = None
     drawn: Worst | None = None  # the worst that the scenario's own population draws
@@ -159,12 +160,12 @@ class _Searched:
     interrupted: bool = False
 
 
-#: conditions that hold in the environment of the loop; the second asks no more, where devices are known
+#: conditions for the environment of the loop
 _OF_HERE = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name
 
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, assessment: Assessment) -> _Searched:
-    """The worst humans, in the environment that needs the most damping; what was found before Ctrl-C is kept."""
+    """Search the worst humans in the environment that needs the most damping, until Ctrl-C or the end."""
     from haptic_loop.sim.adversary import search, search_population
 
     asked = [need for need in assessment.requirements.values() if need.condition in _OF_HERE]
@@ -178,7 +179,7 @@ def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, as
             with render.progress("searching the worst human") as move:
                 frozen = assemble(scenario, chosen.coupling).process.law.frozen().values()
                 loop = scenario.loop(args.case)
-                F = max(frozen, key=lambda F: this_environment(F, loop).ratio)  # the state that asks most
+                F = max(frozen, key=lambda F: this_environment(F, loop).ratio)  # the state that needs the most damping
                 found.append(seek(scenario, F, args.seed, args.generations or 150, progress=move))
     except KeyboardInterrupt:
         return _Searched(*found, ratio=ratio, interrupted=True)
@@ -188,14 +189,14 @@ def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, as
 def _save(
     args: argparse.Namespace, out: Path, question: Validation, findings: Findings, worst: Worst | None, kind: str
 ) -> list[Path]:
-    """Humans that can be replayed with `sim.run --human`, and the picture."""
+    """Save humans for `sim.run --human`, and the picture."""
     scenario, files = question.scenario, []
     named = {f"disagreement-{i}.toml": int(i) for i in findings.index[findings.disagreements]}
     if findings.index.size:
         named |= {"worst-human.toml": int(findings.index[np.argmax(findings.radius)])}
     for name, i in named.items():
         crowd = question.crowd(i)
-        if not isinstance(crowd.humans(0)[0], Human):  # a user's own class, which draws this hand again
+        if not isinstance(crowd.humans(0)[0], Human):  # A class of the user's own draws this hand again.
             continue
         remark = f"seed {question.seed}, index {i}"
         mechanics = crowd.mechanics[0] if crowd.mechanics else ()
@@ -214,7 +215,7 @@ def _save(
 
 
 # ----------------------------------------------------------------------------------------------------
-# The report and its parts. Each says itself what stands in its row of the table.
+# The report and its parts.
 
 
 _NOTHING = "no batch of humans was done"
@@ -222,7 +223,7 @@ _NOTHING = "no batch of humans was done"
 
 @dataclass(frozen=True)
 class _Own:
-    """What the exact loop does in the hands of the scenario, or of --human FILE."""
+    """Growth of the exact loop with the hands of the scenario, or of --human FILE."""
 
     from_: str
     exact: Eigenvalues = off_table("inlined")
@@ -242,7 +243,7 @@ def _assessment_rows(assessment: Assessment) -> render.Rows:
 
 @dataclass(frozen=True, kw_only=True)
 class _Report:
-    """What a validation found; a part that does not exist is null or left out."""
+    """Results of a validation; a missing part is null or left out."""
 
     case: str
     scenario: str
@@ -287,7 +288,7 @@ class _Report:
 def _varying(
     question: Validation, chosen: Chosen, assessment: Assessment, findings: Findings, certified: bool
 ) -> tuple[verdicts.Growing[VaryingDelays] | None, verdicts.Growing[UnevenTicks] | None]:
-    """How many hands grow while delays vary, and while ticks do; None where they do not vary."""
+    """Return the numbers of hands that grow under varying delays and varying periods; None for constant ones."""
     from haptic_loop.sim.switching import DelaysCovered
 
     scenario, switching, timing = question.scenario, None, None
@@ -309,7 +310,7 @@ def _reported(
     wall: float,
     searched: _Searched,
 ) -> _Report:
-    """Everything that was found, and whether all of it holds."""
+    """Return the report, and whether all of its claims hold."""
     scenario, any_done = question.scenario, bool(findings.index.size)
     guarantee = assessment.guarantee
     certified = guarantee is not None

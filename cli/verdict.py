@@ -1,4 +1,4 @@
-"""What every command says of a coupling: the verdict in one sentence, and the rows of its assessment."""
+"""The verdict on a coupling in one sentence, and the rows of its assessment."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from haptic_loop.sim.scenario import Scenario
 
 
 def chosen_by(args: argparse.Namespace, scenario: Scenario) -> Chosen:
-    """The coupling of --coupling for --condition and --no-limiter, designed where it is asked for by name."""
+    """Return the coupling of --coupling, --condition and --no-limiter; a kind of coupling is designed."""
     with render.designing(scenario.loop(args.case), args.coupling, args.condition) as progress:
         return choose(scenario, args.case, args.coupling, args.condition, args.limiter, progress)
 
@@ -69,8 +69,8 @@ def verdict(
     """Say in one or two sentences for whom the loop is stable, what is felt, and what would end it.
 
     Args:
-        assessment: Of exactly what the command is about.
-        nearby: The damping that is needed where the environment is ten percent off, where it was computed.
+        assessment: The assessment of exactly the loop that the command runs or judges.
+        nearby: The damping that is needed if the environment is ten percent off, if it was computed.
         force_error: rms of a run, in percent of the ideal force.
         encoder: Whether friction covers the encoder steps of the devices, where these have steps.
     """
@@ -91,7 +91,7 @@ def verdict(
 
 
 def lost(assessment: Assessment, nearby: Nearby | None) -> str:
-    """Say which change of the environment within ten percent ends the guarantee; "" where none does."""
+    """Return a sentence on the change within ten percent that ends the guarantee, or ""."""
     there, guarantee = nearby and nearby.robustness, assessment.guarantee
     if there is None or there.certified or guarantee is None or guarantee.any_environment:
         return ""
@@ -99,7 +99,7 @@ def lost(assessment: Assessment, nearby: Nearby | None) -> str:
 
 
 def _who(guarantee: Guarantee) -> str:
-    """For whom, and with what: 'every passive hand with this object'."""
+    """Return the hands and objects of a guarantee: 'every passive hand with this object'."""
     place = _OBJECTS.get(guarantee.environments, guarantee.environments)
     delays, facts = guarantee.delays, guarantee.facts
     late = f", with delays that switch within {delays}" if "switching" in facts else ""
@@ -107,7 +107,7 @@ def _who(guarantee: Guarantee) -> str:
 
 
 def _felt(assessment: Assessment, force_error: float | None) -> str:
-    """The share of the stiffness that is rendered, and the force error of a run."""
+    """Return the rendered share of the stiffness and the force error of a run, as a text."""
     figures = assessment.transparency
     share = figures and finite(figures.dc_ratio)
     words = [f"{_percent(share)} of the stiffness"] if share else []
@@ -120,7 +120,7 @@ def _percent(ratio: float) -> str:
 
 
 def _missing(assessment: Assessment) -> str:
-    """What the guarantee lacks of what the loop and the user ask for."""
+    """Return the part of the loop or the request that the guarantee does not cover, as a text."""
     if not assessment.decisive.certified:
         return f"by {_sentence(f'{assessment.condition}: {assessment.decisive.shortfall}')}"
     reason = assessment.ranges and assessment.ranges.reason
@@ -136,7 +136,7 @@ def _sentence(words: str) -> str:
 
 
 def rows(assessment: Assessment) -> render.Rows:
-    """The rows of an assessment that every table begins with."""
+    """Yield the first rows of every table with an assessment."""
     yield from render.certificate_rows(assessment.requirements, 5)
     yield from range_rows(assessment.ranges) if assessment.ranges else ()
     guarantee = assessment.guarantee
@@ -146,7 +146,7 @@ def rows(assessment: Assessment) -> render.Rows:
 
 
 def gain_rows(assessment: Assessment) -> render.Rows:
-    """The gains of a spring-damper, or the static stiffness of a moving average."""
+    """Yield the rows of a spring-damper's gains, or of the static stiffness."""
     gains = assessment.gains
     if "K" in gains:
         K, B = (render.listed(gains[name], 5) for name in ("K", "B"))
@@ -159,7 +159,7 @@ _NEVER = "no damping is enough"
 
 
 def range_rows(ranges: RangesResult) -> Iterator[tuple[str, str]]:
-    """The rows of a check over ranges."""
+    """Yield the rows of a check over ranges."""
     part, count = ranges.part(), len(ranges.members) - 1
     member, requirement = ranges.worst
     exact = ranges.certificate is not None
