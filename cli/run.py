@@ -153,9 +153,11 @@ def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Nearby:
 
 
 def _save(args: argparse.Namespace, out: Path, run: ScenarioRun, report: RunReport) -> list[Path]:
+    from haptic_loop.sim.view.drawn_object import scene_xml
+
     result, stability = replace(run.trace, meta=render.plain(report)), report.stability
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
-    files.append(write(out / "scene.xml", run.simulation.scene.xml))
+    files.append(write(out / "scene.xml", scene_xml(run.simulation)))
     if render.is_drawn(args, out / "figure.png", bool(result.t.size)):
         from haptic_loop.sim.plots import Contacts, Onset, draw_run, save
 

@@ -131,6 +131,7 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
             shown = name.replace("_", "-")
             raise InputError(f"--{shown}: with environment.world there is no linear loop to compare with; leave it out")
     from haptic_loop.models.world import files_of  # loads MuJoCo
+    from haptic_loop.sim.view.drawn_object import scene_xml
 
     assert scenario.environment.world is not None
     scene = {file.resolve() for file in files_of(Path(scenario.environment.world.file))}
@@ -154,7 +155,7 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
     )
     kept = replace(trace, meta=render.plain(report))
     files = [kept.save_npz(out / "trace.npz"), kept.save_csv(out / "trace.csv")]
-    written = finished.simulation.scene.xml, scene_of(scenario, chosen.coupling).xml
+    written = scene_xml(finished.simulation), scene_of(scenario, chosen.coupling).xml
     files += [write(out / name, xml) for name, xml in zip(_WRITTEN, written, strict=True)]
     if not args.no_plot and trace.t.size > 1:
         from haptic_loop.sim.plots import Contacts, draw_run, save

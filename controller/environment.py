@@ -505,15 +505,20 @@ def environment(network: Network, T: Number) -> Lti:
     return E + network.block.at(T) if network.block else E
 
 
-def walled_environment(network: Network, T: Number) -> Lti:
-    """[x; p] -> [f; y]: as `environment`, wall forces p [N] put in and displacements y [m] across walls out."""
+def walled_environment(network: Network, T: Number, places: bool = False) -> Lti:
+    """[x; p] -> [f; y]: as `environment`, wall forces p [N] put in and displacements y [m] across walls out.
+
+    With `places` further ports precede those of the walls: a force on every node in, the node's displacement out.
+    """
     across = network.across(network.walls)
     across = across if across.dtype == int else numbers(across, T)
-    adrift = _adrift(network, (*network.springs, *network.walls))
+    adrift = () if places else _adrift(network, (*network.springs, *network.walls))
+    if places:
+        across = np.vstack([np.eye(across.shape[1], dtype=across.dtype), across])
     E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, across, adrift), T)
     if not network.block:
         return E
-    w = len(network.walls)
+    w = len(across)
     return E + Lti.diag(network.block.at(T), Lti.constant(np.zeros((w, w)), T))
 
 

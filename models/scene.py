@@ -479,7 +479,7 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
                 places = [number[joints[k]], number[base[k]] if base else -1]
                 spec.add_numeric(name=f"{_IMPEDANCE}{i}{axis}", data=[*places, *numbers], size=len(numbers) + 2)
     spec.compile()
-    xml = _EMPTY_CLASSES.sub("", spec.to_xml())
+    xml = written(spec)
     for part in [*(tendon for tendon in spec.tendons if tendon.name.endswith(DRAWN)), *spec.sites]:
         spec.delete(part)
     spec.compiler.discardvisual = True
@@ -493,6 +493,11 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
         points=tuple(tuple(model.joint(name).id for name in part.joints) for part in placed),
         devices=tuple(i for i, part in enumerate(channels) for _ in range(part.handles)),
     )
+
+
+def written(spec: mujoco.MjSpec) -> str:
+    """Return the MJCF of a compiled specification without the empty classes of attached files."""
+    return _EMPTY_CLASSES.sub("", spec.to_xml())
 
 
 def _axis(joint: str) -> list[float]:

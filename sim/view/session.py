@@ -36,6 +36,7 @@ from haptic_loop.sim.engines import ExactEngine
 from haptic_loop.sim.run import Simulation, assemble, outside_forces, run_block
 from haptic_loop.sim.scenario import LONGEST_DELAY, InputError, Scenario, is_world
 from haptic_loop.sim.stability import Mode, worst_mode
+from haptic_loop.sim.view.drawn_object import object_of
 from haptic_loop.sim.world import START_J, InWorld, Late, WorldFigures, live
 
 # ----------------------------------------------------------------------------------------------------
@@ -315,6 +316,7 @@ class Frame:
     overruns: int
     lost: float  # [s]
     factor: float  # simulated over real time
+    nodes: Array | None = None  # (nodes,) displacements of the object's nodes [m]
     pose: Array | None = None  # (nq,) positions of a world's scene
     world: WorldFigures | None = None
 
@@ -379,6 +381,7 @@ class LiveLoop:
             world=world and world.figures(),
             t=self.t,
             q=self.state[:n],
+            nodes=self._nodes,
             mean=recent.mean(axis=0),
             low=recent.min(axis=0),
             high=recent.max(axis=0),
@@ -444,6 +447,8 @@ class LiveLoop:
         buffer.w[:count] = w[:, :, None]
         with np.errstate(over="ignore", invalid="ignore"):  # a process that runs away is noticed below
             run_block(buffer, self._engine, count)
+            if self._motion:
+                self._nodes = self._motion.follow(buffer.process.measured(buffer.x[:count, :, 0]))
         self._tick += count
         if not (np.isfinite(buffer.s[: count + 1]).all() and np.isfinite(buffer.z[: count + 1]).all()):
             self._happen(_Restart())
@@ -476,6 +481,10 @@ class LiveLoop:
         buffer.s[0, :, 0] = s
         buffer.z[0, :, 0] = process.ticked.at_rest(s[: process.channels])
         self.prepared, self._buffer = prepared, buffer
+        self._motion, self._nodes = None, None
+        if drawn := object_of(prepared.simulation):
+            self._motion = drawn.motion(prepared.coupling, prepared.scenario.psi, prepared.scenario.T)
+            self._nodes = self._motion.rest(s[: process.channels])
         self._start_engine()
 
     @property

@@ -17,7 +17,6 @@ import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterable
-from functools import partial
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
@@ -32,6 +31,7 @@ from haptic_loop.controller.lti import Array
 from haptic_loop.design.files import InputError, check_file, write
 from haptic_loop.design.result import Requirement
 from haptic_loop.models.scene import APART, DRAWN, STEP, Scene
+from haptic_loop.sim.view.drawn_object import SPRING, DrawnObject, Shape, object_of
 from haptic_loop.sim.view.session import HISTORY, KEYS, Frame, Grip, LiveLoop, PreparedLoop, keys_help
 from haptic_loop.sim.world import WorldFigures
 
@@ -186,8 +186,10 @@ def _list(values: tuple[int, ...]) -> str:
 class ShownScene:
     """A scene that can be looked at, and pushed with the mouse."""
 
-    def __init__(self, scene: Scene, force_limit: Array, size: tuple[int, int] = _SIZE) -> None:
-        self.scene, self.force_limit = scene, force_limit
+    def __init__(
+        self, scene: Scene, force_limit: Array, size: tuple[int, int] = _SIZE, drawn: DrawnObject | None = None
+    ) -> None:
+        self.scene, self.force_limit, self.object = scene, force_limit, drawn
         self.model = _dressed(scene, size)
         self.data = mujoco.MjData(self.model)
         self.device = _owners(scene)  # joint -> device
@@ -212,7 +214,12 @@ class ShownScene:
         return Grip(channels[0], tuple((self.data.qpos[handles] + drawn).tolist()))
 
     def draw(self, drawn: mujoco.MjvScene, frame: Frame) -> None:
-        """Arrows: the mean force on each device, the range it has had since the last frame, and what pushes."""
+        """Draw the object and arrows: the mean force on each device, its range since the last frame, and pushes."""
+        for shape in self.object.shapes(frame.nodes) if self.object else ():
+            if shape.kind == "spring":
+                _connect(drawn, _BAR, SPRING, shape.at, shape.to, shape.rgba)
+            else:
+                _solid(drawn, _BOX if shape.kind in ("mass", "wall") else _SPHERE, shape)
         for device in range(_devices(self.scene)):
             channels, own = _own(self.scene, device), _colour(device)
             handles = np.array(self.scene.handles)[channels]
@@ -243,8 +250,10 @@ class ShownScene:
 
     def aim(self, camera: mujoco.MjvCamera) -> None:
         """Look from above at the devices, between the words and the plots."""
+        behind = (self.object.reach - STEP) / 2 if self.object else 0.0  # [m] by which the middle moves to the object
         camera.lookat[:] = self.model.stat.center + self.model.stat.extent * np.array((0.0, 0.0, 0.2))
-        camera.distance = 3.0 * self.model.stat.extent
+        camera.lookat[0] -= behind
+        camera.distance = 3.0 * (self.model.stat.extent + behind / 2)
         camera.azimuth, camera.elevation = 90.0, -35.0
 
 
@@ -315,7 +324,7 @@ def stage_for(session: LiveLoop) -> ShownScene:
     simulation = session.prepared.simulation
     if session.world:
         return ShownWorld(session.world.ports[0].world, simulation.process.force_limit)
-    return ShownScene(simulation.scene, simulation.process.force_limit)
+    return ShownScene(simulation.scene, simulation.process.force_limit, drawn=object_of(simulation))
 
 
 def _dressed(scene: Scene, size: tuple[int, int] = _SIZE) -> mujoco.MjModel:
@@ -333,6 +342,8 @@ def _dressed(scene: Scene, size: tuple[int, int] = _SIZE) -> mujoco.MjModel:
         seen.add(number)
         body = spec.body(scene.model.body(number).name)
         body.pos = [place * STEP, device * -APART, 0.03]
+        if body.frame:  # of an attached device, which has a place of its own in the scene's file
+            body.frame.pos = [0.0, 0.0, 0.0]
         if place == 0:
             body.add_geom(type=_SPHERE, size=[0.024] * 3, rgba=(*_colour(device), 1.0), **_MASSLESS)
         else:
@@ -387,6 +398,15 @@ def _shade(device: int, axis: int) -> _Colour:
 def _arrow(drawn: mujoco.MjvScene, at: Array, way: Array, rgba: tuple[float, ...]) -> None:
     if np.abs(way).max() > 1e-4:
         _connect(drawn, _ARROW, 0.005, at, at + way, rgba)
+
+
+def _solid(drawn: mujoco.MjvScene, kind: mujoco.mjtGeom, shape: Shape) -> None:
+    if drawn.ngeom < drawn.maxgeom:
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, shape.quat)
+        colour = np.array(shape.rgba, dtype=np.float32)
+        mujoco.mjv_initGeom(drawn.geoms[drawn.ngeom], kind, np.array(shape.size), np.array(shape.at), turn, colour)
+        drawn.ngeom += 1
 
 
 def _sphere(drawn: mujoco.MjvScene, at: Array, radius: float, rgba: tuple[float, ...]) -> None:
@@ -520,8 +540,8 @@ class FlatPictures:
     A body that moves along z becomes larger when it comes nearer.
     """
 
-    def __init__(self, scene: Scene, force_limit: Array) -> None:
-        self.scene, self.force_limit = scene, force_limit
+    def __init__(self, scene: Scene, force_limit: Array, drawn: DrawnObject | None = None) -> None:
+        self.scene, self.force_limit, self.object = scene, force_limit, drawn
         self._font = ImageFont.load_default(12)
         places, owners, first = _places(scene), _owners(scene), dict[int, int]()
         for joint, body in enumerate(scene.model.jnt_bodyid.tolist()):
@@ -551,14 +571,16 @@ class FlatPictures:
         self._bodies(ImageDraw.Draw(image), frame, max(top, round(_WORDS * image.height)), bottom)
 
     def _bodies(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
-        steps = max(place for _, place, _ in self._shapes) + 2
-        per_metre = (_SIZE[0] - 120) / (steps * STEP + 2 * _LONGEST)
-        origin, row = 60 + (_LONGEST + STEP) * per_metre, (bottom - top) / _devices(self.scene)
+        steps, behind = max(place for _, place, _ in self._shapes) + 1, self.object.reach if self.object else 0.0
+        left = max(_LONGEST + STEP, behind)  # [m] of the picture left of the handles
+        per_metre = (_SIZE[0] - 120) / (left + steps * STEP + _LONGEST)
+        origin, row = 60 + left * per_metre, (bottom - top) / _devices(self.scene)
         usual = min(14.0, 0.3 * row)
+        self._object(pen, frame, origin, per_metre, top, row)
         for i in range(_devices(self.scene)):
             y = top + (i + 0.5) * row
             if len(_own(self.scene, i)) == 1:
-                pen.line((30, y, _SIZE[0] - 30, y), _LIGHT, 2)
+                pen.line((origin - (STEP + _LONGEST / 2) * per_metre, y, _SIZE[0] - 30, y), _LIGHT, 2)
         model = self.scene.model
         for body, place, i in self._shapes:
             moved = frame.q[model.jnt_bodyid == body] @ model.jnt_axis[model.jnt_bodyid == body]
@@ -570,6 +592,26 @@ class FlatPictures:
                 self._force(pen, frame, i, x, y - 0.45 * row, per_metre)
             else:
                 pen.rectangle(corners, _rgb(_GREY))
+
+    def _object(
+        self, pen: ImageDraw.ImageDraw, frame: Frame, origin: float, per_metre: float, top: float, row: float
+    ) -> None:
+        """The virtual object from above; what moves along z is not told."""
+
+        def place(at: Array) -> tuple[float, float]:
+            return origin + at[0] * per_metre, top + (0.5 - at[1] / APART) * row
+
+        for shape in self.object.shapes(frame.nodes) if self.object else ():
+            (x, y), colour = place(shape.at), _rgb(shape.rgba[:3])
+            if shape.kind == "spring":
+                pen.line((x, y, *place(shape.to)), colour, 2)
+            elif shape.kind == "wall":
+                along = 0.25 * row * np.array([-shape.to[1], -shape.to[0]])
+                pen.line((x - along[0], y - along[1], x + along[0], y + along[1]), colour, 4)
+            else:
+                size = 0.7 * shape.size[0] * per_metre
+                corners = (x - size, y - size, x + size, y + size)
+                (pen.rectangle if shape.kind == "mass" else pen.ellipse)(corners, colour)
 
     def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, device: int, x: float, y: float, per_metre: float) -> None:
         """The range of the force since the last frame, and its mean; the device feels -f. In space only the mean."""
@@ -649,8 +691,9 @@ class WorldPictures(FlatPictures):
 def pictures_for(session: LiveLoop) -> FlatPictures:
     """What draws the pictures of this loop's film. Raises InputError where a world needs OpenGL and there is none."""
     simulation, stage = session.prepared.simulation, stage_for(session)
-    make = partial(WorldPictures, stage) if isinstance(stage, ShownWorld) else FlatPictures
-    return make(simulation.scene, simulation.process.force_limit)
+    if isinstance(stage, ShownWorld):
+        return WorldPictures(stage, simulation.scene, simulation.process.force_limit)
+    return FlatPictures(simulation.scene, simulation.process.force_limit, stage.object)
 
 
 def _offscreen(width: int, height: int) -> Any:

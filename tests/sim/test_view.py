@@ -21,11 +21,13 @@ from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.design.result import Chosen
 from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Human, Link, Person
-from haptic_loop.models.scene import build, plant
+from haptic_loop.models.scene import APART, build, plant
+from haptic_loop.sim.run import assemble
 from haptic_loop.sim.run import run as close_loop
 from haptic_loop.sim.scenario import InputError, load
 from haptic_loop.sim.stability import close, dominant_mode
 from haptic_loop.sim.view import stage as drawing
+from haptic_loop.sim.view.drawn_object import object_of, scene_xml
 from haptic_loop.sim.view.session import (
     _DAMPING,
     _STIFFNESS,
@@ -321,6 +323,10 @@ def test_shapes_change_nothing_that_moves(name):
     assert [shown.joint(j).name for j in range(shown.njnt)] == [bare.joint(j).name for j in range(bare.njnt)]
     assert not shown.geom_contype.any()
     assert not shown.geom_conaffinity.any()
+    data = mujoco.MjData(shown)
+    mujoco.mj_kinematics(shown, data)
+    rows = data.xpos[shown.jnt_bodyid, 1]
+    assert rows == pytest.approx(-APART * np.array(_owners(scene)))  # on the rails of their devices
     assert np.array_equal(shown.body_mass, bare.body_mass)
     assert np.array_equal(plant(shown).A, plant(bare).A)
     assert np.array_equal(plant(shown).B, plant(bare).B)
@@ -384,6 +390,80 @@ def test_the_envelope_holds_every_force(ticks):
         assert np.array_equal(np.nanmax(high, axis=0), history.max(axis=0))
     assert np.isnan(low).any() == (ticks < 3333 - 3333 // _COLUMNS)
     assert _scale(history) >= np.abs(history).max(initial=0)
+
+
+# the virtual object
+
+
+def followed(name, coupling, **changes):
+    """A run, and the displacements of the object's nodes at each tick, (ticks, nodes)."""
+    scenario = load(name).replace(**changes)
+    simulation = assemble(scenario, coupling)
+    trace, drawn = close_loop(simulation, "exact", ticks=1500), object_of(simulation)
+    motion = drawn.motion(coupling, scenario.psi, scenario.T)
+    motion.rest(np.zeros(scenario.channels))
+    return scenario, trace, np.array([motion.follow(x[None]) for x in trace.x])
+
+
+@pytest.mark.parametrize(("psi", "K", "B"), [((0, 0), 700.0, 0.5), ((0, 1), 50000.0, 20.0)])
+def test_the_drawn_springs_carry_the_forces(psi, K, B):
+    """800 N/m and 1 N s/m from contact 1 to the mass, 700 N/m to contact 2, by backward differences; f is delayed."""
+    scenario, trace, q = followed("omega-pair", SpringDamper([K, K / 2], [B, B]), psi=psi)
+    for i, stiffness in enumerate((800.0, 700.0)):
+        stretch = q[:, i] - q[:, 2]
+        force = stiffness * stretch + 1.0 * np.diff(stretch, prepend=0.0) / scenario.T
+        late = scenario.theta[i] + psi[i]
+        assert np.abs(force).max() > 0.3
+        np.testing.assert_allclose(trace.f[late:, i], force[: len(force) - late], rtol=0, atol=1e-9)
+
+
+def test_the_drawn_tip_stops_at_the_wall():
+    """3000 N/m and 2 N s/m that push beyond 5 mm: max(0, K h + B (h - h_-)/T), one tick late."""
+    scenario, trace, q = followed("one-wall", SpringDamper([1000.0], [0.5]))
+    h = np.maximum(q[:, 0] - 0.005, 0.0)
+    force = np.maximum(3000 * h + 2 * np.diff(h, prepend=0.0) / scenario.T, 0.0) * (h > 0)
+    assert force.max() > 0.5
+    np.testing.assert_allclose(trace.f[1:, 0], force[:-1], rtol=0, atol=1e-9)
+
+
+def test_held_devices_hold_the_object(none):
+    """Springs in series: 1/K1, 1/800, 1/700, 1/K2."""
+    K, x = np.array([900.0, 400.0]), np.array([0.01, -0.004])
+    motion = object_of(none.simulation).motion(SpringDamper(K, [0.5, 0.5]), (0, 0), SCENARIO.T)
+    f = (x[0] - x[1]) / np.sum(1 / np.array([*K, 800.0, 700.0]))
+    expected = [x[0] - f / K[0], x[1] + f / K[1], x[0] - f / K[0] - f / 800]
+    np.testing.assert_allclose(motion.rest(x), expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(motion.follow(np.tile(x, (300, 1))), expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["omega-pair", "three-rigid", "one-wall", "omega-space", "world-cube"])
+def test_the_scene_file_shows_the_object_beside_the_devices(name):
+    scenario = load(name)
+    simulation = assemble(scenario, SpringDamper([900.0] * scenario.channels, [0.4] * scenario.channels))
+    drawn, bare = (mujoco.MjModel.from_xml_string(xml) for xml in (scene_xml(simulation), simulation.scene.xml))
+    network = scenario.environment
+    parts = 4 if network.world else len(network.points or network.nodes()) + len(network.springs) + len(network.walls)
+    assert drawn.ngeom == bare.ngeom + parts  # of the world: the floor, the cube, the finger and the plate
+    assert not drawn.geom_contype.any()
+    assert drawn.geom_pos[drawn.geom_bodyid == 0][:, 0].max() < -0.09  # left of the motors
+    assert np.array_equal(plant(drawn).A, plant(bare).A)
+    assert np.array_equal(plant(drawn).B, plant(bare).B)
+
+
+def test_a_film_shows_how_the_mass_moves(none):
+    """In pixels, from the distance of 70 mm between the columns of contacts and masses."""
+    running = session(none)
+    pictures = pictures_for(running)
+
+    def middle(frame, kind):
+        rgba = next(s.rgba for s in pictures.object.shapes(frame.nodes) if s.kind == kind)
+        picture = pictures.picture(frame).astype(int)
+        return np.nonzero(np.abs(picture - [round(255 * c) for c in rgba[:3]]).sum(axis=2) == 0)[1].mean()
+
+    still, later = running.frame(0.0), running.frame(0.9)
+    scale = (middle(still, "contact") - middle(still, "mass")) / 0.07
+    assert abs(later.nodes[2]) > 0.005
+    assert middle(later, "mass") - middle(still, "mass") == pytest.approx(scale * later.nodes[2], abs=1.5)
 
 
 class FakeWindow:

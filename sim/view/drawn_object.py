@@ -1,0 +1,220 @@
+"""The virtual object as pictures show it: where its nodes are at each tick, and its masses, springs and walls.
+
+What is drawn is computed beside the loop and changes nothing in it. The displacements of the nodes come from the same
+equations as the forces of a tick before Theta, with these displacements as further outputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.delay import delay
+from haptic_loop.controller.environment import GROUND, Network, walled_environment
+from haptic_loop.controller.law import Law
+from haptic_loop.controller.lti import Array, Lti
+from haptic_loop.models.device import AXES
+from haptic_loop.models.scene import APART, STEP, written
+from haptic_loop.sim.run import Simulation
+
+if TYPE_CHECKING:  # MuJoCo, for which help does not wait
+    import mujoco
+
+_FIRST, _COLUMN, _HEIGHT = STEP + 0.07, 0.07, 0.03  # [m] from the handles to the contacts, between columns, of all
+_RADIUS = {"contact": 0.012, "node": 0.008, "mass": 0.02}  # [m]; a mass is a cube
+SPRING = 0.002  # [m] radius
+_WALL = (0.03, 0.03, 0.002)  # [m] half the sides of a wall; the last is along its normal
+_COLOUR: dict[str, tuple[float, float, float, float]] = {
+    "contact": (0.95, 0.9, 0.3, 1.0),
+    "node": (0.3, 0.3, 0.3, 1.0),
+    "mass": (0.45, 0.35, 0.6, 1.0),
+    "spring": (0.3, 0.3, 0.3, 1.0),
+    "wall": (0.6, 0.45, 0.3, 1.0),
+}
+
+
+class Shape(NamedTuple):
+    """One shape of the object."""
+
+    kind: Literal["contact", "node", "mass", "spring", "wall"]
+    at: Array  # (3,) [m] its centre, or where a spring begins
+    to: Array  # (3,) [m] where a spring ends, or the normal of a wall; unused elsewhere
+
+    @property
+    def rgba(self) -> tuple[float, float, float, float]:
+        return _COLOUR[self.kind]
+
+    @property
+    def size(self) -> tuple[float, ...]:
+        """Half the sides, or the radius first [m]; not of a spring."""
+        return _WALL if self.kind == "wall" else (_RADIUS[self.kind],) * 3
+
+    @property
+    def quat(self) -> Array:
+        """The quaternion that turns z to the normal of a wall; of other shapes none."""
+        import mujoco
+
+        quat = np.array([1.0, 0.0, 0.0, 0.0])
+        if self.kind == "wall":
+            mujoco.mju_quatZ2Vec(quat, self.to)
+        return quat
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnObject:
+    """A network of springs with a place for each of its points, left of the devices."""
+
+    network: Network
+    rest: dict[str, Array]  # (3,) [m] of each point, and of the ground beside it
+    contacts: tuple[str, ...]  # points, one per device
+
+    @classmethod
+    def of(cls, network: Network) -> DrawnObject:
+        """Place contacts before their devices, and every other point a column behind its nearest neighbours."""
+        points = tuple(network.points) or tuple(network.nodes())
+        nodes = set(network.contacts)
+        contacts = tuple(name for name in points if nodes & set(network.coordinates(name)))
+        row, depth = {name: -APART * i for i, name in enumerate(contacts)}, dict.fromkeys(contacts, 0)
+        ends = [part.between for part in (*network.springs, *network.walls)]
+        pairs = [pair for one, other in ends for pair in ((one, other), (other, one)) if GROUND not in pair]
+        for column in range(1, len(points)):
+            near = {other for one, other in pairs if depth.get(one) == column - 1 and other not in depth}
+            for name in [name for name in points if name in near]:
+                y = float(np.mean([row[one] for one, other in pairs if other == name and depth.get(one) == column - 1]))
+                while any(depth[other] == column and abs(row[other] - y) < 2.2 * _RADIUS["mass"] for other in depth):
+                    y -= 2.5 * _RADIUS["mass"]
+                row[name], depth[name] = y, column
+        rest = {name: _place(depth.get(name, 1), row.get(name, 0.0)) for name in points}
+        return cls(network, rest, contacts)
+
+    @property
+    def reach(self) -> float:
+        """[m] from the handles to the ground behind the object."""
+        return _FIRST + _COLUMN - min(0.0, *(float(at[0]) + _FIRST for at in self.rest.values()))
+
+    def motion(self, coupling: Coupling, psi: Sequence[int], T: float) -> Motion:
+        """Return what follows the nodes tick by tick."""
+        return Motion(self.network, coupling, psi, T)
+
+    def shapes(self, displacements: Array | None = None) -> Iterator[Shape]:
+        """Yield the shapes where the nodes have these displacements (nodes,) [m], or at rest."""
+        moved = {name: np.zeros(3) for name in self.rest}
+        if displacements is not None:
+            q = dict(zip(self.network.nodes(), displacements, strict=True))
+            for name in moved:
+                for i, node in enumerate(self.network.coordinates(name)):
+                    axis = AXES.index(node.rpartition(".")[2]) if self.network.points and node != GROUND else i
+                    moved[name][axis] += q.get(node, 0.0)
+        for spring in self.network.springs:
+            a, b = (GROUND if end == GROUND else self.rest[end] + moved[end] for end in spring.between)
+            if isinstance(a, str):
+                a, b = b, a
+            yield Shape("spring", np.asarray(a), np.array([-self.reach, a[1], a[2]]) if isinstance(b, str) else b)
+        for wall in self.network.walls:
+            first, second = wall.between
+            sign = -1.0 if first == GROUND else 1.0
+            near, other = (second, first) if first == GROUND else (first, second)
+            normal = sign * np.pad(np.array(wall.normal or (1.0,)), (0, 3 - len(wall.normal or (1.0,))))
+            away = (wall.gap + self._radius(near)) * normal
+            yield Shape("wall", self.rest[near] + away + moved.get(other, np.zeros(3)), normal)
+        for name, at in self.rest.items():
+            yield Shape(self._kind(name), at + moved[name], at)
+
+    def _kind(self, name: str) -> Literal["contact", "node", "mass"]:
+        return "contact" if name in self.contacts else "mass" if self.network.masses.get(name) else "node"
+
+    def _radius(self, name: str) -> float:
+        return _RADIUS[self._kind(name)]
+
+
+def _place(column: int, y: float) -> Array:
+    return np.array([-_FIRST - column * _COLUMN, y, _HEIGHT])
+
+
+class Motion:
+    """Displacements of all nodes of a network behind a coupling, as the devices move; forces do not reach limits."""
+
+    def __init__(self, network: Network, coupling: Coupling, psi: Sequence[int], T: float) -> None:
+        self._m, nodes = len(network.contacts), len(network.nodes())
+        further = nodes + len(network.walls)
+        G = walled_environment(network, T, places=True)
+        if coupling.compliance(T) is not None:  # otherwise the contacts are where the devices are
+            late = Lti.diag(delay(psi, T), Lti.constant(np.eye(further), T))
+            G = Coupling.around(coupling, late @ G, further)
+        self._law = Law(G, (0,) * (self._m + nodes), network.walls)  # [x; forces on nodes] -> [f; nodes]
+        self._tick = self._law.transition()
+        ports, order = self._law.channels, self._law.open.order
+        self._before, self._after = np.zeros((order + ports, 1)), np.zeros((ports + order, 1))
+        self._z, self._x = self._before[:order], self._before[order : order + self._m, 0]
+        self._nodes, self._next = self._after[self._m : ports, 0], self._after[ports:]
+
+    def rest(self, x: Array) -> Array:
+        """Begin where the devices have been held at x (m,) [m] for long, and return the displacements (nodes,) [m]."""
+        self._z[:, 0] = self._law.at_rest(np.concatenate([x, np.zeros(self._nodes.size)]))
+        self._x[:] = x
+        self._tick(self._before, self._after)
+        return self._nodes.copy()
+
+    def follow(self, x: Array) -> Array:
+        """Return the displacements (nodes,) [m] after ticks with the devices at x (ticks, m) [m]."""
+        for row in x:
+            self._x[:] = row
+            self._tick(self._before, self._after)
+            self._z[:] = self._next
+        return self._nodes.copy()
+
+
+def object_of(simulation: Simulation) -> DrawnObject | None:
+    """Return the object of a loop; None for a MuJoCo world and for environments that are no network."""
+    environment = simulation.scenario.environment
+    return DrawnObject.of(environment) if isinstance(environment, Network) and not environment.world else None
+
+
+# ----------------------------------------------------------------------------------------------------
+# The scene's file.
+
+
+def scene_xml(simulation: Simulation) -> str:
+    """Return the MJCF of the devices with the object at rest beside them, which does not move and touches nothing."""
+    import mujoco
+
+    spec = mujoco.MjSpec.from_string(simulation.scene.xml)
+    kind, dead = mujoco.mjtGeom, {"contype": 0, "conaffinity": 0, "mass": 0}
+    if world := simulation.scenario.environment.world:
+        _add_world(spec, Path(world.file), dead)
+    for shape in drawn.shapes() if (drawn := object_of(simulation)) else ():
+        if shape.kind == "spring":
+            ends = [*shape.at, *shape.to]
+            spec.worldbody.add_geom(type=kind.mjGEOM_CAPSULE, fromto=ends, size=[SPRING, 0, 0], rgba=shape.rgba, **dead)
+        else:
+            form = kind.mjGEOM_BOX if shape.kind in ("mass", "wall") else kind.mjGEOM_SPHERE
+            geom = spec.worldbody.add_geom(type=form, pos=shape.at, size=shape.size, rgba=shape.rgba, **dead)
+            geom.quat = shape.quat
+    spec.compile()
+    return written(spec)
+
+
+def _add_world(spec: mujoco.MjSpec, file: Path, dead: dict[str, Any]) -> None:
+    """Add the geoms of a MuJoCo scene in its first pose, left of the devices; meshes and soft bodies are left out."""
+    import mujoco
+
+    model, kind = mujoco.MjModel.from_xml_path(str(file)), mujoco.mjtGeom
+    data, extent = mujoco.MjData(model), float(model.stat.extent)
+    mujoco.mj_forward(model, data)
+    away = np.array([-_FIRST - extent, 0.0, _HEIGHT]) - model.stat.center
+    for i in range(model.ngeom):
+        shape, material = int(model.geom_type[i]), int(model.geom_matid[i])
+        rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[i]
+        if shape in (kind.mjGEOM_MESH, kind.mjGEOM_HFIELD, kind.mjGEOM_SDF) or not rgba[3]:
+            continue
+        quat, size = np.zeros(4), model.geom_size[i].copy()
+        mujoco.mju_mat2Quat(quat, data.geom_xmat[i])
+        if shape == kind.mjGEOM_PLANE:
+            size[:2] = np.where(size[:2] > 0, np.minimum(size[:2], extent), extent)
+        at = data.geom_xpos[i] + away
+        spec.worldbody.add_geom(type=shape, pos=at, size=size, quat=quat, rgba=rgba, **dead)
