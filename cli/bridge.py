@@ -53,7 +53,15 @@ def main(argv: list[str]) -> int:
         raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
     if args.energy_budget and not args.energy_budget[0]:
         raise InputError("--energy-budget is 0 J: encoders are tested by a small force at arming, give it 0.01 or so")
-    settings = replace(settings, rereference=not args.no_rereference, energy_budget=args.energy_budget)
+    behind = session_cli.boards_behind(args, scenario)
+    for given, what in (
+        (args.latch == "arrival", "--latch arrival"),
+        (is_world(scenario), "a world"),
+        (args.energy_budget, "--energy-budget"),
+    ):
+        if behind and given:
+            raise InputError(f"--port is {args.port}: {what} counts forces by one clock, several boards have several")
+    settings = replace(settings, behind=behind, rereference=not args.no_rereference, energy_budget=args.energy_budget)
     limits = session_cli.limits_from(args, scenario)
     held = args.held or not args.port  # emulated people never let go
     settings = replace(settings, deadman=args.deadman == "device", held=held)
@@ -64,7 +72,7 @@ def main(argv: list[str]) -> int:
     def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
         met, link = timed(scenario, ages, args.quantile, 1e6 * args.guard, at_once)
         asked = args.case, args.coupling, args.condition
-        programs = certified_couplings(met, *asked, link, limiter=args.limiter, start=start)
+        programs = certified_couplings(met, *asked, link, limiter=args.limiter, start=start, behind=behind)
         _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         return programs
 

@@ -16,7 +16,13 @@ from pathlib import Path
 import numpy as np
 
 from haptic_loop.cli import options, render
-from haptic_loop.cli.session_cli import add_link_options, check_link, hold_session, steady_scenario
+from haptic_loop.cli.session_cli import (
+    add_link_options,
+    boards_behind,
+    check_link,
+    hold_session,
+    steady_scenario,
+)
 from haptic_loop.design.files import off_table, plain, write
 from haptic_loop.hw.emulator import nobody
 from haptic_loop.hw.identify import Estimate, Excitation, Swing, capped, chirp, estimate, held, records_of, settled
@@ -89,6 +95,8 @@ def main(argv: list[str]) -> int:
     """Identify every axis. 0: each has a bound above zero, 1: not, or a session did not end as planned."""
     args = _parser().parse_args(argv)
     scenario, settings = steady_scenario(args, "hw.identify"), check_link(args)
+    if boards_behind(args, scenario):
+        raise InputError(f"--port is {args.port}: identify one board at a time, with a scenario of its device")
     low, high = args.band
     if not 0.5 <= low < high <= 0.4 / scenario.T:
         raise InputError(f"--band is {low:g},{high:g}, expected LOW,HIGH within 0.5 to {0.4 / scenario.T:.0f} Hz")

@@ -13,11 +13,15 @@ import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from haptic_loop.cli import options
 from haptic_loop.cli.render import console, progress
+from haptic_loop.hw.boards import Boards, ticks_behind
 from haptic_loop.hw.control import Armable
 from haptic_loop.hw.driver import Operator
 from haptic_loop.hw.emulator import KINDS, Emulator, FaultInjection
@@ -41,7 +45,8 @@ def add_link_options(parser: options.Parser) -> None:
     """Which device, over which line, and how its delay is judged."""
     link = parser.add_argument_group("the link")
     add, number = link.add_argument, options.number
-    port = f"serial port of the device, such as /dev/ttyACM0; or {FORCE_DIMENSION}[:0x,1x], devices and axes"
+    port = "serial port of the device, such as /dev/ttyACM0; A,B: one board at each port, one for each device; or "
+    port += f"{FORCE_DIMENSION}[:0x,1x], devices and axes"
     add("--port", metavar="PATH", help=port)
     virtual = "the whole session in virtual time with an emulated device: no port, no waiting, the same everywhere"
     add("--rehearse", action="store_true", help=virtual)
@@ -170,13 +175,33 @@ def _baud(args: argparse.Namespace) -> int | None:
     A pseudo-terminal has none. /dev/ttyACM0 may be native USB, or a USB chip with a UART behind it: a UART is assumed.
     """
     if args.baud is None:
-        pseudo = not args.port or host_clocked(args) or os.path.realpath(args.port).startswith("/dev/pts/")
+        pseudo = not args.port or all(os.path.realpath(path).startswith("/dev/pts/") for path in _ports(args))
         return None if pseudo else _USUAL_BAUD
     return args.baud or None
 
 
 def _baud_or_none(text: str) -> int:
     return 0 if text == "none" else options.whole(1200, 20_000_000, ", or none for a link without UART")(text)
+
+
+def boards_behind(args: argparse.Namespace, scenario: Scenario) -> tuple[int, ...]:
+    """Return the ticks (m,) by which forces act later than the link's delay: none with one port. Raises InputError."""
+    count, devices = len(_ports(args)), len(scenario.device)
+    if count < 2:
+        return ()
+    if count != devices:
+        raise InputError(f"--port has {count} ports, the scenario {devices} devices: give one for each, or one for all")
+    if scenario.T_min:
+        raise InputError(
+            "T_min: a tick of a board may have no length where clocks slip; with several ports, leave it out"
+        )
+    return ticks_behind(scenario.theta, [len(device.free) for device in scenario.device])
+
+
+def _ports(args: argparse.Namespace) -> list[str]:
+    """Return the paths of --port; a host that is the clock has none."""
+    port: str = args.port or ""
+    return [] if host_clocked(args) else port.split(",")
 
 
 def host_clocked(args: argparse.Namespace) -> bool:
@@ -214,7 +239,7 @@ def hold_session(
         device = _device(args, session, stack)
         if args.port and not args.no_preflight:
             with progress("looking at this machine"):
-                found = preflight(args.port)
+                found = preflight(_ports(args))
             console(args).print(found, soft_wrap=True, highlight=False)
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
         seen = sys.stderr.isatty()
@@ -228,13 +253,16 @@ def hold_session(
 
         def planned(ages: Ages) -> Sequence[Armable]:
             _clear()  # for what a plan prints
+            for path, own in zip(_ports(args), device.ages if isinstance(device, Boards) else (), strict=False):
+                at = {p: round(float(np.percentile(own, p))) for p in (50, 99)}
+                console(args).print(f"{path}: answers are {at[50]} us old, {at[99]} us at the 99th percentile")
             return plan(ages)
 
         operator = Operator(args.arm, seconds, _deadman(args.deadman))
         live = Live(session, device, planned, operator, keyboard, watch, args.pace)
         stack.callback(_clear)
         live.run()
-    return _Held(live.signals, device.dropped if isinstance(device, SerialDevice) else 0)
+    return _Held(live.signals, device.dropped if isinstance(device, SerialDevice | Boards) else 0)
 
 
 def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> HapticDevice:
@@ -247,8 +275,19 @@ def _device(args: argparse.Namespace, session: Session, stack: ExitStack) -> Hap
             _ask_for_clamp("; ".join(adapter.unused_axes))
         return adapter
     with progress("opening the port"):
-        port = stack.enter_context(SerialPort(args.port, session.settings.baud))
-    return SerialDevice(port, lambda: args.pace * time.monotonic())
+        ports = [stack.enter_context(SerialPort(path, session.settings.baud)) for path in _ports(args)]
+    serial = partial(SerialDevice, clock=lambda: args.pace * time.monotonic())
+    if len(ports) == 1:
+        return serial(ports[0])
+    axes = [len(device.free) for device in session.scenario.device]
+    devices = [serial(port, patience=0.0) for port in ports]
+    now = lambda: int(args.pace * time.monotonic_ns()) // 1000  # noqa: E731
+    return Boards(devices, axes, session.settings.behind, now, lambda seconds: _wait_for_any(ports, seconds))
+
+
+def _wait_for_any(ports: Sequence[SerialPort], seconds: float) -> None:
+    """Wait until a port has something to read, at the latest after so many seconds."""
+    select.select(ports, [], [], seconds)
 
 
 def _ask_for_clamp(axes: str) -> None:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import sub
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -35,6 +35,8 @@ from haptic_loop.sim.couplings import assessed, choose, given
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, scene_of
 
+#: part of a period by which boards' clocks may differ, and T_max of their certificate is longer: a ceramic resonator's
+CLOCK_TOLERANCE = 5e-3
 _SPEED_SECONDS = 0.01  # window of a speed estimate: one count of the coarsest encoder is 0.03 m/s
 _FALLBACK = ("spring-damper", "any-environment")  # a reserve coupling, where the requested one is not certified
 
@@ -67,14 +69,22 @@ class _HostController:
 
 
 def host_controller(
-    loop: Loop, coupling: Coupling, link: int, cap: Sequence[float], lag: Sequence[float] | None = None
+    loop: Loop,
+    coupling: Coupling,
+    link: int,
+    cap: Sequence[float],
+    lag: Sequence[float] | None = None,
+    behind: Sequence[int] = (),
 ) -> Controller:
     """Return the loop as the host runs it, at rest and without the delay of `link` ticks that the link adds.
+
+    Of several boards it adds link + `behind` (m,) ticks.
 
     With `lag`, which is rho (m,) [N/m], a limiter of `cap` (m,) [N] limits the forces. Raises ValueError where the
     link is slower than a delay of the loop.
     """
-    return _HostController(loop.delayed(tuple(n - link for n in loop.theta)).law(coupling, cap, lag))
+    waits = tuple(n - link - more for n, more in zip(loop.theta, behind or (0,) * len(loop.theta), strict=True))
+    return _HostController(loop.delayed(waits).law(coupling, cap, lag))
 
 
 def _fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tuple[float, ...]]:
@@ -252,7 +262,8 @@ class Drive:
         self._before: tuple[float, ...] | None = None  # [m] displacements one tick before self.x; None after a gap
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
-        self._commands, self._clock = monitor.CommandMonitor(config), monitor.ClockMonitor(limits.watchdog_us, T)
+        self._commands = None if settings.behind else monitor.CommandMonitor(config)  # boards have one each
+        self._clock = monitor.ClockMonitor(limits.watchdog_us, T)
 
     @property
     def dead(self) -> str | None:
@@ -273,7 +284,8 @@ class Drive:
             self.reference = state.counts if self._rereference else (0,) * state.axes
         x = self.units.positions(map(sub, state.counts, self.reference))
         self._check_motion(x, ticks)
-        self._counters.unlike += self._commands.unlike(state, ticks)
+        if self._commands:
+            self._counters.unlike += self._commands.unlike(state, ticks)
         self._encoders.check(state.counts, state.applied, ticks)
         if self.limits.continuous:
             self._heat.check(self.units.forces(state.applied), ticks)
@@ -301,7 +313,8 @@ class Drive:
         self._before, self.x, self.force = self.x if ticks == 1 else None, x, force
         self._counters.clipped += shaped.clipped
         self._counters.slowed += shaped.slowed
-        self._commands.tell(state.tick, steps)
+        if self._commands:
+            self._commands.tell(state.tick, steps)
         self._record(TraceRow(state.tick, x, asked, self.gain.value, steps, state, self._arming, test))
         return steps
 
@@ -373,6 +386,7 @@ class CertifiedCoupling:
     case: str
     chosen: Chosen
     assessment: Assessment  # holds for the loop with these delays
+    behind: tuple[int, ...] = ()  # (m,) [ticks] that boards add to the link
 
     @property
     def certified(self) -> bool:
@@ -401,7 +415,7 @@ class CertifiedCoupling:
         if is_world(self.scenario):
             waits = [n - self.link for n in self.scenario.theta]
             return WorldController(self.scenario, self.chosen.coupling, start or 0.0, cap, waits)
-        return host_controller(self.scenario.loop(self.case), self.chosen.coupling, self.link, cap, lag)
+        return host_controller(self.scenario.loop(self.case), self.chosen.coupling, self.link, cap, lag, self.behind)
 
     def capped(self, cap: Sequence[float]) -> Assessment:
         """Return the assessment with the force cap (m,) [N] of a session in its report; no proof depends on it."""
@@ -434,18 +448,23 @@ def certified_coupling(
     own: Coupling | Design | None = None,
     limiter: bool | None = None,
     start: float = START_J,
+    behind: tuple[int, ...] = (),
 ) -> CertifiedCoupling:
     """Return the coupling `name`, or the user's `own` one, certified for a link of `link` ticks (0: host clock).
 
     The coupling's limiter limits the forces unless `limiter` is False. In a MuJoCo world the energy shell limits
-    them, with W0 = `start` [J].
+    them, with W0 = `start` [J]. With several boards, axes act `behind` (m,) ticks after the link's, and each board has
+    a clock of its own: the certificate is then for periods that are longer by CLOCK_TOLERANCE.
 
     Raises SafetyStop where the coupling is not certified, InputError where the request contradicts itself.
     """
     if link > MAX_THETA:
         raise SafetyStop(f"the link takes {link} ticks, the protocol carries at most theta = {MAX_THETA}")
-    delays = tuple(max(n, link) for n in scenario.theta)
+    later = behind or (0,) * scenario.channels
+    delays = tuple(max(n, link + more) for n, more in zip(scenario.theta, later, strict=True))
     slower = scenario.replace(theta=delays, latency=None if link else scenario.latency)
+    if behind:
+        slower = slower.replace(T_max=(scenario.T_max or scenario.T) * (1 + CLOCK_TOLERANCE))
     try:
         chosen = choose(slower, case, name, condition, limiter) if own is None else given(own)
     except DesignFailed as error:
@@ -455,8 +474,9 @@ def certified_coupling(
         assessment = assessed(alone, case, chosen, energy_budget=start, limiter=False)
     else:
         assessment = assessed(alone, case, chosen, limiter=limiter)
-    waits = min(MAX_THETA, *slower.theta) if link else 0  # the host adds the rest of longer delays
-    made = CertifiedCoupling(waits, slower, case, chosen, assessment)
+    spare = (n - more for n, more in zip(slower.theta, later, strict=True))
+    waits = min(MAX_THETA, *spare) if link else 0  # the host adds the rest of longer delays
+    made = CertifiedCoupling(waits, slower, case, chosen, assessment, behind)
     if not made.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
         raise SafetyStop(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(made)}")
@@ -472,6 +492,7 @@ def certified_couplings(
     spare: int = 2,
     limiter: bool | None = None,
     start: float = START_J,
+    behind: tuple[int, ...] = (),
 ) -> tuple[CertifiedCoupling, ...]:
     """Return the coupling for the measured delay and up to `spare` reserves, each certified for one tick more.
 
@@ -480,12 +501,13 @@ def certified_couplings(
     not certified, it is the spring-damper by Theorem 4, which has the strongest guarantee. If neither is certified,
     the list ends. Raises SafetyStop where the first coupling is not certified.
     """
-    found = [certified_coupling(scenario, case, name, condition, link, limiter=limiter, start=start)]
+    more: dict[str, Any] = {"limiter": limiter, "start": start, "behind": behind}
+    found = [certified_coupling(scenario, case, name, condition, link, **more)]
     wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), _FALLBACK]
     while len(found) <= spare and wanted:
         kind, by = wanted[0]
         try:
-            reserve = certified_coupling(scenario, case, kind, by, found[-1].link + 1, limiter=limiter, start=start)
+            reserve = certified_coupling(scenario, case, kind, by, found[-1].link + 1, **more)
         except (SafetyStop, InputError):
             wanted.pop(0)
             continue

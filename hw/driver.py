@@ -111,26 +111,20 @@ class Driver:
 
     def _call(self, session: Session) -> None:
         answer: Any
-        if session.stage == Stage.CONNECTING:
-            if (answer := self.device.info()) is not None:
-                self.do(session.met(answer, self.clock()))
-        elif session.stage == Stage.CONFIGURING:
-            assert session.config
-            try:
-                answer = self.device.configure(session.config)
-            except wire.SafetyStop as fault:
-                return self.do(session.fail(str(fault), self.clock()))
-            if answer is not None:
-                self.do(session.configured(answer, self.clock()))
-        else:
-            force, self._force = self._force, None
-            try:
-                state = self.device.exchange(force)
-            except wire.SafetyStop as fault:
-                return self.do(session.fail(str(fault), self.clock()))
-            if state is not None:
-                self.do(session.take(state, self.clock()))
-        return None
+        try:
+            if session.stage == Stage.CONNECTING:
+                if (answer := self.device.info()) is not None:
+                    self.do(session.met(answer, self.clock()))
+            elif session.stage == Stage.CONFIGURING:
+                assert session.config
+                if (answer := self.device.configure(session.config)) is not None:
+                    self.do(session.configured(answer, self.clock()))
+            else:
+                force, self._force = self._force, None
+                if (answer := self.device.exchange(force)) is not None:
+                    self.do(session.take(answer, self.clock()))
+        except wire.SafetyStop as fault:
+            self.do(session.fail(str(fault), self.clock()))
 
     def load(self) -> None:
         """Load couplings for the measured delay while the device rests at zero force."""

@@ -67,8 +67,11 @@ class BytePort(Protocol):
 class SerialDevice:
     """A device at a serial port, which has the clock."""
 
-    def __init__(self, port: BytePort, clock: Callable[[], float] = time.monotonic) -> None:
-        self._port, self._clock = port, clock
+    def __init__(
+        self, port: BytePort, clock: Callable[[], float] = time.monotonic, patience: float = _LONGEST_WAIT
+    ) -> None:
+        """Take `clock` and `patience`, the longest wait of a call, both in seconds."""
+        self._port, self._clock, self._patience = port, clock, patience
         self._decoder, self._waiting = wire.Decoder(), list[wire.Message]()
         self._question: wire.Hello | wire.Config | None = None
         self._begun = self._asked = 0.0  # [s] when the question was asked first, and last
@@ -96,9 +99,13 @@ class SerialDevice:
 
     def exchange(self, force: wire.Force | None) -> wire.State | None:
         if force is not None:
-            self._write(wire.encode(force))
+            self.send(force)
         message = self._next()  # one a call: a flood of other frames must not keep anybody from looking at the time
         return message if isinstance(message, wire.State) else None
+
+    def send(self, force: wire.Force) -> None:
+        """Give a force, and wait for nothing."""
+        self._write(wire.encode(force))
 
     def stop(self, reason: wire.Reason) -> None:
         self._write(wire.encode(wire.Stop(reason)))
@@ -121,7 +128,7 @@ class SerialDevice:
         return message
 
     def _next(self) -> wire.Message | None:
-        if not self._waiting and self._port.wait(_LONGEST_WAIT):
+        if not self._waiting and self._port.wait(self._patience):
             self._waiting += self._decoder.feed(self._port.read())
         return self._waiting.pop(0) if self._waiting else None
 

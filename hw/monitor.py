@@ -56,6 +56,7 @@ class LinkSettings:
     energy_budget: tuple[float, float] | None = None  # W0 and cap [J]
     rereference: bool = True  # positions count from where the handles are at arming
     deadman: bool = False  # forces act only while the deadman at the device is held
+    behind: tuple[int, ...] = ()  # with several boards, ticks by which axes act later than the link (hw/boards.py)
     elsewhere: tuple[int, ...] | None = None  # [counts] places that every handle must have left before arming
 
 

@@ -130,6 +130,7 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     force_step: tuple[float, ...]
     cap: tuple[int, ...]
     energy_budget: BudgetPlan | None = None
+    behind: tuple[int, ...] = ()  # (m,) [ticks] that several boards add to the link
     lag: tuple[float, ...] | None = None  # (m,) [N/m] rho of the limiter, where there was one
 
     @classmethod
@@ -140,7 +141,9 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         rho = program.assessment.force_limits.rho
         loop = program.scenario, program.chosen.coupling.form(), program.link
         device = units.force_step, arming.config.cap, budget and budget.plan
-        return json.loads(msgspec.json.encode(cls(*loop, limits, *device, None if rho is None else tuple(rho))))
+        return json.loads(
+            msgspec.json.encode(cls(*loop, limits, *device, program.behind, None if rho is None else tuple(rho)))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +190,8 @@ def _again(
     if recipe.scenario.environment.world:
         raise ValueError("its forces came from a MuJoCo world, which is not in the trace")
     m, coupling, (asked, sent) = len(recipe.cap), recipe.coupling.build(recipe.scenario.T), into
-    controller = host_controller(recipe.scenario.loop("I"), coupling, recipe.link_delay, recipe.limits.cap, recipe.lag)
+    loop, added = recipe.scenario.loop("I"), (recipe.lag, recipe.behind)
+    controller = host_controller(loop, coupling, recipe.link_delay, recipe.limits.cap, *added)
     units, force = Units((1.0,) * m, recipe.force_step, (1,) * m), (0.0,) * m
     budget, missed = recipe.energy_budget and SentBudget(recipe.energy_budget), 0
     for k in ticks:

@@ -1,4 +1,4 @@
-"""A whole session in virtual time: the bridge's session and the emulated device, with a serial line between them.
+"""A whole session in virtual time: the bridge's session and emulated devices, with serial lines between them.
 
 Nothing waits and nothing is random but by seed, so a session of seconds runs in a fraction of one and always the same.
 """
@@ -20,10 +20,11 @@ from haptic_loop.design.api import COUPLING, bare
 from haptic_loop.design.arguments import number, of_kind, whole
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.result import Design
+from haptic_loop.hw.boards import Boards
 from haptic_loop.hw.control import Armable, CertifiedCoupling, certified_coupling, certified_couplings, timed
 from haptic_loop.hw.driver import Driver, Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection, Line
-from haptic_loop.hw.haptic_device import PortLost, SerialDevice
+from haptic_loop.hw.haptic_device import HapticDevice, PortLost, SerialDevice
 from haptic_loop.hw.limits import ENDED, Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.protocol import Phase
@@ -50,8 +51,80 @@ class _Moment(NamedTuple):
 
 
 @dataclass
+class _Cable:
+    """The host's end of the line to one emulated device. Time goes on while it waits."""
+
+    rehearsal: Rehearsal
+    emulator: Emulator
+    up: Line
+    down: Line
+    period: float  # [us]
+    data: bytes = b""  # what has come in
+    gone: bool = False
+
+    def wait(self, seconds: float) -> bool:
+        """Time goes on until something has come in, or so many seconds are over."""
+        return self.rehearsal.wait(seconds, (self,))
+
+    def read(self) -> bytes:
+        """What has come in. Raises PortLost where the cable was pulled."""
+        if self.gone:
+            raise PortLost("the port is gone")
+        data, self.data = self.data, b""
+        return data
+
+    def write(self, data: bytes) -> int:
+        """Frames to the device, one by one: the line may lose them."""
+        rehearsal, now = self.rehearsal, self.rehearsal.now
+        since = self.emulator.since_armed(round(now))
+        for frame in filter(None, data.split(b"\0")):
+            for when, part in self.down.send(frame + b"\0", now + rehearsal.latency_us / 6, since):
+                rehearsal.at(when, partial(self._deliver, part))
+        return len(data)
+
+    def discard(self) -> None:
+        self.data = b""
+
+    def tick(self) -> None:
+        """A tick of the device."""
+        rehearsal, emulator = self.rehearsal, self.emulator
+        now, clock = rehearsal.now, round(rehearsal.now)
+        if clock < emulator.stalled_until:  # late once, and then in step again: no catching up
+            return rehearsal.at(emulator.stalled_until, self.tick)
+        data = emulator.tick(clock)
+        emulator.advance()
+        if rehearsal.keep:
+            rehearsal.moments.append(_Moment(clock, emulator.device.phase, emulator.applied))
+        rehearsal.at(now + self.period * emulator.stretch, self.tick)
+        if emulator.unplugged and not self.gone:
+            rehearsal.at(now + rehearsal.latency_us, self._unplug)
+        for when, part in self.up.send(data, now, emulator.since_armed(clock)) if data else []:
+            rehearsal.at(when, partial(self._hear, part))
+        return None
+
+    def _hear(self, data: bytes) -> None:
+        self.data += data
+
+    def _unplug(self) -> None:
+        self.gone = True
+
+    def _deliver(self, data: bytes) -> None:
+        self.emulator.receive(data, round(self.rehearsal.now))
+
+
+@dataclass(frozen=True)
+class Further:
+    """One more emulated board of a rehearsal, with a clock of its own (hw/boards.py)."""
+
+    emulator: Emulator
+    clock: float = 1.0  # how long a tick lasts, in T
+    faults: tuple[FaultInjection, ...] = ()  # of its line
+    begin_us: float = 0.0  # its first tick
+
+
+@dataclass
 class Rehearsal:
-    """A session and its emulated device in virtual time: the session's port leads to the emulator.
+    """A session and its emulated devices in virtual time: the session's ports lead to the emulators.
 
     `actions` are what a person does: (seconds after arming, call).
     """
@@ -69,24 +142,26 @@ class Rehearsal:
     clock: float = 1.0  # how long a tick of the device lasts, in T
     keep: bool = True  # every tick of the device in `moments`
     watch: Callable[[Session], None] = lambda session: None  # called at every turn
+    further: Sequence[Further] = ()
     moments: list[_Moment] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._up = Line("up", self.faults, self.seed, self.latency_us)
-        self._down = Line("down", self.faults, self.seed, self.latency_us)
         self._queue: list[tuple[float, int, Callable[[], object]]] = []
         self._number = count()
         self._done: set[int] = set()
-        self._now, self._read, self._gone = 0.0, b"", False  # [us]; what has come in
-        self._ended = 0.0
-        self._period = 1e6 * self.session.scenario.T * self.clock
-        device = SerialDevice(self, lambda: 1e-6 * self._now)
-        self._driver = Driver(self.session, device, self.plan, lambda: round(self._now))
-        self._at(0, self._tick)
+        self.now = self._ended = 0.0  # [us]
+        self._cables: list[_Cable] = []
+        for board in (Further(self.emulator, self.clock, self.faults), *self.further):
+            lines = [Line(way, board.faults, self.seed, self.latency_us) for way in ("up", "down")]
+            period = 1e6 * self.session.scenario.T * board.clock
+            self._cables.append(_Cable(self, board.emulator, lines[0], lines[1], period))
+            self.at(board.begin_us, self._cables[-1].tick)
+        device = _device_of(self._cables, self.session)
+        self._driver = Driver(self.session, device, self.plan, lambda: round(self.now))
 
     def run(self, seconds: float) -> Session:
         """Until `seconds` of virtual time are over. Returns the session."""
-        while self._now <= 1e6 * seconds:
+        while self.now <= 1e6 * seconds:
             self._turn()
         return self.session
 
@@ -98,24 +173,24 @@ class Rehearsal:
 
     def run_to_the_end(self, most: float) -> Session:
         """Until the session has ended and its device has come to rest, or for `most` seconds of virtual time."""
-        while not self._over and self._now <= 1e6 * most:
+        while not self._over and self.now <= 1e6 * most:
             self._turn()
         return self.session
 
     @property
     def _over(self) -> bool:
-        return self.session.stage in ENDED and self._now > self._ended + _GRACE_US
+        return self.session.stage in ENDED and self.now > self._ended + _GRACE_US
 
     def _turn(self) -> None:
         """One call of the device, then what a person does."""
         if not self.session.log:
             self._pass(_BEGIN_US)
-            self.session.start(round(self._now))
-        if self.session.stage == Stage.LOST and self._gone:
+            self.session.start(round(self.now))
+        if self.session.stage == Stage.LOST and any(cable.gone for cable in self._cables):
             self._pass(1000)
         else:
             self._driver.turn()
-        session, now = self.session, round(self._now)
+        session, now = self.session, round(self.now)
         since = self.emulator.since_armed(now)
         for i, (when, call) in enumerate(self.actions):
             if since is not None and since >= when and i not in self._done:
@@ -127,42 +202,22 @@ class Rehearsal:
             self._driver.do(session.arm(now))
         self.watch(session)
         if session.stage not in ENDED:
-            self._ended = self._now
+            self._ended = self.now
 
-    # the host's end of the line
-
-    def wait(self, seconds: float) -> bool:
+    def wait(self, seconds: float, cables: Sequence[_Cable] = ()) -> bool:
         """Time goes on until something has come in, or so many seconds are over, and as long as the host is frozen."""
-        until = self._now + 1e6 * seconds
-        while not self._read and not self._gone and self._queue[0][0] <= until:
+        until, cables = self.now + 1e6 * seconds, cables or self._cables
+        while not (ready := any(cable.data or cable.gone for cable in cables)) and self._queue[0][0] <= until:
             self._next()
-        if not self._read and not self._gone:
-            self._now = until
+        if not ready:
+            self.now = until
         if (frozen := self._frozen_for()) > 0:
             self._pass(frozen)
-        return bool(self._read) or self._gone
-
-    def read(self) -> bytes:
-        """What has come in. Raises PortLost where the cable was pulled."""
-        if self._gone:
-            raise PortLost("the port is gone")
-        data, self._read = self._read, b""
-        return data
-
-    def write(self, data: bytes) -> int:
-        """Frames to the device, one by one: the line may lose them."""
-        since = self.emulator.since_armed(round(self._now))
-        for frame in filter(None, data.split(b"\0")):
-            for when, part in self._down.send(frame + b"\0", self._now + self.latency_us / 6, since):
-                self._at(when, partial(self._deliver, part))
-        return len(data)
-
-    def discard(self) -> None:
-        self._read = b""
+        return any(cable.data or cable.gone for cable in cables)
 
     def _frozen_for(self) -> float:
         """[us] for which the host does nothing."""
-        since = self.emulator.since_armed(round(self._now))
+        since = self.emulator.since_armed(round(self.now))
         if since is None:
             return 0.0
         left = [start + lasts - since for start, lasts in self.host_stalls if start <= since < start + lasts]
@@ -170,42 +225,18 @@ class Rehearsal:
 
     # what happens in time
 
-    def _at(self, when: float, what: Callable[[], object]) -> None:
+    def at(self, when: float, what: Callable[[], object]) -> None:
         heapq.heappush(self._queue, (when, next(self._number), what))
 
     def _pass(self, us: float) -> None:
-        until = self._now + us
+        until = self.now + us
         while self._queue[0][0] <= until:
             self._next()
-        self._now = until
+        self.now = until
 
     def _next(self) -> None:
-        self._now, _, what = heapq.heappop(self._queue)
+        self.now, _, what = heapq.heappop(self._queue)
         what()
-
-    def _tick(self) -> None:
-        emulator, now, clock = self.emulator, self._now, round(self._now)
-        if clock < emulator.stalled_until:  # late once, and then in step again: no catching up
-            return self._at(emulator.stalled_until, self._tick)
-        data = emulator.tick(clock)
-        emulator.advance()
-        if self.keep:
-            self.moments.append(_Moment(clock, emulator.device.phase, emulator.applied))
-        self._at(now + self._period * emulator.stretch, self._tick)
-        if emulator.unplugged and not self._gone:
-            self._at(now + self.latency_us, self._unplug)
-        for when, part in self._up.send(data, now, emulator.since_armed(clock)) if data else []:
-            self._at(when, partial(self._hear, part))
-        return None
-
-    def _hear(self, data: bytes) -> None:
-        self._read += data
-
-    def _unplug(self) -> None:
-        self._gone = True
-
-    def _deliver(self, data: bytes) -> None:
-        self.emulator.receive(data, round(self._now))
 
     # what came of it
 
@@ -223,6 +254,17 @@ class Rehearsal:
             return 0.0
         quiet = next((m.t_us for m in self.moments if m.t_us > last), None)
         return None if quiet is None else 1e-6 * (quiet - begin)
+
+
+def _device_of(cables: Sequence[_Cable], session: Session) -> HapticDevice:
+    """Return the device behind the cables: one board, or several with a clock each."""
+    rehearsal = cables[0].rehearsal
+    serial = partial(SerialDevice, clock=lambda: 1e-6 * rehearsal.now)
+    if len(cables) == 1:
+        return serial(cables[0])
+    axes, behind = [cable.emulator.plant.channels for cable in cables], session.settings.behind
+    devices = [serial(cable, patience=0.0) for cable in cables]
+    return Boards(devices, axes, behind, lambda: round(rehearsal.now), rehearsal.wait)
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,6 +50,9 @@ class SerialPort:
 
         self._fd = self._serial.fileno()
 
+    def fileno(self) -> int:
+        return self._fd
+
     def wait(self, seconds: float) -> bool:
         """Whether there is something to read, at the latest after so many seconds."""
         return bool(select.select([self._fd], [], [], seconds)[0])
@@ -93,12 +96,12 @@ class SerialPort:
             self._serial.close()
 
 
-def preflight(path: str) -> str:
+def preflight(paths: Sequence[str]) -> str:
     """How well this machine can keep time, and what to do where it cannot, as one line.
 
     It asks the system for real-time scheduling and locked memory, and measures for two seconds how late it wakes us.
     """
-    found = _scheduling(), _locked_memory(), _latency_timer(path), _clock_source(), _stalls()
+    found = _scheduling(), _locked_memory(), *map(_latency_timer, paths), _clock_source(), _stalls()
     return "pre-flight: " + "; ".join(found)
 
 

@@ -51,6 +51,12 @@ with ForceDimension(load(), "sn4712x,0y", sdk, clock, sleep) as device:
             said[index] = str(fault)
         stub.stub_status(1, index, int(index in (0, 5)))
 said["after"] = [stub.stub_force(1, 0), stub.stub_force(0, 1)]
+with ForceDimension(load(), "sn4711x,sn4712x", sdk, clock, sleep) as device:
+    device.configure(Config(0, 4, 5, 0, (5000, 2500), (5000, 5000)))
+    state = device.exchange(None)
+    for command, force in ((Command.ARM, (0, 0)), (Command.RUN, (1000, -500))):
+        state = device.exchange(Force(command, state.tick, state.tick, force))
+    said["pair"] = [stub.stub_force(0, 0), stub.stub_force(1, 0)]
 print(json.dumps(said))
 """
 
@@ -77,6 +83,10 @@ def session(tmp_path_factory):
 
 def test_devices_are_opened_by_serial_number_or_index(session):
     assert (session["serial"], session["name"]) == (4712, "omega.3")
+
+
+def test_two_devices_are_told_apart_by_serial_number(session):
+    assert session["pair"] == pytest.approx([0.4, -0.2])
 
 
 def test_axes_without_channel_are_named(session):

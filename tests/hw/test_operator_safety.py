@@ -228,7 +228,7 @@ def test_the_incident_log_has_stages_and_seconds(scenario, rungs, tmp_path):
 
 def test_the_preflight_says_what_the_machine_can_do():
     """In a child, since real-time scheduling and locked memory stay with a process."""
-    code = "from haptic_loop.hw.transport import preflight; print(preflight('/dev/null'))"
+    code = "from haptic_loop.hw.transport import preflight; print(preflight(['/dev/null']))"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     begun = time.monotonic()
     line = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True).stdout
