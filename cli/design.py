@@ -256,8 +256,8 @@ def _assessment(args: argparse.Namespace, scenario: Scenario, loop: Loop, design
 def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: Assessment, stored: Filed) -> _Report:
     from haptic_loop.design import coverage
     from haptic_loop.design.bound import BoundBeside
+    from haptic_loop.design.designs import nearby as nearby_of
     from haptic_loop.design.optimal import Optimal
-    from haptic_loop.design.optimal import nearby as nearby_of
 
     band, best = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None
     known = assessment.requirements.get("switching")

@@ -142,7 +142,7 @@ def _paper(args: argparse.Namespace, scenario: Scenario, report: RunReport) -> t
 
 def _nearby(loop: Loop, chosen: Chosen, assessment: Assessment) -> Nearby:
     """Return the damping needed in environments near the modelled one; empty if no guarantee depends on it."""
-    from haptic_loop.design.optimal import nearby
+    from haptic_loop.design.designs import nearby
     from haptic_loop.design.robustness import Nearby
 
     guarantee = assessment.guarantee

@@ -66,6 +66,12 @@ class ReadOnly:
 
 
 _ROWS, _POINTS, _CELLS = 32, 1024, 2**18  # sizes of the parts of a response, so that they stay in the cache
+_SHORT, _DOUBLINGS = 0.3, 5  # poles of at most 0.3 fade to 2e-17 within 2^5 samples
+_ERROR = 1e-9  # of the largest response of an output: bound on the error of a sum over poles and taps
+_UNIT = 1e-15  # bound on the rounding of a product of few matrices, of the size of its terms
+_UNSEEN = 1e-18  # of the response: weights that are left out
+_ANYWHERE = np.linspace(0.05, 3.0, 6)  # [rad/sample] where the size of a response is looked at, beside its poles
+_OFF_CIRCLE = 1e-9  # of |z|^2 from 1
 
 
 def _response_cost(states: int, inputs: int, points: int) -> float:
@@ -176,8 +182,8 @@ class Lti(ReadOnly):
     def at(self, z: ArrayLike) -> Complex:
         """Return G(z), shape z.shape + (p, m). A stack takes z (n, k) or (1, k) and returns (n, k, p, m).
 
-        One system is evaluated by back substitution in the complex Schur form of A. This remains accurate for the
-        defective matrices of delay lines, which have no basis of eigenvectors.
+        On the unit circle one system is evaluated as a sum over poles and taps (`_terms`), anywhere else, and where
+        poles are too nearly equal for that, by back substitution in the complex Schur form of A.
         """
         z = np.asarray(z, dtype=np.complex128)
         if self.A.ndim > 2 or self.B.ndim > 2 or self.C.ndim > 2 or self.D.ndim > 2:
@@ -188,30 +194,100 @@ class Lti(ReadOnly):
         points = z.ravel()
         step = min(_POINTS, max(_CELLS // max(self.inner_order * self.inputs, 1), 64))
         parts = [self._resolved(points[i : i + step]) for i in range(0, max(points.size, 1), step)]
-        G = np.concatenate(parts, axis=2) + self.D[:, :, None]
-        return np.moveaxis(G, -1, 0).reshape(*z.shape, self.outputs, self.inputs)
+        G = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return (G + self.D).reshape(*z.shape, self.outputs, self.inputs)
 
     def _resolved(self, points: Complex) -> Complex:
-        """Return C (z I - A)^-1 B, shape (p, m, points), by back substitution in blocks of _ROWS rows.
+        """Return C (z I - A)^-1 B, shape (points, p, m).
 
-        Delay lines at the outputs are not part of the substitution: their states are core states times powers of 1/z.
+        Delay lines at the outputs are not part of the core: their states are core states times powers of 1/z.
         """
+        core, lines = self._lines
+        p, m = self.outputs, self.inputs
+        spend(_response_cost(core.size, m, points.size))
+        if not core.size:
+            return np.zeros((points.size, p, m), dtype=np.complex128)
+        terms = self._terms
+        if terms is None or (np.abs(points.real**2 + points.imag**2 - 1) > _OFF_CIRCLE).any():
+            rows = self._substituted(points)
+        else:
+            rows = _summed(*terms, points).reshape(points.size, p + len(lines), m)
+        G = rows[:, :p]
+        for (_, states, late), head in zip(lines, range(p, rows.shape[1]), strict=True):
+            read = np.flatnonzero(self.C[:, states].any(axis=1))
+            powers = np.cumprod(np.broadcast_to(1 / points, (late.max(), points.size)), axis=0)[late - 1]
+            G[:, read] += (self.C[np.ix_(read, states)] @ powers).T[:, :, None] * rows[:, head, None]
+        return G
+
+    def _substituted(self, points: Complex) -> Complex:
+        """Return the outputs and the heads of the delay lines, (points, p + lines, m), in blocks of _ROWS rows."""
         S, U = self._schur
         core, lines = self._lines
-        spend(_response_cost(core.size, self.inputs, points.size))
         at, X = np.tile(points, self.inputs), np.repeat(U.conj().T @ self.B[core], points.size, axis=1)
         for end in range(core.size, 0, -_ROWS):
             first = max(end - _ROWS, 0)
             for i in reversed(range(first, end)):
                 X[i] = (X[i] + S[i, i + 1 : end] @ X[i + 1 : end]) / (at - S[i, i])
             X[:first] += S[:first, first:end] @ X[first:end]
-        G = (self.C[:, core] @ U @ X).reshape(self.outputs, self.inputs, points.size)
-        heads = (U[[head for head, *_ in lines]] @ X).reshape(len(lines), self.inputs, points.size)
-        for (_, states, late), repeated in zip(lines, heads, strict=True):
-            read = np.flatnonzero(self.C[:, states].any(axis=1))
-            powers = np.cumprod(np.broadcast_to(1 / points, (late.max(), points.size)), axis=0)[late - 1]
-            G[read] += (self.C[np.ix_(read, states)] @ powers)[:, None] * repeated
-        return G
+        read = np.concatenate([self.C[:, core], np.eye(core.size)[[head for head, *_ in lines]]])
+        return np.moveaxis((read @ U @ X).reshape(len(read), self.inputs, points.size), -1, 0)
+
+    @cached_property
+    def _terms(self) -> tuple[Complex, Complex, Array] | None:
+        """Split the response of outputs and heads into poles, residues, and weights of z^-1, z^-2, ..
+
+        Return (poles (k,), residues (k, (p + lines) m), weights (j, (p + lines) m)), or None where their error may
+        exceed _ERROR. Poles with |z| > _SHORT are taken one by one, with their right and left eigenvectors V and W:
+        P = V W projects on them. The rest N = (I - P) A has the many poles at or near 0 of delays, which have no
+        eigenvectors of their own; its powers fade within 2^_DOUBLINGS samples, so that its response is a finite sum.
+
+        The states X(z) = V (z - poles)^-1 W B + sum_j Y_j z^-j-1 miss B = (z I - A) X by
+        (V poles - A V) (z - poles)^-1 W B + sum_j (Y_j+1 - A Y_j) z^-j-1 - A Y_last z^-last-1, which is bounded entry
+        by entry at its largest on the circle, as is what the same response from all states makes of it. So no unit of
+        a state matters. The bound is compared with the response itself at a few points: terms may cancel.
+        """
+        core, lines = self._lines
+        A, B = self.A[np.ix_(core, core)], self.B[core]
+        if _is_lower(A):
+            return None
+        C = np.concatenate([self.C[:, core], np.eye(core.size)[[head for head, *_ in lines]]])
+        try:
+            (poles, others), (V, U) = np.linalg.eig(np.stack([A, A.T]))
+            long, same = np.abs(poles) > _SHORT, np.abs(others) > _SHORT
+            if long.sum() != same.sum():
+                return None
+            poles, V, W = poles[long], V[:, long], U[:, same].T
+            W = np.linalg.solve(W @ V, W)
+        except np.linalg.LinAlgError:
+            return None
+        rest = np.eye(core.size) - (V @ W).real
+        Y, rows, power = (
+            rest @ B,
+            C @ rest,
+            rest @ A,
+        )  # Y_j = N^j (I - P) B side by side, C N^j (I - P) below each other
+        for _ in range(_DOUBLINGS):
+            Y, rows = np.hstack([Y, power @ Y]), np.vstack([rows, rows @ power])
+            power = power @ power
+        n, m, p, taps = core.size, self.inputs, len(C), 2**_DOUBLINGS
+        out, into, missed = C @ V, W @ B, A @ Y
+        missed[:, :-m] -= Y[:, m:]
+        weights = np.ascontiguousarray((C @ Y).reshape(p, taps, m).swapaxes(0, 1)).reshape(taps, p * m)
+        terms = poles, (out.T[:, :, None] * into[:, None]).reshape(poles.size, p * m).astype(np.complex128), weights
+        points = np.exp(1j * np.concatenate([_ANYWHERE, np.angle(poles)]))
+        with np.errstate(all="ignore"):  # what is not finite is refused
+            peak = 1 / np.abs(1 - np.abs(poles))
+            driven = peak[:, None] * np.abs(into)
+            wrong = np.abs(A @ V - V * poles) @ driven + np.abs(missed).reshape(n, taps, m).sum(axis=1)
+            error = ((np.abs(out) * peak) @ np.abs(W) + np.abs(rows).reshape(taps, p, n).sum(axis=0)) @ wrong
+            error += _UNIT * np.abs(C) @ (np.abs(V) @ driven + np.abs(Y).reshape(n, taps, m).sum(axis=1))
+            size = np.abs(_summed(*terms, points)).max(axis=0).reshape(p, m).max(axis=1, keepdims=True)
+            if not (error <= _ERROR * size).all():
+                return None
+        count = 1 + np.flatnonzero((np.abs(weights).reshape(taps, p, m) > _UNSEEN * size).any(axis=(1, 2))).max(
+            initial=-1
+        )
+        return *terms[:2], weights[:count]
 
     def at_rest(self, x: Array) -> Array:
         """Return the equilibrium state z = A z + B x for constant inputs x.
@@ -238,20 +314,23 @@ class Lti(ReadOnly):
         for line in lines.values():
             for i, late in line:  # the list grows while it is read
                 line += [(follower, late + 1) for follower in followers.get(i, ())]
-        core = np.setdiff1d(np.arange(self.order), [i for line in lines.values() for i, _ in line[1:]])
+        inner = np.ones(self.order, dtype=bool)
+        inner[[i for line in lines.values() for i, _ in line[1:]]] = False
+        core = np.flatnonzero(inner)
         places = np.searchsorted(core, list(lines))
         parts = [np.array(line[1:], dtype=np.intp).T for line in lines.values()]
         return core, [(int(head), states, late) for head, (states, late) in zip(places, parts, strict=True)]
 
     @cached_property
     def _schur(self) -> tuple[Complex, Complex]:
-        """The Schur form A = U S U* of the core states, with S upper triangular."""
+        """The Schur form A = U S U* of the core states, with S upper triangular. Delay lines have it already."""
+        core = self._lines[0]
+        A = self.A[np.ix_(core, core)]
+        if _is_lower(A):
+            return A[::-1, ::-1].astype(np.complex128), np.eye(core.size)[::-1].astype(np.complex128)
         import scipy
 
-        core = self._lines[0]
-        if not core.size:
-            return np.zeros((0, 0), dtype=np.complex128), np.zeros((0, 0), dtype=np.complex128)
-        S, U, *_ = scipy.linalg.schur(self.A[np.ix_(core, core)], output="complex")
+        S, U, *_ = scipy.linalg.schur(A, output="complex")
         return S, U
 
     def dc(self) -> Array:
@@ -380,6 +459,21 @@ class Lti(ReadOnly):
         D = inverse(self.D)
         B, C = times(self.B, D), times(D, self.C)
         return Lti(self.A - times(B, self.C), B, -C, D, self.T)
+
+
+def _is_lower(A: Array) -> bool:
+    """Return whether no entry above the diagonal differs from zero."""
+    return not np.triu(A, 1).any()
+
+
+def _summed(poles: Complex, residues: Complex, weights: Array, points: Complex) -> Complex:
+    """Return sum residues/(z - poles) + sum_j weights_j z^-j-1 at points z, (points, entries)."""
+    total = (1 / (points[:, None] - poles)) @ residues
+    if len(weights):
+        late = np.cumprod(np.broadcast_to(1 / points, (len(weights), points.size)), axis=0).T
+        total.real += late.real @ weights
+        total.imag += late.imag @ weights
+    return total
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,11 +7,12 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 import numpy as np
 
+from haptic_loop.controller.coupling import Coupling, ForceFilter, NoCoupling
 from haptic_loop.controller.loop import Loop
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Condition
@@ -21,6 +22,10 @@ from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, Know
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.own import called, named
 from haptic_loop.design.result import Design, DesignFailed
+from haptic_loop.design.robustness import Nearby, robustness_nearby
+
+if TYPE_CHECKING:
+    from haptic_loop.design.program import Options
 
 
 class _Kind(NamedTuple):
@@ -215,3 +220,28 @@ def _with_less_damping(loop: Loop, made: Callable[[Loop], Design], condition: Co
     if best is None:
         raise DesignFailed(None, (), f"no coupling was found for {condition.name}: {shortfall}")
     return best
+
+
+def nearby(
+    loop: Loop,
+    coupling: Coupling,
+    options: Options | None = None,
+    condition: Condition = THIS_ENVIRONMENT,
+) -> Nearby:
+    """Return the condition's requirement for environments within ten percent, and the cost of a design for them.
+
+    The result is empty for a condition that holds in any environment. The cost is left out for a condition of the
+    user's own, for walls, for ranges, for an environment that is no network of springs, and for a coupling other than
+    a force filter or none.
+    """
+    if condition.guarantee(loop) == ANY or condition.not_varied(loop):
+        return Nearby()
+    known, there = robustness_nearby(loop, coupling, condition), loop.environment
+    if known is None or loop.ranges or there.one_period or not condition.extensible:
+        return Nearby(known)
+    if not isinstance(coupling, ForceFilter | NoCoupling):
+        return Nearby(known)
+    from haptic_loop.design.optimal import spread  # slow to load
+    from haptic_loop.design.program import DEFAULT
+
+    return Nearby(known, spread(loop, coupling, options or DEFAULT))

@@ -248,8 +248,6 @@ def _floats(W: _Integers) -> Floats:
 
 def _whitening(W: Floats) -> _Integers | None:
     """R such that R'WR is nearly a multiple of the identity, or None where W is far from definite."""
-    import scipy
-
     diagonal = np.diag(W)
     if not (diagonal > 0).all():
         return None
@@ -260,10 +258,10 @@ def _whitening(W: Floats) -> _Integers | None:
         return None
     for added in (0.0, GROWTH):
         try:
-            L = scipy.linalg.cholesky(W + added * np.eye(len(W)), lower=True)
+            L = np.linalg.cholesky(W + added * np.eye(len(W)))
         except np.linalg.LinAlgError:
             continue
-        inverse = scipy.linalg.solve_triangular(L, np.eye(len(W)), lower=True).T
+        inverse = np.tril(np.linalg.inv(L)).T
         size = _FACTOR_BITS - np.ceil(np.log2(np.abs(inverse).max()))
         R = np.rint(np.ldexp(inverse, int(size))).astype(np.int64)
         return R.astype(object) << half.astype(object)[:, None]

@@ -19,7 +19,7 @@ from haptic_loop.design import budgets
 _ERROR = 1e-6  # relative, of the sum
 _ROUNDING = 1e-20  # of the mean: what is left of two responses that agree to ten digits, squared
 _MOST_ROUNDS, _MOST_INTERVALS = 20, 1000  # of halving; in one round
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
+_NODES, _WEIGHTS = np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 9
 
 
 def integral(response: Callable[[Array], Array], grid: Array, error: float = _ERROR) -> float:
@@ -167,8 +167,8 @@ def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: i
     offsets = np.concatenate([[0.0], np.geomspace(0.05, 20, 12)])
     offsets = np.concatenate([-offsets, offsets])
     around = (np.abs(np.angle(poles))[:, None] + width[:, None] * offsets).ravel()
-    grid = np.unique(np.concatenate([even, logarithmic, around]))
-    return grid[(grid >= low) & (grid <= high)]
+    grid = np.sort(np.concatenate([even, logarithmic, around]))  # np.unique would import numpy.ma, at 6 ms
+    return grid[(grid >= low) & (grid <= high) & np.append(True, grid[1:] != grid[:-1])]
 
 
 def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> float:

@@ -20,13 +20,12 @@ from haptic_loop.controller.loop import DelayRange, Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.design import budgets, program
 from haptic_loop.design.certificate import prove, required_damping
-from haptic_loop.design.conditions import Condition, ratio_in
+from haptic_loop.design.conditions import ratio_in
 from haptic_loop.design.conditions import this_environment as requirement_of
 from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.environments import BETA, LIMITER, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
-from haptic_loop.design.guarantees import ANY
 from haptic_loop.design.result import Design, DesignFailed, NotProved, from_ratio
-from haptic_loop.design.robustness import Nearby, Spread, at, robustness_nearby, vertices
+from haptic_loop.design.robustness import Spread, at, vertices
 from haptic_loop.design.spring_damper import design as design_spring_damper
 from haptic_loop.design.transparency import Transparency, decibels, transparency
 from haptic_loop.design.worst_member import Searched, search_ranges
@@ -558,25 +557,3 @@ def spread(
     return Spread(
         db, db - before, candidate.g, max(needs[1:], default=needs[0]), candidate.states, len(needs), proved, reason
     )
-
-
-def nearby(
-    loop: Loop,
-    coupling: Coupling,
-    options: program.Options = program.DEFAULT,
-    condition: Condition = THIS_ENVIRONMENT,
-) -> Nearby:
-    """Return the condition's requirement for environments within ten percent, and the cost of a design for them.
-
-    The result is empty for a condition that holds in any environment. The cost is left out for a condition of the
-    user's own, for walls, for ranges, for an environment that is no network of springs, and for a coupling other than
-    a force filter or none.
-    """
-    if condition.guarantee(loop) == ANY or condition.not_varied(loop):
-        return Nearby()
-    known, there = robustness_nearby(loop, coupling, condition), loop.environment
-    if known is None or loop.ranges or there.one_period or not condition.extensible:
-        return Nearby(known)
-    if not isinstance(coupling, ForceFilter | NoCoupling):
-        return Nearby(known)
-    return Nearby(known, spread(loop, coupling, options))

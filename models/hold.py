@@ -38,17 +38,13 @@ def hold(plant: Plant, T: float, late: Sequence[float] | None = None) -> HeldPla
     If forces latch `late` (m,) [s] after the tick, the state is [s; forces that the actuators hold], and the held
     forces act until then: s+ = A(T) s + B(T) [w; held] + B(T - late) (f - held).
     """
-    import scipy
-
     if late is not None:
         return latched(partial(hold, plant), T, late)
     *many, n, inputs = plant.B.shape
     generator = np.zeros((*many, n + inputs, n + inputs))
     generator[..., :n, :n], generator[..., :n, n:] = plant.A, plant.B
-    if many:
-        step = _expm_in_units(generator * T, np.concatenate([_units(plant.A, T), np.ones((*many, inputs))], axis=1))
-    else:
-        step = scipy.linalg.expm(generator * T)
+    units = np.concatenate([_units(plant.A.reshape(-1, n, n), T), np.ones((math.prod(many), inputs))], axis=1)
+    step = _expm_in_units(generator.reshape(-1, *generator.shape[-2:]) * T, units).reshape(generator.shape)
     return HeldPlant(step[..., :n, :n], step[..., :n, n:], plant.C, T)
 
 
@@ -104,7 +100,7 @@ def expm_each(matrices: _Array) -> _Array:
     """Return the exponential of each of (nsim, n, n) matrices, by scaling and squaring.
 
     Each result depends on its own matrix only. scipy.linalg.expm calls a threaded BLAS for every matrix, which made
-    verdicts about many humans several times slower on busy cores.
+    verdicts about many humans several times slower on busy cores, and its import takes as long as a short run.
     """
     norm = np.abs(matrices).sum(axis=1).max(axis=1)
     halvings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, _LARGEST) / _LARGEST))).astype(int)

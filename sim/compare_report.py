@@ -11,8 +11,8 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.design import compare
 from haptic_loop.design.assessment import Assessment
+from haptic_loop.design.designs import nearby as nearby_with_price
 from haptic_loop.design.files import off_table
-from haptic_loop.design.optimal import nearby as nearby_with_price
 from haptic_loop.design.result import PLAIN_CONDITIONS, Chosen, Requirement
 from haptic_loop.design.robustness import Nearby, robustness_nearby
 from haptic_loop.sim.couplings import assessed

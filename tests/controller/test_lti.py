@@ -119,6 +119,46 @@ def test_output_delays_are_powers_of_z(blocks):
     assert loop._lines[0].size == G.order + 5 + 1  # of three samples behind it two are powers of z
 
 
+def _stiff():
+    """Modes of 0.1 Hz to 400 Hz that hardly decay, with positions in m and velocities in units of 1e6."""
+    radii, angles = 1 - np.geomspace(1e-6, 1e-2, 4), 2 * np.pi * 1e-3 * np.geomspace(0.1, 400, 4)
+    A = np.zeros((8, 8))
+    for i, (r, a) in enumerate(zip(radii, angles, strict=True)):
+        A[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = r * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+    unit = np.geomspace(1e-6, 1e6, 8)
+    rng = np.random.default_rng(3)
+    return Lti(
+        unit[:, None] * A / unit,
+        unit[:, None] * rng.normal(size=(8, 2)),
+        rng.normal(size=(2, 8)) / unit,
+        np.zeros((2, 2)),
+        1e-3,
+    )
+
+
+def _inner_delays():
+    """Three samples in a loop and ten before it: poles at 0 without eigenvectors of their own."""
+    rng = np.random.default_rng(4)
+    G, H = random_lti(rng, 4, 2, 2), random_lti(rng, 3, 2, 2)
+    return G.feedback(0.05 * H @ delay((3, 1), G.T)) @ delay((4, 10), G.T)
+
+
+def _double_pole():
+    """Two equal blocks in series, whose poles repeat without a second eigenvector."""
+    G = random_lti(np.random.default_rng(5), 5, 2, 2)
+    return G @ G
+
+
+@pytest.mark.parametrize(("make", "summed"), [(_stiff, True), (_inner_delays, True), (_double_pole, False)])
+def test_stiff_and_defective_responses_match_plain_solves(make, summed):
+    """Poles and taps are summed only where their error is bounded; the Schur form serves everywhere else."""
+    G = make()
+    assert (G._terms is not None) == summed
+    w = np.concatenate([Z, np.exp(1j * np.abs(np.angle(G.poles())))])  # also where each pole resounds
+    expected = np.array([G.C @ np.linalg.solve(z * np.eye(G.order) - G.A, G.B) + G.D for z in w])
+    np.testing.assert_allclose(G.at(w), expected, atol=1e-9 * np.abs(expected).max(), rtol=0)
+
+
 @pytest.mark.parametrize("steps", [(-1,), (1.5,)])
 def test_a_delay_is_a_whole_number(steps):
     with pytest.raises(ValueError, match="whole number of samples"):
