@@ -1,8 +1,8 @@
-"""What an audit says of a coupling: both conditions, how far it is from their edges, and what would help."""
+"""Audit of a coupling: requirements, margins to the edge of each condition, and changes that would help."""
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does without
+if __name__ == "__main__":  # before the imports, which --help does not need
     from haptic_loop.cli.main import door
 
     door("audit")
@@ -39,7 +39,7 @@ from haptic_loop.design.worst_member import Progress
 # A coupling in its loop, judged by either condition.
 
 
-#: Beyond this many samples a sweep takes seconds, and no device's damping is enough.
+#: longest delay [samples]: beyond it a sweep takes seconds, and no device has enough damping
 LONGEST_DELAY = 100
 
 
@@ -47,20 +47,20 @@ _Asked = ConditionName | Condition
 
 
 def requirement(loop: Loop, coupling: Coupling, condition: _Asked) -> Requirement:
-    """The damping that the condition asks of the devices."""
+    """Return the damping that the condition requires of the devices."""
     asked = named(condition)
     try:
         return asked.judge(loop, coupling)
     except (TooLong, InputError):
         raise
     except ValueError as error:  # no solution of the algebraic loop
-        if place_of(error):  # in a class of the user's own
+        if place_of(error):  # an error in the user's own code
             raise
         return refusal(asked.name, loop.delta, str(error))
 
 
 def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any) -> Requirement:
-    """The same with some of the loop's fields changed; a loop that cannot be is refused."""
+    """Return `requirement` with some of the loop's fields changed; infinite for an impossible loop."""
     try:
         return requirement(msgspec.structs.replace(loop, **changes), coupling, condition)
     except TooLong:
@@ -70,13 +70,13 @@ def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any
 
 
 def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -> Requirement:
-    """The same with the gains, or coefficients, and the delays in samples at another T [s]."""
+    """Return `requirement` at another T [s], with the same coefficients and delays in samples."""
     longest, shortest = (bound and bound * (T / loop.T) for bound in (loop.T_max, loop.T_min))  # in proportion
     return _varied(loop, coupling.at_period(T), condition, T=T, T_max=longest, T_min=shortest)
 
 
 def check_loop(loop: Loop) -> None:
-    """Raises ValueError naming the field where a loop asks for no audit."""
+    """Raise ValueError with the name of the field if the loop cannot be audited."""
     for name in ("theta", "psi"):
         steps = getattr(loop, name)
         if max(steps) > LONGEST_DELAY:
@@ -86,16 +86,15 @@ def check_loop(loop: Loop) -> None:
 
 
 # ----------------------------------------------------------------------------------------------------
-# How far a coupling is from the edge of its certificate: the stiffest K, and what may be wrong before it is lost.
+# Margins: the stiffest K, and the errors of the loop's data that the certificate tolerates.
 #
-# Everything is found by varying the loop and asking the conditions again: no solver. A search goes
-# outwards in steps and locates the edge between the last two, so a gap narrower than a step can be missed; what is
-# returned is itself certified, and the other side of the edge is not.
+# The loop is varied and the conditions are evaluated again, without a solver. A search goes outwards in steps and
+# bisects between the last two, so it can miss a gap narrower than a step. The returned value is certified.
 
 
 _Ratio = Callable[[float], float]  # required over available damping, of a varied loop
 
-#: Searches of the stiffest K and the largest T end here; each is far outside what any device is used with.
+#: ends of the searches for the stiffest K and the largest T, far outside the use of any device
 _STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 _SOFTEST, _STEP = 1.0, 3.0  # [N/m]; between two stiffnesses tried
 _EDGE = 1e-7  # relative accuracy of an edge
@@ -104,7 +103,7 @@ _NOT_CERTIFIED = "not certified: there is nothing to lose"
 
 @dataclass(frozen=True)
 class _Stiffest:
-    """The largest certified stiffness of each channel beside its B [N/m]; None where the reason says why."""
+    """The largest certified stiffness [N/m] of each channel with its B, or None and the reason."""
 
     K: tuple[float | None, ...]
     reason: str | None = off_table("if given", None)
@@ -112,9 +111,9 @@ class _Stiffest:
 
 @dataclass(frozen=True)
 class _Sensitivity:
-    """What may be wrong, one thing at a time, before the certificate is lost; None where the reason says why.
+    """The tolerated error of each datum alone, or None and the reason.
 
-    Errors are relative: delta may be 1 - delta_error times and T 1 + T_error times what was given.
+    Errors are relative: delta may be 1 - delta_error times and T 1 + T_error times its value.
     """
 
     least_delta: tuple[float, ...] | None = None  # [N s/m]: the required damping
@@ -126,7 +125,7 @@ class _Sensitivity:
 
 
 def stiffest(loop: Loop, coupling: Coupling, condition: _Asked) -> _Stiffest:
-    """The largest common scale of all K; channel by channel where the condition judges each of them alone."""
+    """Return the largest certified K: a common scale, or channel by channel if the condition is separable."""
     unknown, asked = (None,) * loop.channels, named(condition)
     gains = coupling.figures(loop.T)
     if "K" not in gains:
@@ -154,7 +153,7 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Asked) -> _Stiffest:
 
 
 def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition) -> _Stiffest:
-    """Between 0 and 2 (delta - B)/T, the bound where z^-n = -1; the set of gains is convex and contains K -> 0."""
+    """Search K from 0 to 2 (delta - B)/T, the bound at z^-n = -1; the set of gains is convex and contains K -> 0."""
     stiffest, reasons = [], []
     for i, (B, delta) in enumerate(zip(dampers, loop.delta, strict=True)):
         if delta <= B:
@@ -173,7 +172,7 @@ def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition
 
 
 def sensitivity(loop: Loop, coupling: Coupling, condition: _Asked) -> _Sensitivity:
-    """How much error in delta, T and delay the certificate by this condition tolerates."""
+    """Return the errors in delta, T and delay that the certificate of this condition tolerates."""
     asked, needs = named(condition), requirement(loop, coupling, condition)
     if not needs.certified:
         return _Sensitivity(reason=_NOT_CERTIFIED)
@@ -193,7 +192,7 @@ def sensitivity(loop: Loop, coupling: Coupling, condition: _Asked) -> _Sensitivi
 
 
 def _of_delta(needs: Requirement, reason: str | None) -> _Sensitivity:
-    """What the requirement alone says."""
+    """Return the tolerated error of delta, which follows from the requirement."""
     if not needs.certified:
         return _Sensitivity(reason=reason)
     return _Sensitivity(needs.required, 1 - needs.ratio, reason=reason)
@@ -265,22 +264,22 @@ def _crossing(f: Callable[[float], float], inside: float, outside: float) -> flo
 
 
 # ----------------------------------------------------------------------------------------------------
-# What would help a coupling that a condition does not certify, found by trying each change alone.
+# Changes that help a coupling that is not certified, each tried alone.
 
 
-_FACTORS = (0.75, 0.5, 0.25, 0.1)  # of B and T that are tried
+_FACTORS = (0.75, 0.5, 0.25, 0.1)  # factors on B and T that are tried
 
 
 @dataclass(frozen=True, eq=False)
 class _Remedy:
-    """One change, as mild as certifies; or, where none does, the one that lowers the required damping most."""
+    """The mildest change that certifies, or the change that lowers the required damping most."""
 
     change: str
     requirement: Requirement
 
 
 def remedies(loop: Loop, coupling: Coupling, condition: _Asked) -> list[_Remedy]:
-    """What certifies, or lowers the required damping by 10 % or more, each change alone; [] where it is certified."""
+    """Return single changes that certify or lower the requirement by 10 %; [] for a certified coupling."""
     asked, needs = named(condition), requirement(loop, coupling, condition)
     if needs.certified or asked.not_varied(loop):
         return []
@@ -303,7 +302,7 @@ def remedies(loop: Loop, coupling: Coupling, condition: _Asked) -> list[_Remedy]
 
 
 def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
-    """One sample less at a time, on every channel that has one; the reference is none later than the loop."""
+    """Shorten the delays of every channel by one sample at a time, without ideal delay lam."""
     steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):
         less = tuple(max(n - fewer, 0) for n in steps)
@@ -315,7 +314,7 @@ def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: s
 
 
 def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> _Remedy:
-    """The largest factor that certifies, in steps of 0.001; where none does, the one that needs the least damping."""
+    """Return the largest factor that certifies, in steps of 0.001, or the one with the least requirement."""
 
     needs = cache(vary)
     for larger, factor in pairwise((1.0, *_FACTORS)):
@@ -330,7 +329,7 @@ def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], s
 
 @dataclass(frozen=True)
 class Margins:
-    """How far a coupling is from the edge of one condition."""
+    """Margins of a coupling to the edge of one condition."""
 
     stiffest: _Stiffest
     sensitivity: _Sensitivity
@@ -355,7 +354,7 @@ class Audit:
     switching: Switching | None
     helps: list[Help]
     not_covered: str = CAVEATS
-    left_over: LeftOver | None = off_table("if given", None)  # what Theorem A asks of known devices
+    left_over: LeftOver | None = off_table("if given", None)  # the necessary damping of known devices (Theorem A)
 
 
 def audit(
@@ -369,10 +368,10 @@ def audit(
     """Assess a coupling and measure how far it is from the edge of each condition.
 
     Args:
-        loop: With the range of delays that may switch, if any.
+        loop: The loop, with the range of switching delays, if any.
         coupling: The coupling to audit.
         asked: The condition that must hold, this-environment if None.
-        seed: Of the environments that are drawn from inside the loop's ranges.
+        seed: Seed of the environments that are drawn from inside the loop's ranges.
         force_limit: (m,) [N], for the report.
         progress: Called with (points done, points in all) of the search over ranges.
 
@@ -394,13 +393,13 @@ def audit(
     )
 
 
-_SWEEPS = 60  # that a search asks for, about
+_SWEEPS = 60  # typical number of sweeps of a search
 
 _Found = TypeVar("_Found")
 
 
 def _in_time(loop: Loop, coupling: Coupling, search: Callable[[], _Found], without: Callable[[str], _Found]) -> _Found:
-    """What a search by many sweeps found, or `without` of the reason where it would take, or takes, too long."""
+    """Return the result of a search by many sweeps, or `without(reason)` if it takes too long."""
     try:
         if reason := too_long(loop.F(coupling), _SWEEPS):
             return without(f"not searched: {reason}")
@@ -408,7 +407,7 @@ def _in_time(loop: Loop, coupling: Coupling, search: Callable[[], _Found], witho
             return search()
     except TooLong as error:
         return without(str(error))
-    except ValueError:  # a loop without a force map, whose requirement says why
+    except ValueError:  # The loop has no force map; its requirement has the reason.
         return search()
 
 
@@ -421,7 +420,7 @@ def _margins(loop: Loop, coupling: Coupling, condition: Condition, needs: Requir
 
 
 def _helps(loop: Loop, coupling: Coupling, condition: Condition) -> list[Help]:
-    """Changes that help a condition that does not hold."""
+    """Return changes that help a condition that does not hold."""
     found = _in_time(loop, coupling, lambda: remedies(loop, coupling, condition), lambda why: [])
     asked = ((remedy.change, remedy.requirement) for remedy in found)
     return [Help(change, condition.name, after.required, after.certified) for change, after in asked]

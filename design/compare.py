@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does without
+if __name__ == "__main__":  # before the imports, which --help does not need
     from haptic_loop.cli.main import door
 
     door("compare")
@@ -40,7 +40,7 @@ class Perceived:
 
 @dataclass(frozen=True, eq=False)
 class Demands:
-    """A coupling in its loop, with what both conditions ask of the devices."""
+    """A coupling in its loop, with the requirements of its conditions."""
 
     F: Lti
     requirements: dict[str, Requirement]
@@ -60,9 +60,10 @@ class Curves:
 def judge(
     loop: Loop, coupling: Coupling, own: Sequence[Condition] = (), known: Mapping[str, Requirement] | None = None
 ) -> Demands:
-    """Every condition of a coupling, as figures and over frequency; F while all walls touch. Raises SingularLoop.
+    """Evaluate every condition of a coupling, as figures and over frequency, with all walls touching.
 
-    `own` are conditions of the user's; `known` are requirements of an assessment of this loop and coupling.
+    `own` are conditions of the user's own; `known` are requirements from an assessment of this loop and coupling.
+    Raises SingularLoop.
     """
     F, known = loop.F(coupling), known or {}
     here = loop.at(loop.environment).switching(None)
@@ -76,7 +77,7 @@ def judge(
 
 
 def grid(loop: Loop, couplings: Sequence[Demands], low_hz: float = _LOWEST_HZ) -> Array:
-    """Frequencies [Hz] up to Nyquist's, dense around every pole, with FEEL_HZ and where conditions bind."""
+    """Return frequencies [Hz] up to Nyquist's, dense around every pole, with FEEL_HZ and the binding ones."""
     per_hz = 2 * np.pi * loop.T
     systems = (loop.E(), *(judged.F for judged in couplings))
     even = frequencies(*systems, low=low_hz * per_hz, high=np.pi, points=200) / per_hz
@@ -86,7 +87,7 @@ def grid(loop: Loop, couplings: Sequence[Demands], low_hz: float = _LOWEST_HZ) -
 
 
 def curves(loop: Loop, judged: Demands, hz: Array) -> Curves:
-    """The curves of one coupling at `hz` (k,)."""
+    """Return the curves of one coupling at `hz` (k,)."""
     w = 2 * np.pi * hz * loop.T
     z = on_circle(w)
     E = loop.E()
@@ -97,17 +98,17 @@ def curves(loop: Loop, judged: Demands, hz: Array) -> Curves:
 
 
 def ideal(loop: Loop, hz: Array) -> tuple[Array, Perceived]:
-    """Singular values of E (k, m) [N/m] and its effective impedance: what an undelayed loop without coupling gives."""
+    """Return the singular values (k, m) [N/m] and the effective impedance of E, the undelayed loop without coupling."""
     E = loop.E().at(on_circle(2 * np.pi * hz * loop.T))
     return _singular_values(E), perceived(E, hz)
 
 
 def _singular_values(G: NDArray[np.complex128]) -> Array:
-    """(k, m, m) -> (k, m), largest first."""
+    """Return the singular values (k, m) of (k, m, m), largest first."""
     return np.linalg.svd(G, compute_uv=False)
 
 
 def perceived(G: NDArray[np.complex128], hz: Array) -> Perceived:
-    """The diagonal of displacement-to-force responses (k, m, m) at `hz` (k,) > 0 as stiffness and damping."""
+    """Return the diagonal of displacement-to-force responses (k, m, m) at `hz` (k,) > 0 as stiffness and damping."""
     own = np.diagonal(G, axis1=1, axis2=2)
     return Perceived(own.real, own.imag / (2 * np.pi * hz)[:, None])

@@ -1,4 +1,4 @@
-"""The file in which a coupling is kept: the loop it was made for, its coefficients and its certificate, as JSON.
+"""JSON files of couplings: the loop, the coefficients and the certificate.
 
 Numbers are plain decimals, rationals are strings "p/q". Reading is strict: an unknown or ill-typed field is an error
 that names it.
@@ -30,7 +30,7 @@ _Part = TypeVar("_Part", bound=msgspec.Struct)
 
 
 class Certificate(Strict, frozen=True):
-    """The claim about a coupling in its loop, and its proof: a base condition, the facts it holds with, multipliers."""
+    """The claim about a coupling in its loop and its proof: base condition, facts, multipliers, matrices."""
 
     condition: str  # the base: a name of design.result.CONDITIONS, or the name of a condition of the user's own
     facts: tuple[str, ...]  # what it covers beyond one linear network with constant delays (design.conditions.FACTS)
@@ -47,7 +47,7 @@ class Certificate(Strict, frozen=True):
 
     @property
     def limiter(self) -> Certificate | None:
-        """The certificate itself where it covers limited forces, else None."""
+        """The certificate itself if it covers limited forces, else None."""
         return self if "limiter" in self.facts else None
 
 
@@ -64,24 +64,24 @@ class Stored(Strict, frozen=True):
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, certificate: Certificate | None = None) -> Stored:
-        """The stored form of a coupling in its loop."""
+        """Return the stored form of a coupling in its loop."""
         made = cls(loop, coupling.form(), certificate)
         filed(loop, coupling)
         return made
 
     def built(self) -> Coupling:
-        """The coupling."""
+        """Return the coupling."""
         return self.coupling.build(self.loop.T)
 
 
-#: What the response of a coupling may differ by from that of its form, beside the largest: rounding.
+#: allowed difference between the responses of a coupling and its form, relative to the largest response: rounding
 _SAME = 1e-9
 
 
 def filed(loop: Loop, coupling: Coupling) -> Coupling:
-    """The coupling as a file gives it back: itself, or what the form of one of the user's own builds.
+    """Return the coupling that a file gives back: itself, or the one that the form of a user's own class builds.
 
-    Raises InputError where that is another system, in the loop or in what it says of its compliance.
+    Raises InputError if that is another system, in the loop or in its compliance.
     """
     built = coupling.form().build(loop.T)
     if type(built) is type(coupling):
@@ -97,19 +97,19 @@ def filed(loop: Loop, coupling: Coupling) -> Coupling:
         z = on_circle(frequencies(own))
         response = own.at(z)
         scale, apart = np.abs(response).max(), np.abs(response - other.at(z)).max()
-        if not apart <= _SAME * scale + rounding(own, z):  # of one that is not a number, too
+        if not apart <= _SAME * scale + rounding(own, z):  # also true for nan
             raise InputError(f"{name}: responses differ by {apart / scale:.1e} of the largest")
     return built
 
 
 def digest(*parts: msgspec.Struct) -> str:
-    """sha256 over the canonical JSON (sorted keys, shortest decimals, 7 as 7.0 where it is a float) of the parts."""
+    """Return sha256 over the canonical JSON of the parts: sorted keys, shortest decimals, floats with a point."""
     plain = [msgspec.json.decode(_canonical(_read_back(part))) for part in parts]
     return hashlib.sha256(msgspec.json.encode(plain)).hexdigest()
 
 
 def _read_back(part: _Part) -> _Part:
-    """The part as a file gives it back; itself where it holds a class of the user's own, which no file can hold."""
+    """Return the part after writing and reading it; unchanged if it contains a class of the user's own."""
     try:
         return msgspec.json.decode(msgspec.json.encode(part), type=type(part))
     except (TypeError, msgspec.ValidationError):
@@ -121,18 +121,18 @@ def _canonical(part: Any) -> bytes:
 
 
 def own_fields(part: Any) -> Any:
-    """An environment or an array of the user's own as plain data: its class and what it holds."""
+    """Return an environment or an array of the user's own as plain data: its class and its fields."""
     return part.tolist() if isinstance(part, np.ndarray) else {"class": type(part).__qualname__} | vars(part)
 
 
 def sealed(certificate: Certificate) -> Certificate:
-    """The certificate with the digest of all its other fields."""
+    """Return the certificate with the digest of its other fields as its seal."""
     unsealed = _read_back(msgspec.structs.replace(certificate, seal=""))
     return msgspec.structs.replace(certificate, seal=hashlib.sha256(_canonical([unsealed])).hexdigest())
 
 
 def load(path: str | Path) -> Stored:
-    """Read a stored coupling. Raises InputError, one line that names the field or the file."""
+    """Read a stored coupling. Raises InputError with the name of the field or the file."""
     content = read(path)
     if not content.strip():
         raise InputError(f"{path}: is empty, expected a coupling as python -m design stores it")
@@ -162,7 +162,7 @@ def _once(pairs: list[tuple[str, Any]]) -> None:
 
 
 def _place(content: bytes, message: str) -> str:
-    """Number and beginning of the line that a message points to as "(byte N)", or nothing."""
+    """Return the number and beginning of the line that a message names as "(byte N)", or ""."""
     found = re.search(r"\(byte (\d+)\)", message)
     if not found:
         return ""

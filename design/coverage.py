@@ -1,4 +1,4 @@
-"""What is covered beyond one linear environment, as figures of a report: ranges, delays that switch, limited forces."""
+"""Figures of reports on switching delays and on ranges."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from haptic_loop.design.result import Design, DesignFailed, Requirement, suffice
 from haptic_loop.design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------
-# What a report says of delays that vary: what switching asks beside that of the playout buffer.
+# Switching delays, compared with a playout buffer.
 
 
 _NOT_COVERED = (
@@ -28,7 +28,7 @@ _NOT_COVERED = (
 
 @dataclass(frozen=True)
 class _Playout:
-    """What the constant delay hi asks, which a playout buffer makes."""
+    """Requirement for the constant delay hi of a playout buffer."""
 
     theta: tuple[int, ...]
     required_damping: tuple[float, ...]
@@ -37,7 +37,7 @@ class _Playout:
 
 @dataclass(frozen=True)
 class Switching:
-    """What any switching within a loop's range of delays asks; only the requirement where its reason says why."""
+    """Requirement for any switching within a loop's range of delays; without a proof only the requirement."""
 
     requirement: Requirement = off_table("inlined")
     lo: tuple[int, ...] = off_table()
@@ -48,7 +48,7 @@ class Switching:
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, known: Requirement | None = None) -> Switching:
-        """`known` is the requirement of an assessment of this loop and coupling, where there is one."""
+        """Evaluate a coupling; `known` is its requirement from an assessment in this loop, if there is one."""
         found, span = known or judged(loop, coupling, SWITCHING), loop.delays
         if found.reason:
             return cls(found, span.lo, span.hi)
@@ -59,12 +59,12 @@ class Switching:
 
 
 # ----------------------------------------------------------------------------------------------------
-# What a guarantee for ranges of parameters costs: the robust coupling beside the one made for the nominal one.
+# Cost of a guarantee for ranges: the robust coupling compared with the nominal one.
 
 
 @dataclass(frozen=True)
 class NominalWorst:
-    """A figure in the nominal environment, and the worst of the ranges."""
+    """A figure in the nominal environment, and its worst value over the ranges."""
 
     nominal: float
     worst: float
@@ -72,7 +72,7 @@ class NominalWorst:
 
 @dataclass(frozen=True)
 class OverRanges:
-    """What a coupling asks and costs over ranges; the mismatch is null in JSON where it is zero."""
+    """Requirement and mismatch of a coupling over ranges; a mismatch of zero is null in JSON."""
 
     coupling: str
     violated: int  # vertices
@@ -83,7 +83,7 @@ class OverRanges:
 
     @classmethod
     def of(cls, name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -> OverRanges:
-        """Members that no device feels have no mismatch."""
+        """Evaluate a coupling over the members; members that no device feels have no mismatch."""
         ratios, figures = [], {}
         for member in members:
             here = loop.at(member.network)
@@ -104,11 +104,11 @@ class OverRanges:
 
 
 def price(loop: Loop, design: Design, kind: str, nominal: Callable[[Loop], Design] | None) -> list[OverRanges]:
-    """A design over the ranges; one made for all of them beside what `nominal` makes for one environment alone."""
+    """Return the figures of a design over the ranges, after those of the design that `nominal` makes without ranges."""
     couplings = {kind: design.coupling}
     if nominal:
         couplings = {"whole ranges": design.coupling}
-        with suppress(DesignFailed):  # ranges are given another basis by default
+        with suppress(DesignFailed):  # Ranges have another basis by default.
             couplings = {"nominal only": nominal(loop.at(loop.environment)).coupling, **couplings}
     members = loop.members()
     return [OverRanges.of(name, loop, coupling, members) for name, coupling in couplings.items()]

@@ -1,8 +1,8 @@
-"""Files: a reader that takes no more than it can hold, a writer that never shows half a file, and words for messages.
+"""Reading files of limited size, writing files atomically, and text for messages.
 
-A folder is made where the user names a folder (--out DIR) or names nothing (out/..); the folder of a file that the user
-names (--json, --video, --out FILE) must exist, for a typing error must not make one. Within `one_command` a file is
-either read or written, and written for one option only: whoever comes second is told so.
+Folders that the user names (--out DIR) and default folders (out/..) are created. The folder of a file that the user
+names (--json, --video, --out FILE) must exist, so that a typing error creates none. Within `one_command` a file is
+either read or written, and written for one option only; the second use is refused.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ _DEEP_KEY = re.compile(rf"(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{_DEEPEST_KEY}}}")
 
 
 class InputError(ValueError):
-    """Something that the user gave and can put right: one line, naming the field."""
+    """A mistake in the user's input: one line that names the field."""
 
 
 # ----------------------------------------------------------------------------------------------------
-# Words that others wrote, in what we say.
+# User input in messages.
 
 
 def printable(text: str) -> str:
-    """What can change neither a terminal nor the direction of writing: everything else as Python escapes it."""
+    """Return the text with control characters and marks of writing direction escaped."""
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
@@ -60,24 +60,24 @@ def _cut(text: str) -> str:
 
 
 def one_line(text: object) -> str:
-    """A message in one line of at most MOST_WORDS characters; user input is cut to 80 characters, a path is not."""
+    """Return a message in one line of at most _MOST_WORDS characters; quoted user input is cut to 80 characters."""
     words = _QUOTED.sub(lambda found: _cut(found[0]), printable(" ".join(str(text).split())))
     half = _MOST_WORDS // 2 - 3
     return words if len(words) <= _MOST_WORDS else f"{words[:half]} [..] {words[-half:]}"
 
 
 # ----------------------------------------------------------------------------------------------------
-# Which files a command has read, and which its options name as output.
+# The files that a command has read, and those that its options name as output.
 
 
 def counted(path: str) -> str:
-    """The place of a value in a file, entries of lists counted from 1: human[0].mass as human #1.mass."""
+    """Return the path of a value with list entries counted from 1: human[0].mass becomes human #1.mass."""
     return re.sub(r"\[(\d+)\]", lambda match: f" #{int(match[1]) + 1}", path)
 
 
 @dataclass
 class _Ledger:
-    """By device and inode where a file exists, and by its path without links."""
+    """Files of a command, identified by device and inode, and by their path without links."""
 
     read: dict[Any, str] = field(default_factory=dict)  # place -> what it was read as
     named: dict[Any, str] = field(default_factory=dict)  # place -> the option that names it as output
@@ -89,7 +89,7 @@ _ledger: ContextVar[_Ledger | None] = ContextVar("ledger", default=None)
 
 @contextmanager
 def one_command() -> Iterator[None]:
-    """What is read or written from here on belongs together."""
+    """Begin a new record of the files that a command reads and writes."""
     token = _ledger.set(_Ledger())
     try:
         yield
@@ -98,7 +98,7 @@ def one_command() -> Iterator[None]:
 
 
 def _places(path: Path) -> set[Any]:
-    """What identifies a file; None for a terminal or another target in which nothing can be destroyed."""
+    """Return the identifiers of a file; none for a terminal or another target without content to destroy."""
     place = _target(path)
     if not place.exists():
         return {place}
@@ -107,7 +107,7 @@ def _places(path: Path) -> set[Any]:
 
 
 def _target(path: Path) -> Path:
-    """A file without the links that lead to it. Raises OSError for links that lead to themselves."""
+    """Return the path with all links resolved. Raises OSError for circular links."""
     place = Path(os.path.realpath(path))
     if place.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
@@ -123,7 +123,7 @@ def _met(places: set[Any], known: dict[Any, str]) -> str | None:
 
 
 def read(path: str | Path, named: str | None = None, most: int = _MOST_STORED, hint: str = "") -> bytes:
-    """The bytes of a regular file of at most `most` bytes, called `named` in messages. Raises InputError."""
+    """Return the bytes of a regular file of at most `most` bytes, called `named` in messages. Raises InputError."""
     named = str(path) if named is None else named
     with _opened(path, named, hint) as file:
         content = file.read(most + 1)
@@ -135,13 +135,13 @@ def read(path: str | Path, named: str | None = None, most: int = _MOST_STORED, h
 
 
 def _without_waiting(path: str, flags: int) -> int:
-    """Open a file so that no read waits, as that of /proc/kmsg would without end; regular files are read as always."""
+    """Open a file without blocking, because reads of /proc/kmsg would wait forever."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 @contextmanager
 def _opened(path: str | Path, named: str, hint: str = "") -> Iterator[BinaryIO]:
-    """A regular file, which no option writes. Raises InputError, also for what goes wrong while it is read."""
+    """Open a regular file that no option writes. Raises InputError, also for errors while it is read."""
     path = Path(path)
     try:
         if path.exists() and not path.is_file():
@@ -167,7 +167,7 @@ def _opened(path: str | Path, named: str, hint: str = "") -> Iterator[BinaryIO]:
 
 
 def read_text(path: str | Path, named: str | None = None, hint: str = "") -> str:
-    """The text of a file in UTF-8. Raises InputError."""
+    """Return the text of a file in UTF-8. Raises InputError."""
     try:
         return read(path, named, _MOST_TEXT, hint).decode()
     except UnicodeDecodeError:
@@ -175,7 +175,7 @@ def read_text(path: str | Path, named: str | None = None, hint: str = "") -> str
 
 
 def toml(text: str, named: str) -> dict[str, Any]:
-    """The content of TOML text. Raises InputError."""
+    """Return the content of TOML text. Raises InputError."""
     if found := _DEEP_KEY.search(text):
         line = text.count("\n", 0, found.start()) + 1
         raise InputError(f"{named}: line {line}: a key of more than {_DEEPEST_KEY} names joined by dots")
@@ -188,7 +188,7 @@ def toml(text: str, named: str) -> dict[str, Any]:
 
 
 def read_arrays(path: str | Path, expected: str) -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file, in which no object is unpickled. Raises InputError where it is not one."""
+    """Return the arrays of an npz file without unpickling objects. Raises InputError."""
     try:
         with _opened(path, str(path)) as file, ZipFile(file) as archive:
             entries = archive.infolist()
@@ -203,7 +203,7 @@ def read_arrays(path: str | Path, expected: str) -> dict[str, NDArray[Any]]:
 
 
 def _array(archive: ZipFile, entry: ZipInfo) -> NDArray[Any]:
-    """One array; what it declares must be what is there, before any memory is taken."""
+    """Return one array, after comparing its declared size with the size of its data."""
     with archive.open(entry) as member:
         version = npy.read_magic(member)
         header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
@@ -219,7 +219,7 @@ def _array(archive: ZipFile, entry: ZipInfo) -> NDArray[Any]:
 
 
 def check_file(option: str, path: Path, expected: str = "a file") -> Path:
-    """Whether a file that the user named can be written, before any work is done. Raises InputError."""
+    """Return the path of a file that the user named. Raises InputError if it cannot be written."""
     try:
         if path.is_dir():
             raise InputError(f"{option} {path}: is a folder, expected {expected}")
@@ -249,14 +249,14 @@ def check_file(option: str, path: Path, expected: str = "a file") -> Path:
 
 
 def out_file(named: str | None, default: str, expected: str = "a file") -> Path:
-    """The file of --out, by the rule above. Raises InputError."""
+    """Return the file of --out, or the default one in a new folder. Raises InputError."""
     if named is None:
         folder(Path(default).parent)
     return check_file("--out", Path(default if named is None else named), expected)
 
 
 def folder(path: Path) -> Path:
-    """Make a folder that files can be written to. Raises InputError where that cannot be."""
+    """Create a folder that files can be written to. Raises InputError."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         _try(path)
@@ -277,8 +277,8 @@ def _try(place: Path, name: str = "") -> None:
 def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path:
     """Write a file under a temporary name and rename it into place; a device or a pipe is written directly.
 
-    A link stays a link: the file that it points to is written. Raises InputError where that cannot be, and where the
-    command has read the file or has written it for another option.
+    A link stays a link: the file that it points to is written. Raises InputError if the file cannot be written, or if
+    the command has read it or written it for another option.
     """
     try:
         place = _target(path)
@@ -304,7 +304,7 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
 def remove(path: Path) -> None:
     """Remove a file that an earlier run wrote, if it is there.
 
-    Raises InputError where that cannot be, and where the command has read the file or has written it.
+    Raises InputError if it cannot be removed, or if the command has read or written it.
     """
     try:
         if path.is_symlink() or path.is_file():
@@ -315,7 +315,7 @@ def remove(path: Path) -> None:
 
 
 def _spare(path: Path) -> None:
-    """Raises InputError where a file must stay as it is."""
+    """Raise InputError if the command has read the file or written it."""
     if ledger := _ledger.get():
         places = _places(path)
         if known := _met(places, ledger.read):
@@ -336,16 +336,16 @@ InJson = Literal["always", "if given", "inlined", "left out"]
 
 
 def off_table(json: InJson = "always", default: Any = MISSING) -> Any:
-    """A field of a report that no table shows.
+    """Return a dataclass field of a report that no table shows.
 
-    In JSON it is a key `always`, or only `if given`, where it is not None; or `left out`; or it is a report of its own
-    whose keys are `inlined` among the others.
+    `json` says whether its JSON has the key `always`, only `if given` (not None), or `left out`; `inlined` puts the
+    keys of a nested report among the others.
     """
     return field(default=default, metadata={"json": json})
 
 
 def plain(report: Any) -> Any:
-    """A report as JSON takes it: dataclasses by `part()` or their fields, null for what is infinite or no number."""
+    """Return a report as plain data: dataclasses by `part()` or their fields, None for infinity and nan."""
     if is_dataclass(report) and not isinstance(report, type):
         own = getattr(report, "part", None)
         return plain(own()) if own else _part(report)
@@ -374,7 +374,7 @@ def _part(report: Any) -> dict[str, Any]:
 
 
 def write_json(destination: str | Path, report: Any) -> None:
-    """A report as JSON to a file, or to standard output for '-'."""
+    """Write a report as JSON to a file, or to standard output for '-'."""
     text = json.dumps(plain(report), indent=2, allow_nan=False) + "\n"
     if str(destination) == "-":
         try:
@@ -387,7 +387,7 @@ def write_json(destination: str | Path, report: Any) -> None:
 
 
 def nobody_reads() -> None:
-    """Send what is still written to standard output to nowhere, because its reader has left."""
+    """Discard further standard output, because its reader has left."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())
     os.close(nowhere)
