@@ -1,12 +1,12 @@
-"""How wrong a run is: its engine beside the exact one, and its forces beside those of an ideal environment.
+"""Errors of runs: of an engine against the exact one, and of forces against those of an ideal environment.
 
-`measure` gives what one setting of an engine costs and how wrong it is, from the same run; `compare_engines` finds the
-engine and the step that keep an error that is asked for on a scene of one's own.
+`measure` returns the cost and the errors of one setting of an engine, from the same run. `compare_engines` finds the
+cheapest engine and step that keep a given error on a scene.
 """
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does without
+if __name__ == "__main__":  # before the imports, which --help does not need
     from haptic_loop.cli.main import door
 
     door("accuracy")
@@ -29,12 +29,12 @@ from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode
 from haptic_loop.sim.trace import Trace
 
-# ---- beside the exact engine
+# ---- errors against the exact engine
 
 
 @dataclass(frozen=True)
 class PositionError:
-    """Device positions against the exact engine's closed loop; None with a reason where there is none."""
+    """Error of device positions against the exact engine, or None and the reason."""
 
     position_relative_rms: float | None = None
     position_max_m: float | None = None
@@ -44,9 +44,9 @@ class PositionError:
 def position_error(
     trace: Trace, exact: Trace | None, simulation: Simulation, grows: bool | None = None
 ) -> PositionError:
-    """Of a trace beside the exact engine's.
+    """Return the position error of a trace against the exact engine.
 
-    `grows` says whether the loop is unstable where its eigenvalues do not: then the trace is compared up to the first
+    `grows` says whether the loop is unstable, if its eigenvalues do not. An unstable trace is compared up to the first
     clipped tick, because growth multiplies any difference.
     """
     if exact is None:
@@ -77,13 +77,13 @@ _SETTINGS = (
     *(("mujoco", "implicitfast", n) for n in (1, 4, 12)),
     *(("mujoco", "discrete", n) for n in (4, 12)),
 )
-_REPEATS = 3  # the least of their times is the cost
-_TAIL = 4000  # ticks in which a limit cycle is measured
+_REPEATS = 3  # number of runs; the least CPU time is the cost
+_TAIL = 4000  # last ticks, in which a limit cycle is measured
 
 
 @dataclass(frozen=True)
 class Row:
-    """What one setting of an engine costs and how wrong it is; null where a figure does not exist."""
+    """Cost and errors of one setting of an engine; a missing figure is null."""
 
     engine: str
     integrator: str | None
@@ -101,7 +101,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class _Reference:
-    """The exact engine's answers: with the coupling that was asked for, and without any."""
+    """Results of the exact engine, with the coupling and without one."""
 
     coupled: Simulation
     uncoupled: Simulation
@@ -123,9 +123,9 @@ def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
 def measure_all(
     coupled: Simulation, uncoupled: Simulation, default: int, progress: Callable[[int, int], None]
 ) -> tuple[list[Row], list[str], bool]:
-    """Rows of every setting that is stable on this plant, the reasons of those that are not, and whether it was ended.
+    """Return (rows of the settings that are stable on this plant, reasons of the others, whether it was interrupted).
 
-    `default` is the number of substeps that RK4 takes where nobody says it.
+    `default` is the default number of substeps of RK4.
     """
     rows: list[Row] = []
     skipped: list[str] = []
@@ -146,7 +146,7 @@ def measure_all(
 
 
 def measure(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
-    """One row: errors of position [-], growth [1/s] and limit cycle [-], [Hz], and the cost of that very run."""
+    """Return the row of a setting: errors of position [-], growth [1/s] and limit cycle [-], [Hz], and the cost."""
     settings = (engine, integrator, substeps)
     trace, wall = _timed(truth.coupled, *settings)
     for _ in range(_REPEATS - 1):
@@ -157,9 +157,9 @@ def measure(truth: _Reference, engine: str, integrator: str | None, substeps: in
 
 
 def _with_front(rows: Sequence[Row]) -> list[Row]:
-    """Set `pareto`: no other row of that kind of engine is at least as good in cost and both errors, and better in one.
+    """Set `pareto` for rows that no other row of the same kind of engine beats in cost and both errors.
 
-    The exact engine is on it by itself: only a linear plant has one.
+    The exact engine is always on the front: it exists for linear plants only.
     """
     points, marked = np.array([_point(row) for row in rows]), []
     for i, row in enumerate(rows):
@@ -170,7 +170,7 @@ def _with_front(rows: Sequence[Row]) -> list[Row]:
 
 
 def _limit_cycle(trace: Trace, channel: int) -> tuple[float, float]:
-    """Standard deviation [N] and frequency [Hz] of a force's tail; the spectral peak is refined by a parabola."""
+    """Return standard deviation [N] and frequency [Hz] of a force's tail; a parabola refines the spectral peak."""
     force = trace.f[-_TAIL:, channel]
     level = np.log(np.abs(np.fft.rfft((force - force.mean()) * np.hanning(force.size))) + 1e-300)
     peak = int(np.clip(np.argmax(level[1:-1]) + 1, 1, level.size - 2))
@@ -183,13 +183,13 @@ def _limit_cycle(trace: Trace, channel: int) -> tuple[float, float]:
 def _timed(simulation: Simulation, engine: str, integrator: str | None, substeps: int | None) -> tuple[Trace, float]:
     begin = time.perf_counter()
     trace = run(simulation, make_engine(simulation, engine, integrator, substeps))
-    if trace.interrupted:  # a part of a run is no measurement
+    if trace.interrupted:  # an incomplete run cannot be measured
         raise KeyboardInterrupt
     return trace, time.perf_counter() - begin
 
 
 def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> tuple[float, bool]:
-    """The larger growth-rate error of the two loops, and whether both verdicts are right."""
+    """Return the larger growth-rate error of the two loops, and whether both verdicts are right."""
     errors, right = [], True
     for simulation in (truth.coupled, truth.uncoupled):
         held = _measured_hold(simulation, engine, integrator, substeps)
@@ -202,7 +202,7 @@ def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: in
 def _cycle(
     truth: _Reference, engine: str, integrator: str | None, substeps: int | None
 ) -> tuple[float, float, float, float] | tuple[None, None, None, None]:
-    """Amplitude and frequency of the limit cycle, and their errors."""
+    """Return amplitude and frequency of the limit cycle, and their errors."""
     if truth.cycle is None:
         return None, None, None, None
     channel, amplitude, frequency = truth.cycle
@@ -218,14 +218,14 @@ def _point(row: Row) -> Array:
     return np.array([row.wall_s_per_simulated_s, position, abs(row.growth_rate_error)])
 
 
-# ---- how long a run can be believed
+# ---- limits of the model
 
 
 @dataclass(frozen=True)
 class Credible:
-    """Up to when a run stays within what its devices declare credible, and what it asks of them at most.
+    """The time up to which a run stays within the devices' declared limits of the model, and the largest values.
 
-    Figures per device; a rigid device has no transmission, and its force is None.
+    Figures are per device; the transmission force of a rigid device is None.
     """
 
     until_s: float | None
@@ -237,10 +237,10 @@ class Credible:
 
 
 def credible(simulation: Simulation, trace: Trace) -> Credible:
-    """The model has a linear transmission of any strength, and motors of any speed.
+    """Check a run against the limits of the model, whose transmissions and motors have none.
 
-    `until_s` is the first time at which a transmission carries more than `credible_force`, or a motor moves faster than
-    `credible_speed`; None where that never happens.
+    `until_s` is the first time at which a transmission carries more than `credible_force` or a motor moves faster than
+    `credible_speed`, or None.
     """
     n, devices = simulation.scene.model.nq, simulation.scenario.axis_devices
     forces: list[float | None] = []
@@ -267,7 +267,7 @@ def credible(simulation: Simulation, trace: Trace) -> Credible:
 
 
 def _not_credible(found: Credible, until: float) -> str:
-    """One sentence, for report and caption."""
+    """Return one sentence for report and caption."""
     pairs = zip(found.transmission_force_n, found.credible_force_n, strict=True)
     carried = max(((f, c) for f, c in pairs if f is not None and c), key=lambda pair: pair[0] / pair[1], default=None)
     speeds = zip(found.motor_speed_m_per_s, found.credible_speed_m_per_s, strict=True)
@@ -278,19 +278,19 @@ def _not_credible(found: Credible, until: float) -> str:
     return f"from t = {until:.2f} s on the motion is the linear model's and no device's: {what}"
 
 
-# ---- beside the ideal environment
+# ---- errors against the ideal environment
 
 
 @dataclass(frozen=True, eq=False)
 class ForceError:
-    """Two answers to the same displacements, from rest at t = 0 and over the whole run, before any force limit."""
+    """Forces of the coupled loop and of the ideal environment for the same displacements, before any force limit."""
 
-    asked: Array = off_table("left out")  # (N, m) what the coupled loop asks of the motors, F x [N]
-    ideal: Array = off_table("left out")  # (N, m) what the delay-matched environment itself would ask, Lambda E x [N]
+    asked: Array = off_table("left out")  # (N, m) forces of the coupled loop, F x [N]
+    ideal: Array = off_table("left out")  # (N, m) forces of the delay-matched environment, Lambda E x [N]
     error_percent: float | None = off_table()  # rms(asked - ideal)/rms(ideal), over all ticks and channels
     asked_rms_n: float | None = off_table()
     ideal_rms_n: float | None = off_table()
-    reason: str | None = off_table("if given")  # why the two cannot be compared
+    reason: str | None = off_table("if given")  # reason why there is no comparison
 
     @classmethod
     def of(cls, asked: Array, ideal: Array, reason: str | None = None) -> ForceError:
@@ -305,10 +305,10 @@ class ForceError:
 
 
 def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> ForceError:
-    """The run's forces before their limits, and those of Lambda E, for the displacements that the encoders gave.
+    """Return the run's forces before their limits and those of Lambda E, for the measured displacements.
 
-    Where delays switch or a limiter stands before them, the forces are those that arrived, within their limits. Of
-    walls there is no linear ideal.
+    With switching delays or a limiter the forces are those that arrived, within their limits. Walls have no linear
+    ideal.
     """
     process = simulation.process
     if process.walls:
@@ -319,7 +319,7 @@ def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> For
 
 
 def response(G: Lti, x: Array) -> Array:
-    """y = G x from rest; x (N, inputs), y (N, outputs)."""
+    """Return y = G x (N, outputs) from rest for x (N, inputs)."""
     rows = np.zeros((x.shape[0] + 1, G.order + x.shape[1]))  # [state, x] of every tick
     rows[:-1, G.order :] = x
     step = np.hstack([G.A, G.B]).dot
@@ -334,20 +334,20 @@ def _rms(values: Array) -> float:
         return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
-# ---- speed against error for a scene of one's own: which engine and step keep an error that is asked for
+# ---- the cheapest engine and step for a given error
 #
-# The error is the relative rms of the encoders' positions over the run: against the exact loop on a smooth scene. Where
-# something rubs there is no exact loop: Runge-Kutta with n steps is compared with 2 n, until they are near enough.
-# Differences that shrink by q with every halving sum up to q/(1 - q) of the last one, which is what the finest run
-# misses; the method is of first order at least, q = 1/2. One pair may agree by chance, so q is seen over two halvings,
-# and is no less than _EVEN, since switching by friction makes it jump.
+# The error is the relative rms of the encoders' positions over the run, on a smooth scene against the exact loop. With
+# friction there is no exact loop: Runge-Kutta with n steps is compared with 2 n, until the difference is small enough.
+# If differences shrink by q with every halving, the finest run errs by q/(1 - q) times the last one; the order is one
+# at least, q = 1/2. One pair may agree by chance, so q is taken over two halvings, and is at least _EVEN because
+# friction makes it jump.
 
 _CANDIDATES = ((EXPONENTIAL, 1), ("RK4", 1), ("RK4", 2), ("RK4", 4), ("RK4", 8), ("Euler", 1), ("Euler", 4))
-_MOST_COMPARED = 256  # substeps, where a refined run is the reference
-_EVALUATIONS = {"RK4": 4}  # of the dynamics in a step; the others take one
+_MOST_COMPARED = 256  # largest number of substeps of a refined reference
+_EVALUATIONS = {"RK4": 4}  # evaluations of the dynamics in a step; one for the others
 _MOST_EVALUATIONS = 6e7  # in all runs of a refinement: two minutes, at 2e-6 s each
 _EVEN = 0.6
-_CONTRACTS = 0.7  # q above this is no convergence; then a few times the largest difference is what may be missed
+_CONTRACTS = 0.7  # above it the differences do not converge; the error is then a few times the largest one
 _FEW = 4.0
 
 
@@ -359,7 +359,7 @@ class EngineChoice:
     substeps: int
     position_relative_rms: float  # of the encoders' positions over the run, at most, as far as refining shows
     verdict_correct: bool  # whether the loop that it simulates has the exact loop's verdict
-    cpu_s: float  # of that run: measured and shown, it decides nothing
+    cpu_s: float  # CPU time of that run, for the report only
 
     @property
     def name(self) -> str:
@@ -367,18 +367,19 @@ class EngineChoice:
 
     @property
     def cost(self) -> tuple[int, float]:
-        """The evaluations of the dynamics per tick; of as many, the setting of the smaller error counts as cheaper."""
+        """Evaluations of the dynamics per tick, then the error: the order of settings by cost."""
         return self.substeps * _EVALUATIONS.get(self.integrator, 1), self.position_relative_rms
 
 
 def compare_engines(
     simulation: Simulation, error: float, ticks: int | None = None, progress: Progress = lambda done, ticks: None
 ) -> tuple[EngineChoice, ...]:
-    """Every setting that is stable on the scene's plant, the cheapest first, over `ticks` of the scenario (all).
+    """Return the settings that are stable on the scene's plant, the cheapest first, over `ticks` of the scenario.
 
-    With its walls, limits, encoder steps, varying delays and net; verdicts are of the loop without a net and with
-    constant delays. Where something rubs the reference is refined until RK4 keeps `error`. Raises InputError where it
-    cannot, or not with 60 million evaluations of the dynamics, and where nothing moves. `progress` is that of each run.
+    Runs have the scenario's walls, limits, encoder steps, varying delays and net; verdicts are for constant delays
+    without a net. With friction the reference is refined until RK4 keeps `error`. `progress` is that of each run.
+
+    Raises InputError if 60 million evaluations of the dynamics do not suffice, or if nothing moves.
     """
     if not error > 0:
         raise InputError(f"--error is {error:g}, expected a positive relative error")
@@ -390,7 +391,7 @@ def compare_engines(
         truth, missed = _positions(simulation, ticks, "exact", progress=progress)[0], 0.0
     else:
         truth, missed = _refined(simulation, error, ticks, runs, progress)
-        rest = ("RK4",) if simulation.scene.plant.felt is None else ("RK4", EXPONENTIAL)  # which knows no such scene
+        rest = ("RK4",) if simulation.scene.plant.felt is None else ("RK4", EXPONENTIAL)  # it cannot step such a scene
         settings = [*runs, *(one for one in _CANDIDATES if one[0] not in rest)]
     _require_motion(truth)
     choices = []
@@ -404,7 +405,7 @@ def compare_engines(
 
 
 def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
-    """The cheapest setting with an error small enough and the right verdict. Raises InputError without one."""
+    """Return the cheapest setting with a small enough error and the right verdict. Raises InputError."""
     kept = [choice for choice in choices if choice.verdict_correct and choice.position_relative_rms <= error]
     if kept:
         return min(kept, key=lambda choice: choice.cost)
@@ -414,7 +415,7 @@ def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
 
 @dataclass(frozen=True)
 class CrossCheck:
-    """The run beside that of another integrator."""
+    """Difference of the run from that of another integrator."""
 
     integrator: str
     substeps: int
@@ -425,9 +426,9 @@ class CrossCheck:
 
 
 def cross_check(simulation: Simulation, trace: Trace, settings: EngineSettings) -> CrossCheck:
-    """The run again by RK4, which shares no matrix with the exponential and the exact engine; by it, if RK4 ran.
+    """Repeat the run by RK4, which shares no matrix with the other engines, or by the exponential one if RK4 ran.
 
-    `simulation` is what ran, with its net. Positions are compared as far as neither ended before its time.
+    `simulation` is the one that ran, with its net. Positions are compared up to the earlier end of both runs.
     """
     other = EXPONENTIAL if settings.integrator == "RK4" else "RK4"
     linear = simulation.smooth.even
@@ -450,7 +451,7 @@ def _refined(
     runs: dict[tuple[str, int], tuple[Array, float]],
     progress: Progress,
 ) -> tuple[Array, float]:
-    """(positions of a run by RK4, the most that it misses), fine enough to judge the error; all runs are kept."""
+    """Return (positions of a refined run by RK4, bound of its error); all runs are kept."""
     finest, best, gaps = 1, math.inf, list[float]()
     runs["RK4", 1] = _positions(simulation, ticks, "mujoco", "RK4", 1, progress)
     _require_motion(runs["RK4", 1][0])
@@ -462,7 +463,7 @@ def _refined(
         best = min(best, gaps[-1] + missed)
         if gaps[-1] + missed <= error:
             return fine, missed
-        needed = min(max(2 * gaps[-1] / error, 1.0) * finest, _MOST_COMPARED)  # by a method of first order
+        needed = min(max(2 * gaps[-1] / error, 1.0) * finest, _MOST_COMPARED)  # for a method of first order
         count = ticks * _EVALUATIONS["RK4"] * 2 * needed  # with n + n/2 + ... substeps
         if count > _MOST_EVALUATIONS:
             raise InputError(
@@ -475,7 +476,7 @@ def _refined(
 
 
 def _missed(gaps: Sequence[float]) -> float:
-    """Most that the finest of some runs misses, from the differences of successive ones; inf of less than three."""
+    """Return a bound of the finest run's error from the differences of successive runs; inf for less than three."""
     *_, first, second, last = math.inf, math.inf, *gaps
     if not math.isfinite(first + second + last):
         return math.inf
@@ -491,7 +492,7 @@ def _positions(
     substeps: int | None = None,
     progress: Progress = lambda done, ticks: None,
 ) -> tuple[Array, float]:
-    """Positions (N, m) of a run from rest, with its CPU seconds."""
+    """Return the positions (N, m) of a run from rest, and its CPU time [s]."""
     stepped = make_engine(simulation, engine, integrator, substeps)
     begin = time.process_time()
     trace = run(simulation, stepped, ticks=ticks, progress=progress)
@@ -501,13 +502,13 @@ def _positions(
 
 
 def _require_motion(positions: Array) -> None:
-    """Raises InputError where there is nothing to be relative to."""
+    """Raise InputError if nothing moves, so that there is no relative error."""
     if not positions.any():
         raise InputError("--error is relative to the motion, and nothing moves: give a tap, or a human an amplitude")
 
 
 def _apart(own: Array, truth: Array) -> float:
-    """Relative rms difference; infinite where one of the runs ended early."""
+    """Return the relative rms difference; infinite if one of the runs ended early."""
     if own.shape != truth.shape:
         return math.inf
     scale = float(np.mean(truth**2))
@@ -515,13 +516,11 @@ def _apart(own: Array, truth: Array) -> float:
 
 
 # ----------------------------------------------------------------------------------------------------
-# Which integrator and how many substeps a plant asks for, and what an engine itself does in one period.
+# The default integrator and number of substeps of a plant, and the map of an engine over one period.
 #
-# On a smooth scene the exponential integrator is exact with one step. Of MuJoCo's own ones two speeds decide, both from
-# the eigenvalues of the continuous plant: the fastest weakly damped mode, which must be resolved (mode h <= 0.2), and
-# the strongest damping, which must be followed (rate h < 1). What the rule picks is then checked: the loop that the
-# engine simulates must have the exact loop's verdict, else the number is doubled. Where an error is asked for, runs
-# decide.
+# On a smooth scene the exponential integrator is exact with one step. For MuJoCo's own integrators the eigenvalues of
+# the continuous plant decide: the fastest weakly damped mode must be resolved (mode h <= 0.2), and the strongest
+# damping followed (rate h < 1). The number is doubled until the loop that the engine simulates has the exact loop's verdict.
 
 MOST = 10_000  # substeps
 _MODE_LOST = "it damps fast modes away"
@@ -533,9 +532,9 @@ _UNIT = 1e-6
 def settle(
     simulation: Simulation, engine: AnyEngine, integrator: str | None = None, substeps: int | None = None
 ) -> tuple[str | None, int | None, list[str]]:
-    """(integrator, substeps, remarks) of a run for which some were asked; without any but for MuJoCo.
+    """Return (integrator, substeps, remarks) of a run, with defaults where they are None; only MuJoCo has any.
 
-    Raises InputError where they cannot be had.
+    Raises InputError for impossible settings.
     """
     if engine != "mujoco":
         for name, asked in (("integrator", integrator), ("substeps", substeps)):
@@ -554,13 +553,13 @@ def settle(
 
 
 def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
-    """1 of the exponential integrator on a smooth scene, else 4 at least and more where the rule or the verdict asks.
+    """Return 1 for the exponential integrator on a smooth scene, else at least 4, by the rule and the verdict above.
 
-    Raises InputError where no number up to 10000 does.
+    Raises InputError if no number up to 10000 suffices.
     """
     if integrator == EXPONENTIAL and default_integrator(simulation.scene) == EXPONENTIAL:
         return 1
-    if integrator == "discrete":  # it remembers more than position and velocity, so no map of those can vouch for it
+    if integrator == "discrete":  # It has more state than position and velocity, so their map does not describe it.
         raise InputError(f"--integrator discrete gives no verdict to rely on: {_MODE_LOST}; use RK4 or give --substeps")
     simulation = simulation.smooth.even
     speed, T = pace(simulation.scene.plant.A), simulation.scenario.T
@@ -575,7 +574,7 @@ def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
 
 
 def _check_substeps(simulation: Simulation, integrator: str, substeps: int) -> list[str]:
-    """Remarks on a number of substeps that was asked for. Raises InputError outside the stable region."""
+    """Return remarks on the user's number of substeps. Raises InputError outside the stable region."""
     if integrator == EXPONENTIAL:
         nearer = "of first order where devices rub, RK4 is nearer at equal cost (--cross-check: by how much)."
         rubs = default_integrator(simulation.scene) != EXPONENTIAL
@@ -598,7 +597,7 @@ def _check_substeps(simulation: Simulation, integrator: str, substeps: int) -> l
 
 
 def _step_radius(simulation: Simulation, integrator: str, substeps: int) -> float:
-    """Spectral radius of one substep on the plant alone, which is passive: above 1 the integrator is unstable."""
+    """Return the spectral radius of one substep on the passive plant: above 1 the integrator is unstable."""
     step = _measured_hold(simulation, "mujoco", integrator, 1, simulation.scenario.T / substeps)
     return float(np.abs(np.linalg.eigvals(step.A)).max()) if np.isfinite(step.A).all() else np.inf
 
@@ -623,10 +622,10 @@ def _measured_hold(
     substeps: int | None = None,
     T: float | None = None,
 ) -> HeldPlant:
-    """The map s[k+1] = A s[k] + B [w; f][k] of an engine, from stepping every basis state and input once.
+    """Return the map s[k+1] = A s[k] + B [w; f][k] of an engine, by stepping every basis state and input once.
 
-    Closed with the force map it gives the growth rate that this engine simulates, without a trace. `T` [s] is
-    the scenario's period where it is not given.
+    Closed with the force map it has the growth rate that the engine simulates. The default of `T` [s] is the scenario's
+    period.
     """
     period, simulation = simulation.scenario.T if T is None else T, simulation.even
     stepped = make_engine(simulation, engine, integrator, substeps, period)
@@ -646,7 +645,7 @@ def _measured_hold(
 def simulated_growth(
     simulation: Simulation, integrator: str | None, substeps: int | None, engine: AnyEngine = "mujoco"
 ) -> float:
-    """The growth rate [1/s] of the loop that an engine simulates with these settings; of walls, in the worst state."""
+    """Return the growth rate [1/s] of the loop that an engine simulates; with walls that of the worst contact state."""
     held = _measured_hold(simulation, engine, integrator, substeps)
     if not all(np.isfinite(part).all() for part in (held.A, held.B)):
         raise InputError(f"engine {engine_name(engine)}: a tick from rest leaves the range of numbers")

@@ -1,4 +1,4 @@
-"""The coupling that a command was asked for, by name or in a file, and what a stored one is worth in a loop."""
+"""The coupling of a command, by name or from a file, and its assessment in the scenario's loop."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def choose(
     limiter: bool | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Chosen:
-    """The coupling of a case; by default the designed spring-damper.
+    """Return the coupling of a case; by default a spring-damper is designed.
 
     See design.designs.design_by_kind for `condition`, `limiter` and `progress`.
 
-    Raises InputError where the request contradicts itself, DesignFailed where there is no such coupling.
+    Raises InputError for contradicting options, DesignFailed if no coupling was found.
     """
     try:
         asked, own = name_and_own(condition)
@@ -68,7 +68,7 @@ def _choose(
     limiter: bool | None,
     progress: Callable[[str, int, int], None],
 ) -> Chosen:
-    """The same, by the name of the condition, and the user's own of that name."""
+    """Choose by the name of the condition, and the user's own condition of that name."""
     if case == "none":
         if name not in (None, "none"):
             raise InputError(f"--coupling {name} with --case none: that case is the loop without coupling")
@@ -97,14 +97,14 @@ def _choose(
 
 
 def own_of(name: str, loop: Loop) -> Chosen:
-    """What a user's own function makes of a loop, which it must fit. Raises InputError."""
+    """Return the coupling that a user's own function makes for a loop. Raises InputError."""
     found = own_coupling(name, loop)
     called(f"--coupling {name}", fitting, loop, found)
     return given(found, name)
 
 
 def given(coupling: Any, kind: str = "given") -> Chosen:
-    """A coupling, or that of a design with its proofs; None is the loop without one."""
+    """Return the choice of a coupling, or of a design with its proofs; None is the loop without a coupling."""
     if isinstance(coupling, Design):
         proof = (coupling.certificate and coupling.certificate.limiter) or None
         return replace(coupling, kind=kind, limiter=proof)
@@ -113,7 +113,7 @@ def given(coupling: Any, kind: str = "given") -> Chosen:
 
 
 def read_coupling(path: str | Path) -> Stored:
-    """A stored coupling. Raises InputError where it cannot be read."""
+    """Read a stored coupling. Raises InputError."""
     stored = load(path)
     try:
         stored.built()
@@ -123,7 +123,7 @@ def read_coupling(path: str | Path) -> Stored:
 
 
 def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
-    """The stored coupling in a loop of so many channels at T [s]. Raises InputError where it cannot stand there."""
+    """Return the stored coupling for a loop of `channels` at T [s]. Raises InputError if it does not fit."""
     if len(stored.loop.delta) != channels:
         raise InputError(f"{path} couples {len(stored.loop.delta)} channels, the loop has {channels}")
     coupling = stored.coupling.build(T)
@@ -135,14 +135,14 @@ def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
 def from_file(
     stored: Stored, loop: Loop, kind: str = "given", own: Condition | None = None, coupling: Coupling | None = None
 ) -> Chosen:
-    """The stored coupling with what its file proves, and notes on what the file says of this loop.
+    """Return the stored coupling with the proofs of its file, and notes on differences between both loops.
 
     Args:
         stored: The content of the file.
-        loop: The loop in which the coupling is to stand.
+        loop: The loop in which the coupling is used.
         kind: The name of the coupling in reports.
         own: A condition of the user's own, for a certificate of that name.
-        coupling: The coupling of the file, where it was built for another T.
+        coupling: The coupling of the file, if it was built for another T.
 
     Returns:
         The choice. Its `certificate` holds for the loop of the file, which may be another one: `assess` compares them.
@@ -156,7 +156,7 @@ def from_file(
     except (ValueError, ArithmeticError) as error:
         reason = str(error)
     notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []
-    delays = ("theta", "varying_delay", "lam")  # lam matters to transparency only
+    delays = ("theta", "varying_delay", "lam")  # lam affects the transparency only
     differ = [n for n in loop.__struct_fields__ if n not in delays and getattr(loop, n) != getattr(stored.loop, n)]
     proved = claim is not None and not reason
     switching = stored.loop.varying_delay if proved and not differ else None
@@ -208,17 +208,17 @@ def assessed(
     Args:
         scenario: Its ranges, delays, periods and force limits must all be covered by a guarantee.
         case: The reference delays, "none", "I" or "II".
-        chosen: The coupling, with the proofs that it comes with.
-        environment: What runs in place of the scenario's environment, see design.assessment.assess.
-        energy_budget: W0 [J], see there.
-        limiter: False where forces are clipped, as the user asks.
-        seed: Of the environments that are drawn from inside ranges.
-        band_hz: Where the mismatch counts.
-        progress: Called with (points done, points in all) of the search over ranges.
+        chosen: The coupling with its proofs.
+        environment: The environment that runs instead of the scenario's (design.assessment.assess).
+        energy_budget: W0 [J] (design.assessment.assess).
+        limiter: False to clip forces.
+        seed: Seed of the environments that are drawn from inside ranges.
+        band_hz: Frequency band [Hz] of the mismatch.
+        progress: Called with (points done, number of points) of the search over ranges.
 
     Returns:
-        The assessment. Packets that are lost make forces older than any certificate covers, so that there is no
-        guarantee but that of an energy budget.
+        The assessment. With lost packets only an energy budget gives a guarantee, because forces may become older
+        than any certificate covers.
     """
     assessment = assess(
         scenario.loop(case),

@@ -28,18 +28,18 @@ from haptic_loop.sim.trace import Trace
 
 
 def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> EncoderSteps | None:
-    """Whether the devices' friction pays for their encoders' steps."""
+    """Compare the devices' friction with that needed for their encoder steps; None without steps."""
     fields = ("encoder_step", "friction", "friction_max")
     steps, friction, most = ([getattr(device, field) for device in scenario.axis_devices] for field in fields)
     friction = [f / n for f, n in zip(friction, _shared(scenario), strict=True)]
     try:
         return EncoderSteps.of(scenario.loop(case), coupling, steps, friction, most)
-    except ValueError:  # no solution of the algebraic loop, which the conditions have said
+    except ValueError:  # The algebraic loop has no solution, which the conditions report.
         return None
 
 
 def _shared(scenario: Scenario) -> list[float]:
-    """What a friction force is divided by on each channel: sqrt(n) where one number is that of n axes together."""
+    """Return the divisor of a friction force on each channel: sqrt(n) if one number is that of n axes together."""
     counts = [1 if isinstance(d.friction, tuple) else len(d.free) for d in scenario.device]
     return [count**0.5 for d, count in zip(scenario.device, counts, strict=True) for _ in d.free]
 
@@ -54,7 +54,7 @@ def friction_left_out(devices: Sequence[Device]) -> list[str]:
 
 
 # ----------------------------------------------------------------------------------------------------
-# What the paper prints beside what comes out here, for its own scenario.
+# The paper's figures compared with ours.
 
 
 #: The transparency indices (25) printed beside the gains [dB]; no reading of Figure 4 that we tried gives them.
@@ -63,7 +63,7 @@ _PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A figure that the paper prints, and the same one computed here."""
+    """A figure of the paper and its value computed here."""
 
     what: str
     paper: str
@@ -72,7 +72,7 @@ class PaperRow:
 
 
 def beside_the_paper(scenario: Scenario, case: str, stability: Stability, coupling: Coupling) -> tuple[PaperRow, ...]:
-    """Every figure that the paper prints, beside ours; empty for any loop but the paper's."""
+    """Return the paper's figures with ours; empty for any loop but the paper's."""
     if scenario.varying_delay or scenario.loop(case) != load().loop(case):
         return ()
     figure = _figure(case, stability)
@@ -115,7 +115,7 @@ def _figure(case: str, stability: Stability) -> PaperRow:
 
 
 # ----------------------------------------------------------------------------------------------------
-# What a run with varying delays says: the delays it met, whether it grew, and what certificates cover.
+# Varying delays: ages, growth, and the cover of certificates.
 
 
 _JUDGED = 4.0  # [s] at most of the linear loop from which a growth is read: later numbers may overflow
@@ -123,7 +123,7 @@ _JUDGED = 4.0  # [s] at most of the linear loop from which a growth is read: lat
 
 @dataclass(frozen=True)
 class DelaySpan:
-    """The range of delays and how they vary within it."""
+    """The range of delays and the pattern within it."""
 
     lo: tuple[int, ...]
     hi: tuple[int, ...]
@@ -139,7 +139,7 @@ class DelaySpan:
 
 @dataclass(frozen=True)
 class _Age:
-    """Of the forces in use, per channel, from the first arrival on [samples]."""
+    """Ages of the forces in use, per channel, after the first arrival [samples]."""
 
     least: list[int]
     largest: list[int]
@@ -148,7 +148,7 @@ class _Age:
 
 @dataclass(frozen=True)
 class _PeriodGrowth:
-    """Of the worst switching found, over one period of it."""
+    """Growth over one period of the worst switching found."""
 
     ticks: int
     growth_rate_per_s: float
@@ -189,12 +189,12 @@ class _DelaysMet:
 
     @property
     def worst(self) -> _DelaysMet | _PeriodGrowth:
-        """Where the growth is read: of the worst switching found, else of the run's delays."""
+        """The record with the growth: that of the worst switching found, else that of the run's delays."""
         return self.period or self
 
     @property
     def how(self) -> str:
-        """How that growth was found."""
+        """The source of that growth, in words."""
         if self.period:
             return f"growth by the eigenvalues of the product over the {self.period.ticks} ticks of a period"
         return f"growth of the linear loop after an impulse, over {self.judged_s:.3g} s under the run's delays"
@@ -206,7 +206,7 @@ def _verdict(growth: float) -> str:
 
 @dataclass(frozen=True)
 class VaryingDelays:
-    """All that a report says of delays that vary; `met` is of a run, where they switch."""
+    """Figures of varying delays; `met` belongs to a run with switching delays."""
 
     span: DelaySpan = off_table("inlined")
     met: _DelaysMet | None = off_table("inlined")
@@ -229,7 +229,7 @@ class VaryingDelays:
 
 @dataclass(frozen=True)
 class _Periods:
-    """How long ticks are [s]."""
+    """Lengths of ticks [s]."""
 
     least: float
     mean: float
@@ -238,7 +238,7 @@ class _Periods:
 
 @dataclass(frozen=True)
 class UnevenTicks:
-    """What periods a run had, and how late its forces latched."""
+    """The periods of a run, and the latencies of its forces."""
 
     period_s: _Periods
     recorded: bool
@@ -253,7 +253,7 @@ class UnevenTicks:
 
 
 def switched_stability(simulation: Simulation, trace: Trace, delays: VaryingDelays) -> Stability:
-    """stability_of for delays that switch: such a loop has eigenvalues only over a period of the switching."""
+    """Return `stability_of` for switching delays, which have eigenvalues only over a period of the switching."""
     met = delays.met
     assert met is not None
     constant = eigenvalues(dominant_mode(close(simulation.plant, simulation.F)))

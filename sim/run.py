@@ -1,4 +1,4 @@
-"""From a scenario and a coupling to a trace: the computer's side and the plant, closed tick by tick.
+"""Runs: the computer's side and the plant of a scenario, closed tick by tick.
 
     trace = run(assemble(scenario, coupling), "mujoco")
 
@@ -8,7 +8,7 @@ controller.tick for the order of these steps and sim.engines for what advances t
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does without
+if __name__ == "__main__":  # before the imports, which --help does not need
     from haptic_loop.cli.main import door
 
     door("run")
@@ -52,32 +52,32 @@ from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.trace import Trace
 
 ENGINES = ("mujoco", "exact")
-AnyEngine = str | Engine | Callable[["Simulation"], Engine]  # a name, one of a user's own, or what makes it
+AnyEngine = str | Engine | Callable[["Simulation"], Engine]  # a name, an engine of the user's own, or its class
 
 _Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the hands (ticks, outside) [N]
 _AfterBlock = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
-Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
+Progress = Callable[[int, int], None]  # (ticks done, number of ticks)
 
-_COPIES = 4  # of a trace, at most, from the run to its report
-_SMALL = 1e8  # [bytes] of a trace for which the free memory is not looked up
-_COLUMNS = 50  # numbers a tick that the report of a trace on the disk takes in memory
-_BLOCK = 2048  # ticks between two looks at the clock, the keyboard and the numbers
-_AHEAD = 8  # blocks for which outside forces are asked at once
+_COPIES = 4  # largest number of copies of a trace from the run to its report
+_SMALL = 1e8  # [bytes] size of a trace below which the free memory is not checked
+_COLUMNS = 50  # numbers per tick that the report of a trace on disk needs in memory
+_BLOCK = 2048  # ticks between two checks of the clock, the keyboard and the numbers
+_AHEAD = 8  # number of blocks for which outside forces are sampled together
 
 
 @dataclass(frozen=True)
 class EngineSettings:
-    """What moves the plant, and by which steps; None for what the plant asks."""
+    """Engine, integrator and steps; None for the default of the plant."""
 
     engine: AnyEngine = "mujoco"
-    integrator: str | None = None  # of MuJoCo, and so are the substeps
+    integrator: str | None = None  # of MuJoCo
     substeps: int | None = None  # per period
-    error: float | None = None  # in place of both: relative rms of the positions, which the cheapest keeps
+    error: float | None = None  # relative rms of the positions that the cheapest setting must keep, instead of both
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A scenario with its coupling, ready to run: what the computer does every tick, and the plant that it moves."""
+    """A scenario with its coupling, ready to run: the computer's process of a tick, and the plant."""
 
     scenario: Scenario
     coupling: Coupling
@@ -88,27 +88,27 @@ class Simulation:
 
     @cached_property
     def loop(self) -> Loop:
-        """All that a design may know; the reference does not matter."""
+        """The loop of designs; the reference delays do not matter."""
         return self.scenario.loop("I")
 
     @cached_property
     def E(self) -> Lti:
-        """What is to be felt: the environment, with every wall touching."""
+        """The environment, with every wall touching."""
         return self.loop.E()
 
     @property
     def F(self) -> Lti:
-        """What the devices feel while no wall touches, at the constant delays."""
+        """The force map while no wall touches, at the constant delays."""
         return self.process.law.open
 
     @property
     def friction(self) -> bool:
-        """Whether a device has Coulomb friction: the scene has it then, `plant` has not."""
+        """Whether a device has Coulomb friction, which the scene contains and `plant` does not."""
         return any(np.any(device.friction) for device in self.scenario.device)
 
     @property
     def smooth(self) -> Simulation:
-        """The same without Coulomb friction in the scene, which is what linear verdicts are about."""
+        """Return the simulation without Coulomb friction in the scene, for linear verdicts."""
         if not self.friction:
             return self
         devices = tuple(msgspec.structs.replace(device, friction=0.0) for device in self.scenario.device)
@@ -118,7 +118,7 @@ class Simulation:
     def held_by(
         self, humans: tuple[Hand, ...], persons: tuple[Person, ...], mechanics: Sequence[Mechanics] = ()
     ) -> Simulation:
-        """The same in the hands of others, who do not move by themselves; `mechanics` are those of drawn devices."""
+        """Return the simulation with other hands, which do not move by themselves; `mechanics` are drawn devices."""
         devices = self.scenario.device
         if mechanics:
             devices = tuple(map(Mechanics.of, mechanics, devices))
@@ -130,14 +130,14 @@ class Simulation:
 
     @property
     def even(self) -> Simulation:
-        """The same in periods T, with forces that latch at ticks: what integrators and their steps are judged on."""
+        """Return the simulation with even periods T and forces that latch at ticks, for comparing integrators."""
         if self.timing is None:
             return self
         return replace(self, plant=hold(self.scene.plant, self.scenario.T), timing=None)
 
     @property
     def felt(self) -> Lti:
-        """What the devices feel of E: F with every wall touching."""
+        """The force map with every wall touching."""
         return list(self.process.law.frozen().values())[-1]
 
 
@@ -145,14 +145,14 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
     """Build both sides of the loop; with `lag`, rho (m,) [N/m], forces leave through a limiter and are not clipped.
 
     `seed` draws periods and latencies where they vary.
-    Raises SingularLoop where the algebraic loop of environment and coupling has no solution, InputError for walls that
-    no compliance V stands before.
+    Raises SingularLoop if the algebraic loop of environment and coupling has no solution, InputError for walls and a
+    coupling without a compliance V.
     """
     if scenario.environment.walls and coupling.holds_model:
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
     axes = scenario.axis_devices
     limits, steps = (np.array([getattr(axis, of) for axis in axes]) for of in ("force_limit", "encoder_step"))
-    if scenario.environment.world:  # the scene's forces come from a net (sim.world), and no linear law is known
+    if scenario.environment.world:  # The forces of the scene come from a net (sim.world).
         law = Law(Lti.constant(np.zeros((scenario.channels,) * 2), scenario.T), scenario.theta)
     else:
         box = bool(scenario.environment.walls)  # vectors are not solved together with walls
@@ -172,7 +172,7 @@ def run(
     start: Array | None = None,
     progress: Progress = lambda done, ticks: None,
 ) -> Trace:
-    """Close the loop and return what every tick saw.
+    """Run the loop and return the trace.
 
     `engine` is an engine, its class, or the name of one, with its default step; `outside`, `ticks` and the plant state
     `start`, (states, 1), are those of the scenario and rest where they are not given. The trace ends early where
@@ -192,7 +192,7 @@ def run(
         nonlocal diverged, net, done
         net, rows = buffer.net, buffer.rows[:count]
         diverged = engine.troubled()
-        if not np.isfinite(rows.sum()):  # rarely, and then looked at row by row
+        if not np.isfinite(rows.sum()):  # rare; then the rows are checked one by one
             finite = np.isfinite(buffer.s[:count]).all(axis=(1, 2)) & np.isfinite(buffer.f[:count]).all(axis=(1, 2))
             diverged |= not finite.all()
             count = count if finite.all() else int(np.argmin(finite))
@@ -203,7 +203,7 @@ def run(
 
     try:
         run_blocks(process, engine, outside, ticks, start, keep, _BLOCK)
-    except KeyboardInterrupt:  # what was finished is kept
+    except KeyboardInterrupt:  # The finished ticks are kept.
         interrupted = True
     n, m, handles = simulation.scene.model.nq, process.channels, simulation.scene.handles
     z, s, w, f = np.split(record[:done], np.cumsum(widths)[:3], axis=1)
@@ -226,15 +226,15 @@ def run(
 
 
 def _columns(rows: Array, which: tuple[int, ...]) -> Array:
-    """These columns, which are no copy where they lie side by side."""
+    """Return these columns, as a view if they are adjacent."""
     together = slice(which[0], which[-1] + 1)
     return rows[:, together] if which == tuple(range(which[0], which[-1] + 1)) else rows[:, list(which)]
 
 
 def _room(width: int, ticks: int, T: float) -> Array:
-    """(ticks, width): in memory, or in a temporary file that ends with the trace where that is not enough.
+    """Return an array (ticks, width) in memory, or in a temporary file if the memory is too small.
 
-    Raises InputError where the report of such a trace does not fit into memory, or the trace on the disk.
+    Raises InputError if the report of such a trace does not fit into memory, or the trace not on the disk.
     """
     shape, each = (ticks, width), 8 * width
     free = _free_memory() if each * ticks > _SMALL else np.inf
@@ -250,7 +250,7 @@ def _room(width: int, ticks: int, T: float) -> Array:
 
 
 def _free_memory() -> float:
-    """[bytes]; infinite where the system does not say."""
+    """Return the free memory [bytes]; infinite if the system does not say."""
     try:
         lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
         return 1024 * int(lines["MemAvailable"].split()[0])
@@ -269,12 +269,12 @@ def run_blocks(
 ) -> None:
     """Close the loop for `ticks` periods from the plant states `start`, (states, nsim); `each_block` sees each block.
 
-    Row 0 of the buffer is the block's first tick. So few ticks in a block that it stays in the processor's cache.
+    Row 0 of the buffer is the block's first tick. A block is small enough for the processor's cache.
     """
     ahead = outside(0, min(_AHEAD * block, ticks))
     buffer = StepBuffer(process, min(block, ticks), start.shape[0], ahead.shape[1], start.shape[1])
     buffer.s[0] = start
-    # a diverging run is reported, not warned about
+    # A diverging run is reported without warnings.
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
         engine.start(buffer)
         if not callable(getattr(engine, "advance", None)):
@@ -294,7 +294,7 @@ def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
     """Close the loop for the first `ticks` rows of the buffer."""
     done = 0
     if buffer.calm and isinstance(engine, RunsBlocks) and engine.run_block:
-        engine.run_block(ticks)  # the same by the linear law, whose forces are looked at afterwards
+        engine.run_block(ticks)  # the linear law, whose forces are checked afterwards
         done = buffer.linear_until(ticks)
         if done == ticks:
             return
@@ -307,14 +307,14 @@ def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
 
 
 def beginnings(T: float, timing: Timing | None, first: int, ticks: int) -> Array:
-    """[s] when ticks first .. first + ticks - 1 begin, (ticks,)."""
+    """Return the times [s] at which ticks first .. first + ticks - 1 begin, (ticks,)."""
     return timing.times(first, ticks) if timing else np.arange(first, first + ticks) * T
 
 
 def outside_forces(
     scenario: Scenario, scene: Scene, first: int, ticks: int, voluntary: bool = True, timing: Timing | None = None
 ) -> Array:
-    """_Outside forces [N] at ticks first .. first + ticks - 1, sampled as they begin, shape (ticks, outside).
+    """Return the external forces [N] at the beginnings of ticks first .. first + ticks - 1, (ticks, outside).
 
     The voluntary motion reaches the end of each human, the tap reaches one handle.
     """
@@ -349,12 +349,12 @@ def make_engine(
     substeps: int | None = None,
     T: float | None = None,
 ) -> Engine:
-    """The engine of that name for one simulation, which MuJoCo advances by T seconds (default: the scenario's).
+    """Return the engine of a name for one simulation; MuJoCo advances it by T seconds (default: the scenario's).
 
-    Without an integrator it is the scene's default, without substeps they are 1 of the exponential one and 4 of others.
-    A user's own is taken as it is, or made of the simulation.
-    Raises ValueError for an unknown name, for Coulomb friction before the exact engine, and for uneven ticks before an
-    engine of one's own, and for what is no engine.
+    The default integrator is that of the scene; the default number of substeps is 1 for the exponential one and 4 for
+    others. An engine of the user's own is used as it is, or made from the simulation.
+    Raises ValueError for an unknown name or an object that is no engine, for the exact engine with Coulomb friction,
+    and for an engine of the user's own with uneven ticks.
     """
     if not isinstance(engine, str):
         return _own_engine(simulation, engine)
@@ -374,7 +374,7 @@ def make_engine(
 
 
 def engine_name(engine: AnyEngine) -> str:
-    """The name of an engine in reports."""
+    """Return the name of an engine in reports."""
     if isinstance(engine, str):
         return engine
     kind: Any = engine if hasattr(engine, "__qualname__") else type(engine)

@@ -1,15 +1,14 @@
-"""Z-width maps: which K and B of a plane are safe - certified, with random humans, and simulated.
+"""Z-width maps: safe K and B by certificates, with random humans, and in simulations.
 
-What K and B are is decided by the sweep. With `CouplingSweep` they are the gains of a spring-damper coupling, the same
-on every channel, in one environment or against a rigid wall. With `EnvironmentSweep` the coupling is fixed, and they
-are those of every spring at a contact of the environment. A map asks of each cell both conditions (design.conditions,
-for a whole row of cells at once), the eigenvalues of the exact loop with every human of a population, and, at a sparse
-part of the cells, MuJoCo with the encoder steps, the friction and the walls of the scenario.
+With `CouplingSweep` K and B are the gains of a spring-damper coupling, the same on every channel, in one environment or
+against a rigid wall. With `EnvironmentSweep` the coupling is fixed, and K and B belong to every spring at a contact. A
+map evaluates for each cell the conditions (for a row of cells at once) and the eigenvalues of the exact loop with every
+human of a population; for a few cells it runs MuJoCo with the encoder steps, friction and walls of the scenario.
 """
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # before the imports, which --help does without
+if __name__ == "__main__":  # before the imports, which --help does not need
     from haptic_loop.cli.main import door
 
     door("zwidth")
@@ -47,7 +46,7 @@ from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.stability import MARGINAL
 
 # ----------------------------------------------------------------------------------------------------
-# What K and B are, and what is asked of the loop with them.
+# Sweeps over K and B.
 
 
 MODEL_KEPT = "model kept"
@@ -55,16 +54,16 @@ MODEL_KEPT = "model kept"
 
 @dataclass(frozen=True, eq=False)
 class _Sweep(ABC):
-    """What both kinds share: devices, delays and an environment; K and B are (n,) arrays of as many cells."""
+    """Devices, delays and an environment; K and B are (n,) arrays for n cells."""
 
     devices: tuple[Device, ...]  # (m,)
     population: Population
     loop: Loop  # without ranges and with constant delays
-    own: Condition | None = field(kw_only=True, default=None)  # a further condition, of the user's
+    own: Condition | None = field(kw_only=True, default=None)  # a condition of the user's own
 
     @abstractmethod
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
-        """The damping that the condition asks at one point, by a sweep of its own, which a map is checked against."""
+        """Return the requirement of a condition at one point, by a separate sweep, to check maps."""
 
     @cached_property
     def asked(self) -> dict[str, Condition]:
@@ -84,14 +83,14 @@ class _Sweep(ABC):
 
     @property
     def decisive(self) -> str:
-        """The condition by which a coupling that was asked about is judged."""
+        """The condition that judges the couplings of --mark."""
         return (self.own or THIS_ENVIRONMENT).name
 
     def _one_by_one(self, condition: str, K: Array, B: Array) -> Array:
         return np.array([self.requirement(condition, k, b).ratio for k, b in zip(K.tolist(), B.tolist(), strict=True)])
 
     def _actuators(self) -> tuple[Array, Array]:
-        """Force limits [N] beyond reach, and encoder steps [m], (m,) each."""
+        """Return unreachable force limits [N] and the encoder steps [m], (m,) each."""
         devices = limit_cycles.unlimited(self.devices)
         return np.array([d.force_limit for d in devices]), np.array([d.encoder_step for d in devices])
 
@@ -105,7 +104,7 @@ class CouplingSweep(_Sweep):
 
     @property
     def usual_scale(self) -> str:
-        """Against a rigid wall couplings are all of one size; against an environment far stiffer ones can be safe."""
+        """Linear against a rigid wall; logarithmic in environments, where far stiffer couplings can be safe."""
         return "linear" if self.loop.environment is environment.RIGID_WALL else "log"
 
     @property
@@ -120,25 +119,25 @@ class CouplingSweep(_Sweep):
 
     @cached_property
     def _multipliers(self) -> dict[str, tuple[Array | None, str | None]]:
-        """What a condition needs beside every coupling, (m,); or why it says nothing of this loop."""
+        """By condition the multiplier (m,) for every coupling, or the reason why the loop is not covered."""
         return {name: each.least_multiplier(self.loop) for name, each in self.asked.items()}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
-        """F of every coupling, a stack for each frozen contact state of the environment, all walls touching first.
+        """Return F of every coupling, a stack for each frozen contact state, with all walls touching first.
 
-        Off a rigid wall the device is free, which is safe by itself. Random hands meet these states; a certificate is
-        about walls that make and break contact.
+        Away from a rigid wall the device is free and safe. Random hands meet these states; certificates cover walls
+        that make and break contact.
         """
         return tuple(state.F(self._couplings(K, B)) for state in self.loop.frozen()[::-1])
 
     def processes(self, K: Array, B: Array) -> list[Process]:
-        """What the computer does every T with each coupling, with motors that never clip."""
+        """Return the computer's process with each coupling, with motors that never clip."""
         limits, steps = self._actuators()
         V = self._couplings(K, B).compliance(self.loop.T)
         return [Process(self.loop.law(Compliance(V[i])), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Required over available damping, (n,); inf where no damping is enough. Walls make and break contact."""
+        """Return required over available damping (n,), or inf, for walls that make and break contact."""
         asked, (given, reason) = self.asked[condition], self._multipliers[condition]
         if reason:
             return np.full(K.size, np.inf)
@@ -147,14 +146,14 @@ class CouplingSweep(_Sweep):
             each = [None] * self.loop.channels if given is None else [(p,) for p in given.tolist()]
             loops = [*set(zip(map(self.loop.channel, range(self.loop.channels)), each, strict=True))]
             couplings = self._couplings(K, B, 1)
-        elif self.walls and asked.guarantee(self.loop) != ANY:  # every coupling has multipliers of its own
+        elif self.walls and asked.guarantee(self.loop) != ANY:  # Every coupling has its own multipliers.
             return self._one_by_one(condition, K, B)
         found = [asked.ratios(loop, couplings, multiplier) for loop, multiplier in loops]
         known = [ratios for ratios in found if ratios is not None]
         return np.max(known, axis=0) if known else self._one_by_one(condition, K, B)
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
-        """The same of one coupling by a sweep of its own, which a map is checked against."""
+        """Return the requirement of one coupling by a separate sweep, to check maps."""
         asked, (given, reason), coupling = self.asked[condition], self._multipliers[condition], self._coupling(K, B)
         if reason:
             return refusal(condition, self.loop.delta, reason)
@@ -171,16 +170,15 @@ class CouplingSweep(_Sweep):
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentSweep(_Sweep):
-    """K and B are those of every spring at a contact; the loop is what the coupling, which is fixed, was designed for.
+    """K and B of every spring at a contact, for a fixed coupling that was designed for the loop.
 
-    An optimal coupling is the pair of a fixed Q and a model of the environment, and where that is another one than the
-    model was of, two things may happen:
+    An optimal coupling is a fixed Q and a model of the environment. In another environment there are two cases:
 
-        this-environment   the model is the environment of the cell: F = Theta (Psi E - Psi E Q Psi E), as with ranges
-        model kept    nobody tells the coupling: V = Q (I - Psi E0 Q)^-1 of the scenario's E0 faces E
+        this-environment   the model follows: F = Theta (Psi E - Psi E Q Psi E), as with ranges
+        model kept    the model stays that of the scenario's E0: V = Q (I - Psi E0 Q)^-1 before E
 
-    A coupling of each cell's own would be certified everywhere, since Q near E^-1 turns the force off. Raises
-    ValueError where the network has no spring at a contact, or walls.
+    A coupling designed for each cell would be certified everywhere, since Q near E^-1 turns the force off. Raises
+    ValueError if the network has walls, or no spring at a contact.
     """
 
     coupling: Coupling
@@ -199,7 +197,7 @@ class EnvironmentSweep(_Sweep):
 
     @property
     def stiffness_scale(self) -> float:
-        """What the middle of the map is about [N/m]: the geometric mean of these springs."""
+        """The middle of the map [N/m]: the geometric mean of these springs."""
         stiff = [s.stiffness for s in contact_springs(self.loop.network) if s.stiffness > 0]
         return float(np.exp(np.mean(np.log(stiff)))) if stiff else 1000.0
 
@@ -214,23 +212,23 @@ class EnvironmentSweep(_Sweep):
         return {name: needs.reason for name, needs in self._everywhere.items() if needs.reason}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
-        """F in every environment, the coupling's model following it; one stack, since there is no contact to freeze."""
+        """Return F in every environment, with the coupling's model following it, as one stack."""
         return (self._at(K, B).F(self.coupling),)
 
     def processes(self, K: Array, B: Array) -> list[Process]:
-        """What the computer does every T in each environment, with motors that never clip."""
+        """Return the computer's process in each environment, with motors that never clip."""
         (limits, steps), sent = self._actuators(), self._at(K, B).sent(self.coupling)
         return [Process(Law(sent[i], self.loop.theta), limits, steps) for i in range(K.size)]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
-        """Required over available damping, (n,); inf where no damping is enough."""
+        """Return required over available damping (n,), or inf."""
         if condition in self._everywhere:
             return np.full(K.size, self._everywhere[condition].ratio)
         found = self._judge(condition).ratios(self._at(K, B), self._facing(condition))
         return self._one_by_one(condition, K, B) if found is None else found
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
-        """The damping that the condition asks of the devices in one environment, by a sweep of its own."""
+        """Return the requirement of a condition in one environment, by a separate sweep."""
         if condition in self._everywhere:
             return self._everywhere[condition]
         network, varied = self.loop.network, contact_springs(self.loop.network)
@@ -240,7 +238,7 @@ class EnvironmentSweep(_Sweep):
 
     @cached_property
     def _everywhere(self) -> dict[str, Requirement]:
-        """The requirements that no spring of the environment changes, by condition; and those that do not apply."""
+        """Requirements that do not depend on the springs, by condition, and refusals of those that do not apply."""
         found: dict[str, Requirement] = {}
         for name, each in self.asked.items():
             reason = each.not_varied(self.loop) or each.beyond(self.loop)
@@ -253,7 +251,7 @@ class EnvironmentSweep(_Sweep):
         return THIS_ENVIRONMENT if condition == MODEL_KEPT else self.asked[condition]
 
     def _facing(self, condition: str) -> Coupling:
-        """The coupling; for MODEL_KEPT as the V whose model stays that of the scenario's environment."""
+        """Return the coupling; for MODEL_KEPT the V whose model stays that of the scenario's environment."""
         return (self._kept if condition == MODEL_KEPT else None) or self.coupling
 
     @cached_property
