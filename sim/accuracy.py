@@ -520,7 +520,7 @@ def _apart(own: Array, truth: Array) -> float:
 #
 # On a smooth scene the exponential integrator is exact with one step. For MuJoCo's own integrators the eigenvalues of
 # the continuous plant decide: the fastest weakly damped mode must be resolved (mode h <= 0.2), and the strongest
-# damping followed (rate h < 1). The number is doubled until the loop that the engine simulates has the exact loop's verdict.
+# damping followed (rate h < 1). The number is doubled until the simulated loop has the verdict of the exact one.
 
 MOST = 10_000  # substeps
 _MODE_LOST = "it damps fast modes away"
