@@ -46,15 +46,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from haptic_loop.controller.lti import Array, Lti
 
-EPS = 0.05  # the share of the damping that a budget leaves alone
-_UNTOLD = 4096  # ticks that wait for the device's word; older ones stay booked as their largest loss
-_HUGE = 1e12  # [N], from which a force is no number any more
-_SHAVE = 1 - 1e-12  # of a scaled force, so that rounding takes nothing from the reserve
+EPS = 0.05  # share of the damping that a budget does not use
+_UNTOLD = 4096  # ticks that wait for the device's report; older ones stay booked with their largest loss
+_HUGE = 1e12  # [N] larger forces count as errors
+_SHAVE = 1 - 1e-12  # factor on a scaled force against rounding
 
 
 @dataclass(frozen=True, kw_only=True)
 class NetFigures:
-    """What a net has done so far."""
+    """Figures of a net's action so far."""
 
     guarantee: str | None  # in one line
     ticks: int
@@ -63,7 +63,7 @@ class NetFigures:
 
 @dataclass(frozen=True, kw_only=True)
 class ShellFigures(NetFigures):
-    """What a net has done that keeps an account of energy."""
+    """Figures of a net that keeps an account of energy."""
 
     start_J: float
     cap_J: float | None
@@ -73,17 +73,17 @@ class ShellFigures(NetFigures):
 
 @dataclass(frozen=True, kw_only=True)
 class BudgetFigures(ShellFigures):
-    """What an energy budget has done."""
+    """Figures of an energy budget."""
 
     eps: float = EPS
     reserved_J: float
-    dropped_ticks: int = 0  # in which a device let go of a force that was too old
+    dropped_ticks: int = 0  # ticks in which a device dropped a force that was too old
     surprises: int
-    idle: str | None = None  # why it never acts, where that is proved
+    idle: str | None = None  # reason why it never acts, if that is proved
 
 
 class _Acting:
-    """How often a net acted, of every simulation."""
+    """Counts of a net's action in every simulation."""
 
     def __init__(self, nsim: int) -> None:
         self.ticks = 0
@@ -94,12 +94,12 @@ class _Acting:
         self.limited += np.asarray(acted)
 
     def figures(self, guarantee: str | None = None) -> NetFigures:
-        """Of the simulation in which it acted most."""
+        """Return the figures of the simulation in which it acted most."""
         return NetFigures(guarantee=guarantee, ticks=self.ticks, limited_ticks=int(self.limited.max()))
 
 
 class _Net(_Acting):
-    """What budgets have in common: W of every simulation, its cap, and how small it made a force."""
+    """Common part of budgets: W of every simulation, its cap, and the smallest scale of a force."""
 
     def __init__(self, start: float, cap: float, nsim: int) -> None:
         super().__init__(nsim)
@@ -120,7 +120,7 @@ class _Net(_Acting):
         np.minimum(self.least, scale, out=self.least)
 
     def figures(self, guarantee: str | None = None) -> ShellFigures:
-        """The least energy and scale, the most that was limited."""
+        """Return the least energy and scale, and the largest number of limited ticks."""
         return ShellFigures(
             **vars(super().figures(guarantee)),
             start_J=self._start,
@@ -132,15 +132,15 @@ class _Net(_Acting):
 
 @dataclass(frozen=True)
 class Packets:
-    """How old the forces may be that a tick uses, (m,) each [samples]."""
+    """Range of the ages of the forces that a tick uses, (m,) each [samples]."""
 
     lo: ArrayLike
     hi: ArrayLike | None = None  # default: always lo
-    hold: int = 0  # ticks more for which a device holds a force whose successors are lost
+    hold: int = 0  # further ticks for which a device holds a force whose successors are lost
 
 
 def _principal(level: Array) -> tuple[Array, Array]:
-    """The eigenvalues (m,) and eigenvectors (m, m) of a block diagonal matrix, which do not mix its blocks."""
+    """Return the eigenvalues (m,) and eigenvectors (m, m) of a block diagonal matrix, block by block."""
     m, starts = len(level), [k for k in range(len(level)) if not level[:k, k:].any()]
     values, axes = np.zeros(m), np.zeros((m, m))
     for a, b in pairwise([*starts, m]):
@@ -149,10 +149,10 @@ def _principal(level: Array) -> tuple[Array, Array]:
 
 
 class EnergyBudget(_Net):
-    """Scales the forces that are sent to the devices; see the head of this file.
+    """Scales the forces that are sent to the devices, as described at the head of this file.
 
-    A tick is one call of `limit`, which gives the force to send. Where delays vary, or packets are lost, the devices
-    tell which forces acted: at once (`acted`), later (`tell`) or never, which is safe and makes the budget poor.
+    A tick is one call of `limit`, which returns the force to send. With varying delays or lost packets the devices
+    report which forces acted: at once (`acted`), later (`tell`) or never, which is safe and conservative.
     """
 
     def __init__(
@@ -168,8 +168,8 @@ class EnergyBudget(_Net):
     ) -> None:
         """`delta` (m,) or Delta_D (m, m) damping that the devices guarantee [N s/m], `T` the (largest) period [s].
 
-        A matrix is taken to its principal axes, device by device: r(f) = T f' Delta^-1 f/4. The scale of forces is one
-        number, so that it is the same in all axes; encoder errors are bounded in these axes.
+        A matrix is diagonalised device by device: r(f) = T f' Delta^-1 f/4. The scale of forces is one number for all
+        axes; encoder errors are bounded in the principal axes.
 
         `encoder_step` (m,) or one for all [m]: positions are rounded to it. `start` and `cap` are W0 and the most that
         W may be [J]. Raises ValueError for numbers out of range.
@@ -195,21 +195,21 @@ class EnergyBudget(_Net):
             raise ValueError(f"encoder_step is {steps.tolist()}, expected steps >= 0 in m")
         damping = (1 - EPS) * delta[:, None]
         self._step, self._coarse = steps[:, None], bool(steps.any())
-        self._damping, self._square = damping / T, T / (4 * damping)  # of dx^2 and of a^2
+        self._damping, self._square = damping / T, T / (4 * damping)  # coefficients of dx^2 and of a^2
         #: (depth, m, nsim) the most that this tick and those after it may lose [J], by the packets sent so far
         self._reserve = np.zeros((int(oldest.max()) + 1, delta.size, nsim))
         ahead = np.arange(len(self._reserve))[:, None]
-        self._reached = (lo <= ahead) & (ahead <= oldest)  # (depth, m) by a packet that is sent now
+        self._reached = (lo <= ahead) & (ahead <= oldest)  # (depth, m) ticks that a packet sent now may reach
         self._channel = np.nonzero(self._reached)[1]
         self._delay = lo if (lo == oldest).all() else None
         self._sent = np.zeros_like(self._reserve)  # the force of tick k is row k % depth
-        self._untold: dict[int, tuple[Array, Array]] = {}  # by tick: dx, and what was booked
-        self._last = (-1, np.zeros((delta.size, nsim)))  # the newest tick of which it is known what acted, and that
-        self.surprises = 0  # ticks in which a device told of a force larger than any that could have been in use
+        self._untold: dict[int, tuple[Array, Array]] = {}  # tick -> dx and the booked loss
+        self._last = (-1, np.zeros((delta.size, nsim)))  # the newest tick whose force is known, and that force
+        self.surprises = 0  # ticks with a reported force larger than any that could have been in use
 
     @property
     def reserved(self) -> Array:
-        """(nsim,) what the packets on their way may lose [J]: never more than `energy`."""
+        """The largest loss (nsim,) [J] of the packets on their way; at most `energy`."""
         return self._reserve.sum(axis=(0, 1))
 
     def figures(self, guarantee: str | None = None) -> BudgetFigures:
@@ -217,11 +217,11 @@ class EnergyBudget(_Net):
         return BudgetFigures(**vars(super().figures(guarantee)), reserved_J=reserved, surprises=self.surprises)
 
     def limit(self, wanted: ArrayLike, dx: ArrayLike, acted: ArrayLike | None = None) -> Array:
-        """The force to send now, (m, nsim) [N]: s times the wanted one, s in [0, 1] the same for all channels.
+        """Return the force to send now (m, nsim) [N]: s times `wanted`, with one s in [0, 1] for all channels.
 
-        `dx` [m] is the displacement since the last call and `acted` [N] the force that acted meanwhile (default: what
-        was sent, if delays are constant; else not known yet). At the first call both are ignored. The device must be
-        able to apply what is sent: clip what is wanted. What is not a number, or beyond all bounds, is sent as zero.
+        `dx` [m] is the displacement since the last call and `acted` [N] the force that acted meanwhile (default: the
+        sent one for constant delays, else unknown). The first call ignores both. `wanted` must be clipped to forces
+        that the device can apply. A force that is nan or larger than _HUGE is sent as zero.
         """
         if self.ticks:
             self._book(self._turned(dx), None if acted is None else self._turned(acted))
@@ -235,18 +235,18 @@ class EnergyBudget(_Net):
         return sent if self._axes is None else self._axes @ sent
 
     def _turned(self, values: ArrayLike) -> Array:
-        """Values (m, nsim) in the principal axes."""
+        """Return values (m, nsim) in the principal axes."""
         values = np.asarray(values, dtype=float)
         return values if self._axes is None else self._axes.T @ values
 
     def tell(self, tick: int, acted: ArrayLike) -> None:
-        """The forces that acted in a tick (counted from 0) that was booked as its largest loss, (m, nsim)."""
+        """Report the forces (m, nsim) that acted in a tick (counted from 0) that was booked with its largest loss."""
         if tick not in self._untold:
             raise ValueError(f"tick {tick} does not wait for the devices' word")
         self._settle(tick, self._turned(acted), *self._untold.pop(tick))
 
     def _book(self, dx: Array, acted: Array | None) -> None:
-        """W after the tick that has just ended."""
+        """Update W after the tick that has just ended."""
         tick, most = self.ticks - 1, self._reserve[0].copy()
         self._reserve[:-1] = self._reserve[1:]
         self._reserve[-1] = 0.0
@@ -266,23 +266,23 @@ class EnergyBudget(_Net):
             self._earn((acted * dx + self._damping * dx**2 + most).sum(axis=0))
             return
         sure = np.maximum(np.abs(dx) - self._step, 0.0)
-        before = self._last[1] if self._last[0] == tick - 1 else -acted  # unknown: as costly as it can be
+        before = self._last[1] if self._last[0] == tick - 1 else -acted  # unknown: the most costly one
         change = np.abs(acted - before) + np.abs(acted) - np.abs(before)
         self._earn((acted * dx + self._damping * sure**2 - self._step / 2 * change + most).sum(axis=0))
         if tick > self._last[0]:
             self._last = (tick, acted.copy())
 
     def _loss(self, force: Array) -> Array:
-        """The most that a force can lose while it is held for a tick [J], per channel."""
+        """Return the largest loss [J] of a force that is held for a tick, per channel."""
         square = self._square * force**2
         return square + 2 * self._step * np.abs(force) if self._coarse else square
 
     def _scale(self, wanted: Array) -> Array:
-        """(nsim,) the largest s for which the reserve with the packet s f is there.
+        """Return the largest s (nsim,) for which the energy covers the reserve with the packet s f.
 
-        The ticks that the packet reaches then reserve max(M, s^2 r + s b) each, M what they reserve now. Their sum is
-        within the energy exactly if sum (s^2 r + s b) <= room + sum M over every set of them; the sets that decide
-        have the ticks in which the packet overtakes M first.
+        The ticks that the packet reaches then reserve max(M, s^2 r + s b) each, where M is their present reserve. Their
+        sum is within the energy if and only if sum (s^2 r + s b) <= room + sum M over every set of them; the deciding
+        sets have the ticks in which the packet overtakes M first.
         """
         room = np.maximum(self.energy - self.reserved, 0.0)
         scale, now = np.ones_like(room), self._reserve[self._reached]  # (ticks that the packet reaches, nsim)
@@ -298,7 +298,7 @@ class EnergyBudget(_Net):
 
 
 class Shell(_Net):
-    """Makes whatever computes the environment's force passive, behind a coupling V with u = x - V f.
+    """Makes any computed force of the environment passive, behind a coupling V with u = x - V f.
 
     W[k+1] = min(cap, W[k] + f'(u - u_-)) and f = s f_wanted with the largest s in [0, 1] that keeps it nonnegative. V
     answers within the tick, u = u0 - D_V f, so that W is a concave parabola in s, nonnegative at 0: s is its upper
@@ -307,7 +307,7 @@ class Shell(_Net):
     """
 
     def __init__(self, V: Lti, *, start: float = 0.0, cap: float = np.inf, nsim: int = 1) -> None:
-        """Raises ValueError where V is not square, or where its direct part could give energy."""
+        """Raise ValueError if V is not square, or if its direct part could give energy."""
         super().__init__(start, cap, nsim)
         if V.inputs != V.outputs:
             raise ValueError(f"the coupling has {V.inputs} inputs and {V.outputs} outputs, expected as many")
@@ -316,15 +316,15 @@ class Shell(_Net):
         self._V = V
         self._state = np.zeros((V.order, nsim))
         self._before = self._free = np.zeros((V.outputs, nsim))
-        self._released = np.zeros(nsim)  # [J] that was credited
+        self._released = np.zeros(nsim)  # [J] credited energy
 
     def free(self, x: ArrayLike) -> Array:
-        """u0, (m, nsim) [m]: where the port would be at device positions x (m, nsim) if f were zero in this tick."""
+        """Return u0 (m, nsim) [m], the port's displacement at device positions x (m, nsim) for f = 0 in this tick."""
         self._free = np.asarray(x, dtype=float) - self._V.C @ self._state
         return self._free.copy()
 
     def credit(self, released: ArrayLike) -> None:
-        """Count what gravity and springs of the environment have released so far, (nsim,) [J]; only increases count.
+        """Credit the energy that gravity and springs have released so far, (nsim,) [J]; only increases count.
 
         Then sum f'(u - u_-) >= -(W0 + released) at every tick, with the largest `released` up to that tick: s = 0 is
         admissible as before, since neither term falls.
@@ -334,10 +334,10 @@ class Shell(_Net):
         self._earn(rise)
 
     def limit(self, wanted: ArrayLike, rounded: Callable[[Array], Array] = lambda f: f) -> tuple[Array, Array]:
-        """f = s f_wanted [N] and the port's displacement u [m] with it, (m, nsim) each; ends the tick.
+        """Return f = s f_wanted [N] and the port's displacement u [m], (m, nsim) each, and end the tick.
 
-        `rounded` gives the force that a device can be sent in place of s f_wanted; where that one would cost more
-        energy than there is, f is 0.
+        `rounded` maps s f_wanted to a force that can be sent to a device; f is 0 if that force would cost too much
+        energy.
         """
         wanted, spoilt = _finite(wanted)
         linear = (wanted * (self._free - self._before)).sum(axis=0)
@@ -351,7 +351,7 @@ class Shell(_Net):
         return force, self.book(force)
 
     def book(self, force: Array) -> Array:
-        """Count a force (m, nsim) [N] that acts in this tick, whatever it costs; the port's u [m] with it."""
+        """Book a force (m, nsim) [N] that acts in this tick, whatever its cost; return the port's u [m]."""
         u = self._free - self._V.D @ force
         self._earn((force * (u - self._before)).sum(axis=0))
         self._state = self._V.A @ self._state + self._V.B @ force
@@ -359,7 +359,7 @@ class Shell(_Net):
         return u.copy()
 
     def _scale(self, linear: Array, square: Array) -> Array:
-        """(nsim,) the largest s in [0, 1] with W + linear s - square s^2 >= 0."""
+        """Return the largest s (nsim,) in [0, 1] with W + linear s - square s^2 >= 0."""
         W = np.maximum(self.energy, 0.0)
         scale = np.ones_like(W)
         short = W + linear - square < 0
@@ -372,13 +372,13 @@ class Shell(_Net):
 
 
 def _root(square: Array, linear: Array, most: Array) -> Array:
-    """The largest s >= 0 with square s^2 + linear s <= most, all >= 0; inf where there is none."""
+    """Return the largest s >= 0 with square s^2 + linear s <= most, all >= 0; inf if every s is allowed."""
     slope = linear + np.sqrt(linear**2 + 4 * square * most)
     return np.divide(2 * most, slope, out=np.where(square + linear > 0, 0.0, np.inf), where=slope > 0)
 
 
 def _finite(wanted: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
-    """The force with zero where it is no finite number, and in which simulations that was so."""
+    """Return the force with zero for entries that are not finite, and the simulations (nsim,) with such entries."""
     wanted = np.asarray(wanted, dtype=float)
     good = np.abs(wanted) < _HUGE
     return np.where(good, wanted, 0.0), np.asarray(~good.all(axis=0))

@@ -1,4 +1,4 @@
-"""The law that a tick computes, from positions to forces: linear, but for walls that push and for limited forces."""
+"""The law of a tick from positions to forces: a linear block, walls that push, and limited forces."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen, taps
 #         p[k] = max(0, K h[k] + B (h[k] - h[k-1])/T),    h = max(0, d),
 #
 # which is a ramp, p = a max(0, d - c) with a = K + B/T and c = B h[k-1] / (T a): continuous and monotone in d. It
-# dissipates: p[k] (d[k] - d[k-1]) >= K h[k]^2/2 - K h[k-1]^2/2 for every d, whatever B. While a wall touches, it is
-# the spring-damper between the same nodes, but for the constant force of its gap.
+# dissipates: p[k] (d[k] - d[k-1]) >= K h[k]^2/2 - K h[k-1]^2/2 for every d and B. A touching wall is the spring-damper
+# between the same nodes except for the constant force of its gap.
 #
-# The wall forces enter the linear block as further inputs and the ways are further outputs, y = y_free - D p: the
-# environment and the coupling give way at once. So the algebraic loop of a tick is the linear complementarity problem
+# The wall forces are further inputs of the linear block and the ways are further outputs, y = y_free - D p, because
+# environment and coupling respond within the tick. The algebraic loop of a tick is the linear complementarity problem
 #
 #         p >= 0,   s = (1/a + D) p - (y_free - gap - c) >= 0,   p's = 0,
 #
-# whose matrix has positive principal minors, since D is positive semidefinite for a passive environment and coupling:
-# there is exactly one solution, and it is found by trying every set of touching walls.
+# whose matrix has positive principal minors, since D is positive semidefinite for a passive environment and coupling.
+# So there is exactly one solution; the code tries every set of touching walls.
 
 
 Transition = Callable[[Array, Array], object]  # [z; x] (order + m, nsim) -> writes [f; z+] (m + order, nsim)
@@ -42,15 +42,15 @@ State = tuple[bool, ...]  # which walls touch
 
 @dataclass(frozen=True, eq=False)
 class Law(ReadOnly):
-    """From positions to the forces that answer them, tick by tick: the linear block of a loop, and walls that push.
+    """The map of a tick from positions to forces: the linear block of a loop, and walls that push.
 
     `sent` is the block [x; p] -> [f_e; y] before Theta, and the walls turn y into p. The state is that of the block
-    with its delays, then h [m], how deep each wall was pressed at the tick before.
-    Raises SingularLoop where the walls' forces are not determined.
+    with its delays, then h [m], the depth of each wall at the previous tick.
+    Raises SingularLoop if the walls' forces are not determined.
     """
 
     sent: Lti  # m + w inputs and outputs
-    theta: tuple[int, ...] = ()  # (m,) delays of the forces behind it [samples]; none unless given
+    theta: tuple[int, ...] = ()  # (m,) delays of the forces [samples]; () is no delay
     walls: tuple[Wall, ...] = ()
 
     def __post_init__(self) -> None:
@@ -68,26 +68,26 @@ class Law(ReadOnly):
 
     @property
     def unsolved(self) -> int:
-        """How many vectors of limited forces were set to 0 so far because no solution was found."""
+        """Number of vectors of limited forces that were set to 0 because no solution was found."""
         return 0
 
     @property
     def without_theta(self) -> Self:
-        """The same with forces that are not delayed."""
+        """Return the law without the delays of the forces."""
         return replace(self, theta=(0,) * self.channels)
 
     @property
     def unlimited(self) -> Self:
-        """The same for forces of any size."""
+        """Return the law without force limits."""
         return self
 
     @property
     def bounds(self) -> list[tuple[int, float]]:
-        """Where [f; z+] holds a force that is limited before it is sent, and its limit [N], channel by channel."""
+        """Return (row of [f; z+], limit [N]) of each force that is limited before it is sent."""
         return []
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
-        """Where forces (ticks, m, ..) were limited: here by the actuators, which have `most`, (m, ..) [N]."""
+        """Return where forces (ticks, m, ..) were limited: here at the actuators' limits `most` (m, ..) [N]."""
         return np.abs(force) >= most
 
     @property
@@ -97,7 +97,7 @@ class Law(ReadOnly):
 
     @cached_property
     def _problem(self) -> Complementarity:
-        """What a tick solves for the wall forces."""
+        """The problem of a tick for the wall forces."""
         m = self.channels
         return Complementarity(np.diag(1 / self.steepness) - self.sent.D[m:, m:])
 
@@ -107,28 +107,28 @@ class Law(ReadOnly):
 
     @cached_property
     def _block(self) -> Lti:
-        """What a tick solves for put in, too: [x; p] -> [f; y]."""
+        """The block [x; p] -> [f; y], including the unknowns of a tick."""
         return self._delayed(self.sent)
 
     @cached_property
     def open(self) -> Lti:
-        """F while no wall touches, with the state of the whole: h does not reach the force."""
+        """F while no wall touches, with the state of the law, although h does not affect the force."""
         G, m, w = self._block, self.channels, len(self.walls)
         A, B = np.pad(G.A, ((0, w), (0, w))), np.pad(G.B[:, :m], ((0, w), (0, 0)))
         return Lti(A, B, np.pad(G.C[:m], ((0, 0), (0, w))), G.D[:m, :m], G.T)
 
     @property
     def linear(self) -> Array:
-        """[f; z+] of a tick by its [z; x], (m + order, order + m), while no wall touches and no force is limited."""
+        """The matrix (m + order, order + m) from [z; x] to [f; z+], while no wall touches and no force is limited."""
         F = self.open
         return np.block([[F.C, F.D], [F.A, F.B]])
 
     def at_rest(self, x: Array) -> Array:
-        """The state in which it rests with the displacements x (m,) [m] held, no wall touching."""
+        """Return the steady state for held displacements x (m,) [m], with no wall touching."""
         return self.open.at_rest(x)
 
     def frozen(self) -> dict[State, Lti]:
-        """F of every contact state, without the gaps' constant forces; none touches in the first, all in the last."""
+        """Return F of every contact state, without the gaps' constant forces, from no touching wall to all walls."""
         block, m, T, walls = self._delayed(self.sent), self.channels, self.sent.T, range(len(self.walls))
         if not self.walls:
             return {(): block}
@@ -142,7 +142,7 @@ class Law(ReadOnly):
         return maps
 
     def transition(self) -> Transition:
-        """One tick for any number of simulations."""
+        """Return the function of one tick for any number of simulations."""
         if not self.walls:
             return self.linear.dot
         G, m, w, F = self._block, self.channels, len(self.walls), self.open
@@ -154,7 +154,7 @@ class Law(ReadOnly):
         solve, depth = self._problem.solve, slice(G.order, F.order)
 
         def tick(before: Array, after: Array) -> None:
-            way = reach(before) - gap  # into the walls, if these did not push
+            way = reach(before) - gap  # into the walls without their forces
             force = solve(way - memory * before[depth])
             linear(before, after)
             after += kick(force)
@@ -163,24 +163,24 @@ class Law(ReadOnly):
         return tick
 
     def together(self, laws: Sequence[Law]) -> Transition:
-        """One tick of one simulation each, of laws of this kind with as many states and walls."""
+        """Return one tick for several laws of this kind and size, one simulation for each."""
         if not self.walls:
             return _side_by_side(laws)
         return _one_by_one(laws) if len(self.walls) > 1 else _one_wall(laws)
 
     def depths(self, z: Array) -> Array:
-        """h [m] at each tick but the last, (ticks - 1, w, ..), from the states at all of them, (ticks, order, ..)."""
+        """Return h [m] at each tick but the last, (ticks - 1, w, ..), from the states (ticks, order, ..)."""
         return z[1:, z.shape[1] - len(self.walls) :]
 
 
 def _side_by_side(laws: Sequence[Law]) -> Transition:
-    """While all of them are linear."""
+    """Return one tick for several laws while all of them are linear."""
     blocks = _last_axis([law.linear for law in laws])
     return lambda before, after: np.einsum("oin,in->on", blocks, before, out=after)
 
 
 def _one_by_one(laws: Sequence[Law]) -> Transition:
-    """Whatever they are, in turn."""
+    """Return one tick for several laws of any kind, one after the other."""
     transitions = [law.transition() for law in laws]
 
     def together(before: Array, after: Array) -> None:
@@ -193,7 +193,7 @@ def _one_by_one(laws: Sequence[Law]) -> Transition:
 
 
 def _one_wall(laws: Sequence[Law]) -> Transition:
-    """The complementarity problem of one wall is p = max(0, q)/M."""
+    """Return one tick for several laws with one wall each, where p = max(0, q)/M."""
     m, blocks = laws[0].channels, [law._block for law in laws]
     linear, order = _side_by_side(laws), blocks[0].order
     reach = _last_axis([np.concatenate([G.C[m], [0.0], G.D[m, :m]]) for G in blocks])
@@ -213,7 +213,7 @@ def _one_wall(laws: Sequence[Law]) -> Transition:
 
 
 def _last_axis(parts: Sequence[Array]) -> Array:
-    """Arrays of one shape as one, along a last axis."""
+    """Stack arrays of one shape along a new last axis."""
     return np.ascontiguousarray(np.moveaxis(np.array(parts), 0, -1))
 
 
@@ -222,8 +222,8 @@ def _last_axis(parts: Sequence[Array]) -> Array:
 #
 #         f_e = G (x - e) - rho (e - e_-),      e_i f_e,i = L_i |e_i|     (e is in the normal cone of the box at f_e)
 #
-# It stands before Theta: delays carry limited forces. While no force reaches its limit, e = 0 and nothing changes.
-# With the forces that the tick would send without slip, f_free, and the feedthrough D_G it solves
+# It acts before Theta, so that delays carry limited forces. While no force reaches its limit, e = 0. With the forces
+# without slip, f_free, and the feedthrough D_G the limiter solves
 #
 #         f_e = f_free - (D_G + rho) e,         f_e in the box, e in its normal cone there,
 #
@@ -240,14 +240,14 @@ class Limiter(Law):
     """The forces of a loop before Theta, [x; p] -> [f_e; y], limited by a slip e; walls turn y into p.
 
     Its state is [that of `sent`, e [m] at the tick before, the lines of Theta, h [m] of the walls].
-    Raises SingularLoop where the limited forces are not determined.
+    Raises SingularLoop if the limited forces are not determined.
     """
 
-    limit: Array  # (m,) [N], inf where there is none; the same for all axes of a vector
+    limit: Array  # (m,) [N], inf without a limit; the same for all axes of a vector
     rho: Array  # (m,) [N/m] the slip's lag: 0 under any-environment, beta delta/T under this-environment
-    balls: tuple[slice, ...] = ()  # neighbouring channels whose force is limited as a vector; others by themselves
+    balls: tuple[slice, ...] = ()  # neighbouring channels whose force is limited as a vector
 
-    if TYPE_CHECKING:  # what __post_init__ accepts is more than what the fields then hold
+    if TYPE_CHECKING:  # __post_init__ accepts more types than the fields hold
 
         def __init__(
             self,
@@ -280,7 +280,7 @@ class Limiter(Law):
 
     @cached_property
     def _sizes(self) -> tuple[int, ...]:
-        """How many channels each limited vector has, if any has several; () otherwise."""
+        """The number of channels of each limited vector; () if none has several."""
         sizes, at = [], 0
         while self.balls and at < self.channels:
             end = next((ball.stop for ball in self.balls if ball.start == at), at + 1)
@@ -301,7 +301,7 @@ class Limiter(Law):
         return list(zip(self.sent_rows.tolist(), _inner_box(self.limit, self._sizes).tolist(), strict=True))
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
-        """Where the contact slipped, which is before the force arrives."""
+        """Return where the contact slipped, which is before the force arrives."""
         return self.slips(z) != 0
 
     @cached_property
@@ -321,7 +321,7 @@ class Limiter(Law):
 
     @cached_property
     def problem(self) -> BoxProblem | BallProblem:
-        """What a tick solves for [e; p]; all its limits are in N."""
+        """The problem of a tick for [e; p]; all its limits are in N."""
         m, w = self.channels, len(self.walls)
         if self.balls:
             return BallProblem(-self._step.D[:, m:], self.limit, self._sizes)
@@ -332,13 +332,13 @@ class Limiter(Law):
 
     @cached_property
     def kick(self) -> Array:
-        """What [e; p] adds to [f; z+], (m + order, m + w)."""
+        """The matrix (m + order, m + w) from [e; p] to [f; z+]."""
         G, m, w = self._block, self.channels, len(self.walls)
         return np.vstack([G.D[:m, m:], G.B[:, m:], np.zeros((w, m + w))])
 
     @cached_property
     def sent_rows(self) -> NDArray[np.intp]:
-        """Where [f; z+] holds f_e, (m,): the output itself, or the first place of its line."""
+        """The rows (m,) of f_e in [f; z+]: the output itself, or the first place of its delay line."""
         m = self.channels
         lines = m + self._step.order + np.concatenate([[0], np.cumsum(self.theta)[:-1]]).astype(int)
         return np.where(np.array(self.theta) == 0, np.arange(m), lines)

@@ -1,4 +1,4 @@
-"""The tick: what the computer does every T seconds, and when.
+"""The tick: the steps of the computer every T seconds, and their times.
 
         tick k, at time kT
           1  x = encoder positions, sampled                (the plant's state just before kT)
@@ -9,10 +9,9 @@
 
 With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
 Steps 2, 3 and 5 are linear: they are ONE state-space block, and a tick is one matrix product
-[f; z+] = [C D; A B] [z; x] for any number of simulations at once. Walls that touch (controller.law) and forces that
-are limited (controller.law) ask for a small complementarity problem more; a force that is clipped is what the
-actuators make of it.
-Where delays vary, Theta is not in the block: its forces pass through a line that holds (controller.delay).
+[f; z+] = [C D; A B] [z; x] for any number of simulations at once. Touching walls and limited forces (controller.law)
+add a small complementarity problem; actuators clip forces.
+With varying delays Theta is not in the block: its forces pass through a delay line that holds (controller.delay).
 """
 
 from __future__ import annotations
@@ -31,41 +30,41 @@ from haptic_loop.controller.environment import Wall
 from haptic_loop.controller.law import Law, Transition
 from haptic_loop.controller.lti import Array, Lti, ReadOnly, frozen
 
-RunBlock = Callable[[int], None]  # so many ticks from row 0 on
+RunBlock = Callable[[int], None]  # runs this number of ticks from row 0
 
-_PART = 128  # ticks of a block whose memory and views stay in the cache
-_ROUNDED = 1e-14  # relative: a force vector that was scaled to its limit is no shorter than this below it
-_CALM = 1 - 1e-9  # of the limiter's forces: above that they are being limited
+_PART = 128  # number of ticks of a block that fits into the cache
+_ROUNDED = 1e-14  # relative rounding error of a force vector that was scaled to its limit
+_CALM = 1 - 1e-9  # share of the limit above which the limiter acts
 
 
 class Net(Protocol):
-    """A nonlinear step between the forces of F and the devices, with a memory of its own; one for every record.
+    """A nonlinear step with memory between the forces of F and the devices, made anew for every record.
 
-    Both methods change forces (m, nsim) [N] in place, at every tick, in this order; packets travel in between.
+    `send` and then `apply` change forces (m, nsim) [N] in place at every tick; packets travel in between.
     """
 
     def send(self, x: Array, force: Array, /) -> None:
-        """Before the delays, given the positions (m, nsim) [m] as the encoders give them."""
+        """Change the forces before the delays; `x` (m, nsim) [m] are the measured positions."""
         ...
 
     def apply(self, k: int, force: Array, /) -> None:
-        """Behind them, at tick k."""
+        """Change the forces after the delays, at tick k."""
         ...
 
     def figures(self) -> NetFigures:
-        """What it has done so far."""
+        """Return the figures of its action so far."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Process(ReadOnly):
-    """A law with what wraps around it: force limits, encoder steps, delays that vary, and a net."""
+    """A law with force limits, encoder steps, varying delays and a net."""
 
     law: Law  # with the constant delays of the loop
     force_limit: Array  # (m,) [N], inf where there is none
     encoder_step: Array  # (m,) [m], 0 for an ideal encoder
     delays: Ticks | None = None  # (ticks, m, nsim or 1) of every packet [samples], in place of Theta; None: constant
-    net: Callable[[int], Net] | None = None  # a fresh one for so many simulations; it takes delays
+    net: Callable[[int], Net] | None = None  # makes a net for a number of simulations
     balls: tuple[slice, ...] = ()  # neighbouring channels with one limit, which bounds the length of their force vector
 
     def __post_init__(self) -> None:
@@ -85,7 +84,7 @@ class Process(ReadOnly):
 
     @cached_property
     def ticked(self) -> Law:
-        """What a tick computes: the law, without Theta where forces travel as packets."""
+        """The law of a tick, without Theta if forces travel as packets."""
         return self.law if self.delays is None else self.law.without_theta
 
     @property
@@ -95,7 +94,7 @@ class Process(ReadOnly):
 
     @property
     def linear(self) -> Array:
-        """[f; z+] of a tick by its [z; x], (m + order, order + m), while no wall touches and no force is limited."""
+        """The matrix (m + order, order + m) from [z; x] to [f; z+], while no wall touches and no force is limited."""
         return self.ticked.linear
 
     @cached_property
@@ -108,12 +107,12 @@ class Process(ReadOnly):
 
     @property
     def unlimited(self) -> Process:
-        """The linear process: without force limits and encoder steps."""
+        """Return the process without force limits and encoder steps."""
         endless, ideal = np.full(self.channels, np.inf), np.zeros(self.channels)
         return replace(self, law=self.law.unlimited, force_limit=endless, encoder_step=ideal)
 
     def measured(self, x: Array) -> Array:
-        """Positions (.., m) as the encoders give them: rounded to whole steps, or x itself where none is coarse."""
+        """Return positions (.., m) rounded to whole encoder steps, or x itself if all encoders are ideal."""
         coarse = self.encoder_step > 0
         if not coarse.any():
             return x
@@ -121,9 +120,9 @@ class Process(ReadOnly):
         return np.where(coarse, np.round(x / step) * step, x)
 
     def applied(self, force: Array, out: Array | None = None) -> Array:
-        """What the actuators make of forces (.., m, nsim) [N] that are asked of them."""
+        """Return the forces (.., m, nsim) [N] clipped at the actuators' limits."""
         high = self.force_limit[:, None]
-        for ball in self.balls:  # what clips a vector shortens it and keeps its direction
+        for ball in self.balls:  # A clipped vector keeps its direction.
             force = force if out is not None else force.copy()
             vector = force[..., ball, :]
             length = np.linalg.norm(vector, axis=-2, keepdims=True)
@@ -133,7 +132,7 @@ class Process(ReadOnly):
 
 
 def at_limit(force: Array, force_limit: Array, balls: Sequence[slice] = ()) -> NDArray[np.bool_]:
-    """Where forces (ticks, m, nsim) are at limits (m,) [N] of the actuators; in a ball all of its channels are."""
+    """Return where forces (ticks, m, nsim) are at the actuators' limits (m,) [N]; balls count as a whole."""
     clipped = np.abs(force) >= force_limit[:, None]
     for ball in balls:
         length = np.linalg.norm(force[:, ball], axis=1, keepdims=True)
@@ -142,7 +141,7 @@ def at_limit(force: Array, force_limit: Array, balls: Sequence[slice] = ()) -> N
 
 
 class StepBuffer:
-    """The record of a block of ticks, laid out so that the loop writes it without copying.
+    """The record of a block of ticks, in a layout that the loop writes without copying.
 
     A row holds [z, s, w, f] of one tick for all simulations: process state, plant state (whose first
     `channels` entries are the measured positions x), outside forces, and forces fed back; the next row
@@ -157,7 +156,7 @@ class StepBuffer:
         plant_states: int,
         outside: int = 0,
         nsim: int = 1,
-        transition: Transition | None = None,  # in place of the process's own
+        transition: Transition | None = None,  # replaces that of the process
     ) -> None:
         nz, m = process.F.order, process.channels
         if plant_states < m:
@@ -166,7 +165,7 @@ class StepBuffer:
         self.process = process
         self._width = width = nz + plant_states + outside + m
         self._memory = np.zeros(((ticks + 1) * width, nsim))
-        #: (ticks + 1, entries, nsim): the last row holds only what the last tick left behind
+        #: (ticks + 1, entries, nsim); the last row holds only the states after the last tick
         self.rows = rows = self._memory.reshape(ticks + 1, width, nsim)
         self.z, self.s, self.w, self.f = np.split(rows, np.cumsum([nz, plant_states, outside]), axis=1)
         self.x = self.s[:, :m]
@@ -179,15 +178,15 @@ class StepBuffer:
         self.net = process.net(nsim) if process.net else None
         self.first = 0  # the tick of row 0
         self._straight = nsim == 1 and not (self._quantised or process.walls or self._line or self.net)
-        #: whether to try the next ticks by the linear law alone: nothing can bend it but limits that are far now
+        #: whether to try the next ticks by the linear law alone: no force is near its limit
         self.calm = self._straight
         bounds, most = process.ticked.bounds, process.force_limit.copy()
-        for ball in process.balls:  # within this box no vector is longer than the limit
+        for ball in process.balls:  # No vector within this box is longer than the limit.
             most[ball] /= (ball.stop - ball.start) ** 0.5
         most = most.tolist()
         within = bool(bounds) and self.net is None
         within &= all(limit <= largest for (_, limit), largest in zip(bounds, most, strict=False))
-        #: whether a force may leave the tick that is more than the actuators have
+        #: whether a force may exceed the actuators' limits
         self.clips = not within and bool((process.force_limit < np.inf).any())
         if self.clips:
             bounds += enumerate(most)
@@ -198,7 +197,7 @@ class StepBuffer:
     def _transition(self) -> Transition:
         return self._given or self.process.ticked.transition()
 
-    # views are made once, and only those that are used: making one costs as much as a small product
+    # Views are made once and only if they are used: making one costs as much as a small product.
 
     @cached_property
     def plant_state(self) -> list[Array]:
@@ -227,14 +226,11 @@ class StepBuffer:
 
     @property
     def limited(self) -> bool:
-        """Whether the limiter or the actuators may limit a force, so that a block is taken back."""
+        """Whether the limiter or the actuators may limit a force, so that a linear block may have to be repeated."""
         return bool(self._bounds)
 
     def linear_until(self, ticks: int, most: float = 1.0) -> int:
-        """The first of these ticks in which a force is more than `most` of its limit, else `ticks`.
-
-        Not a number counts as such.
-        """
+        """Return the first of these ticks in which a force is nan or above `most` of its limit, else `ticks`."""
         for forces, limit in self._asked:
             sent, limit = forces[:ticks], most * limit
             if not (sent.max() <= limit and sent.min() >= -limit):
@@ -243,7 +239,7 @@ class StepBuffer:
         return ticks
 
     def tick(self, k: int) -> None:
-        """Steps 1, 2, 3 and 5 for row k, whose plant state has been written: f[k] and z[k + 1]."""
+        """Do steps 1, 2, 3 and 5 for row k, whose plant state has been written: write f[k] and z[k + 1]."""
         seen = self.seen(k)
         self._transition(seen, self.law_output[k])
         if self.net is not None:
@@ -256,12 +252,12 @@ class StepBuffer:
             self.process.applied(self.force[k], self.force[k])
 
     def ticking(self) -> Callable[[int], object]:
-        """The shortest function that does `tick` for this process."""
+        """Return the fastest function that does `tick` for this process."""
         return self._shortest or self.tick
 
     @cached_property
     def _shortest(self) -> Callable[[int], object] | None:
-        """`tick` where it is one product, and one look at the forces that a limiter may limit."""
+        """Return `tick` as one product and one test of the limited forces, or None if it needs more."""
         if self._quantised or self._line is not None or self.net is not None:
             return None
         transition, seen, after, process = self._transition, self.law_input, self.law_output, self.process
@@ -269,7 +265,7 @@ class StepBuffer:
             if self.clips:
                 return None
             return lambda k: transition(seen[k], after[k])
-        # a single simulation spends its time in calls: its forces are looked at without numpy, of two channels by name
+        # Calls dominate the time of a single simulation: its forces are tested without numpy.
         linear, force, clips, limited = process.linear.dot, self.force, self.clips, process.law.bounds
         first = self._width - process.channels
         asked: list[tuple[Any, float, float]] = [
@@ -288,14 +284,14 @@ class StepBuffer:
                 if clips:
                     process.applied(force[k], force[k])
                 return
-            for numbers, least, most in asked:  # what numpy's clip does, in a third of its time
+            for numbers, least, most in asked:  # three times as fast as numpy's clip
                 if not least <= numbers[k] <= most:
                     numbers[k] = least if numbers[k] < least else most if numbers[k] > most else numbers[k]
 
         return tick
 
     def seen(self, k: int) -> Array:
-        """[z; x] of row k with x as the encoders give it, (order + m, nsim); the plant's own positions stay."""
+        """Return [z; x] (order + m, nsim) of row k with measured x; the plant's own positions do not change."""
         row = self.law_input[k]
         if not self._quantised:
             return row
@@ -303,7 +299,7 @@ class StepBuffer:
         return np.concatenate([row[:-m], self.process.measured(row[-m:].T).T])
 
     def rewind(self, ticks: int) -> None:
-        """Start a new block where this one stood after `ticks` ticks."""
+        """Start a new block from the states after `ticks` ticks of this one."""
         self.calm = self.calm or (self._straight and self.linear_until(ticks, _CALM) == ticks)
         self.z[0] = self.z[ticks]
         self.s[0] = self.s[ticks]
@@ -311,9 +307,9 @@ class StepBuffer:
 
 
 class FusedTicks:
-    """The plant's step and the law at its end in one product a tick: [f; z+; s] of the next one.
+    """One product for the plant's step and the law of the next tick: [f; z+; s] of the next tick.
 
-    A row of the memory is [w, f, z+, s, a] of a tick, where the entries a are the engine's own. The next s is
+    A row of the memory is [w, f, z+, s, a] of a tick, where the entries a belong to the engine. The next s is
     A s + B [w; f] + G a; without B the product reads a row from z+ on.
     """
 
@@ -332,14 +328,14 @@ class FusedTicks:
         self._buffer, self._law = buffer, partial(law.dot, buffer.rows[0, : nz + m], buffer.after[0])
 
     def copied(self, n: int) -> tuple[list[memoryview], ...]:
-        """[w, f] and a of each row, n positions and velocities of the next: copied in half the time of an array's."""
+        """Return memory views of [w, f] and a of each row, and of n positions and velocities of the next row."""
         numbers, row, (to_z, to_s, to_a) = self._numbers, self._row, self._ends
         q = row + to_s
         ranges = (0, to_z), (to_a, row), (q, q + n), (q + n, q + 2 * n)
         return tuple([numbers[i + a : i + b] for i in range(0, len(numbers) - row, row)] for a, b in ranges)
 
     def parts(self, ticks: int) -> Iterator[int]:
-        """Ticks to be made from row 0 of the memory on, again and again, until the first rows of the buffer are."""
+        """Yield numbers of ticks to run from row 0 of the memory, until `ticks` rows of the buffer are written."""
         buffer, after, s = self._buffer, self._after, self._s
         self._law()
         after[0], s[0] = buffer.after[0, :, 0], buffer.s[0, :, 0]
