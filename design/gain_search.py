@@ -1,11 +1,11 @@
-"""Spring-damper gains for one environment: a local search from several starts, under a condition that is sampled.
+"""Spring-damper gains for one environment: a local search from several starts, with the condition at frequencies.
 
-The set is not convex in (K, B), so nothing here is proved best. The rms mismatch is minimised by sequential quadratic
-programming with the condition at sampled frequencies; where the refined sweep of the condition finds it violated in
-between, that frequency is added and the search resumed. What is returned passes that sweep.
+The set is not convex in (K, B), so the result may be a local optimum. The rms mismatch is minimised by sequential
+quadratic programming with the condition at sampled frequencies. Frequencies at which a refined sweep finds a violation
+are added, until the gains pass the sweep.
 
-A condition is asked for its block at G = 0 and G = I, and with its multiplier 0 and 1, once for the frequencies: it is
-affine in both, channel by channel, so these responses have all its values and slopes.
+The block of a condition is evaluated at G = 0 and G = I, and with its multiplier 0 and 1. It is affine in both, channel
+by channel, so these responses determine all its values and slopes.
 """
 
 from __future__ import annotations
@@ -33,37 +33,37 @@ from haptic_loop.design.transparency import BAND_HZ, transparency
 if TYPE_CHECKING:  # slow to load
     from scipy.optimize import OptimizeResult
 
-#: The sampled condition keeps half as much again as the promised reserve, for what lies between the samples.
+#: reserve of the sampled condition, 1.5 times that of the design, for frequencies between the samples
 _SAMPLED_RESERVE = 1.5 * RESERVE
 SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
-_CLOSEST_POLE = 1e-5  # from the unit circle
-_STUCK = 1e-3  # a search that leaves the sampled condition violated by this has no feasible point nearby
-FEW = 12  # devices up to which steps are cheap
-_ROUGH = 0.01  # a violation that further steps will mend
+_CLOSEST_POLE = 1e-5  # least distance of poles from the unit circle
+_STUCK = 1e-3  # violation at the end of a search from which there is no feasible point nearby
+FEW = 12  # largest number of devices for which steps are cheap
+_ROUGH = 0.01  # violation that further steps can remove
 _DIFFERENCE = 1e-7
 
 
 def damper_rate(z: Complex, T: float) -> Complex:
-    """(z-1)/(Tz) [1/s], what a damper of 1 N s/m adds to the stiffness of a spring-damper; the shape of z."""
+    """Return (z-1)/(Tz) [1/s] in the shape of z, the stiffness of a damper of 1 N s/m."""
     return SpringDamper([1.0], [1.0]).sampled(z, T).inverse().G[..., 0, 0] - 1
 
 
 @dataclass(frozen=True, eq=False)
 class _Around:
-    """The loop around sampled responses, for gains at x: G = (I + Psi E V)^-1 Psi E and how gains move it."""
+    """Responses of the loop for gains at x: G = (I + Psi E V)^-1 Psi E and its derivatives."""
 
     x: Array
     G: Complex  # (k, m, m)
-    by: Array | Complex  # (2, k, m) an unknown of channel i, log K or B/delta, moves G by G[:, i] by[., i] G[i, :]
+    by: Array | Complex  # (2, k, m) the derivative of G by log K or B/delta of channel i is G[:, i] by[., i] G[i, :]
 
 
 class SampledLoop:
     """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta, ..).
 
-    The gains are the first 2m entries; behind them are the unknowns of a condition's multiplier, where it has some.
+    The first 2m entries are the gains; the rest are the unknowns of the condition's multiplier.
     """
 
-    #: the channels that have a second row in the block, with an unknown multiplier, and its bounds in x
+    #: channels with a second row in the block and an unknown multiplier, and the bounds of the multiplier in x
     active: NDArray[np.intp] = np.zeros(0, dtype=int)
     bounds = (0.0, 0.0)
 
@@ -94,28 +94,28 @@ class SampledLoop:
         return np.concatenate([np.log(coupling.K), coupling.B / self.delta])
 
     def judged(self, x: Array) -> Requirement:
-        """What the refined sweep of its condition says of the gains at x."""
+        """Return the requirement of the gains at x, by the refined sweep of the condition."""
         return this_environment(self.loop.F(self.coupling(x)), self.loop)
 
     def demand(self, G: Sampled, mu: Array) -> Demand[Sampled]:
-        """What must be positive real, affine in G and the multiplier mu (active,)."""
+        """Return the demand, affine in G and the multiplier mu (active,)."""
         return this_environment_demand(self.loop.late(G), self.loop)
 
     def block(self, G: Sampled, mu: Array) -> Sampled:
-        """The same at the damping that is spent."""
+        """Return the block at the damping that a design may use."""
         demand = self.demand(G, mu)
         return demand.free + demand.gain * (1 - _SAMPLED_RESERVE)
 
     def mu(self, x: Array) -> tuple[Array, Array]:
-        """The multiplier in x (active,) and its derivative by what is in x, (active,) or a symmetric matrix."""
+        """Return the multiplier in x (active,) and its derivative by the unknowns, (active,) or a symmetric matrix."""
         return np.zeros(0), np.zeros(0)
 
     def multiplier(self, x: Array) -> Sequence[Sequence[float]] | None:
-        """The limiter's multiplier c in x, where the condition has one."""
+        """Return the limiter's multiplier c in x, or None."""
         return None
 
     def add(self, w: float) -> None:
-        """Impose the condition at the frequency w [rad/sample] too."""
+        """Impose the condition also at the frequency w [rad/sample]."""
         self._impose(np.append(self.conditions, w))
 
     def _impose(self, w: Array) -> None:
@@ -137,11 +137,11 @@ class SampledLoop:
         self._affine = none, of_G - none, of_mu - none, entries(1, 1) - of_G - of_mu + none
 
     def _responses(self, w: Array) -> Sampled:
-        """Psi E at exp(jw)."""
+        """Return Psi E at exp(jw)."""
         return Sampled.of(delay(self.loop.psi, self.loop.T) @ self.E, on_circle(w)[None])
 
     def _around(self, x: Array, where: str) -> _Around:
-        """The loop at the frequencies of the band or of the conditions; that of the last x is remembered."""
+        """Return the loop at the frequencies of the band or of the condition, cached for the last x."""
         gains, known = self._gains(x), self._known.get(where)
         if known is None or not np.array_equal(known.x, gains):
             coupling, delayed = self.coupling(x), self._delayed[where]
@@ -152,7 +152,7 @@ class SampledLoop:
         return known
 
     def square_mismatch(self, x: Array) -> float:
-        """Logarithm of the mean over log frequency of ||M||_F^2 / ||E||_F^2."""
+        """Return the logarithm of the mean over log frequency of ||M||_F^2 / ||E||_F^2."""
         log_w = np.log(self.band)
         return float(np.log(self._mean(x) / (log_w[-1] - log_w[0])))
 
@@ -161,7 +161,7 @@ class SampledLoop:
         return float(np.trapezoid((np.abs(M) ** 2).sum(axis=(1, 2)) / self.size2, np.log(self.band)))
 
     def square_mismatch_slope(self, x: Array) -> Array:
-        """Its gradient by x; the unknowns behind the gains do not move it."""
+        """Return the gradient of `square_mismatch`, which is 0 for the unknowns after the gains."""
         around = self._around(x, "band")
         F = self.late * around.G
         back = np.einsum("kij,kji->ki", around.G @ (F - self.target).conj().swapaxes(1, 2), F)
@@ -170,16 +170,16 @@ class SampledLoop:
         return np.concatenate([slope, np.zeros(x.size - slope.size)])
 
     def room(self, x: Array) -> Array:
-        """The least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency; (k,), or (k + 1,).
+        """Return the least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency; (k,) or (k + 1,).
 
-        Delay in the environment can make the loop unstable where the sampled condition still holds, so there the
-        distance of its poles from the circle is the last entry.
+        With delay in the environment the loop can be unstable although the sampled condition holds, so the distance of
+        its poles from the circle is the last entry.
         """
         room = self._least(x)[0]
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def room_slope(self, x: Array) -> Array:
-        """The gradient of `room`; poles are differenced."""
+        """Return the gradient of `room`, with differences for the poles."""
         around, (_, v), (mu, moves) = self._around(x, "conditions"), self._least(x), self.mu(x)
         m, active = self.loop.channels, self.active
         Gv = np.einsum("kij,kj->ki", around.G, v[:, :m])
@@ -200,7 +200,7 @@ class SampledLoop:
         return np.vstack([slope, self._stability_slope(x)]) if any(self.loop.psi) else slope
 
     def _spread(self, mu: Array) -> Array:
-        """mu of each entry of the block that is kept, (m + 3 active,)."""
+        """Return mu for each stored entry of the block, (m + 3 active,)."""
         first = np.zeros(self.loop.channels)
         first[self.active] = mu
         return np.concatenate([first, mu, mu, mu])
@@ -210,7 +210,7 @@ class SampledLoop:
         return np.array([(self.stability(x + step) - at) / _DIFFERENCE for step in steps])
 
     def parts(self, x: Array) -> tuple[Complex, Complex, Array]:
-        """The Hermitian part of the block: its first corner (k, m, m), what is below it, the diagonal of its last."""
+        """Return the Hermitian part of the block: first corner (k, m, m), part below, diagonal of the last."""
         G, mu, m, p = self._around(x, "conditions").G, self._spread(self.mu(x)[0]), self.loop.channels, self.active.size
         none, of_G, of_mu, of_both = self._affine
         fixed, of_G = none + of_mu * mu, of_G + of_both * mu
@@ -220,9 +220,9 @@ class SampledLoop:
         return first, below, fixed[:, m + 2 * p :].real
 
     def _least(self, x: Array) -> tuple[Array, Complex]:
-        """Least eigenvalue (k,) of the block, and v (k, m + active) whose v* block v it is; of the last x.
+        """Return the least eigenvalue (k,) of the block and its vector v (k, m + active), cached for the last x.
 
-        By the Schur complement of its last corner, which is diagonal and positive.
+        It uses the Schur complement of the last corner, which is diagonal and positive.
         """
         if self._last is None or not np.array_equal(self._last[0], x):
             first, below, corner = self.parts(x)
@@ -235,12 +235,12 @@ class SampledLoop:
         return self._last[1], self._last[2]
 
     def stability(self, x: Array) -> float:
-        """By how much more than CLOSEST_POLE the poles keep away from the circle."""
+        """Return the distance of the poles from the circle beyond _CLOSEST_POLE."""
         poles = self.loop.F(self.coupling(x)).poles()
         return float(1 - _CLOSEST_POLE - np.abs(poles).max(initial=0.0))
 
     def search(self, x: Array, most: int) -> OptimizeResult:
-        """The local optimum from x, by so many steps."""
+        """Return the local optimum from x, by at most `most` steps."""
         from scipy.optimize import minimize  # slow to load
 
         m = self.loop.channels
@@ -252,13 +252,13 @@ class SampledLoop:
 
 
 class SwitchingLoop(SampledLoop):
-    """Safe under any switching of the delays: x = (log K, B/delta, log alpha T/delta of the channels whose varies).
+    """The loop under any switching of delays: x = (log K, B/delta, log alpha T/delta of the channels that switch).
 
-    What is returned passes the sweep of `SWITCHING`, which knows nothing of the multiplier found here.
+    The result passes the sweep of `SWITCHING`, which searches its own multiplier.
     """
 
     bounds = (np.log(1e-4), np.log(10.0))
-    _first = 0.5  # alpha T/delta that a search begins with where the start has none
+    _first = 0.5  # first value of alpha T/delta
 
     def __init__(self, loop: Loop, lo: Sequence[int], hi: Sequence[int]) -> None:
         if loop.environment.walls or loop.latency:
@@ -267,7 +267,7 @@ class SwitchingLoop(SampledLoop):
         super().__init__(loop.switching(DelayRange(tuple(lo), tuple(hi))))
 
     def point(self, coupling: SpringDamper) -> Array:
-        """The gains with their best multiplier."""
+        """Return x of the gains with their best multiplier."""
         unit = self.delta / self.loop.T
         a = (np.array(SWITCHING.required(self.loop, coupling).multiplier or self._first * unit) / unit)[self.active]
         return np.concatenate([super().point(coupling), np.clip(np.log(np.maximum(a, 1e-300)), *self.bounds)])
@@ -286,10 +286,10 @@ class SwitchingLoop(SampledLoop):
 
 
 class LimiterLoop(SampledLoop):
-    """Safe also while forces are limited: x = (log K, B/delta, c) and one weight c per channel, of the lag 1."""
+    """The loop with limited forces: x = (log K, B/delta, c) with one weight c per channel, of the lag 1."""
 
     bounds = (0.0, 5.0)
-    _first = 0.5  # the weight that a search begins with
+    _first = 0.5  # first value of the weight
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.active = np.arange(loop.channels)
@@ -299,7 +299,7 @@ class LimiterLoop(SampledLoop):
         super().__init__(loop, band_hz)
 
     def point(self, coupling: SpringDamper) -> Array:
-        """The gains with a usual multiplier."""
+        """Return x of the gains with the first multiplier."""
         return np.append(super().point(coupling), np.full(self.loop.channels, self._first))
 
     def judged(self, x: Array) -> Requirement:
@@ -317,13 +317,13 @@ class LimiterLoop(SampledLoop):
 
 
 class KnownDeviceLoop(SampledLoop):
-    """Safe on known devices: x = (log K, B/delta, log of beta as a share of the largest one of each channel).
+    """The loop on known devices: x = (log K, B/delta, log of beta relative to its largest value on each channel).
 
     The condition is the Schur complement of the row of v, with M = -beta F/z + l21: He[F/(z-1)] + l11 - M*M/(4 l22).
     """
 
     bounds = (np.log(1e-3), np.log(0.999))
-    _first = 0.35  # the share that a search begins with: the optimum of the default loops lies at 0.29 to 0.47
+    _first = 0.35  # first value of the share; the default loops' optima are 0.29 to 0.47
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.active, self.share = np.arange(loop.channels), 1 - _SAMPLED_RESERVE
@@ -334,7 +334,7 @@ class KnownDeviceLoop(SampledLoop):
         return np.append(super().point(coupling), np.full(self.loop.channels, np.log(self._first)))
 
     def beta(self, x: Array) -> Array:
-        """beta (m,) [s] in x."""
+        """Return beta (m,) [s] in x."""
         return np.exp(x[2 * self.loop.channels :]) * self.largest
 
     def judged(self, x: Array) -> Requirement:
@@ -351,7 +351,7 @@ class KnownDeviceLoop(SampledLoop):
         self._z = z
 
     def _complement(self, x: Array) -> tuple[Array, Complex, Complex]:
-        """The least eigenvalue (k,) in units of Delta_D/T, its v (k, m), and M v/(4 l22) (k, m)."""
+        """Return the least eigenvalue (k,) in units of Delta_D/T, its vector v (k, m), and M v/(4 l22) (k, m)."""
         beta, z = self.beta(x), self._z
         F = self._lines * self._around(x, "conditions").G
         cost = period_cost(self.loop, np.full(z.size, self.share), beta)
@@ -369,7 +369,7 @@ class KnownDeviceLoop(SampledLoop):
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def room_slope(self, x: Array) -> Array:
-        """The gradient of `room`, in beta and in the poles by differences."""
+        """Return the gradient of `room`, with differences for beta and the poles."""
         room, v, below = self._complement(x)
         around, z, m = self._around(x, "conditions"), self._z, self.loop.channels
         left = v.conj() / (z - 1)[:, None] + 2 * below.conj() * self.beta(x) / z[:, None]
@@ -385,11 +385,11 @@ class KnownDeviceLoop(SampledLoop):
 
 
 # ----------------------------------------------------------------------------------------------------
-# The search: frequencies are added where a refined sweep finds the condition violated between those sampled.
+# The search, with frequencies added where a refined sweep finds a violation.
 
 
 def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, int]:
-    """(x of a local optimum that passes the refined sweep of its condition or None, searches)."""
+    """Return (x of a local optimum that passes the refined sweep or None, number of searches)."""
     x = sampled.point(start)
     for searches in range(1, budgets.GAIN_ROUNDS + 1):
         x = sampled.search(x, budgets.GAIN_STEPS[1 + (sampled.loop.channels <= FEW)]).x
@@ -397,7 +397,7 @@ def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, i
         if requirement.ratio <= 1 - RESERVE:
             return x, searches
         stuck = sampled.room(x).min() < -_STUCK
-        if stuck or requirement.frequency_hz is None:  # None: unstable, so there is no frequency to add
+        if stuck or requirement.frequency_hz is None:  # None: unstable, without a frequency to add
             return None, searches
         sampled.add(max(2 * np.pi * sampled.loop.T * requirement.frequency_hz, 1e-6))
     return None, budgets.GAIN_ROUNDS
@@ -406,10 +406,10 @@ def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, i
 def least_rms(
     sampled: Callable[[], SampledLoop], starts: Iterable[SpringDamper], band_hz: tuple[float, float] = BAND_HZ
 ) -> tuple[SpringDamper | None, float, int, Sequence[Sequence[float]] | None]:
-    """(gains, rms mismatch as a ratio, searches, multiplier) of the best local optimum; gains None if none was found.
+    """Return (gains or None, rms mismatch as a ratio, number of searches, multiplier) of the best local optimum.
 
-    `sampled` makes the condition, fresh for every start. Of more than FEW devices, where starts hardly matter and
-    steps are expensive, the first optimum is taken (`likeliest_first`).
+    `sampled` makes the loop anew for every start. For more than FEW devices, for which starts hardly matter and steps
+    are expensive, the first optimum is returned (`likeliest_first`).
     """
     best, least, searches, multiplier = None, np.inf, 0, None
     for start in starts:
@@ -428,7 +428,7 @@ def least_rms(
 
 
 def likeliest_first(sampled: SampledLoop, starts: Sequence[SpringDamper]) -> list[SpringDamper]:
-    """Where a few steps lead from each start, the least mismatch first; last what then still violates the condition."""
+    """Return the points after a few steps from each start, ordered by mismatch, with infeasible ones last."""
     points = [sampled.search(sampled.point(start), budgets.GAIN_STEPS[0]).x for start in starts]
     points.sort(key=lambda x: (sampled.room(x).min() < -_ROUGH, sampled.square_mismatch(x)))
     return [sampled.coupling(x) for x in points]

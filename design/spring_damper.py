@@ -1,6 +1,6 @@
 """Spring-damper couplings (26): the best under either condition, the stiffest, and the moving average.
 
-any-environment has a convex set of gains, described here; for one environment design.gain_search looks for them.
+any-environment has a convex set of gains, described here; design.gain_search searches gains for one environment.
 
 Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (gain_set).
 """
@@ -55,18 +55,18 @@ from haptic_loop.design.transparency import BAND_HZ, decibels, transparency
 # ----------------------------------------------------------------------------------------------------
 # The convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
 #
-# A channel has V = 1/W with W = k + b (1 - 1/z). Multiplied by W and its conjugate, what V brings to the block of
-# `any_environment_demand` is k/2 + b, what the damping takes is |Theta-hat W|^2, and the row of a multiplier is
-# 2 (1 - Theta-hat W): in Schur's form all is affine in (k, b), without conservatism. A test compares it to that block.
+# A channel has V = 1/W with W = k + b (1 - 1/z). After multiplication by W and its conjugate, the part of V in the
+# block of `any_environment_demand` is k/2 + b, that of the damping is |Theta-hat W|^2, and the row of a multiplier is
+# 2 (1 - Theta-hat W). By a Schur complement this is affine in (k, b), without conservatism.
 #
-# `lemma1` makes it one matrix inequality, with half as many unknowns as entries; beyond _MOST_STORED of these it is
-# imposed frequency by frequency, in the two unknowns alone, and where the solution fails in between, there too. These
-# sets contain the exact one and the rounds shrink them to it: both ways end at the same gains.
+# `lemma1` makes it one matrix inequality whose unknowns are half of its entries. With more than _MOST_STORED unknowns
+# the inequality is imposed at frequencies, in (k, b) alone, and again where the solution violates it. Both ways end at
+# the same gains.
 
 
-_MOST_STORED = 180  # unknowns besides the gains, of all channels
-_PER_LOBE = 8  # frequencies per ripple of a delay at which the inequality is imposed first
-_MISSED = 2e-6  # of the usable damping: what the inequality may miss in between, far less than the reserve of a design
+_MOST_STORED = 180  # largest number of unknowns besides the gains, of all channels
+_PER_LOBE = 8  # initial frequencies per ripple of a delay
+_MISSED = 2e-6  # allowed violation between frequencies, relative to the usable damping; far below a design's reserve
 
 
 @dataclass(frozen=True)
@@ -74,10 +74,10 @@ class _Channel:
     """The gains (k, b) of one device, in units of its usable damping."""
 
     theta: int
-    shortage: float  # phi of its multiplier, 0 where psi is
+    shortage: float  # phi of its multiplier, 0 if psi = 0
 
     def rows(self, gains: Array) -> Lti:
-        """c with k/2 + b >= |c|^2 on |z| = 1; its C and D are affine in the gains, its A and B are fixed."""
+        """Return c with k/2 + b >= |c|^2 on |z| = 1; its C and D are affine in the gains, its A and B are fixed."""
         k, b = gains
         late = theta_hat((self.theta,), np.ones(1), 1.0)  # a delay line: D and C are its coefficients
         taken = taps(np.convolve(np.append(late.D, late.C), [k + b, -b]).tolist(), 1.0)
@@ -86,7 +86,7 @@ class _Channel:
         return vstack(taken, (np.eye(1) - taken) * (1 / np.sqrt(1 / self.shortage - 1)))
 
     def exactly(self, unknowns: Sequence[int]) -> Inequality:
-        """At all frequencies; the unknowns behind the gains are a storage."""
+        """Return the inequality at all frequencies; the unknowns after the gains are a storage."""
 
         def matrix(x: Array) -> Array:
             c = self.rows(x[:2])
@@ -98,7 +98,7 @@ class _Channel:
         return Inequality.of(matrix, unknowns)
 
     def sampled(self, unknowns: Sequence[int], w: Array) -> Inequality:
-        """At the frequencies w [rad/sample], as [[k/2 + b, c'], [c, I]] >= 0."""
+        """Return the inequality [[k/2 + b, c'], [c, I]] >= 0 at the frequencies w [rad/sample]."""
         z = on_circle(w)
 
         def arrows(x: Array) -> Array:
@@ -111,18 +111,18 @@ class _Channel:
         return Inequality.of(arrows, unknowns)
 
     def missed(self, gains: Array) -> Array:
-        """Peaks [rad/sample] at which the gains miss the inequality by more than _MISSED."""
+        """Return peaks [rad/sample] at which the gains violate the inequality by more than _MISSED."""
         c, room = self.rows(gains), gains[0] / 2 + gains[1]
         excess = lambda w: (np.abs(c.at(on_circle(w))) ** 2).sum(axis=(1, 2)) - room  # noqa: E731
         return peaks(excess, self.grid(2), _MISSED)
 
     def grid(self, finer: int = 1) -> Array:
-        """_PER_LOBE to each ripple, from 0 to pi [rad/sample]."""
+        """Return frequencies from 0 to pi [rad/sample], _PER_LOBE for each ripple."""
         return np.linspace(0, np.pi, finer * _PER_LOBE * (self.theta + 1) + 1)
 
 
 class GainSet:
-    """The gains of any-environment in units of the usable damping, with phi (m,) [N s/m] where psi >= 1."""
+    """The gains of any-environment in units of the usable damping, with phi (m,) [N s/m] if psi >= 1."""
 
     def __init__(self, loop: Loop, phi: Array | None = None, most_stored: int = _MOST_STORED) -> None:
         shortage = np.zeros(loop.channels) if phi is None else phi / usable(loop)
@@ -131,10 +131,10 @@ class GainSet:
         self._stored = stored if stored.sum() <= most_stored else None
 
     def solve(self, cost: Array, what: str, more: Sequence[Inequality] = ()) -> Array:
-        """The unknowns of least cost: gains (k_1, ..., k_N, b_1, ..., b_N), each channel's in its set, then others.
+        """Return the unknowns of least cost: gains (k_1, ..., k_N, b_1, ..., b_N) in their sets, then others.
 
-        `more` inequalities bound these, too. Raises as ConeProgram.solve, and DesignFailed where one still fails after
-        all rounds.
+        `more` are further inequalities. Raises the errors of ConeProgram.solve, and DesignFailed if the gains violate
+        an inequality after all rounds.
         """
         N, own = len(self.channels), len(cost)
         blocks = [*more, Inequality.least(range(2 * N), 0.0)]
@@ -160,12 +160,12 @@ class GainSet:
 # One step of the convex-concave sequence for ||W1 L W2||_inf (23) over spring-damper gains.
 #
 # With g = k + b (1 - 1/z) per channel the norm is below mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1: L g
-# is affine in the gains, and g* g is replaced by its tangent at the gains before, which lies below it. So every step
-# keeps what the one before achieved, and mu^2 enters linearly: no bisection.
+# is affine in the gains, and g* g is replaced by its tangent at the previous gains, which lies below it. So no step
+# increases the norm, and mu^2 enters linearly, without bisection.
 
 
 def step(shaping: Shaping, gains: GainSet, at: Array, norm: float, w: Array) -> tuple[Array, float]:
-    """(gains, bound on the norm at the frequencies w) of one convex-concave step from the gains `at`."""
+    """Return (gains, bound on the norm at the frequencies w) after one convex-concave step from the gains `at`."""
     cost = np.append(np.zeros(at.size), 1.0)
     cuts = _tangent(shaping, at, norm, w)
     x = gains.solve(cost, "a step of the convex sequence", [cuts])
@@ -188,9 +188,9 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
     return gain_block(range(2 * N + 1), rows, row_slopes, base, tangent[..., None] * diagonal)
 
 
-#: The sequence stops when a step improves the norm by less than this, relatively.
+#: relative improvement of the norm at which the sequence stops
 _SETTLED = 1e-6
-#: A damper of less than this share of the device's damping is none: solvers leave 1e-9 where the optimum has zero.
+#: dampers below this share of the device's damping become 0: solvers leave 1e-9 instead of zero
 _NEGLIGIBLE = 1e-6
 
 
@@ -204,15 +204,14 @@ def design(
     W1: Lti | None = None,
     W2: Lti | None = None,
 ) -> Design:
-    """The best spring-damper under `condition`; by default the starts are chosen, a start need not be feasible.
+    """Return the best spring-damper under `condition`. Starts need not be feasible; there are default ones.
 
     any-environment: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start.
-    this-environment: minimises the rms mismatch in this environment from every start, local optima only; with
-    `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it, with `limiter` also
-    while forces are limited (any-environment is anyway, at no cost).
-    `band_hz` is where the mismatch counts.
+    this-environment: finds local optima of the rms mismatch over `band_hz` [Hz] from every start. With `switching` =
+    (lo, hi) [samples] the coupling is safe under any switching of the forces' delays, with `limiter` also while forces
+    are limited (any-environment always covers this).
 
-    Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for this-environment.
+    Raises Infeasible if Theorem 4 admits no gains, DesignFailed if the search finds none for this-environment.
     """
     if named(condition) in (KNOWN_DEVICE, KNOWN_DEVICE_ANY):
         if switching or limiter:
@@ -227,10 +226,10 @@ def design(
     return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
 
 
-#: Digits that gains keep in a loop of many devices, finer than RESERVE: with all of them exact proofs take minutes.
+#: digits of gains in a loop of many devices, finer than RESERVE: with all digits exact proofs take minutes
 _DIGITS = 5
-_SWEEPS = 150  # take as long as a search for gains in this environment
-#: Devices whose search ends within half a minute.
+_SWEEPS = 150  # cost of a search for gains in this environment, in sweeps
+#: largest number of devices whose search ends within half a minute
 _MOST_ANY, _MOST_LIMITED = 48, 32
 
 
@@ -240,11 +239,11 @@ def _require_few(loop: Loop, most: int, what: str) -> None:
 
 
 def design_with(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
-    """A spring-damper, with the limiter's block in the place of the linear one where that is asked for or usual.
+    """Return a spring-damper; it covers limited forces if `limiter` is True, or None and such a coupling is found.
 
-    Raises DesignFailed at once for so many devices that the search would take minutes.
+    Raises DesignFailed at once if the number of devices would make the search take minutes.
     """
-    if not named(condition).extensible:  # with rho = 0 it covers limited forces anyway
+    if not named(condition).extensible:  # It covers limited forces with rho = 0.
         if limiter and named(condition) is KNOWN_DEVICE:
             raise ValueError("limiter: forces that are limited are not covered by known-device, ask this-environment")
         _require_few(
@@ -289,7 +288,7 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
 
 
 def _short(coupling: SpringDamper) -> SpringDamper:
-    """The gains of many devices, in so few digits that a proof stays short."""
+    """Return gains of many devices with few digits, so that a proof stays short."""
     if coupling.K.size <= FEW:
         return coupling
     K, B = ([float(f"{v:.{_DIGITS}g}") for v in gains] for gains in (coupling.K, coupling.B))
@@ -303,7 +302,7 @@ def _for_this_environment(
     limiter: bool,
     band_hz: tuple[float, float] | None,
 ) -> Design:
-    each = np.full(loop.channels, 1000.0)  # gains do not matter to how long it takes
+    each = np.full(loop.channels, 1000.0)  # any gains; the time does not depend on them
     if reason := too_long(loop.F(SpringDamper(each, each / 1000)), _SWEEPS):
         raise DesignFailed(None, (), reason)
     started, starts = time.perf_counter(), starts or _default_starts(loop)
@@ -315,7 +314,7 @@ def _for_this_environment(
     if many:
         starts = likeliest_first(sampled(), starts)
     coupling, rms, searches, c = (None, np.inf, 0, None) if many and limiter else least_rms(sampled, starts, band)
-    if limiter:  # a little softer than without limits: nearly always found from there
+    if limiter:  # The result is a little softer than without limits, so the search starts there.
         limited = partial(LimiterLoop, loop, band)
         linear, before = coupling, searches
         coupling, rms, searches, c = least_rms(limited, [linear] if linear else starts, band)
@@ -342,9 +341,9 @@ def _for_this_environment(
 
 
 def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tuple[float, float] | None) -> Design:
-    """The spring-damper of least rms mismatch under known-device; that of this-environment where it is no worse.
+    """Return the spring-damper of least rms mismatch under known-device or this-environment.
 
-    Raises DesignFailed where neither certifies one, or the condition says nothing of the loop.
+    Raises DesignFailed if neither certifies one, or if known-device does not cover the loop.
     """
     if reason := KNOWN_DEVICE.beyond(loop):
         raise DesignFailed(None, (), f"{KNOWN_DEVICE.name}: {reason}")
@@ -371,11 +370,11 @@ def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tupl
 
 
 _ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4, 12)])  # shares of the largest beta
-_ON_CIRCLE = 721  # frequencies at which the set of gains is imposed, from 0 to pi
+_ON_CIRCLE = 721  # number of frequencies from 0 to pi at which the set of gains is imposed
 
 
 def _stiffest_known(loop: Loop) -> Design:
-    """The stiffest spring-damper that known-device-any certifies, channel by channel; objective in N/m, all together.
+    """Return the stiffest spring-damper that known-device-any certifies; the objective is the sum of K [N/m].
 
     He[V/(1-z)] > chi is Re W > chi |W|^2 |1 - 1/z|^2/T with W = K/D + B and Re W = K T/2 + B: a convex set of (K, B)
     for each beta, on which the largest K for a given B is the least root of a quadratic over frequency. B and beta are
@@ -397,14 +396,14 @@ def _stiffest_known(loop: Loop) -> Design:
 
 
 def _stiffest_channel(loop: Loop) -> tuple[float, float]:
-    """K [N/m] and B [N s/m] of the stiffest spring-damper before any environment, with the reserve of a design."""
+    """Return K [N/m] and B [N s/m] of the stiffest spring-damper before any environment, with a design's reserve."""
     from scipy.optimize import minimize_scalar  # slow to load
 
     z = on_circle(np.linspace(1e-6, np.pi, _ON_CIRCLE))
     steps = np.abs(1 - 1 / z) ** 2 / loop.T
 
     def stiffest(B: float, limits: Array) -> float:
-        """The largest K with K T/2 + B >= limits steps |K/D + B|^2 at all frequencies, 0 where there is none.
+        """Return the largest K with K T/2 + B >= limits steps |K/D + B|^2 at all frequencies, or 0.
 
         |1/D|^2 steps = T, and the real part of 1/D is T/2.
         """
@@ -418,7 +417,7 @@ def _stiffest_channel(loop: Loop) -> tuple[float, float]:
         return float(high.min()) if low.max() <= high.min() else 0.0
 
     def at(eta: float) -> tuple[float, float]:
-        """(-K, B) of the best B for this share of the largest beta."""
+        """Return (-K, B) of the best B for this share of the largest beta."""
         beta = eta * largest_beta(loop, 1 - _STIFF_RESERVE)
         cost = period_cost(loop, np.full(z.size, 1 - _STIFF_RESERVE), beta)
         limits = chi(z, loop.theta, cost, beta)[:, 0]
@@ -434,16 +433,16 @@ def _stiffest_channel(loop: Loop) -> tuple[float, float]:
     return float(f"{-K:.{_STIFF_DIGITS}g}"), float(f"{B:.{_STIFF_DIGITS}g}")
 
 
-_TAPS = 4096  # frequencies from which the Fourier coefficients of chi are taken
-_SLACK = 2e-4  # of the largest chi: what a coupling has above it, half of which may be lost to the truncation
+_TAPS = 4096  # number of frequencies for the Fourier coefficients of chi
+_SLACK = 2e-4  # constant above chi, relative to the largest chi; truncation may use half of it
 
 
 def _stiffest_linear(loop: Loop) -> Design:
-    """The stiffest linear coupling that known-device-any certifies, channel by channel; objective in N/m, all together.
+    """Return the stiffest linear coupling that known-device-any certifies; the objective is the sum in N/m.
 
     V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k has He[V/(1-z)] = chi, with the Fourier coefficients chi_k of chi and
-    V(1) = 2 chi_0; no linear coupling is stiffer, since V(1)/2 is the mean of He[V/(1-z)]. The series ends where what
-    is left is below half of the constant that is added.
+    V(1) = 2 chi_0; no linear coupling is stiffer, since V(1)/2 is the mean of He[V/(1-z)]. The series ends where the
+    rest is below half of the added constant.
     """
     from scipy.optimize import minimize_scalar  # slow to load
 
@@ -464,7 +463,7 @@ def _stiffest_linear(loop: Loop) -> Design:
         eta = float(found.x)
         limits = needed(eta)
         series = np.fft.rfft(limits).real / _TAPS
-        left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # of the terms from each on
+        left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # sums of the terms from each one on
         count = int(np.argmax(left < _SLACK / 2 * limits.max()))
         kept = series[1:count]
         weights = -2 * np.diff(np.append(kept, 0.0), prepend=0.0)
@@ -480,16 +479,16 @@ def _stiffest_linear(loop: Loop) -> Design:
     return Design(coupling, KNOWN_DEVICE_ANY.name, "stiffness", stiffness, requirement, 0, wall_s)
 
 
-_TAP_DIGITS = 12  # of a coefficient: the error is far below the slack, and the exact proof stays short
-_STIFF_RESERVE = 1e-3  # of the damping: gains are rounded to six digits, and frequencies lie between those imposed
+_TAP_DIGITS = 12  # digits of a coefficient; their error is far below the slack
+_STIFF_RESERVE = 1e-3  # unused share of the damping, for rounded gains and frequencies between the imposed ones
 _STIFF_DIGITS = 6
 
 
 def _default_starts(loop: Loop) -> list[SpringDamper]:
-    """Around 2 d/(n T), the stiffness that no linear coupling exceeds for any passive environment.
+    """Return starts around 2 d/(n T), the largest stiffness of a linear coupling before any passive environment.
 
-    With delay in the environment a loop is stable if the coupling is the stiffer of the two at every frequency,
-    which the last start takes from the environment's stiffness at half the sampling rate.
+    With delay in the environment a loop is stable if the coupling is stiffer than the environment at every frequency;
+    the last start has the environment's stiffness at half the sampling rate.
     """
     spend = usable(loop)
     K = spend / (loop.T * (np.asarray(loop.theta) + np.asarray(loop.psi) + 1))
@@ -501,12 +500,10 @@ def _default_starts(loop: Loop) -> list[SpringDamper]:
 
 
 def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
-    """The stiffest linear coupling that Theorem 4 admits; objective in N/m, of all channels together.
-
-    With the condition known-device-any the stiffest that it admits, `_stiffest_linear`.
+    """Return the stiffest linear coupling that Theorem 4 or known-device-any admits; the objective is in N/m.
 
     V = T/(2 delta) (1 + ... + z^-theta) needs exactly delta at every frequency. With the constant e n^2 T/(2 delta)
-    beside it, n = theta + 1, it needs delta/(1 + e) where the sum is largest, and less elsewhere.
+    added, n = theta + 1, it needs delta/(1 + e) where the sum is largest, and less elsewhere.
     """
     if condition == KNOWN_DEVICE_ANY.name:
         return _stiffest_linear(loop)
@@ -522,7 +519,7 @@ def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
 
 
 def _stiffest_in_frame(loop: Loop) -> Design:
-    """The stiffest linear coupling for any environment where forces latch late or delays switch; N/m, all together.
+    """Return the stiffest linear coupling for any environment with a latency or switching delays.
 
     He[V/(1-z)] = chi is attained by V = V(1) - 2 (z-1) sum_{k>=1} chi_k z^-k, whose series is finite, and V(1)/2 is the
     mean of chi (docs/theory.md). The multiplier of least mean is found by a convex program, or in closed form.
@@ -544,7 +541,7 @@ def _stiffest_in_frame(loop: Loop) -> Design:
 
 
 def _late_chi(loop: Loop, i: int) -> Array:
-    """chi_0, chi_1, .. of l (Q delta)^-1 l*/4 with l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta], with the best Q."""
+    """Return chi_k of l (Q delta)^-1 l*/4 with l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta], with the best Q."""
     (first, last), theta = (loop.latency or ())[i], loop.theta[i]
     inverse = np.diag([last, (loop.T_max or loop.T) - first])
     if first < last:
@@ -556,7 +553,7 @@ def _late_chi(loop: Loop, i: int) -> Array:
 
 
 def _switched_chi(loop: Loop, i: int) -> Array:
-    """chi_0, .. of |vt|^2/(4 (delta/T - alpha/2)) + h^2/(2 alpha), vt the mean window, at the alpha of least chi_0."""
+    """Return chi_k of |vt|^2/(4 (delta/T - alpha/2)) + h^2/(2 alpha), vt the mean window, with the best alpha."""
     lo, hi = loop.delays.lo[i], loop.delays.hi[i]
     damping, half = (1 - RESERVE) * loop.delta[i] / (loop.T_max or loop.T), (hi - lo) / 2
     window = np.where(np.arange(hi + 1) > lo, 0.5, 1.0)
@@ -594,9 +591,9 @@ _Q = "q11", "q12", "q22"
 
 
 def _moving_average_of_levels(loop: Loop, started: float) -> Design:
-    """The stiffest linear coupling of matrix levels: V = T/2 Delta^-1 (1 + .. + z^-theta), and a little more.
+    """Return the stiffest linear coupling for matrix levels: V = T/2 Delta^-1 (1 + .. + z^-theta) with a reserve.
 
-    It attains V(1) = T/2 blockdiag(n_i Delta_i^-1), the least of all by a matrix inequality.
+    It attains the lower bound V(1) = T/2 blockdiag(n_i Delta_i^-1) of a matrix inequality.
     """
     inverses = np.linalg.inv(even_level(loop)) * loop.T / 2
     weight = np.array([[float(f"{v:.{_TAP_DIGITS}g}") for v in row] for row in (inverses + inverses.T) / 2])
@@ -611,7 +608,7 @@ def _moving_average_of_levels(loop: Loop, started: float) -> Design:
 def _verified(
     loop: Loop, coupling: Coupling, phi: Array | None, figure: str, objective: float, sdps: int, started: float
 ) -> Design:
-    """The design, with Theorem 4's requirement from the coupling alone; raises DesignFailed unless it is certified."""
+    """Return the design with the requirement of Theorem 4. Raises DesignFailed unless it is certified."""
     requirement = ANY_ENVIRONMENT.required(loop, coupling, phi)
     if not requirement.certified:
         why = requirement.reason or f"it requires {max(requirement.required):.6g} N s/m"
@@ -626,10 +623,10 @@ def _coupling(loop: Loop, gains: Array) -> SpringDamper:
 
 
 def _start(loop: Loop, certified: GainSet, start: SpringDamper | None) -> Array:
-    """The gains of the set nearest to `start`, or the stiffest of the set."""
+    """Return the gains of the set nearest to `start`, or the stiffest ones of the set."""
     N, more = loop.channels, []
     cost = np.repeat([-1.0, 0.0], N)
-    if start is not None:  # of least t with |gains - wanted| <= t
+    if start is not None:  # minimise t with |gains - wanted| <= t
         wanted = np.concatenate([start.K * loop.T, start.B]) / np.tile(usable(loop), 2)
         cost = np.append(np.zeros(2 * N), 1.0)
 
