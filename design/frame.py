@@ -1,14 +1,14 @@
 """The block of a condition, composed from one hands' side and the facts of the environment's side.
 
-Every proof in docs/theory.md has two sides, which meet only in the displacements and in the forces as the devices
-receive them. The **hands' side** bounds from below what every passive hand takes, whatever forces act. Its inputs are
-the displacements of a period: dx, or xa and xb before and after a force latches. A **fact** of the environment's side
-says how forces come about; it adds inputs, a row for each, and multipliers. The block's form, summed over ticks, is
+Every proof in docs/theory.md has two sides, which share only the displacements and the forces as the devices receive
+them. The **hands' side** is a lower bound of the energy that every passive hand and the devices take, whatever forces
+act. Its inputs are the displacements of a period: dx, or xa and xb before and after a force latches. A **fact** of the
+environment's side describes the forces; it adds inputs, a row for each, and multipliers. The quadratic form is
 
-    sum f'(displacement that f multiplies) + what the damping takes + the multipliers' terms,
+    sum over ticks of f'(displacement that f multiplies) + energy taken by the damping + terms of the multipliers,
 
-and the block must be strictly positive real, with its pole at z = 1 split off. `Collected` holds what the hands' side
-and the facts enter, and builds the block in any arithmetic.
+and its block must be strictly positive real, with its pole at z = 1 split off. `Collected` collects the entries of both
+sides and builds the block in any arithmetic.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Demand(Generic[AnyBlock]):
     gain: AnyBlock
     static: Mapping[str, Array] = field(default_factory=dict)
     semidefinite: tuple[str, ...] = ()
-    spare: Array | None = None  # (n,) that the diagonal keeps in a search for multipliers
+    spare: Array | None = None  # (n,) margin of the diagonal in a search for multipliers
 
     def __post_init__(self) -> None:
         for name, part in (("free", self.free), ("gain", self.gain)):
@@ -53,10 +53,10 @@ class Demand(Generic[AnyBlock]):
 
 
 def even_damping(loop: Loop, T: Number | None = None) -> Any:
-    """Delta_D T/T_max [N s/m], (m,): the damping that does in even periods T what delta does in periods up to T_max.
+    """Return Delta_D T/T_max [N s/m], (m,), the damping in even periods T that equals delta in periods up to T_max.
 
-    The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. Nothing else
-    in the energy balance depends on T: the force map is the same at every tick, however long the tick is.
+    The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. The rest of
+    the energy balance does not depend on T: the force map is the same at every tick.
     """
     T = loop.T if T is None else T
     damping = numbers(loop.delta, T)
@@ -64,7 +64,7 @@ def even_damping(loop: Loop, T: Number | None = None) -> Any:
 
 
 def even_level(loop: Loop, T: Number | None = None) -> Any:
-    """Delta_D T/T_max [N s/m], (m, m), as `even_damping` has its diagonal."""
+    """Return Delta_D T/T_max [N s/m] as a matrix (m, m)."""
     T = loop.T if T is None else T
     level = loop.Delta(exact=isinstance(T, Fraction))
     return level if loop.T_max is None else level * (T / numbers(loop.T_max, T))
@@ -74,7 +74,7 @@ Weights = Sequence[Any]  # w_0 + w_1/z + .. of a row, or w_0 + w_1 z + .. of a d
 
 
 def product(p: Weights, q: Weights) -> list[Any]:
-    """The weights of the product of two polynomials."""
+    """Return the weights of the product of two polynomials."""
     out: list[Any] = [0] * (len(p) + len(q) - 1)
     for i, a in enumerate(p):
         for j, b in enumerate(q):
@@ -83,9 +83,9 @@ def product(p: Weights, q: Weights) -> list[Any]:
 
 
 def less_advance(p: Weights, follows: Any) -> list[Any]:
-    """The weights of (p(1/z) - follows z)/(z - 1) for p(1) = follows: causal, with the same number of weights.
+    """Return the weights of (p(1/z) - follows z)/(z - 1) for p(1) = follows, which is causal.
 
-    With p = z^-theta it is -(1 + 1/z + .. + z^-theta), the window of a delay with its sign turned.
+    For p = z^-theta this is -(1 + 1/z + .. + z^-theta), the negative window of a delay.
     """
     out, left = [], follows
     for weight in p:
@@ -100,27 +100,27 @@ class Input:
 
     name: str
     channel: int
-    moved: Weights = (1,)  # w_0 + w_1 z + ..: its share of the displacement that the force f[k] multiplies
-    follows: int = 1  # 1 where the environment follows it, 0 for a speed
-    slips: bool = True  # whether the limiter's slip is taken off it
+    moved: Weights = (1,)  # w_0 + w_1 z + ..: its weights in the displacement that the force f[k] multiplies
+    follows: int = 1  # 1 if the environment follows it, 0 for a speed
+    slips: bool = True  # whether the limiter's slip is subtracted from it
 
 
 class Collected(Generic[AnyBlock]):
-    """What hands' side and facts enter: inputs, weights of forces, rows, and constant terms."""
+    """The entries of hands' side and facts: inputs, weights of forces, rows, and constant terms."""
 
     def __init__(
         self, T: Number, path: Sequence[Weights], walls: int, hands: Sequence[Input], any_object: bool = False
     ) -> None:
-        """Begin with the rows of the hands' inputs.
+        """Enter the rows of the hands' inputs.
 
-        With `any_object` the displacement that a force multiplies is relative to what a passive object behind the
-        forces as they leave does: x[k] - x[k-1] beside f_e[k] is taken off (docs/theory.md, "any environment").
+        With `any_object` the energy of a passive object behind the forces as they leave is subtracted: the factor of
+        f_e[k] is the displacement without x[k] - x[k-1] (docs/theory.md, "any environment").
         """
         self.T, self.channels, self.walls = T, len(path), walls
-        self.path, self.hands = path, hands  # path: per channel the weights of the nominal delay of its forces
+        self.path, self.hands = path, hands  # path: the weights of each channel's nominal delay
         self.places: dict[tuple[str, int], int] = {}  # (name, channel or wall) -> input
         self._into: list[tuple[int, int, Weights]] = []  # (output of the inputs' filter, input, weights)
-        self._force: list[tuple[int, int, Weights]] = []  # (channel, input, weights) beside the environment's response
+        self._force: list[tuple[int, int, Weights]] = []  # (channel, input, weights), besides the response
         self._sums: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of f_e, scale)
         self._steps: list[tuple[int, int, Weights, Any]] = []  # (row, channel, weights of df_e, scale)
         self._walls: list[tuple[int, int, Any, bool]] = []  # (row, wall, weight of dy, whether it is summed)
@@ -130,20 +130,20 @@ class Collected(Generic[AnyBlock]):
         self._keep: list[tuple[int, float]] = []
         for i in hands:
             row, weights = self.input(i.name, i.channel), product(path[i.channel], i.moved)
-            if any_object or not i.follows:  # no pole: the weights of a speed add up to 0
+            if any_object or not i.follows:  # The weights of a speed add up to 0, so there is no pole.
                 self.steps(row, i.channel, less_advance(weights, i.follows))
             else:
                 self.sums(row, i.channel, weights)
                 self._into.append((i.channel, row, (1,)))
 
     def limit(self) -> None:
-        """Take the limiter's slip off the displacements that carry it: an input more per channel."""
+        """Subtract the limiter's slip, one more input per channel, from the displacements of inputs with `slips`."""
         for i in self.hands:
             if i.slips:
                 self.input("de", i.channel)
 
     def take(self, damping: Any, rest: Sequence[Any] = ()) -> None:
-        """Enter the quadratic form of the hands' side, of displacements from which no slip is taken off."""
+        """Enter the quadratic form of the hands' side, in displacements without subtracted slip."""
         parts = [self._with_slip(i) for i in self.hands]
         for enter, form in zip((self.damping, self.term, self.before), (damping, *rest), strict=False):
             for g, h in zip(*np.nonzero(form), strict=True):
@@ -152,25 +152,25 @@ class Collected(Generic[AnyBlock]):
                         enter(row, column, form[g, h])
 
     def _with_slip(self, i: Input) -> list[int]:
-        """The numbers of the inputs of which a hands' input consists."""
+        """Return the numbers of the inputs that add up to a hands' input."""
         slip = self.places.get(("de", i.channel)) if i.slips else None
         return [self.places[i.name, i.channel], *([] if slip is None else [slip])]
 
     def input(self, name: str, place: int) -> int:
-        """A new input, of a device or a wall; its number."""
+        """Add an input of a device or a wall and return its number."""
         self.places[name, place] = len(self.places)
         return len(self.places) - 1
 
     def of(self, name: str) -> dict[int, int]:
-        """The inputs of a name: device or wall -> number."""
+        """Return the inputs of a name as device or wall -> number."""
         return {place: i for (known, place), i in self.places.items() if known == name}
 
     def slip(self, channel: int) -> int:
-        """The limiter's slip of a channel."""
+        """Return the number of the limiter's slip of a channel."""
         return self.places["de", channel]
 
     def moving(self, channel: int) -> list[tuple[int, Weights]]:
-        """The inputs of which the displacement that a channel's force multiplies consists, with their weights in z."""
+        """Return the inputs that add up to the displacement that a channel's force multiplies, with weights in z."""
         parts: list[tuple[int, Weights]] = [
             (self.places[i.name, i.channel], i.moved) for i in self.hands if i.channel == channel
         ]
@@ -180,49 +180,49 @@ class Collected(Generic[AnyBlock]):
     def size(self) -> int:
         return len(self.places)
 
-    # -- what an input does
+    # -- effects of inputs
 
     def press(self, i: int, wall: int, weights: Weights) -> None:
-        """A share of the steps of a wall's force."""
+        """Let input i add to the steps of a wall's force."""
         self._into.append((self.channels + wall, i, weights))
 
     def force(self, i: int, channel: int, weights: Weights) -> None:
-        """A share of the steps of a device's force beside what the environment answers."""
+        """Let input i add to the steps of a device's force, besides the environment's response."""
         self._force.append((channel, i, weights))
 
-    # -- what a row reads
+    # -- terms of rows
 
     def sums(self, row: int, channel: int, weights: Weights, scale: Any = 1) -> None:
-        """The row reads weights of the force as it leaves, which is the sum of its steps: a pole at z = 1."""
+        """Add the weighted force as it leaves to a row; as the sum of its steps it has a pole at z = 1."""
         self._sums.append((row, channel, weights, scale))
 
     def steps(self, row: int, channel: int, weights: Weights, scale: Any = 1) -> None:
-        """The row reads weights of the steps of the force as it leaves."""
+        """Add the weighted steps of the force as it leaves to a row."""
         self._steps.append((row, channel, weights, scale))
 
     def way(self, row: int, wall: int, weight: Any, summed: bool = False) -> None:
-        """The row reads the steps of the way into a wall, or the way itself."""
+        """Add the steps of the way into a wall to a row, or the way itself if `summed`."""
         self._walls.append((row, wall, weight, summed))
 
     def term(self, row: int, column: int, weight: Any) -> None:
-        """The row reads an input."""
+        """Add the weighted input `column` to a row."""
         self._terms.append((row, column, weight))
 
     def before(self, row: int, column: int, weight: Any) -> None:
-        """The row reads an input of the tick before."""
+        """Add the weighted input `column` of the previous tick to a row."""
         self._before.append((row, column, weight))
 
     def damping(self, row: int, column: int, weight: Any) -> None:
-        """As `term`, in proportion to the damping of the devices."""
+        """Add a term that is proportional to the damping of the devices."""
         self._gain.append((row, column, weight))
 
     def keep(self, row: int, amount: float) -> None:
-        """An amount that the diagonal keeps in a search, so that multipliers may be rounded."""
+        """Add a margin to the diagonal in a search, so that multipliers may be rounded."""
         self._keep.append((row, amount))
 
     @property
     def spare(self) -> Array | None:
-        """(n,) what `keep` collected, None where that is nothing."""
+        """The margins (n,) of `keep`, or None."""
         spare = np.zeros(self.size)
         for row, amount in self._keep:
             spare[row] += amount
@@ -232,7 +232,7 @@ class Collected(Generic[AnyBlock]):
 
     @property
     def states(self) -> int:
-        """How many states the block has beside those of the environment's response."""
+        """The number of states of the block besides those of the environment's response."""
         return self._bank(self._reads()[1]).order + self._filter()[0].order
 
     def _matrix(self, entries: Sequence[tuple[int, int, Any]]) -> Any:
@@ -245,18 +245,18 @@ class Collected(Generic[AnyBlock]):
         return self._matrix(self._gain)
 
     def _reads(self) -> tuple[list[tuple[int, Any, bool]], list[tuple[int, Weights]]]:
-        """Per reading of the forces (row, scale, summed); and (channel, weights)."""
+        """Return (row, scale, summed) of each term with forces, and its (channel, weights)."""
         kinds = [*((r, True) for r in self._sums), *((r, False) for r in self._steps)]
         return [(row, scale, summed) for (row, _, _, scale), summed in kinds], [(c, w) for (_, c, w, _), _ in kinds]
 
     def _bank(self, reads: Sequence[tuple[int, Weights]]) -> Lti:
-        """Forces as they leave (m,) -> one output per reading, over one delay line per channel."""
+        """Return the block from forces as they leave (m,) to the weighted forces, with one delay line per channel."""
         order = sorted(range(len(reads)), key=lambda r: reads[r][0])
         parts = [_taps([w for c, w in reads if c == channel], self.T) for channel in range(self.channels)]
         return Lti.diag(*parts).rows(np.argsort(order)) if reads else Lti.constant(np.zeros((0, self.channels)), self.T)
 
     def _filter(self) -> tuple[Lti, list[int]]:
-        """Inputs -> (x, p, steps of forces beside, inputs of the tick before); and which those last inputs are."""
+        """Return the block from inputs to (x, p, added steps of forces, previous inputs), and which are the last."""
         late = sorted({j for _, j, _ in self._before})
         first, second = self.channels + self.walls, 2 * self.channels + self.walls
         entries = [*self._into, *((first + c, i, w) for c, i, w in self._force)]
@@ -264,19 +264,19 @@ class Collected(Generic[AnyBlock]):
         return _of_weights(entries, second + len(late), self.size, self.T), late
 
     def build(self, G: AnyBlock | None) -> tuple[Array, AnyBlock, Any]:
-        """(the residue at z = 1, (n, n); the block without its pole; the part that damping multiplies).
+        """Return (residue at z = 1 (n, n), block without its pole, matrix that the damping multiplies).
 
-        G takes [x; p], displacements and wall forces, to [f_e; y], forces as they leave and ways into walls. None: no
-        environment, whose forces' steps are an input instead (`force`).
+        G maps [x; p], displacements and wall forces, to [f_e; y], forces as they leave and ways into walls. With None
+        the steps of the forces are inputs instead (`force`).
         """
         m, w, n, T = self.channels, self.walls, self.size, self.T
         into, late = self._filter()
         rows, reads = self._reads()
         bank = self._bank(reads)
         follows = len(reads)
-        # signals: readings of the forces, ways into walls, inputs of the tick before
+        # signals: weighted forces, ways into walls, inputs of the previous tick
         inner = m + w  # outputs of G
-        rest = m + len(late)  # outputs of the filter that pass beside G
+        rest = m + len(late)  # outputs of the filter that bypass G
         mix: Any = numbers(np.zeros((m + w + len(late), inner + rest), dtype=int), T) + 0
         for i in range(m):
             mix[i, i] = mix[i, inner + i] = 1
@@ -315,7 +315,7 @@ def signals_of(signals: Any) -> int:
 
 
 def _taps(rows: Sequence[Weights], T: Number) -> Lti:
-    """One channel -> w_0 + w_1/z + .. for each row, over one delay line."""
+    """Return the block from one channel to w_0 + w_1/z + .. for each row, with one delay line."""
     n = max((len(row) for row in rows), default=1) - 1
     table: Any = numbers(np.zeros((len(rows), n + 1), dtype=int), T) + 0
     for r, row in enumerate(rows):
@@ -327,7 +327,7 @@ def _taps(rows: Sequence[Weights], T: Number) -> Lti:
 
 
 def _of_weights(entries: Sequence[tuple[int, int, Weights]], outputs: int, inputs: int, T: Number) -> Lti:
-    """A block of weighted and delayed inputs, over one delay line per input."""
+    """Return a block of weighted and delayed inputs, with one delay line per input."""
     length = [max((len(w) for _, j, w in entries if j == i), default=1) for i in range(inputs)]
     starts = np.cumsum([0, *(n - 1 for n in length)])
     order = int(starts[-1])

@@ -5,8 +5,8 @@ be positive (semi)definite; its arguments are numbers or cvxpy expressions.
 
 Two transfer matrices of the paper can never satisfy the strict inequalities printed for them:
   E-hat = z/(z-1) Psi E has a pole at z = 1 wherever E has static stiffness, and A'PA - P < 0 excludes it (15), (17).
-      Remedy: the Hermitian part of E(1) z/(z-1) on |z| = 1 is the constant E(1)/2, so what is left, E-hat less
-      its pole plus E(1)/2, carries the same condition and is stable (`design.conditions.delayed_environment_demand`).
+      Remedy: the Hermitian part of E(1) z/(z-1) on |z| = 1 is the constant E(1)/2, so E-hat without its pole plus
+      E(1)/2 satisfies the same condition and is stable (`design.conditions.delayed_environment_demand`).
   V-hat = (1 - 1/z)(V - Theta-hat) vanishes at z = 1, where (2) asks 0 > 0.
       Remedy: divide by |1 - 1/z|^2 (`design.conditions.v_hat`).
 """
@@ -50,19 +50,19 @@ from haptic_loop.design.result import (
     refusal,
 )
 
-#: Designs ask for (1 - RESERVE) of the available damping, so that they are certified as stored.
+#: share of the damping that designs do not use, so that the rounded coupling is certified
 RESERVE = 1e-4
 
 
 def usable(loop: Loop) -> Array:
-    """(m,) the damping that a design may spend [N s/m], in even periods. Raises ValueError where there is none."""
+    """Return the damping (m,) [N s/m] that a design may use, in even periods. Raises ValueError if it is 0."""
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
     return (1 - RESERVE) * even_damping(loop)
 
 
 def _low_pass(channels: int, T: float, f0: float = 80.0) -> Lti:
-    """w(z) I, the backward Euler discretisation of 1/(1 + s/(2 pi f0)), f0 in Hz (section 6 of the paper)."""
+    """Return w(z) I, the backward Euler discretisation of 1/(1 + s/(2 pi f0)), f0 in Hz (section 6 of the paper)."""
     a = 2 * np.pi * f0 * T
     gain, pole = a / (1 + a), 1 / (1 + a)
     one = np.eye(channels)
@@ -122,23 +122,23 @@ class Shaping:
         self.environment = delay(loop.psi, T) @ E  # Psi E
 
     def parts(self, w: Array) -> tuple[Complex, Complex, Complex]:
-        """W1 Psi E, W2 and W1 (I - Psi Lambda^-1 Theta) at exp(jw), each (k, ., .)."""
+        """Return W1 Psi E, W2 and W1 (I - Psi Lambda^-1 Theta) at exp(jw), each (k, ., .)."""
         z = on_circle(w)
         W1 = self.W1.at(z)
         return W1 @ self.environment.at(z), self.W2.at(z), W1 @ self.late.at(z)
 
     def grid(self, *systems: Lti) -> Array:
-        """Frequencies [rad/sample] from 0 to pi that resolve every pole of E, the weights and `systems`."""
+        """Return frequencies [rad/sample] from 0 to pi that resolve every pole of E, the weights and `systems`."""
         known = (self.environment, self.W1, self.W2, *systems)
         return np.concatenate([[0.0], frequencies(*known)])
 
     def gain(self, V: Lti, w: Array) -> Array:
-        """sigma_max of W1 L W2 at exp(jw), shape (k,)."""
+        """Return sigma_max of W1 L W2 at exp(jw), shape (k,)."""
         left, right, late = self.parts(w)
         return np.linalg.norm((left @ V.at(on_circle(w)) + late) @ right, 2, axis=(1, 2))
 
     def norm(self, V: Lti) -> tuple[float, float]:
-        """(||W1 L W2||_inf, the frequency where it is attained [rad/sample])."""
+        """Return (||W1 L W2||_inf, its frequency [rad/sample])."""
         return supremum(lambda w: self.gain(V, w), self.grid(V))
 
 
@@ -147,12 +147,12 @@ class Shaping:
 
 
 def packed(n: int) -> int:
-    """Number of free entries of a symmetric matrix (n, n)."""
+    """Return the number of free entries of a symmetric matrix (n, n)."""
     return n * (n + 1) // 2
 
 
 def symmetric_from(vector: Array, n: int) -> Array:
-    """The symmetric (n, n) matrix whose upper triangle, row by row, is `vector`."""
+    """Return the symmetric (n, n) matrix whose upper triangle, row by row, is `vector`."""
     M = np.zeros((n, n))
     M[np.triu_indices(n)] = vector
     return M + np.triu(M, 1).T
@@ -163,16 +163,16 @@ def symmetric_from(vector: Array, n: int) -> Array:
 
 
 def unit_environment(E: Lti, delta: Sequence[float] | Array) -> Lti:
-    """E in units where T = 1 and Delta_D = I: T Delta_D^-1/2 E Delta_D^-1/2."""
+    """Return E in units where T = 1 and Delta_D = I: T Delta_D^-1/2 E Delta_D^-1/2."""
     root = 1 / np.sqrt(np.asarray(delta))
     return Lti(E.A, E.B * root, E.T * root[:, None] * E.C, E.T * root[:, None] * E.D * root, 1.0)
 
 
 def balanced(G: Lti, negligible: float = 1e-11) -> Lti:
-    """G, stable, with equal diagonal Gramians; states of Hankel value below `negligible` of the largest are left out.
+    """Return a stable G with equal diagonal Gramians, by the square-root method.
 
-    Square-root method. Only states that no input reaches or no output shows to rounding are left out, so the
-    response is unchanged: this is not a model reduction.
+    States with a Hankel value below `negligible` times the largest are dropped. No input reaches them or no output
+    shows them to rounding, so the response does not change.
     """
     import scipy
 
@@ -188,7 +188,7 @@ def balanced(G: Lti, negligible: float = 1e-11) -> Lti:
 
 
 def reachability_scaled(G: Lti) -> Array:
-    """S (n, n) such that the states S^-1 x of G have the identity as reachability Gramian (regularised)."""
+    """Return S (n, n) such that the states S^-1 x of G have the identity as reachability Gramian (regularised)."""
     import scipy
 
     W = scipy.linalg.solve_discrete_lyapunov(G.A, G.B @ G.B.T)
@@ -197,7 +197,7 @@ def reachability_scaled(G: Lti) -> Array:
 
 
 def _root(A: Array, B: Array) -> Array:
-    """R with R R' = the Gramian of (A, B), defined for singular ones too."""
+    """Return R with R R' = the Gramian of (A, B), also for singular Gramians."""
     import scipy
 
     W = scipy.linalg.solve_discrete_lyapunov(A, B @ B.T)
@@ -208,16 +208,16 @@ def _root(A: Array, B: Array) -> Array:
 # ----------------------------------------------------------------------------------------------------
 # A gain at sampled frequencies, affine in real variables, with cutting planes.
 #
-# A problem in frequency has infinitely many constraints of which few bind. It is solved with some of them, the result
-# is checked on a refined sweep by code that knows no solver, and the worst frequency is added.
+# A problem over all frequencies has infinitely many constraints, of which few bind. It is solved at some frequencies,
+# the result is checked by a refined sweep, and the worst frequency is added.
 
 
 def gain_block(
     unknowns: Sequence[int], rows: Complex, row_slopes: Complex, base: Complex, base_slopes: Complex | Array
 ) -> Inequality:
-    """[[base, rows*], [rows, t I]], where t is the last of the unknowns.
+    """Return the inequality [[base, rows*], [rows, t I]] >= 0, where t is the last of the unknowns.
 
-    rows (k, p, m) with slopes (q, k, p, m); base (k, m, m) with slopes (q, k, m, m). Where base >= 0 it says
+    rows (k, p, m) with slopes (q, k, p, m); base (k, m, m) with slopes (q, k, m, m). For base >= 0 it means
     rows* rows <= t base.
     """
     q, k, p, m = row_slopes.shape
@@ -235,12 +235,12 @@ def gain_block(
 # Theorem 4, and the least multiplier Phi of an environment with delay inside (psi >= 1), by (17).
 
 
-#: Phi is enlarged by this, relatively, so that a sweep confirms what a solver found to its own tolerance.
+#: relative increase of Phi that covers the solver's tolerance
 _ROOM = 1e-6
 
 
 def least_phi(loop: Loop) -> Array | None:
-    """`least_multiplier`, verified on a refined sweep; None where psi = 0, since a passive environment needs none."""
+    """Return `least_multiplier`, verified on a refined sweep, or None for psi = 0, which needs none."""
     if not any(loop.psi):
         return None
     phi = least_multiplier(loop) + _ROOM * even_damping(loop)
@@ -250,29 +250,29 @@ def least_phi(loop: Loop) -> Array | None:
     return phi
 
 
-_MOST_STATES = 30  # of E-hat with its delays, for which the least trace is sought: 42 take ten seconds, 400 20 GB
+_MOST_STATES = 30  # states of E-hat up to which the least trace is computed: 42 take ten seconds, 400 20 GB
 
 
 def least_multiplier(loop: Loop) -> Array:
-    """Diagonal Phi [N s/m], shape (N,), with E-hat + Phi passive and Phi < Delta_D; of least trace for few states.
+    """Return the diagonal Phi (N,) [N s/m] with E-hat + Phi passive and Phi < Delta_D; of least trace for few states.
 
-    Raises Infeasible, with the damping that would be needed, where even a full Phi is not below Delta_D.
+    Raises Infeasible, with the damping that would be needed, if even a full Phi is not below Delta_D.
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
     none = np.zeros(loop.channels)
-    least, _ = uncovered(unit, loop.psi, none)  # of a full Phi, and of least on every channel
+    least, _ = uncovered(unit, loop.psi, none)  # bound for a full Phi and for each channel
     if least >= 1:
         raise Infeasible(None, (), _needs(loop.psi, delta, least))
     regular = delayed_environment_demand(delay(loop.psi, 1.0) @ unit, none).free
     if regular.order > _MOST_STATES:
         return max(least, 0.0) * delta
-    # halfway between the least largest entry and Delta_D: least trace alone may touch Delta_D
+    # Entries are at most halfway to Delta_D: the least trace alone may touch Delta_D.
     return np.maximum(_of_least_trace(balanced(regular), (1 + least) / 2), 0.0) * delta
 
 
 def _of_least_trace(regular: Lti, most: float) -> Array:
-    """The entries of the diagonal Phi <= most of least trace that makes `regular` passive."""
+    """Return the entries of the diagonal Phi <= most with least trace that makes `regular` passive."""
     m, n = regular.inputs, regular.order
     ports, zero = Ports.same(regular), np.zeros((regular.inputs,) * 2)
 
@@ -296,17 +296,17 @@ def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
 
 
 class _AnyEnvironment(Multiplied):
-    """Theorem 4 of the paper: safe around every passive environment; with psi >= 1 around this one.
+    """Theorem 4 of the paper: stability before every passive environment; with psi >= 1 before this one.
 
-    Its multiplier is then Phi (m,) [N s/m]. Walls are covered without delay in the environment, and refused with it; so
-    are a latency and delays that switch, which have a block of their own (design.facts.compose_any).
+    For psi >= 1 the multiplier is Phi (m,) [N s/m]. Walls, a latency and switching delays are covered for psi = 0 only;
+    latency and switching delays use the block of design.facts.compose_any.
     """
 
     name, source, separable = "any-environment", "the paper's Theorem 4", True
     covers = conditions.BEYOND
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
-        """The facts of the environment's side that its block needs."""
+        """Return the facts of the environment's side that the block needs."""
         return (Switching(),) if loop.varying_delay else ()
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
@@ -318,7 +318,7 @@ class _AnyEnvironment(Multiplied):
 
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
         V = coupling.compliance(loop.period(exact))
-        assert V is not None  # where it is None, `required` refuses
+        assert V is not None  # `required` refuses None
         if exact:
             require_size(V.order + sum(loop.delays.hi))
         return V
@@ -336,7 +336,7 @@ class _AnyEnvironment(Multiplied):
         return compose_any(V, loop, self.facts(loop), values, scaled)
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
-        """The least Phi, None where none is needed; and why it says nothing of the loop, whatever the coupling."""
+        """Return (the least Phi or None if none is needed, the reason why the loop is not covered)."""
         if (reason := self.beyond(loop)) or not any(loop.psi):
             return None, reason
         try:
@@ -372,7 +372,7 @@ class _AnyEnvironment(Multiplied):
         count = len(coupling.sampled(np.array([[1j]]), loop.T).G)
 
         def demand(V: Sampled) -> Demand[Sampled]:
-            """The block, with the usual multipliers of a latency in a range and of delays that switch."""
+            """Return the block, with the default multipliers of a latency in a range and of switching delays."""
             if _in_frame(loop):
                 return self.block(V, loop, self.usual(None, loop))
             return conditions.any_environment_demand(V, loop, multiplier)
@@ -380,13 +380,13 @@ class _AnyEnvironment(Multiplied):
         return conditions.any_environment_ratios(lambda z: coupling.sampled(z, loop.T), count, loop, demand)
 
     def _without(self, coupling: Coupling) -> str:
-        """Why it says nothing of a coupling that has no V(z)."""
+        """Return the reason why a coupling without V(z) is refused."""
         if coupling.holds_model:
             return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
         return "without a coupling there is nothing that Theorem 4 could use"
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
-        """Without a multiplier it takes the least one, where it needs one."""
+        """Return the requirement; without `multiplier` by the least one, if one is needed."""
         reason, V = self.beyond(loop), coupling.compliance(loop.T)
         if reason or V is None:
             return refusal(self.name, loop.delta, reason or self._without(coupling))
@@ -450,7 +450,7 @@ ANY_ENVIRONMENT = _AnyEnvironment()
 
 
 def _in_frame(loop: Loop) -> bool:
-    """Whether the block is one of the frame, because forces latch late or their delays switch."""
+    """Return whether the block comes from design.frame, because of a latency or switching delays."""
     return bool(loop.latency or loop.varying_delay)
 
 
@@ -480,7 +480,7 @@ class Ports(NamedTuple):
 
 
 def lemma1(G: Ports, P: _Matrix, Delta: _Matrix, Phi: _Matrix) -> _Matrix:
-    """(2), with its sign turned: x'Px - x+'Px+ + supply as a quadratic form of (x, u); it and P must be > 0."""
+    """Return the negative of (2), x'Px - x+'Px+ + supply as a quadratic form of (x, u); it and P must be > 0."""
     A, B, C2, D2, C1, D1 = G
     corner = C2.T / 2 - A.T @ P @ B - C1.T @ Delta @ D1
     state = P - A.T @ P @ A - C1.T @ Delta @ C1
@@ -489,7 +489,7 @@ def lemma1(G: Ports, P: _Matrix, Delta: _Matrix, Phi: _Matrix) -> _Matrix:
 
 
 def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix) -> _Matrix:
-    """[[Y, R'], [R, S]] of (3); with Q > 0, Y = Q^-1 and Sigma = Delta^-1 it is Lemma 1 (Sigma None: Delta = 0).
+    """Return [[Y, R'], [R, S]] of (3); with Q > 0, Y = Q^-1 and Sigma = Delta^-1 it is Lemma 1 (Sigma None: Delta = 0).
 
     Affine in A, B, C, D, which may therefore be unknowns.
     """
@@ -508,7 +508,7 @@ def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix
 
 
 def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matrix, mu2: _Matrix) -> _Matrix:
-    """The matrix of Lemma 3 and (24): with X = U^-1 it is positive iff ||G||_inf < mu; mu2 = mu^2 is scalar."""
+    """Return the matrix of Lemma 3 and (24): with X = U^-1 it is positive iff ||G||_inf < mu; mu2 = mu^2 is scalar."""
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
     rows = [
         [X, np.zeros((n, m)), A.T, C.T],
@@ -520,14 +520,14 @@ def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matri
 
 
 def symmetric(rows: list[list[_Matrix]]) -> _Matrix:
-    """The block matrix, made exactly symmetric; an array if every block is one. Empty blocks are left out."""
+    """Return the block matrix, made exactly symmetric; an array if every block is one. Empty blocks are left out."""
     kept = [[block for block in row if 0 not in block.shape] for row in rows]
     kept = [row for row in kept if row]
     numbers = all(isinstance(block, np.ndarray) for row in kept for block in row)
     if numbers:
         M = np.block(kept)
     else:
-        import cvxpy as cp  # loaded by who makes expressions
+        import cvxpy as cp  # loaded only for expressions
 
         M = cp.bmat(kept)
     return (M + M.T) / 2
