@@ -31,7 +31,7 @@ _NO_MODEL = "a MuJoCo world has no linear model E(z): any-environment needs none
 #: largest amounts, far from where arithmetic ends and beyond what anybody renders
 MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
 _MOST_WALLS = 6
-_MOST_TICKS = 100  # between two steps of a world
+_MOST_TICKS = 100  # largest number of ticks between two steps of a world
 _MOST_NODES, _MOST_PARTS = 200, 2000  # a mass is two states, and a proof has at most a few hundred
 
 
@@ -52,15 +52,15 @@ def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
 
 
 class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A spring and a damper in parallel between two nodes, or points with several coordinates.
+    """A spring and a damper in parallel between two nodes or two points with several coordinates.
 
-    Between points it acts on every coordinate alike, or along one direction.
+    Between points it acts on every coordinate, or along one direction.
     """
 
     between: tuple[str, str]
     stiffness: float  # [N/m]
     damping: float = 0.0  # [N s/m]
-    inertance: float | msgspec.UnsetType = msgspec.UNSET  # [kg] of an inerter beside them
+    inertance: float | msgspec.UnsetType = msgspec.UNSET  # [kg] of an inerter in parallel
     along: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # the direction, of unit length once it is built
 
     def __post_init__(self) -> None:
@@ -73,20 +73,20 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
 
     def amounts(self, number: Callable[[float], Any]) -> tuple[Any, Any, Any]:
-        """Mass [kg], damping [N s/m] and stiffness [N/m] between the ends."""
+        """Return mass [kg], damping [N s/m] and stiffness [N/m] between the ends."""
         return number(self.inertance or 0.0), number(self.damping), number(self.stiffness)
 
 
 class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A one-sided spring-damper: it pushes the first node back once it is `gap` beyond the second; see law.py.
+    """A one-sided spring-damper that pushes the first node back once it is `gap` beyond the second (controller.law).
 
-    Between points with several coordinates, beyond means further along `normal`, the direction into the wall.
+    Between points with several coordinates the distance counts along `normal`, the direction into the wall.
     """
 
     between: tuple[str, str]
     stiffness: float  # [N/m]
     damping: float = 0.0  # [N s/m], only while in contact, and never pulling
-    gap: float = 0.0  # [m] free way from rest; negative where it is compressed at rest
+    gap: float = 0.0  # [m] free way from rest; negative if it is compressed at rest
     normal: tuple[float, ...] | msgspec.UnsetType = msgspec.UNSET  # of unit length once it is built
 
     def __post_init__(self) -> None:
@@ -103,15 +103,15 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
 
     def slope(self, T: Number) -> Number:
-        """K + 2 B/T [N/m], in the arithmetic of T: no motion that alternates between ticks is met more stiffly."""
+        """Return K + 2 B/T [N/m], its largest stiffness for alternating motions, in the arithmetic of T."""
         return numbers(self.stiffness, T) + 2 * numbers(self.damping, T) / T
 
 
 def parts_of(element: Any) -> list[Spring | Wall]:
-    """What an element of one's own is made of. Raises ValueError for what is none.
+    """Return the springs and walls of an element of the user's own. Raises ValueError for another object.
 
-    Nodes that it names beside its ends are its own. What is not linear is made of springs and walls: a hardening
-    spring is a spring with walls beside it, which begin to push beyond their gaps.
+    Nodes besides its ends belong to the element. A hardening spring is a spring with walls in parallel, which push
+    beyond their gaps.
     """
     made = element.parts() if callable(getattr(element, "parts", None)) else None
     parts = list(made) if isinstance(made, list | tuple) else []
@@ -124,11 +124,11 @@ def parts_of(element: Any) -> list[Spring | Wall]:
 
 
 class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """E(z) = C (z I - A)^-1 B + D by its numbers, contact displacements [m] to forces [N], which hold at one period T.
+    """E(z) = C (z I - A)^-1 B + D from contact displacements [m] to forces [N], as numbers for one period T.
 
     It is passive at every frequency, not only on a grid: He [(1 - z) E(z)] >= 0, with E(1) symmetric and nonnegative.
-    Where that holds within rounding only, a spring of at most 1e-6 of its mean gain is added to D. Raises ValueError
-    for a block that produces energy, or whose passivity cannot be decided.
+    If that holds within rounding only, a spring of at most 1e-6 of its mean gain is added to D. Raises ValueError for a
+    block that produces energy, or whose passivity cannot be decided.
     """
 
     A: tuple[tuple[float, ...], ...]
@@ -139,7 +139,7 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, E: Lti) -> Block:
-        """The block of an E(z) over floats."""
+        """Return the block of an E(z) over floats."""
         A, B, C, D = (tuple(map(tuple, part.tolist())) for part in (E.A, E.B, E.C, E.D))
         return cls(A, B, C, D, E.T)
 
@@ -155,7 +155,7 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         _correction(self)
 
     def at(self, T: Number) -> Lti:
-        """E(z) in the arithmetic of T, with the correction of D that makes it passive for certain.
+        """Return E(z) in the arithmetic of T, with the correction of D that makes it provably passive.
 
         Raises ValueError for another period.
         """
@@ -171,18 +171,18 @@ class Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return A, B, C, D
 
 
-_ROUNDING = 1e-9  # of the mean gain: an asymmetry or a negative direction of E(1) that rounding of its numbers explains
-_ENOUGH, _MOST_LIFT = 1e-8, 1e-6  # of the mean gain: springs that a block needs in parallel to be passive for certain
+_ROUNDING = 1e-9  # allowed asymmetry and negativity of E(1), relative to the mean gain
+_ENOUGH, _MOST_LIFT = 1e-8, 1e-6  # springs, relative to the mean gain, that are added to make a block passive
 
 
 @functools.lru_cache(maxsize=64)
 def _correction(block: Block) -> Any:
-    """What D needs so that the block is passive for certain, (m, m) of Fractions. Raises ValueError where that is much.
+    """Return the correction of D (m, m), Fractions, that makes the block provably passive. Raises ValueError.
 
     Backward Euler takes the power f'(x - x_-)/T, so E is passive if E(1) is symmetric and nonnegative and
     He [E z/(z-1)] >= 0. With the pole split off, that is He H >= 0 on the whole circle for
     H = E(1)/2 - C (I-A)^-1 B - C (I-A)^-1 A (zI-A)^-1 B. A spring of l N/m beside the block adds l/2 to H.
-    Objects at the edge, such as a free mass or a spring between two contacts, get a spring that covers the error bound.
+    Objects at the edge of passivity, such as a free mass, get a spring that covers the error bound.
     """
     T = rational(block.T)
     A, B, C, D = (numbers(part, T) for part in block._arrays())
@@ -216,42 +216,42 @@ def _correction(block: Block) -> Any:
 
 
 class Environment:
-    """What a loop asks of its environment. Your own class has `contacts` and `E(T)`."""
+    """Base class of environments. A class of the user's own has `contacts` and `E(T)`."""
 
     __slots__ = ()
     contacts: Any  # tuple[str, ...], one a channel
     walls: tuple[Wall, ...] = ()
-    here: Any = "this environment"  # str: how a guarantee names it
-    world: Any = None  # a MuJoCo scene that is known by its file alone
+    here: Any = "this environment"  # str: its name in guarantees
+    world: Any = None  # a MuJoCo scene, known by its file only
     one_period = False  # whether it is known for one T only
 
     def check(self, psi: Sequence[int], T: float) -> None:
-        """Raises ValueError where no loop with this environment makes sense."""
+        """Raise ValueError if no loop with this environment makes sense."""
         self.E(T)
 
     def as_network(self) -> Network:
-        """Itself, if it is one. Raises ValueError."""
+        """Return itself if it is a network. Raises ValueError otherwise."""
         raise ValueError(f"{self.here} is no network of springs, dampers and masses")
 
     def E(self, T: Number) -> Lti:
-        """E(z), contact displacements [m] to forces [N], every wall touching, in the arithmetic of T."""
+        """Return E(z) from contact displacements [m] to forces [N], with every wall touching, in T's arithmetic."""
         raise TypeError(f"{type(self).__name__} has no E(T): define it")
 
     def sent(self, coupling: Coupling, psi: Sequence[int], T: Number) -> Lti:
-        """G = (I + Psi E V)^-1 Psi E: the forces that leave through the coupling. Raises SingularLoop."""
+        """Return G = (I + Psi E V)^-1 Psi E, the map to the forces as they leave. Raises SingularLoop."""
         return coupling.around(delay(psi, T) @ self.E(T))
 
     def sent_at(self, coupling: Coupling, psi: Sequence[int], z: Complex, T: float) -> Sampled:
-        """The same at points z of the circle."""
+        """Return G at points z of the circle."""
         return coupling.around(Sampled.of(delay(psi, T) @ self.E(T), z))
 
     def frozen(self) -> Sequence[Environment]:
-        """The linear environments that it is made of, by the walls that touch."""
+        """Return the linear environments for every set of touching walls."""
         return (self,)
 
 
 class RigidWall(Environment, enum.Enum):
-    """E -> infinity: a wall that does not give, behind a coupling and never left. One channel."""
+    """E -> infinity: a rigid wall behind a coupling, always in contact. One channel."""
 
     RIGID_WALL = "rigid wall"  # as files have it
 
@@ -272,7 +272,7 @@ class RigidWall(Environment, enum.Enum):
         raise ValueError("a rigid wall has no E(z): its force is whatever the coupling in front of it makes")
 
     def sent(self, coupling: Coupling, psi: Sequence[int], T: Number) -> Lti:
-        """V^-1. Raises ValueError for a coupling without a V, SingularLoop where V has no inverse."""
+        """Return V^-1. Raises ValueError for a coupling without a V, SingularLoop if V has no inverse."""
         V = coupling.compliance(T)
         if V is None:
             raise ValueError("a rigid wall needs a spring-damper or another V in front of it")
@@ -286,19 +286,19 @@ RIGID_WALL = RigidWall.RIGID_WALL
 
 
 class _NoModel(SingularLoop):
-    """An environment of which no E(z) is known, so that no condition on this environment says anything."""
+    """The environment has no known E(z), so that this-environment does not apply."""
 
     def __init__(self) -> None:
         super().__init__(_NO_MODEL)
 
 
 class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A MuJoCo scene in place of a network: no E(z) is known, so only any-environment can be certified."""
+    """A MuJoCo scene instead of a network. It has no known E(z), so only any-environment can be certified."""
 
     file: str  # MJCF
     digest: str  # SHA-256 over the contents of the scene's files
-    along: tuple[tuple[tuple[float, float, float], ...], ...]  # for each contact the directions in which it slides
-    every: int = 1  # the scene steps once in so many ticks
+    along: tuple[tuple[tuple[float, float, float], ...], ...]  # directions in which each contact slides
+    every: int = 1  # number of ticks for one step of the scene
 
     def __post_init__(self) -> None:
         if not 1 <= self.every <= _MOST_TICKS:
@@ -310,12 +310,12 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
 
     contacts: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
     springs: tuple[Spring, ...] = ()
-    masses: dict[str, float] = {}  # [kg], by node; nodes that are not named have none
+    masses: dict[str, float] = {}  # [kg], by node; other nodes have no mass
     walls: Annotated[tuple[Wall, ...], msgspec.Meta(max_length=_MOST_WALLS)] = ()  # 2^6 contact states
-    block: Block | None = None  # beside all these, of E(z) what is known by its numbers alone
-    elements: tuple[Any, ...] = ()  # of one's own: their parts are put among springs and walls
-    world: World | None = None  # in place of everything else
-    points: dict[str, tuple[str, ...]] = {}  # the coordinates of each point in space, nodes or ground where it is held
+    block: Block | None = None  # an E(z) that is added to the network
+    elements: tuple[Any, ...] = ()  # of the user's own: their parts become springs and walls
+    world: World | None = None  # replaces everything else
+    points: dict[str, tuple[str, ...]] = {}  # the coordinates of each point in space: nodes, or ground if held
     linear_model_of: str = ""  # the scene and the pose of which `block` is the linear model
 
     def __post_init__(self) -> None:
@@ -393,7 +393,7 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         return tuple(held(self, touching) for touching in walls)
 
     def coordinates(self, end: str) -> tuple[str, ...]:
-        """The nodes of a point in space; any other name is a node itself."""
+        """Return the nodes of a point in space; another name is a node itself."""
         return self.points.get(end, (end,))
 
     def _check_axes(self, part: Spring | Wall) -> None:
@@ -412,13 +412,13 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
             raise ValueError(f"the wall {what} has no normal, expected {axes} numbers: the direction into the wall")
 
     def nodes(self) -> list[str]:
-        """Contacts first, then internal nodes in the order of their first mention."""
+        """Return the contacts, then the internal nodes in the order of their first mention."""
         ends = (end for part in (*self.springs, *self.walls) for end in part.between)
         inner = (node for end in ends for node in self.coordinates(end) if node != GROUND)
         return list(dict.fromkeys((*self.contacts, *inner)))
 
     def matrices(self, number: Callable[[float], Any] = float) -> tuple[Array, Array, Array]:
-        """Mass [kg], damping [N s/m] and stiffness [N/m] over `nodes()`, each (nodes, nodes).
+        """Return mass [kg], damping [N s/m] and stiffness [N/m] over `nodes()`, each (nodes, nodes).
 
         `number` makes the entries: float, or an exact type such as Fraction.
         """
@@ -436,7 +436,7 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         return M, D, K
 
     def _lengths(self, part: Spring | Wall) -> list[list[tuple[str, float]]]:
-        """The lengths that a part acts on, each as nodes with their coefficients: one a coordinate, or one in all."""
+        """Return the lengths that a part acts on, one or one for each coordinate, as nodes with coefficients."""
         direction = part.along if isinstance(part, Spring) else part.normal
         ends = [(self.coordinates(end), sign) for end, sign in zip(part.between, (1, -1), strict=True) if end != GROUND]
         count = len(ends[0][0]) if ends else 0
@@ -446,14 +446,14 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         return [[(node, c) for node, c in signed if c and node != GROUND]]
 
     def joined(self, part: Spring | Wall) -> list[list[str]]:
-        """The nodes that each length of a part joins; ground stands for a missing end."""
+        """Return the nodes that each length of a part joins, with ground for a missing end."""
         free = [[node for node, _ in ends] for ends in self._lengths(part)]
         return [nodes if len(nodes) > 1 else [*nodes, GROUND] for nodes in free if nodes]
 
     def across(self, parts: Sequence[Spring | Wall]) -> Array:
-        """The displacement across each part, as rows over `nodes()`: +1 at its first end, -1 at its second.
+        """Return the displacement across each part as rows over `nodes()`: +1 at its first end, -1 at its second.
 
-        Between points with several coordinates the part has a direction, whose entries take the place of 1.
+        Between points with several coordinates the entries of the part's direction replace 1.
         """
         index = {name: i for i, name in enumerate(self.nodes())}
         lengths = [self._lengths(part) for part in parts]
@@ -470,7 +470,7 @@ _Matrices = tuple[Array, Array, Array]
 
 
 class Networks(Environment):
-    """Networks with the same nodes, the contacts first, by their matrices: a stack where these have axes."""
+    """Networks with the same nodes, the contacts first, by their matrices; matrices with axes are a stack."""
 
     def __init__(self, contacts: tuple[str, ...], matrices: _Matrices) -> None:
         self.contacts, self.matrices = contacts, matrices
@@ -479,7 +479,7 @@ class Networks(Environment):
         return Lti(*_realise(self.matrices, len(self.contacts), T), T)
 
     def sampled(self, z: Complex, T: float) -> Sampled:
-        """E at z (n, k) from the dynamic stiffness itself, Z_cc - Z_ci Z_ii^-1 Z_ic at s = (z-1)/(Tz)."""
+        """Return E at z (n, k) from the dynamic stiffness itself, Z_cc - Z_ci Z_ii^-1 Z_ic at s = (z-1)/(Tz)."""
         M, D, K = (part[..., None, :, :] for part in self.matrices)
         s = ((z - 1) / (T * z))[..., None, None]
         Z = M * s**2 + D * s + K
@@ -493,12 +493,12 @@ class Networks(Environment):
 
 
 def environment(network: Network, T: Number) -> Lti:
-    """E(z), contact displacements [m] to forces [N], by backward Euler s -> (z-1)/(Tz); no wall touches.
+    """Return E(z) from contact displacements [m] to forces [N], by backward Euler s -> (z-1)/(Tz), without walls.
 
     Internal nodes obey M (v - v-)/T + D v + K q + (coupling to the contacts) = 0 with q = q- + T v, solved
-    for v at every tick. The states are q- and v- of the internal nodes, and what the contact dampers and
-    masses need of the past; see `_adrift` for bodies without a place of rest. In the arithmetic of T. Raises ValueError
-    if an internal node is held by nothing.
+    for v at every tick. The states are q- and v- of the internal nodes, and past values for the contact dampers and
+    masses; see `_adrift` for bodies without a place of rest. The arithmetic is that of T. Raises ValueError if nothing
+    holds an internal node.
     """
     adrift = _adrift(network, network.springs)
     E = Lti(*_realise(_solvable(network, T), len(network.contacts), T, adrift=adrift), T)
@@ -506,9 +506,9 @@ def environment(network: Network, T: Number) -> Lti:
 
 
 def walled_environment(network: Network, T: Number, places: bool = False) -> Lti:
-    """[x; p] -> [f; y]: as `environment`, wall forces p [N] put in and displacements y [m] across walls out.
+    """Return `environment` with ports for walls, [x; p] -> [f; y]: wall forces p [N] to displacements y [m] across.
 
-    With `places` further ports precede those of the walls: a force on every node in, the node's displacement out.
+    With `places` every node has a port before those of the walls, from a force to the node's displacement.
     """
     across = network.across(network.walls)
     across = across if across.dtype == int else numbers(across, T)
@@ -523,14 +523,13 @@ def walled_environment(network: Network, T: Number, places: bool = False) -> Lti
 
 
 def _adrift(network: Network, springs: Sequence[Spring | Wall]) -> list[list[int]]:
-    """The bodies that no spring joins to a contact or to the ground, as lists of their internal nodes' indices.
+    """Return the bodies that no spring joins to a contact or to ground, as lists of indices of internal nodes.
 
-    Only dampers drag such a body, so it may come to rest anywhere, and no force tells where: the place of one of its
-    nodes would be a state that integrates for ever and is never seen. The places of its nodes are kept relatively to
-    the first one.
+    Only dampers drag such a body, so its place does not affect any force and would be an unobservable integrator. The
+    places of its nodes are stored relative to the first one.
     """
     names = network.nodes()
-    body = {name: name for name in (*names, GROUND)}  # each points to another node of its body, in the end to one
+    body = {name: name for name in (*names, GROUND)}  # union-find: each node points towards its body's root
 
     def head(name: str) -> str:
         while body[name] != name:
@@ -563,7 +562,7 @@ def _solvable(network: Network, T: Number) -> _Matrices:
     return M, D, K
 
 
-_SLACK = 1e-9  # of the largest stiffness: less is rounding of directions, which are known to 1e-16
+_SLACK = 1e-9  # share of the largest stiffness below which a stiffness is rounding of directions
 
 
 def _check_held(network: Network, K: Array, names: Sequence[str]) -> None:
@@ -585,10 +584,10 @@ def _realise(
     across: Array | None = None,
     adrift: Sequence[Sequence[int]] = (),
 ) -> tuple[Array, Array, Array, Array]:
-    """A, B, C, D of the network (M, D, K) whose first `c` nodes are contacts; see `environment`.
+    """Return A, B, C, D of the network (M, D, K) whose first `c` nodes are contacts; see `environment`.
 
     With `across` (w, nodes) there are w more inputs, forces that push the displacements `across q` back, and w more
-    outputs, these displacements. The places of internal nodes in a group of `adrift` are kept relatively to its first.
+    outputs, these displacements. The places of internal nodes in a group of `adrift` are relative to its first node.
     The arithmetic is that of the entries.
     """
     (Mcc, Mci, Mic, Mii), (Dcc, Dci, Dic, Dii), (Kcc, Kci, Kic, Kii) = (
@@ -632,7 +631,7 @@ def _quarters(c: int) -> tuple[tuple[slice, slice], ...]:
 
 
 def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
-    """Indices of the states that reach the outputs, now or later; the others are dropped."""
+    """Return the indices of the states that reach the outputs, now or later."""
     count = after.shape[-1]
     reads = (after.reshape(-1, count - inputs, count)[..., inputs:] != 0).any(axis=0)
     used = (force.reshape(-1, count)[:, inputs:] != 0).any(axis=0)
@@ -642,7 +641,7 @@ def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
 
 
 def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
-    """The network with the touching walls (default: all) as two-sided springs, without the others."""
+    """Return the network with the touching walls (default: all) as two-sided springs, without the others."""
     touching = [True] * len(network.walls) if touching is None else touching
     walls = zip(network.walls, touching, strict=True)
     springs = (Spring(w.between, on * w.stiffness, on * w.damping, along=w.normal) for w, on in walls)

@@ -1,12 +1,12 @@
-"""Loop, the specification: all that a design, a check, a map or a bridge knows of what is to be made safe.
+"""The loop of designs, checks, maps and the bridge: devices, delays and environment.
 
                  x  sampled                                     Delta_D  damping that the devices guarantee
     devices ---------------> (+) ---> Psi E ---+---> Theta ---> f  held for T
                               ^-               |
                               +----- V <-------+                F = Theta (I + Psi E V)^-1 Psi E     (6)
 
-Of a device its damping is known, and bounds of motor and transmission where they are guaranteed; of a human nothing.
-It computes nothing in time: the tick is controller.tick.
+Known of a device are its damping and, if guaranteed, bounds of motor and transmission; of a human nothing is known.
+controller.tick runs it in time.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from haptic_loop.controller.law import Law, Limiter
 from haptic_loop.controller.lti import Array, Block, Complex, Lti, Sampled, as_like
 from haptic_loop.controller.ranges import Member, Ranges, members
 
-MOST_SAMPLES = 1000  # of delay on a channel; every one is a state
+MOST_SAMPLES = 1000  # longest delay of a channel; every sample is a state
 _Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=MOST_SAMPLES)], ...]
 _Positive = Annotated[float, msgspec.Meta(gt=0)]
-Rows = tuple[tuple[float, ...], ...]  # of a matrix
+Rows = tuple[tuple[float, ...], ...]  # rows of a matrix
 
 
 class DelayRange(Strict, frozen=True):
-    """Delays that may be any from lo to hi, on every channel and anew at every tick."""
+    """Delays between lo and hi, which may change at every tick and differ between channels."""
 
     lo: _Steps  # (m,) [samples]
     hi: _Steps  # (m,) [samples]
@@ -44,20 +44,20 @@ class DelayRange(Strict, frozen=True):
             raise ValueError(f"delays from {list(self.lo)} to {list(self.hi)}, expected 0 <= lo <= hi on every channel")
 
     def __str__(self) -> str:
-        """'[1, 2] samples', or '[1, 2], [0, 3] samples' where the channels differ."""
+        """Return '[1, 2] samples', or '[1, 2], [0, 3] samples' if the channels differ."""
         spans = [f"[{a}, {b}]" for a, b in zip(self.lo, self.hi, strict=True)]
         return f"{', '.join(spans if len(set(spans)) > 1 else spans[:1])} samples"
 
     def contains(self, other: DelayRange) -> bool:
-        """Whether every delay that `other` allows is allowed here; a constant theta is DelayRange(theta, theta)."""
+        """Return whether the range contains `other`; a constant theta is DelayRange(theta, theta)."""
         below, above = zip(self.lo, other.lo, strict=True), zip(self.hi, other.hi, strict=True)
         return all(a <= b for a, b in below) and all(a >= b for a, b in above)
 
 
 class DeviceBounds(Strict, frozen=True):
-    """What is guaranteed of a device beside its damping: every device within these bounds is meant."""
+    """Guaranteed bounds of a device besides its damping, for every device within them."""
 
-    motor_mass_min: _Positive  # [kg] of all that moves rigidly with the motor's shaft, at the encoder's coordinate
+    motor_mass_min: _Positive  # [kg] mass that moves rigidly with the motor's shaft, at the encoder's coordinate
     transmission_stiffness_max: _Positive  # [N/m] between the motor and everything behind it
     transmission_damping_min: _Positive  # [N s/m] in parallel to that stiffness
     transmission_damping_max: _Positive  # [N s/m]
@@ -68,22 +68,22 @@ class DeviceBounds(Strict, frozen=True):
             raise ValueError(f"transmission_damping_min is {least:g} N s/m, above transmission_damping_max = {most:g}")
 
 
-class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without the newer fields keeps the digest it had
-    """All that enters a condition beside the coupling."""
+class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of the digest
+    """The data of a condition besides the coupling."""
 
     T: _Positive  # [s]
     theta: _Steps  # (m,) transmission delays [samples]
     psi: _Steps  # (m,) environment delays [samples]
-    lam: _Steps  # (m,) delays of the reference [samples]; they matter to transparency only
+    lam: _Steps  # (m,) delays of the reference [samples], for transparency only
     delta: tuple[_Positive, ...]  # (m,) damping that the devices guarantee [N s/m]
-    environment: Network | RigidWall  # or a class of one's own, which cannot be stored
-    ranges: Ranges | None = None  # what else the environment may be
-    varying_delay: DelayRange | None = None  # what else the delays of the forces may be, switching at every tick
-    T_max: _Positive | None = None  # [s] the longest period there is, where it varies from tick to tick; T if None
-    latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] least and most by which forces latch after kT
-    T_min: _Positive | None = None  # [s] the shortest period there is; only the known-device condition asks for it
-    known_devices: tuple[DeviceBounds, ...] | None = None  # (m,) bounds of the devices, where they are guaranteed
-    axes: tuple[int, ...] | None = None  # how many channels each device has; None: every device has one
+    environment: Network | RigidWall  # or a class of the user's own, which cannot be stored
+    ranges: Ranges | None = None  # ranges of the environment's parameters
+    varying_delay: DelayRange | None = None  # delays of the forces that may switch at every tick
+    T_max: _Positive | None = None  # [s] longest period if periods vary; None: T
+    latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] least and largest latency of forces after kT
+    T_min: _Positive | None = None  # [s] shortest period, for the known-device condition
+    known_devices: tuple[DeviceBounds, ...] | None = None  # (m,) guaranteed bounds of the devices
+    axes: tuple[int, ...] | None = None  # number of channels of each device; None: one
     levels: tuple[Rows, ...] | None = None  # Delta_i per device [N s/m], its diagonal in delta; None: diag(delta)
 
     def __post_init__(self) -> None:
@@ -115,7 +115,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         self._check_axes()
 
     def _check_axes(self) -> None:
-        """Raise ValueError unless the axes share the channels and each Delta_i is a level; drop what is the default."""
+        """Raise ValueError unless axes and levels fit the channels; replace defaults by None."""
         m, axes = self.channels, (1,) * self.channels if self.axes is None else self.axes
         if sum(axes) != m or min(axes) < 1:
             raise ValueError(f"axes is {list(axes)}, expected numbers of axes >= 1 with the sum {m}, one per contact")
@@ -179,11 +179,11 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         return tuple(slice(first, last) for first, last in zip([0, *ends[:-1]], ends, strict=True))
 
     def per_device(self, values: ArrayLike) -> Array:
-        """The least of the values (m,) of each device's channels."""
+        """Return the least of the values (m,) over each device's channels."""
         return np.minimum.reduceat(np.asarray(values, dtype=float), [own.start for own in self.devices])
 
     def per_channel(self, values: Sequence[Any]) -> tuple[Any, ...]:
-        """A value per device as one per channel."""
+        """Return a value per device as one per channel."""
         return tuple(v for v, n in zip(values, self.axes or (1,) * self.channels, strict=True) for _ in range(n))
 
     @property
@@ -194,7 +194,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         return tuple(float(np.linalg.eigvalsh(np.array(level))[0]) for level in self.levels)
 
     def Delta(self, exact: bool = False) -> Any:
-        """Delta_D = blockdiag(Delta_1, ..) (3) [N s/m], (m, m), which the devices guarantee."""
+        """Return the guaranteed damping Delta_D = blockdiag(Delta_1, ..) (3) [N s/m], (m, m)."""
         T = self.period(exact)
         out = numbers(np.diag(self.delta), T)
         for own, level in zip(self.devices, self.levels or (), strict=self.levels is not None):
@@ -202,15 +202,15 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         return out
 
     def period(self, exact: bool = False) -> Number:
-        """T, whose type decides the arithmetic of what is built with it."""
+        """Return T, whose type determines the arithmetic of all blocks."""
         return rational(self.T) if exact else self.T
 
     def E(self, exact: bool = False) -> Lti:
-        """The environment E(z), every wall touching."""
+        """Return the environment E(z), with every wall touching."""
         return self.environment.E(self.period(exact))
 
     def sent(self, coupling: Coupling, exact: bool = False) -> Lti:
-        """G = (I + Psi E V)^-1 Psi E: the forces as they leave for the devices. Raises SingularLoop."""
+        """Return G = (I + Psi E V)^-1 Psi E, the map to the forces as they leave. Raises SingularLoop."""
         if not exact:
             return self.environment.sent(coupling, self.psi, self.T)
         asked = (self.environment, coupling, self.psi, self.T)
@@ -221,27 +221,27 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         return found
 
     def sent_at(self, coupling: Coupling, z: Complex) -> Sampled:
-        """The same at points z of the circle, (n, k) or (1, k)."""
+        """Return G at points z of the circle, (n, k) or (1, k)."""
         return self.environment.sent_at(coupling, self.psi, z, self.T)
 
     def late(self, G: Block) -> Block:
-        """Theta G (6): what devices feel of forces G as they leave."""
+        """Return Theta G (6), the forces G as the devices feel them."""
         return as_like(G, delay(self.theta, G.T)) @ G
 
     def F(self, coupling: Coupling, exact: bool = False) -> Lti:
-        """F = Theta G (6): displacements to forces, as the devices see them. Raises SingularLoop."""
+        """Return F = Theta G (6) from displacements to forces at the devices. Raises SingularLoop."""
         return self.late(self.sent(coupling, exact))
 
     def walled(self, coupling: Coupling, exact: bool = False) -> Lti:
-        """[x; p] to [f; y]: as F with no wall touching, wall forces [N] put in and the ways into walls [m] out.
+        """Return F without walls and with ports for them, [x; p] to [f; y]: wall forces [N] to ways into walls [m].
 
-        Psi and Theta delay what the devices feel of the walls. Raises SingularLoop, and ValueError for a coupling that
-        walls cannot stand behind.
+        Psi and Theta also delay the walls' forces at the devices. Raises SingularLoop, and ValueError for a coupling
+        that excludes walls.
         """
         return self._beside_walls(self.theta, exact) @ self.walled_before_delay(coupling, exact)
 
     def walled_before_delay(self, coupling: Coupling, exact: bool = False) -> Lti:
-        """[x; p] to [f_e; y]: as `walled`, with the forces as they leave, before Theta."""
+        """Return `walled` with the forces as they leave, before Theta: [x; p] to [f_e; y]."""
         E = walled_environment(self.network, self.period(exact))
         return coupling.around(self._beside_walls(self.psi, exact) @ E, further=len(self.environment.walls))
 
@@ -256,11 +256,11 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         rho: ArrayLike | None = None,
         balls: Sequence[slice] = (),
     ) -> Law:
-        """What a tick computes; with `rho` (m,) [N/m] forces leave through a limiter of `limit` (m,) [N].
+        """Return the law of a tick; with `rho` (m,) [N/m] forces leave through a limiter of `limit` (m,) [N].
 
-        `balls` are neighbouring channels whose force is limited as a vector, the others by themselves.
+        `balls` are neighbouring channels whose force is limited as a vector.
 
-        Raises SingularLoop, and ValueError for a coupling that walls cannot stand behind.
+        Raises SingularLoop, and ValueError for a coupling that excludes walls.
         """
         walls = self.environment.walls
         sent = self.walled_before_delay(coupling) if walls else self.sent(coupling)
@@ -269,26 +269,26 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
         return Limiter(sent, self.theta, walls, limit=limit, rho=rho, balls=tuple(balls))
 
     def members(self) -> tuple[Member, ...]:
-        """The environment, and the vertices of its ranges where it has some."""
+        """Return the environment and the vertices of its ranges."""
         if self.ranges:
             return members(self.network, self.ranges)
         return (Member("the nominal environment", self.environment),)
 
     @property
     def network(self) -> Network:
-        """The environment, of which parameters or walls are asked. Raises ValueError where it is no network."""
+        """The environment as a network. Raises ValueError if it is none."""
         return self.environment.as_network()
 
     def frozen(self) -> tuple[Loop, ...]:
-        """The loop around each frozen contact state of its environment."""
+        """Return the loop for each frozen contact state of its environment."""
         return tuple(self.at(state) for state in self.environment.frozen())
 
     def at(self, network: Environment) -> Loop:
-        """The loop around this environment, known exactly."""
+        """Return the loop with this environment, without ranges."""
         return msgspec.structs.replace(self, environment=network, ranges=None)
 
     def channel(self, i: int) -> Loop:
-        """Device i alone, at a rigid wall: any-environment is of the same gains whatever is behind them."""
+        """Return channel i at a rigid wall: any-environment does not depend on the environment."""
         own, known, late, span = slice(i, i + 1), self.known_devices, self.latency, self.varying_delay
         return Loop(
             self.T,
