@@ -1,4 +1,4 @@
-"""python -m sim.accuracy: what each engine costs and how wrong it is, every row's error and cost from the same run."""
+"""python -m sim.accuracy: cost and error of each engine, from the same run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from haptic_loop.sim.engines import EXPONENTIAL
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import InputError, require_even_ticks, require_linear, require_no_world
 
-_MOST_STEPS = 3_000_000  # of a row: a minute or two
+_MOST_STEPS = 3_000_000  # largest number of steps for a row: a minute or two
 _LEGEND = (
     "position: relative rms error; growth: error [1/s], the larger of the loop with and without the coupling",
     "cycle: standard deviation [N] and frequency of the limit cycle without coupling, once it is sustained",
@@ -24,7 +24,7 @@ _LEGEND = (
 
 @dataclass(frozen=True)
 class _Report:
-    """Every engine and step on one loop."""
+    """Rows of every engine and step on one loop."""
 
     case: str
     scenario: str

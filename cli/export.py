@@ -1,6 +1,6 @@
-"""python -m design.export coupling.json: a stored coupling, or its whole discrete process, for use elsewhere.
+"""python -m design.export coupling.json: export a stored coupling, or its whole discrete process, as C.
 
-Like design.check it works from the file alone, loop included: what is exported is what is certified.
+Like design.check it uses the file alone, including its loop: the exported process is the certified one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from haptic_loop.sim.scenario import InputError
 
 @dataclass(frozen=True)
 class _Proof:
-    """Whether the certificate on file holds."""
+    """Whether the certificate of the file holds."""
 
     proved: bool
     reason: str | None
@@ -47,7 +47,7 @@ class _Proof:
 
 @dataclass(frozen=True)
 class _Exported:
-    """What was written."""
+    """The report of an export."""
 
     what: str
     states: int
@@ -60,7 +60,7 @@ class _Exported:
     forces: str | None = render.figure("forces")
     single: str | None = render.figure("single precision", json="if given")
     test: dict[str, Any] = render.figure("test vector", "{[ticks]} ticks, in the file")
-    claim: str | None = render.figure("claim", json="if given")  # of a condition of the user's own
+    claim: str | None = render.figure("claim", json="if given")  # on a condition of the user's own
 
 
 def main(argv: list[str]) -> int:
@@ -125,7 +125,7 @@ def _parser() -> options.Parser:
 
 
 def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: str | None) -> ExportedBlock:
-    """The block that was asked for, with lines on where it comes from. Raises InputError."""
+    """Return the block to export, with comment lines on its source. Raises InputError."""
     limit = options.per_channel("--force-limit", args.force_limit, stored.loop.channels) if args.force_limit else None
     try:
         block = process_block(stored, not args.without_theta, limit) if args.process else coupling_block(stored)
@@ -138,7 +138,7 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: st
 
 
 def _error(block: ExportedBlock) -> str:
-    """Return what single precision costs, as one line."""
+    """Return one line on the error of single precision."""
     error, largest = single_precision_error(block)
     unit = "N" if block.output.letter == "f" else "m"
     return f"differs from double precision by at most {error:.2g} {unit}; the largest value is {largest:.3g} {unit}"

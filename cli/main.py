@@ -1,4 +1,4 @@
-"""haptic-loop COMMAND: every command under one name; python -m sim.run and its like are doors to the same."""
+"""haptic-loop COMMAND: every command under one name, and the entry points of python -m sim.run and others."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from haptic_loop.design.own import is_refusal, place_of
 from haptic_loop.design.result import DesignFailed
 from haptic_loop.sim.scenario import InputError
 
-#: command -> what python -m calls it, and what it is for; it lives in the file of its name in this folder
+#: command -> (module of python -m, purpose); the command is in the file of its name in this folder
 COMMANDS = {
     "audit": ("design.audit", "are these gains safe, and how far"),
     "design": ("design", "design a coupling, prove its certificate and store both"),
@@ -44,11 +44,11 @@ COMMANDS = {
 }
 
 
-_LEADING = 5  # commands with which most users begin
+_LEADING = 5  # number of commands that --help shows first
 
 
 def door(command: str) -> NoReturn:
-    """Run the command of this name with the words of the command line."""
+    """Run the command of this name with the arguments of the command line."""
     execute(lambda argv: import_module(f"haptic_loop.cli.{command}").main(argv))
 
 
@@ -71,7 +71,7 @@ def _command(name: str) -> ModuleType:
 
 
 def _load_on_first_use(*names: str) -> None:
-    """Load these parts of NumPy when one of their names is read, and not as SciPy is imported: a third of its time."""
+    """Load these parts of NumPy only when one of their names is read, which saves a third of SciPy's import time."""
     for name in names:
         spec = find_spec(f"numpy.{name}")
         if spec and spec.loader and spec.name not in sys.modules:
@@ -82,25 +82,25 @@ def _load_on_first_use(*names: str) -> None:
 
 
 # ----------------------------------------------------------------------------------------------------
-# From the words of a command line to an exit code.
+# Running a command.
 
 
 def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> NoReturn:
     """Run a command and leave with its exit code; bad input is one line on standard error.
 
-    Whoever reads standard output may stop at any line (`| head -1`): the command's own exit code stays what it is,
-    also under `set -o pipefail`. SIGTERM ends a command as Ctrl-C does: temporary files are removed.
+    The reader of standard output may stop at any line (`| head -1`) without changing the exit code, also under
+    `set -o pipefail`. SIGTERM ends a command like Ctrl-C: temporary files are removed.
     """
     code: str | int | None
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of processes that this one starts
-    _load_on_first_use("f2py", "testing")  # of NumPy: SciPy names both as it is imported, and uses neither
-    os.environ["MPLBACKEND"] = "Agg"  # pictures are files; a name that matplotlib does not know would stop its import
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for child processes
+    _load_on_first_use("f2py", "testing")  # SciPy's import names both without using them
+    os.environ["MPLBACKEND"] = "Agg"  # Pictures are files; an unknown name would stop the import of matplotlib.
     _streams()
     sys.unraisablehook = _not_lost
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _terminated)
     try:
-        # the matrices here are small: more BLAS threads only wait for each other, and the last digits depend on them
+        # The matrices are small: more BLAS threads only wait for each other and change the last digits.
         with threadpool_limits(1, user_api="blas"), one_command():
             code = main(sys.argv[1:] if argv is None else argv)
     except (InputError, SingularLoop) as error:
@@ -113,10 +113,10 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
         code = end.code
     except MemoryError:
         code = _say("error: there is not enough memory for this", UNFINISHED)
-    except OSError as error:  # a full disk behind standard output, mostly
+    except OSError as error:  # mostly a full disk
         code = _cannot(error)
-    except Exception as error:  # not 1, which says that what was asked does not hold
-        place, code = place_of(error), UNFINISHED  # a mistake of ours, or one in a class that the user named
+    except Exception as error:  # not 1, which means that a claim does not hold
+        place, code = place_of(error), UNFINISHED  # a mistake in this package or in the user's own class
         if place and is_refusal(error):
             code = _say(f"error: {place}: {error}", BAD_INPUT)
         else:
@@ -138,13 +138,13 @@ def _say(message: str, code: int) -> int:
 
 
 def _cannot(error: OSError) -> int:
-    """Say in one line what the operating system refused; later output is discarded."""
+    """Print an error of the operating system in one line; later output is discarded."""
     nobody_reads()
     return _say(f"error: {error.filename or 'standard output'}: {error.strerror or error}", BAD_INPUT)
 
 
 def _streams() -> None:
-    """Replace closed standard streams, and characters that a terminal cannot show."""
+    """Replace closed standard streams, and escape characters that a terminal cannot show."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         stream = getattr(sys, name)
         if stream is None:
@@ -158,7 +158,7 @@ def _terminated(number: int, frame: Any) -> NoReturn:
 
 
 def _not_lost(unraisable: Any) -> None:
-    """Repeat a Ctrl-C that came during Python's clean-up, where it would be lost."""
+    """Repeat a Ctrl-C that came during Python's clean-up, which would lose it."""
     if issubclass(unraisable.exc_type, KeyboardInterrupt):
         _thread.interrupt_main()
     else:

@@ -1,4 +1,4 @@
-"""python -m hw.replay: a recorded session through the controller again, and the forces compared bit by bit."""
+"""python -m hw.replay: feed a recorded session through the controller and compare the forces bit by bit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from haptic_loop.hw.recording import load, replay
 
 @dataclass(frozen=True)
 class _Compared:
-    """The machine-readable result."""
+    """The report of a replay."""
 
     trace: str = render.figure("trace")
     ticks: int = render.figure("ticks")
@@ -26,7 +26,7 @@ class _Compared:
 
 
 def main(argv: list[str]) -> int:
-    """Replay a trace. 0: every force is the recorded one bit by bit, 1: not."""
+    """Replay a trace. 0: every force equals the recorded one bit by bit, 1: not."""
     parser = options.Parser(
         "hw.replay",
         "Feed a recorded session through the controller again and compare the forces bit by bit.",

@@ -1,4 +1,4 @@
-"""The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour."""
+"""The terminal of reports, which cuts no number of a table and reads no name as markup."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from rich.text import Text
 
 from haptic_loop.design.files import nobody_reads, printable
 
-_CUT = "…"  # what stands in a table for the end of a word that did not fit
-_WIDEST = 400  # characters
+_CUT = "…"  # rich's mark for a cut word
+_WIDEST = 400  # characters of the widest table
 _STEP = 2
-_OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # what opens no tag of our reports: a unit, a name
+_OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # an opening bracket that begins no tag of reports
 
 
 class Screen(Console):
-    """A console that cuts nothing off: words may be broken, numbers are not; a table may be wider than the terminal."""
+    """A console that breaks words, but no numbers, and lets tables be wider than the terminal."""
 
     def print(self, *objects: Any, **how: Any) -> None:
         """Print as rich does, but widen until no table loses a character."""
@@ -31,22 +31,22 @@ class Screen(Console):
             self._width = own
 
     def render_str(self, text: str, **how: Any) -> Text:
-        """As rich's, but a file `[/b].npz` or a device that calls itself `:x:` is printed as it is."""
+        """Render as rich does, but print names such as `[/b].npz` or `:x:` literally."""
         how, text = how | {"emoji": False}, printable(text)
         if how.get("markup") is not False:
             try:
                 return super().render_str(_OTHER_BRACKET.sub(r"\\[", text), **how)
-            except MarkupError:  # one of our own tags, closed too often
+            except MarkupError:  # an unbalanced closing tag
                 how |= {"markup": False}
         return super().render_str(text, **how)
 
-    def on_broken_pipe(self) -> None:  # rich itself would leave with 1, our "it does not hold"
-        """Go on without output where its reader has gone (`| head -1`); the exit code stays the same."""
+    def on_broken_pipe(self) -> None:  # rich would exit with 1, which means that a claim does not hold
+        """Continue without output after its reader has left (`| head -1`), with the same exit code."""
         self.quiet = True
         nobody_reads()
 
     def _needed(self, table: Table) -> int:
-        least = 4 * len(table.columns) + 1  # frames and padding, and one character for each column
+        least = 4 * len(table.columns) + 1  # frames, padding and one character for each column
         for width in range(max(self.width, least), _WIDEST, _STEP):
             lines = self.render_lines(table, self.options.update(width=width), pad=False)
             if not any(_CUT in part.text for line in lines for part in line):

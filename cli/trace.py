@@ -1,4 +1,4 @@
-"""python -m sim.trace: what a stored trace of sim.run or hw.bridge shows: its picture, and what grows in it."""
+"""python -m sim.trace: draw a stored trace of sim.run or hw.bridge, and measure the growth of its oscillations."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from haptic_loop.design.files import check_file
 from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.trace import Growth, Trace, growths
 
-_ZOOM_HZ = 10.0  # the picture shows six periods of it where nothing oscillates
+_ZOOM_HZ = 10.0  # without an oscillation the picture shows six periods of this frequency
 
 
 @dataclass(frozen=True)
 class _Traced:
-    """The machine-readable result."""
+    """The report of a trace."""
 
     trace: str
     ticks: int
@@ -24,7 +24,7 @@ class _Traced:
 
 
 def main(argv: list[str]) -> int:
-    """Look at a trace. 0: done, whatever it shows."""
+    """Analyse a trace. 0: done, whatever the result."""
     args = _parser().parse_args(argv)
     if args.plot is not None:
         check_file("--plot", Path(args.plot))

@@ -37,9 +37,9 @@ _EXAMPLES = (
     "python -m sim.view --coupling optimal",
     "python -m sim.view --video out.gif --script '0:none 1:theta+1 6:designed'",
 )
-_SCRIPT = "0:none 1:theta+1 6:designed"  # of a video: an oscillation starts and dies
-_AFTER = 3.0  # [s] that a video goes on after the last event of its script
-_LONGEST = 3600  # [s]
+_SCRIPT = "0:none 1:theta+1 6:designed"  # default script of a video: an oscillation starts and dies
+_AFTER = 3.0  # [s] of video after the last event of its script
+_LONGEST = 3600  # [s] longest video
 
 
 def main(argv: list[str]) -> int:
@@ -57,7 +57,7 @@ def main(argv: list[str]) -> int:
         args.coupling, args.duration = args.coupling or "moving-average", args.duration or scenario.duration
         args.script = args.script or "0:restart"
     label, script = _beginning(args, scenario.channels)
-    # --case none begins without a coupling; those that keys bring are for case I
+    # --case none begins without a coupling; keys choose couplings for case I.
     given = args.coupling if label == GIVEN else None
     menu = Menu("I" if args.case == "none" else args.case, args.condition, given, args.limiter)
     prepared = first_loop(menu, scenario, label)
@@ -78,14 +78,14 @@ def main(argv: list[str]) -> int:
 
 @dataclass(frozen=True)
 class _Event:
-    """A change of the loop: when it was made, and the verdicts on the loop after it."""
+    """A change of the loop: its time, and the verdicts on the loop after it."""
 
     t_s: float
     event: str
     coupling: str
     theta: tuple[int, ...]
     psi: tuple[int, ...]
-    exact_growth_rate_per_s: float  # null in JSON where there is none
+    exact_growth_rate_per_s: float  # null in JSON without one
     exact_frequency_hz: float
     assessment: Assessment
 
@@ -109,7 +109,7 @@ class _Event:
 
 @dataclass(frozen=True)
 class _Film:
-    """The file that was made."""
+    """The film's file."""
 
     file: str
     pictures: int
@@ -118,7 +118,7 @@ class _Film:
 
 @dataclass(frozen=True)
 class _Clock:
-    """How far the window's clock ran ahead of the loop."""
+    """The lead of the window's clock over the loop."""
 
     overruns: int
     lost_s: float
@@ -126,7 +126,7 @@ class _Clock:
 
 @dataclass(frozen=True)
 class _Ended:
-    """How the session was shown, and whether the keyboard ended it."""
+    """The film or the clock of a session, and whether the keyboard ended it."""
 
     interrupted: bool
     video: _Film | None = off_table("if given", None)
@@ -135,7 +135,7 @@ class _Ended:
 
 @dataclass(frozen=True)
 class _Report:
-    """What was seen; its fields are the keys of its JSON."""
+    """The report of a session."""
 
     case: str
     scenario: str
@@ -145,7 +145,7 @@ class _Report:
     ended: _Ended = off_table("inlined")
 
     def lines(self) -> Iterator[str]:
-        """One line per event, and where the film is."""
+        """Yield one line per event, and the file of the film."""
         yield from (event.line() for event in self.events)
         yield f"{self.simulated_s:6.2f} s  end        {self.clipped_ticks} ticks at a force limit"
         if clock := self.ended.clock:
@@ -181,18 +181,18 @@ def _parser() -> options.Parser:
 
 
 def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
-    """The first coupling, as the user calls it, and what follows. Raises InputError."""
+    """Return the first coupling by the user's name, and the script after it. Raises InputError."""
     label = _label(args)
     told = args.video and args.coupling is None and args.case != "none"
     text = args.script if args.script is not None else _SCRIPT if told else None
     script = () if text is None else parse_script(text, channels)
     if script and script[0][0] == 0 and isinstance(script[0][1], Couple):
-        return script[0][1].name, script[1:]  # nothing else need be designed first
+        return script[0][1].name, script[1:]  # the only coupling that is needed first
     return label, script
 
 
 def _label(args: argparse.Namespace) -> str:
-    """The name of the first coupling, as the window shows it. Raises InputError."""
+    """Return the name of the first coupling in the window. Raises InputError."""
     name = args.coupling
     if args.case == "none":
         if name not in (None, "none"):
@@ -208,12 +208,12 @@ def _label(args: argparse.Namespace) -> str:
 
 
 def _names() -> list[str]:
-    """The names of couplings in other commands, and those in the window."""
+    """Return the names of couplings in other commands and in the window."""
     return list(dict.fromkeys([*LABELS, *COUPLINGS]))
 
 
 def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
-    """Film the session by its own clock, so that the film is the same every time; after Ctrl-C it is shorter."""
+    """Film the session by its own clock, so that the film is reproducible; Ctrl-C makes it shorter."""
     from haptic_loop.sim.view.stage import pictures_for, save_film
 
     seconds = args.duration or (session.script_ends + _AFTER)

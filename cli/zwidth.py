@@ -1,6 +1,6 @@
 """python -m sim.zwidth: the Z-width map (K-B plane): certified, exact for random humans, simulated.
 
-options -> CouplingSweep or EnvironmentSweep: whose K and B -> Grid -> Map -> files
+options -> CouplingSweep or EnvironmentSweep -> Grid -> Map -> files
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _EXAMPLES = (
     "python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0",
     "python -m sim.zwidth --coupling optimal --grid 10",
 )
-_FINEST = 1e-5  # [m] least default threshold: what a desk device's encoders resolve
+_FINEST = 1e-5  # [m] least default threshold: the resolution of a desk device's encoders
 
 
 def main(argv: list[str]) -> int:
@@ -44,7 +44,7 @@ def main(argv: list[str]) -> int:
     if args.case == "none":
         instead = "use --case I, or --coupling none for a map over environments"
         raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
-    chosen = chosen_by(args, scenario) if args.coupling else None  # over the whole map the same
+    chosen = chosen_by(args, scenario) if args.coupling else None  # one coupling for the whole map
     sweep, fixed = _sweep(args, scenario, chosen), None
     if chosen:
         assessment = assessment_of(args, scenario, chosen)
@@ -130,7 +130,7 @@ def _mark(text: str) -> tuple[float, float]:
 
 
 def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) -> zwidth.Sweep:
-    """What varies over the map: the couplings of a loop, or the environments behind one coupling. Raises InputError."""
+    """Return the sweep over couplings of a loop, or over environments of one coupling. Raises InputError."""
     devices, loop = scenario.axis_devices, scenario.loop("I")
     if loop.axes:
         raise InputError(
@@ -180,7 +180,7 @@ def _share(count: int, report: MapReport) -> str:
 
 
 def _designed_rows(fixed: FixedCoupling) -> render.Rows:
-    """The fixed coupling in the environment that it was designed for."""
+    """Yield the rows of the fixed coupling in the environment of its design."""
     asked, guarantee = [*fixed.assessment.requirements.items()], fixed.assessment.guarantee
     needs = "; ".join(
         f"{name} needs {100 / need.margin:.4g} % of the damping ({need.proof})" for name, need in asked if need.margin
@@ -204,7 +204,7 @@ def _effects(effects: Shown) -> str:
 
 
 def _marked(report: MapReport) -> Iterator[str]:
-    """A line for every coupling that was asked about."""
+    """Yield a line for every coupling of --mark."""
     for mark in report.marks or ():
         stiffest = mark.stiffest_K_at_this_B
         ends = ", ".join(f"{name} {_limit(K)}" for name, K in stiffest.items())
@@ -218,7 +218,7 @@ def _limit(K: float | str | None) -> str:
 
 
 def _needs(need: Requirement) -> str:
-    """The damping that the worst channel needs."""
+    """Return the text of the damping that the worst channel needs."""
     worst, least = max(need.required), min(need.available)
     return f"needs {worst:.6g} of {least:.6g} N s/m ({render.certified(need, proof=False)})"
 
@@ -254,7 +254,7 @@ def _remarks(report: MapReport) -> Iterator[str]:
 
 
 def _about(conditions: Sequence[str]) -> str:
-    """What the axes are, and what a certified cell guarantees."""
+    """Return the words for the axes and for the guarantee of a certified cell."""
     line = "K and B are those of every spring at a contact; each is certified for its environment alone, by a sweep"
     if zwidth.MODEL_KEPT not in conditions:
         return f"{line}."

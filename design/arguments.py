@@ -1,4 +1,4 @@
-"""Checks of the arguments of functions for scripts: what is wrong is said in one line that names the argument."""
+"""Checks of function arguments, with one-line errors that name the argument."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 
 
 def of_kind(name: str, value: Any, kind: type, expected: str) -> None:
-    """Raises TypeError where `value` is no `kind`."""
+    """Raise TypeError unless `value` is a `kind`."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} is {shown(value)}, expected {expected}")
 
 
 def whole(name: str, value: Any, low: int, high: float = math.inf) -> int:
-    """A whole number from `low` to `high`, numpy's too. Raises TypeError, ValueError."""
+    """Return a whole number from `low` to `high`; NumPy integers are allowed. Raises TypeError, ValueError."""
     span = f"{low} to {high}" if high < math.inf else f"{low} or more"
     allowed = f"whole numbers, {span}"
     try:
@@ -31,20 +31,20 @@ def whole(name: str, value: Any, low: int, high: float = math.inf) -> int:
 
 
 def number(name: str, value: Any, expected: str = "a number") -> float:
-    """A float, numpy's too. Raises TypeError."""
+    """Return a float; NumPy numbers are allowed. Raises TypeError."""
     if isinstance(value, bool | str | bytes) or not hasattr(value, "__float__") or getattr(value, "ndim", 0):
         raise TypeError(f"{name} is {shown(value)}, expected {expected}")
     return float(value)
 
 
 def one_of(name: str, value: Any, allowed: Collection[str]) -> None:
-    """Raises ValueError."""
+    """Raise ValueError unless `value` is one of the allowed words."""
     if not isinstance(value, str) or value not in allowed:
         raise ValueError(f"{name} is {value!r}, allowed are {', '.join(allowed)}")
 
 
 def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:
-    """Raises TypeError for an option that `what` does not have."""
+    """Raise TypeError for an option that `what` does not have."""
     for option in options:
         if option not in allowed:
             close = difflib.get_close_matches(option, allowed, n=1)
@@ -53,7 +53,7 @@ def known(options: Iterable[str], allowed: Collection[str], what: str) -> None:
 
 
 def shown(value: Any) -> str:
-    """The value, shortened, with its type."""
+    """Return the value as a short text with its type."""
     text = repr(value)
     if len(text) > 60 or "\n" in text or type(value).__module__.startswith("haptic_loop"):
         return f"a {type(value).__name__}"

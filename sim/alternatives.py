@@ -1,8 +1,8 @@
-"""The same devices and hands with every coupling: what each guarantee costs, from no coupling to the optimal one.
+"""Comparison of couplings with the same devices and hands, from no coupling to the optimal one.
 
-The couplings are: none, the paper's printed gains where the loop is the paper's, the spring-damper for any passive
-environment, the one for this environment, and the optimal coupling where it is quick to find. Each is judged with the
-proof that it comes with and drives the same hands in the exact engine.
+The couplings are: none, the paper's gains for the paper's loop, the spring-dampers for any passive environment and for
+this environment, and the optimal coupling if it is quick to find. Each is assessed with its proof and drives the same
+hands in the exact engine.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _ROWS: dict[tuple[str, str | None], float] = {
     ("spring-damper", "this-environment"): math.inf,
     ("optimal", "this-environment"): math.inf,
 }
-_QUICK = 2  # channels of an optimal one
+_QUICK = 2  # largest number of channels with an optimal coupling
 
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
     """One coupling in the loop, or the reason why there is none."""
 
-    coupling: str  # its kind
+    coupling: str  # kind
     condition: str | None
     guarantee: str | None = off_table(default=None)
     dc_ratio: float | None = None  # share of the static stiffness that is felt
@@ -51,17 +51,17 @@ class Alternative:
     requirements: dict[str, Requirement] | None = off_table("left out", None)
     trace: Trace | None = off_table("left out", None)  # of the exact engine
     ideal: Array | None = off_table("left out", None)  # (N, m) forces of the ideal environment at its displacements [N]
-    until_s: float | None = off_table("left out", None)  # from here on the trace is not credible
+    until_s: float | None = off_table("left out", None)  # time from which the trace is not credible
 
     @property
     def name(self) -> str:
-        """The name in tables and pictures; that of a spring-damper is its condition."""
+        """The name in tables and pictures: for a spring-damper its condition."""
         if self.coupling == "spring-damper":
             return self.condition or ""
         return self.coupling
 
     def needs(self, condition: str) -> float | None:
-        """Required over available damping of the worst device; None where no damping is enough."""
+        """Return required over available damping of the worst device; None if no damping is enough."""
         requirement = (self.requirements or {}).get(condition)
         if requirement is None:
             return None

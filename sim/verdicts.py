@@ -1,4 +1,4 @@
-"""What a validation found, part by part: the figures of its report, and the words of their rows in its table."""
+"""Parts of the report of a validation: figures, and the texts of their rows."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from haptic_loop.sim.crowds import Findings, Validation
 from haptic_loop.sim.run import engine_name
 from haptic_loop.sim.stability import unstable
 
-_SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be slower in its last quarter than before
-_ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
+_SETTLING = 4  # number of decay times of the slowest mode after which hands must be slower in the last quarter
+_ROUNDING = 1e-9  # allowed negative W(N), relative to the magnitudes of its terms
 
 
 @dataclass(frozen=True)
 class Unstable:
-    """Hands that make the loop unstable, by engine; None for one that was not asked."""
+    """Numbers of hands that make the loop unstable, by engine; None for an engine that did not run."""
 
     exact: int
     mujoco: int | None
-    own: int | None = off_table("if given", None)  # by an engine of the user's own
+    own: int | None = off_table("if given", None)  # of an engine of the user's own
     others: str = off_table("left out", "")
 
     @classmethod
     def of(cls, question: Validation, exact: int, other: int | None) -> Unstable:
-        """`other` is the count of the engine that the question compares with the exact one."""
+        """Count unstable hands; `other` is the count of the engine that is compared with the exact one."""
         if other is None or question.engine == "exact":
             return cls(exact, None)
         if isinstance(question.engine, str):
@@ -47,7 +47,7 @@ class Unstable:
 
 @dataclass(frozen=True)
 class EnvironmentsMet:
-    """Which environments the loops had, and in which of them a loop was unstable."""
+    """The environments of the loops, and those in which a loop was unstable."""
 
     of: str
     count: int
@@ -69,7 +69,7 @@ class EnvironmentsMet:
 
 
 def disagreement_words(findings: Findings, engine: str, most: int = 3) -> str:
-    """The number of disagreements; of the first ones each engine's rate and how to look at it."""
+    """Return the number of disagreements, and for the first ones both rates and a command that repeats them."""
     places = np.flatnonzero(findings.disagreements)
     words = [str(places.size)]
     for k in places[:most]:
@@ -83,7 +83,7 @@ def disagreement_words(findings: Findings, engine: str, most: int = 3) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Held:
-    """A channel's human: links, or of a user's own class what the handle feels of it."""
+    """A channel's human: its links, or the port of a class of the user's own."""
 
     links: tuple[Link, ...] | None = off_table("if given", None)
     class_: str | None = off_table("if given", None)
@@ -102,7 +102,7 @@ class _Held:
 
 @dataclass(frozen=True)
 class DrawnHumans:
-    """A set of humans that the population drew, and the environment that it met."""
+    """A set of humans that the population drew, with their environment."""
 
     seed: int
     index: int
@@ -142,7 +142,7 @@ class WorstDrawn:
 
 @dataclass(frozen=True)
 class Traces:
-    """What the traces say, and whether they are long enough for hands to be slower at their end."""
+    """Figures of the traces, and whether they are long enough for hands to slow down."""
 
     duration_s: float
     humans: int
@@ -197,7 +197,7 @@ class Traces:
 
 @dataclass(frozen=True)
 class EnergyAudit:
-    """Traces on which W >= 0 was asked: forces that were clipped are covered by nothing, those of a limiter are."""
+    """Traces with a test of W >= 0. Clipped forces are not covered, forces of a limiter are."""
 
     audited: int
     clipped: int
@@ -217,12 +217,12 @@ class EnergyAudit:
         return f"{self.audited - self.violated} of {self.audited}{left}"
 
 
-_Met = TypeVar("_Met")  # which delays, or which ticks
+_Met = TypeVar("_Met")  # delays or ticks
 
 
 @dataclass(frozen=True)
 class Growing(Generic[_Met]):
-    """How many humans grow while delays or ticks vary; it holds unless certificates cover these and one grows."""
+    """The number of humans that grow while delays or ticks vary; none may grow if certificates cover them."""
 
     met: _Met = off_table("inlined")
     covered: bool = off_table()  # by certificates
@@ -252,7 +252,7 @@ class Growing(Generic[_Met]):
 
 @dataclass(frozen=True)
 class Attacked:
-    """What a search found, and how far the loop is from its required damping."""
+    """The result of a search, and the loop's distance from its required damping."""
 
     found: bool
     spectral_radius: float
@@ -284,6 +284,6 @@ def _held(humans: tuple[Hand, ...]) -> list[_Held]:
 
 
 def largest(values: Array) -> float | None:
-    """The largest finite value; None where there is none."""
+    """Return the largest finite value, or None."""
     values = values[np.isfinite(values)]
     return float(values.max()) if values.size else None
