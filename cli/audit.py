@@ -234,7 +234,7 @@ def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
 
     if args.varying_delay is None:
         return loop.varying_delay
-    span = options.delay_range(args.varying_delay, loop.channels, LONGEST_DELAY)
+    span = options.delay_range(args.varying_delay, loop, LONGEST_DELAY)
     if not span.contains(DelayRange(loop.theta, loop.theta)):
         raise InputError(f"--varying-delay is {span}, expected a range around theta = {listed(loop.theta)} (--theta)")
     return span

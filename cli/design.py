@@ -135,7 +135,7 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
             raise InputError("--varying-delay is for --coupling optimal or --condition this-environment")
         if loop.ranges:
             raise InputError("--varying-delay and [ranges]: switching delays are judged in one environment; give one")
-        span = options.delay_range(args.varying_delay, loop.channels, LONGEST_DELAY)
+        span = options.delay_range(args.varying_delay, loop, LONGEST_DELAY)
         with options.refused("--varying-delay: "):
             loop = loop.switching(span)
     return loop

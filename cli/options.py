@@ -397,9 +397,11 @@ def per_channel(option: str, values: tuple[_Given, ...], channels: int, what: st
     return values
 
 
-def delay_range(pairs: tuple[tuple[int, int], ...], channels: int, most: int) -> DelayRange:
-    """Return the range of delays of --varying-delay on every channel. Raises InputError."""
-    lo, hi = zip(*per_channel("--varying-delay", pairs, channels, "ranges"), strict=True)
+def delay_range(pairs: tuple[tuple[int, int], ...], loop: Loop, most: int) -> DelayRange:
+    """Return the range of delays of --varying-delay, per device or channel, on every channel. Raises InputError."""
+    if loop.axes and len(pairs) == len(loop.axes):
+        pairs = loop.per_channel(pairs)
+    lo, hi = zip(*per_channel("--varying-delay", pairs, loop.channels, "ranges"), strict=True)
     if any(not 0 <= a <= b <= most for a, b in zip(lo, hi, strict=True)):
         asked = ",".join(f"{a}-{b}" for a, b in pairs)
         raise InputError(f"--varying-delay is {asked}, expected 0 <= LO <= HI <= {most} samples")
@@ -532,7 +534,9 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
     if args.pattern is not None:
         changes |= _pattern(args.pattern, scenario.channels)
     if args.varying_delay is not None:
-        pairs = per_channel("--varying-delay", args.varying_delay, scenario.channels, "ranges")
+        each = len(args.varying_delay) == len(scenario.device)
+        count = len(scenario.device) if each else scenario.channels
+        pairs = per_channel("--varying-delay", args.varying_delay, count, "ranges")
         changes["lo"], changes["hi"] = zip(*pairs, strict=True)
     changes |= {name: value for name in ("loss", "playout") if given(value := getattr(args, name))}
     if not changes:

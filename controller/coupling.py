@@ -79,6 +79,10 @@ class Coupling:
         """Return the coupling with all K and all B multiplied by factors, if it has such gains."""
         return self
 
+    def turned(self, Q: Array) -> Coupling:
+        """Return the coupling Q V Q' in other coordinates of the channels, for an orthogonal Q (m, m)."""
+        raise ValueError(f"a coupling of class {type(self).__name__} is of the axes that it has")
+
     def in_series(self, T: Number) -> Lti | None:
         """Return a block with the poles that it adds to the environment, if it closes no loop; otherwise None."""
         return None
@@ -108,6 +112,9 @@ class NoCoupling(Coupling):
 
     def around(self, environment: Block, further: int = 0) -> Block:
         return environment
+
+    def turned(self, Q: Array) -> NoCoupling:
+        return self
 
     def form(self) -> _NoForm:
         return _NoForm()
@@ -174,6 +181,10 @@ class SpringDamper(ReadOnly, Coupling):
     def scaled(self, stiffness: float = 1.0, damping: float = 1.0) -> SpringDamper:
         return replace(self, K=stiffness * self.K, B=damping * self.B)
 
+    def turned(self, Q: Array) -> MatrixSpringDamper:
+        K, B = (Q * gains @ Q.T for gains in (self.K, self.B))
+        return MatrixSpringDamper((K + K.T) / 2, (B + B.T) / 2)
+
     def sampled(self, z: Complex, T: float) -> Sampled:
         """Return V at z (n, k) or (1, k), for gains (n, m) or (m,)."""
         beta, points = self._beta(T), np.asarray(z)[..., None]
@@ -232,7 +243,7 @@ class MatrixSpringDamper(ReadOnly, Coupling):
         return Lti(memory[at], gain[at], memory, gain, T)
 
     def figures(self, T: float) -> dict[str, Any]:
-        return {"K": self.K.tolist(), "B": self.B.tolist()} | super().figures(T)
+        return {"stiffness": np.diag(self.K).tolist()} | super().figures(T)
 
     def scaled(self, stiffness: float = 1.0, damping: float = 1.0) -> MatrixSpringDamper:
         return MatrixSpringDamper(stiffness * self.K, damping * self.B)
@@ -453,6 +464,12 @@ class ForceFilter(ReadOnly, Coupling):
 
     def figures(self, T: float) -> dict[str, Any]:
         return {"order": self.filter(T).order}
+
+    def turned(self, Q: Array) -> ForceFilter:
+        """Return Q R Q', rounded to decimals with R_0 such that R(1) = g I holds exactly."""
+        later = np.round(Q @ _own_columns(self.R[1:]) @ Q.T, 10)
+        first = self._static() - numbers(later, Fraction(1)).sum(axis=0)
+        return ForceFilter(self.poles, self.pairs, np.concatenate([first.astype(float)[None], later]))
 
     def around(self, environment: Block, further: int = 0) -> Block:
         """Return R Psi E for `environment` = Psi E."""

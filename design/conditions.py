@@ -87,7 +87,7 @@ def v_hat(H: Block) -> tuple[Array, Block]:
 
 
 #: reason for which a condition is refused for devices whose levels Delta_i are not diagonal
-FULL_LEVELS = "levels: it is derived for devices whose Delta_i is diagonal"
+FULL_LEVELS = "is proved where every Delta_i is diagonal: give damping as one number for each axis"
 
 
 def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | None = None) -> Demand[Block]:
@@ -99,7 +99,7 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     Theta-hat and Delta_D^-1, in proportion to 1/s. Raises ValueError for a phi that is not a multiplier.
     """
     if phi is not None and loop.levels:
-        raise ValueError(FULL_LEVELS)
+        raise ValueError(f"levels: any-environment with psi >= 1 {FULL_LEVELS}")
     T, damping = V.T, even_damping(loop, V.T)
     shortage = numbers([0] * loop.channels if phi is None else phi, T)
     if len(shortage) != len(damping) or not ((shortage >= 0) & (shortage < damping)).all():

@@ -12,8 +12,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 import numpy as np
 
+from haptic_loop.controller.arithmetic import Number, numbers
 from haptic_loop.controller.coupling import Coupling, ForceFilter, NoCoupling
+from haptic_loop.controller.environment import Environment
 from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT
@@ -82,7 +85,7 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """
     less = loop.environment.walls or loop.environment.world or loop.ranges or loop.varying_delay
     conditions = kind_of(kind).conditions
-    if loop.known_devices and KNOWN_DEVICE in conditions and not (less or loop.latency):
+    if loop.known_devices and KNOWN_DEVICE in conditions and not (less or loop.latency or loop.levels):
         return KNOWN_DEVICE.name  # never worse than this-environment
     plain = [each for each in conditions if not isinstance(each, KnownDevice)]
     return (plain[-1] if less and not loop.latency else plain[0]).name  # The last one covers more environments.
@@ -140,9 +143,10 @@ def design_by_kind(
     if asked not in able:
         raise ValueError(f"condition is {asked!r}, for {kind} allowed are {', '.join(able)}")
     made_for = able[asked]
+    if loop.levels and (reason := made_for.beyond(loop)):
+        raise ValueError(reason)
     if loop.levels and kind != "moving-average":
-        why = "is designed for devices whose Delta_i is diagonal; a moving-average takes any, and a file is judged"
-        raise ValueError(f"levels: {kind} {why}")
+        return _in_principal_axes(loop, kind, own or made_for, progress, options)
     if chosen.model and loop.environment.walls:
         reason = f"environment.walls: an {kind} coupling holds a linear model, so it cannot face walls"
         raise ValueError(f"{reason}{_before_walls(loop)}")
@@ -163,6 +167,59 @@ def design_by_kind(
     if chosen.model or anywhere or not (loop.latency or loop.environment.walls):
         return made(loop)
     return _with_less_damping(loop, made, made_for)
+
+
+class _Turned(Environment):
+    """An environment in other coordinates of the contacts: E becomes Q'E Q with an orthogonal Q (m, m)."""
+
+    def __init__(self, of: Environment, Q: Array) -> None:
+        self.contacts, self.of, self.Q, self.world = of.contacts, of, Q, of.world
+
+    def E(self, T: Number) -> Lti:
+        Q = numbers(self.Q, T)
+        return Q.T @ self.of.E(T) @ Q
+
+
+_ROUNDED = 1e-9  # of the damping: turned levels leave more than the rounding of their eigenvalues
+
+
+def _in_principal_axes(
+    loop: Loop,
+    kind: str,
+    condition: Condition,
+    progress: Callable[[str, int, int], None],
+    options: dict[str, Any],
+) -> Design:
+    """Return the design in the principal axes of the levels, turned back, and judged by the levels themselves.
+
+    With Delta_i = Q_i diag(d) Q_i' of every device, Q' Delta Q is diagonal, and no condition and no mismatch changes
+    if E and V become Q'E Q and Q'V Q (docs/theory.md). Raises ValueError where the condition or a design says nothing
+    of full levels, DesignFailed where the coupling is not certified.
+    """
+    for name, there in (("environment.walls", loop.environment.walls), ("ranges", loop.ranges)):
+        if there:
+            why = f"a {kind} is designed in the principal axes of the damping, into which {name} are not turned"
+            raise ValueError(f"levels: {why}; a moving-average takes any")
+    if kind == "ccl":
+        able = "spring-damper, moving-average and optimal take any"
+        raise ValueError(f"levels: ccl is designed for devices whose Delta_i is diagonal; {able}")
+    Delta, Q = loop.Delta(), np.zeros((loop.channels,) * 2)
+    for own in loop.devices:
+        Q[own, own] = np.linalg.eigh(Delta[own, own])[1]
+    values = np.diag(Q.T @ Delta @ Q)
+    straight = msgspec.structs.replace(
+        loop,
+        environment=_Turned(loop.environment, Q),
+        delta=tuple(((1 - _ROUNDED) * values).tolist()),
+        levels=None,
+    )
+    found = design_by_kind(straight, kind, condition, progress, **options)
+    coupling = found.coupling.turned(Q)
+    requirement = condition.judge(loop, coupling)
+    if not requirement.certified:
+        why = f"the designed coupling is not certified by {condition.name}: {requirement.shortfall}"
+        raise DesignFailed(None, (), why)
+    return replace(found, coupling=coupling, requirement=requirement, certificate=None)
 
 
 def _instead(loop: Loop, words: str, kind: str, **options: Any) -> str:

@@ -251,6 +251,12 @@ class SampledLoop:
         return minimize(self.square_mismatch, x, jac=self.square_mismatch_slope, method="SLSQP", **problem)
 
 
+def _shared(loop: Loop) -> tuple[list[int], Array]:
+    """The first channel of each device, and the mean over the axes of a device, (m, m): they share one multiplier."""
+    of = np.array(loop.per_channel(range(len(loop.devices))))
+    return [own.start for own in loop.devices], (of[:, None] == of) / np.bincount(of)[of]
+
+
 class SwitchingLoop(SampledLoop):
     """The loop under any switching of delays: x = (log K, B/delta, log alpha T/delta of the channels that switch).
 
@@ -264,12 +270,15 @@ class SwitchingLoop(SampledLoop):
         if loop.environment.walls or loop.latency:
             raise ValueError("gains for delays that switch are designed in linear environments and without a latency")
         self.active = np.flatnonzero(np.subtract(hi, lo))
+        self.lead, self.shared = _shared(loop)
+        self.unit = np.array(loop.per_channel(loop.per_device(even_damping(loop)).tolist())) / loop.T
         super().__init__(loop.switching(DelayRange(tuple(lo), tuple(hi))))
 
     def point(self, coupling: SpringDamper) -> Array:
         """Return x of the gains with their best multiplier."""
-        unit = self.delta / self.loop.T
-        a = (np.array(SWITCHING.required(self.loop, coupling).multiplier or self._first * unit) / unit)[self.active]
+        multiplier = SWITCHING.required(self.loop, coupling).multiplier
+        alpha = np.array(self.loop.per_channel(multiplier)) if multiplier else self._first * self.unit
+        a = (alpha / self.unit)[self.active]
         return np.concatenate([super().point(coupling), np.clip(np.log(np.maximum(a, 1e-300)), *self.bounds)])
 
     def judged(self, x: Array) -> Requirement:
@@ -278,11 +287,15 @@ class SwitchingLoop(SampledLoop):
     def demand(self, G: Sampled, mu: Array) -> Demand[Sampled]:
         alpha = np.zeros(self.loop.channels)
         alpha[self.active] = mu
-        return SWITCHING.block(G, self.loop, alpha)
+        return SWITCHING.block(G, self.loop, alpha[self.lead])
 
     def mu(self, x: Array) -> tuple[Array, Array]:
-        alpha = np.exp(x[2 * self.loop.channels :]) * (self.delta / self.loop.T)[self.active]
-        return alpha, alpha
+        logs, unit = x[2 * self.loop.channels :], self.unit[self.active]
+        if self.loop.axes is None:
+            return np.exp(logs) * unit, np.exp(logs) * unit
+        shared = self.shared[np.ix_(self.active, self.active)]
+        alpha = np.exp(shared @ logs) * unit
+        return alpha, alpha[:, None] * shared
 
 
 class LimiterLoop(SampledLoop):
@@ -293,9 +306,7 @@ class LimiterLoop(SampledLoop):
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.active = np.arange(loop.channels)
-        self.lead = [own.start for own in loop.devices]  # of the channels, which share one multiplier in a device
-        of = np.array(loop.per_channel(range(len(loop.devices))))
-        self.shared = (of[:, None] == of) / np.bincount(of)[of]  # (m, m) the mean over the axes of a device
+        self.lead, self.shared = _shared(loop)
         super().__init__(loop, band_hz)
 
     def point(self, coupling: SpringDamper) -> Array:

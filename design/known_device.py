@@ -500,7 +500,7 @@ class KnownDevice(Condition):
         if not loop.known_devices:
             return _NONE
         if loop.levels:
-            return FULL_LEVELS
+            return f"levels: {self.name} {FULL_LEVELS}"
         return _NO_SHORTEST if shortest_period(loop) is None else super().beyond(loop)
 
     def without(self, coupling: Coupling) -> str | None:

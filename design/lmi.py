@@ -348,7 +348,8 @@ class _AnyEnvironment(Multiplied):
         if loop.environment.walls and any(loop.psi):
             return "with delay in the environment its multiplier is of a linear one: no walls"
         if loop.levels and (any(loop.psi) or _in_frame(loop)):
-            return f"{conditions.FULL_LEVELS} with a late environment, a latency or delays that switch"
+            what = "psi >= 1" if any(loop.psi) else "a latency" if loop.latency else "delays that switch"
+            return f"levels: {self.name} with {what} {conditions.FULL_LEVELS}"
         if _in_frame(loop) and any(loop.psi):
             what = "a latency" if loop.latency else "delays that switch"
             return f"with delay in the environment its multiplier is of whole, constant samples: no {what}"

@@ -9,7 +9,7 @@ from haptic_loop.cli import options, render
 from haptic_loop.cli.run import _parser as run_parser
 from haptic_loop.controller.loop import DelayRange
 from haptic_loop.design.files import one_line
-from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.scenario import InputError, load
 
 
 def parser():
@@ -54,8 +54,8 @@ def test_good_words():
     assert (args.count, args.length, args.K, args.theta) == (3, 1e-3, (1.0, 2.0), (0,))
     assert args.mark == [(5000.0, 0.0), (1.0, 2.0)]
     assert options.per_channel("--theta", args.theta, 3) == (0, 0, 0)
-    assert options.delay_range(args.varying_delay, 2, 9) == DelayRange((1, 0), (2, 3))
-    assert options.delay_range(options._delay_ranges("1,2"), 2, 9) == DelayRange((1, 1), (2, 2))
+    assert options.delay_range(args.varying_delay, load().loop("I"), 9) == DelayRange((1, 0), (2, 3))
+    assert options.delay_range(options._delay_ranges("1,2"), load().loop("I"), 9) == DelayRange((1, 1), (2, 2))
     with pytest.raises(InputError, match="--K has 2 entries, expected 3"):
         options.per_channel("--K", args.K, 3)
 

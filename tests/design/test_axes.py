@@ -7,17 +7,21 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from haptic_loop.cli import verdict
+from haptic_loop.cli.options import delay_range
 from haptic_loop.controller.arithmetic import Number, numbers
 from haptic_loop.controller.budget import EPS, EnergyBudget, Packets
 from haptic_loop.controller.complementarity import BallProblem, BoxProblem, magnitudes
-from haptic_loop.controller.coupling import MatrixSpringDamper, SpringDamper
-from haptic_loop.controller.environment import Network, Networks, Spring
+from haptic_loop.controller.coupling import ForceFilter, MatrixSpringDamper, SpringDamper
+from haptic_loop.controller.environment import Network, Networks, Spring, Wall
 from haptic_loop.controller.loop import DelayRange, DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti
+from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove, required_damping
 from haptic_loop.design.conditions import encoder_friction
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import SWITCHING, LimitedForces
+from haptic_loop.design.gain_search import SwitchingLoop
 from haptic_loop.design.known_device import KNOWN_DEVICE
 
 LEVELS = ((1.5, 0.4), (0.4, 0.9)), ((1.2, -0.3), (-0.3, 2.0))
@@ -121,6 +125,14 @@ ONE = np.eye(2)
 SPRINGS = between(rotated(30, [900, 300]), rotated(-50, [700, 200]), np.array([[50.0, 10.0], [10.0, 80.0]]))
 MASS = Plane(4, np.diag([0, 0, 0, 0, 0.5, 0.5]), between(0.5 * ONE, 0.4 * ONE, 0.2 * ONE), SPRINGS)
 LOOP = _with(environment=MASS)
+#: one device whose plane holds a mass of 0.5 kg, with springs along the axes of its level
+CORNER = Plane(
+    2,
+    np.diag([0, 0, 0.5, 0.5]),
+    np.diag([0.5] * 4) - 0.5 * np.eye(4, k=2) - 0.5 * np.eye(4, k=-2) + np.diag([0, 0, 0.2, 0.2]),
+    np.kron([[1, -1], [-1, 1.2]], np.diag([900.0, 300.0])),
+)
+TURN = np.array([[0.8, 0.6], [-0.6, 0.8]])
 BUILT = MatrixSpringDamper(
     [[1500, 300, 0, 0], [300, 800, 0, 0], [0, 0, 1000, -200], [0, 0, -200, 700]], 0.2 * np.eye(4)
 )
@@ -191,6 +203,28 @@ def test_rigid_wall_with_a_stiffness_matrix() -> None:
     isotropic.environment.matrices = (*isotropic.environment.matrices[:2], 1000.0 * np.eye(2))
     least = 2.5 / np.linalg.eigvalsh(level)[0]
     assert required_damping(isotropic, stiff, "this-environment").ratio == pytest.approx(least, rel=1e-5)
+
+
+@pytest.mark.parametrize(("theta", "damping", "needs"), [(0, 2.0, 3.5), (1, 2.0, 4.2221), (1, 0.0, 4.5)])
+def test_a_wall_in_space_faces_the_level_along_its_normal(theta: int, damping: float, needs: float) -> None:
+    """s Delta >= c n n' holds for s = c n' Delta^-1 n, with the c [N s/m] that a bare wall needs of a single axis."""
+    normal, level = np.array([0.6, 0.8]), np.array(LEVELS[0])
+    wall = Wall(("a", "ground"), 3000.0, damping, normal=tuple(normal))
+    network = Network(("a.x", "a.y"), walls=(wall,), points={"a": ("a.x", "a.y")})
+    loop = Loop(1e-3, (theta,) * 2, (0, 0), (0, 0), (1.5, 0.9), network, axes=(2,), levels=LEVELS[:1])
+    stiff = MatrixSpringDamper(1e9 * np.eye(2), np.zeros((2, 2)))
+    expected = needs * normal @ np.linalg.solve(level, normal)
+    assert required_damping(loop, stiff, "this-environment").ratio == pytest.approx(expected, rel=1e-4)
+
+
+def test_longest_period_scales_matrix_levels() -> None:
+    """A wall with the stiffness matrix K needs (theta + 1/2) T_max times the largest eigenvalue of Delta^-1 K."""
+    K, level = rotated(20, [2500.0, 900.0]), np.array(LEVELS[0])
+    wall = Plane(2, np.zeros((2, 2)), np.zeros((2, 2)), K)
+    loop = Loop(1e-3, (1, 1), (0, 0), (0, 0), (1.5, 0.9), wall, axes=(2,), levels=LEVELS[:1], T_max=1.4e-3)
+    stiff = MatrixSpringDamper(1e9 * np.eye(2), np.zeros((2, 2)))
+    largest = np.linalg.eigvals(np.linalg.solve(level, K)).real.max()
+    assert required_damping(loop, stiff, "this-environment").ratio == pytest.approx(2.1e-3 * largest, rel=1e-5)
 
 
 def turned(loop: Loop, Q: np.ndarray) -> Loop:
@@ -384,6 +418,63 @@ def test_stiffest_coupling_attains_the_matrix_bound() -> None:
     bound = LOOP.T / 2 * np.diag([2.0, 2.0, 3.0, 3.0]) @ np.linalg.inv(LOOP.Delta())
     assert np.linalg.eigvalsh(V1 - bound)[0] > 0
     assert prove(LOOP, design.coupling, "any-environment").proof == "rational"
-    for kind in ("spring-damper", "ccl", "optimal"):
-        with pytest.raises(ValueError, match=r"levels: .* Delta_i is diagonal"):
-            design_by_kind(LOOP, kind)
+    with pytest.raises(ValueError, match=r"levels: ccl is designed for devices whose Delta_i is diagonal"):
+        design_by_kind(LOOP, "ccl")
+
+
+@pytest.mark.parametrize("condition", ["any-environment", "this-environment"])
+def test_designs_turn_with_the_axes(condition: str) -> None:
+    """The scalar design of diagonal levels, and that of the same loop in other coordinates, where levels are full."""
+    straight = Loop(1e-3, (1, 1), (0, 0), (0, 0), (1.5, 0.9), CORNER, axes=(2,))
+    Q = np.zeros((4, 4))
+    Q[:2, :2] = Q[2:, 2:] = TURN
+    objective = design_by_kind(straight, "spring-damper", condition).objective
+    aslant = turned(straight, Q)
+    assert aslant.levels is not None
+    design = design_by_kind(aslant, "spring-damper", condition)
+    assert isinstance(design.coupling, MatrixSpringDamper)
+    assert design.objective == pytest.approx(objective, rel=1e-4)
+    assert prove(aslant, design.coupling, condition).proof == "rational"
+
+
+def test_optimal_couplings_take_full_levels() -> None:
+    Q = np.zeros((4, 4))
+    Q[:2, :2] = Q[2:, 2:] = TURN
+    straight = Loop(1e-3, (1, 1), (0, 0), (0, 0), (1.5, 0.9), CORNER, axes=(2,))
+    designs = [design_by_kind(loop, "optimal", bases=((2, 1),)) for loop in (straight, turned(straight, Q))]
+    assert designs[1].objective == pytest.approx(designs[0].objective, rel=1e-3)
+    assert prove(turned(straight, Q), designs[1].coupling, "this-environment").proof == "rational"
+
+
+def test_a_turned_filter_keeps_its_static_share() -> None:
+    R = np.array([[[0.25, -0.125], [0.5, 0.375]], [[0.5, 0.125], [-0.5, 0.375]]])
+    before = ForceFilter([0.5], np.zeros((0, 2)), R)
+    after, z = before.turned(TURN), np.exp(1j * np.array([0.1, 1.0, 3.0]))
+    assert after.g == before.g == 0.75
+    np.testing.assert_allclose(after.filter(1e-3).at(z), TURN @ before.filter(1e-3).at(z) @ TURN.T, atol=1e-9)
+
+
+def test_switching_search_shares_a_multiplier() -> None:
+    """Options give delays per device; the slope by gains and multipliers is that of differences."""
+    loop = msgspec.structs.replace(LOOP, levels=None)
+    span = delay_range(((0, 1), (2, 2)), loop, 9)
+    assert (span.lo, span.hi) == ((0, 0, 2, 2), (1, 1, 2, 2))
+    search = SwitchingLoop(loop, span.lo, span.hi)
+    x = search.point(SpringDamper([900.0, 800.0, 700.0, 600.0], [0.3] * 4))
+    x[8:] += [0.1, -0.2]
+    steps = 1e-6 * np.eye(x.size)
+    differences = np.stack([(search.room(x + step) - search.room(x - step)) / 2e-6 for step in steps], axis=1)
+    assert np.abs(search.room_slope(x) - differences).max() < 1e-5 * np.abs(differences).max()
+
+
+def test_reports_show_matrix_gains_on_their_diagonal() -> None:
+    rows = dict(verdict.gain_rows(assess(PAIR, BUILT)))
+    assert rows == {"coupling, static": "1500, 800, 1000, 700 N/m"}
+
+
+def test_walls_and_ranges_are_not_turned() -> None:
+    walls = (Wall(("a", "ground"), 1000.0, normal=(1.0, 0.0)),)
+    network = Network(("a.x", "a.y"), walls=walls, points={"a": ("a.x", "a.y")})
+    loop = Loop(1e-3, (1, 1), (0, 0), (0, 0), (1.5, 0.9), network, axes=(2,), levels=LEVELS[:1])
+    with pytest.raises(ValueError, match=r"levels: .* environment.walls are not turned; a moving-average takes any"):
+        design_by_kind(loop, "spring-damper")
