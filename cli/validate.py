@@ -20,7 +20,7 @@ from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import ANY, RANGES
 from haptic_loop.design.known_device import KNOWN_DEVICE
-from haptic_loop.design.result import PLAIN_CONDITIONS, Chosen
+from haptic_loop.design.result import KNOWN_CONDITIONS, PLAIN_CONDITIONS, Chosen
 from haptic_loop.models.human import Human, Population
 from haptic_loop.models.scene import MIXED
 from haptic_loop.sim import verdicts
@@ -318,7 +318,9 @@ def _reported(
         certified = guarantee is not None and guarantee.environments in (ANY, RANGES)
     mode = worst_mode(assemble(scenario, chosen.coupling))
     own = _Own(args.human or scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
-    energy = verdicts.EnergyAudit.of(question, findings) if certified and question.ticks else None
+    plain = any(each.certified for name, each in assessment.requirements.items() if name not in KNOWN_CONDITIONS)
+    # W counts delta dx^2/T, which a proof for known devices does not need
+    energy = verdicts.EnergyAudit.of(question, findings) if certified and plain and question.ticks else None
     switching, timing = _varying(question, chosen, assessment, findings, certified)
     worst, drawn = (w and verdicts.Attacked.of(w, searched.ratio, certified) for w in (searched.worst, searched.drawn))
     also = all(part.holds for part in (own, energy, switching, timing, worst, drawn) if part)

@@ -39,7 +39,7 @@ from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.environments import LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
 from haptic_loop.design.frequency import too_long
 from haptic_loop.design.guarantees import ANY, RANGES
-from haptic_loop.design.known_device import KNOWN_DEVICE, described
+from haptic_loop.design.known_device import KNOWN_DEVICE, LimitedKnownDevice, described
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Design, NotProved, Requirement, suffices
 from haptic_loop.design.transparency import BAND_HZ, Transparency, transparency
@@ -250,36 +250,53 @@ def covered_limits(
     for each in requirements.values():
         if each.certified and each.lag is not None:
             return ForceLimits(each.lag, f"{each.condition} covers limited forces")
-    if not requirements[THIS_ENVIRONMENT.name].certified:
+    extended = [name for name in _EXTENDED if name in requirements and requirements[name].certified]
+    if not extended:
         return ForceLimits(None, "no guarantee that it could extend")
     less = any(each.certified and each.guarantee == ANY for each in requirements.values())
-    return replace(_by_its_own_block(loop, coupling, proof, known), less=less)
+    found = [_by_its_own_block(loop, coupling, proof, known, extended[0])]
+    if found[0].rho is None and len(extended) > 1:
+        found.insert(0, _by_its_own_block(loop, coupling, None, known, extended[1]))
+    covered = next((each for each in found if each.rho is not None), found[-1])
+    return replace(covered, less=less)
+
+
+_EXTENDED = THIS_ENVIRONMENT.name, KNOWN_DEVICE.name  # conditions that have a block for limited forces
 
 
 def _by_its_own_block(
-    loop: Loop, coupling: Coupling, proof: Certificate | None, known: Certificate | None
+    loop: Loop, coupling: Coupling, proof: Certificate | None, known: Certificate | None, base: str
 ) -> ForceLimits:
-    """Find the limiter of this-environment."""
+    """Find the limiter of the condition `base`."""
     if proof:
         try:
             requirement, condition = recheck(loop, coupling, proof, known), condition_of(proof)
-            assert isinstance(condition, LimitedForces)
-            c = condition.rows(loop, requirement.multiplier or ())
+            assert isinstance(condition, LimitedForces | LimitedKnownDevice)
+            c = _rows(condition, loop, requirement)
             return ForceLimits(lag(loop, proof), _OWN_PROOF, requirement, c, proof)
         except NotProved:  # made for another loop
             pass
-    limiter = LimitedForces(beta_of(loop, proof)) if proof else LIMITER
+    plain = LimitedForces(beta_of(loop, proof)) if proof else LIMITER
+    limiter = LimitedKnownDevice(plain) if base == KNOWN_DEVICE.name else plain
     requirement = required_damping(loop, coupling, limiter)
-    c = limiter.rows(loop, requirement.multiplier or ())
+    c = _rows(limiter, loop, requirement)
     if not requirement.certified:
         needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
         return ForceLimits(None, requirement.reason or needs, requirement, c)
-    rho = loop.per_channel(limiter.rho(loop))
+    rho = loop.per_channel(plain.rho(loop))
     try:
         proved = prove(loop, coupling, limiter, swept=requirement)
     except NotProved as refused:
         return ForceLimits(rho, f"swept, not proved: {refused}", requirement, c)
     return ForceLimits(rho, _OWN_PROOF, replace(requirement, proof="rational"), c, proved)
+
+
+def _rows(
+    condition: LimitedForces | LimitedKnownDevice, loop: Loop, requirement: Requirement
+) -> tuple[tuple[Any, ...], ...]:
+    """Return the weights c of a limiter's requirement, one row per device."""
+    plain = condition.limiter if isinstance(condition, LimitedKnownDevice) else condition
+    return plain.rows(loop, requirement.multiplier or ())
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -42,7 +42,7 @@ from haptic_loop.design.exact import (
     rows_of,
 )
 from haptic_loop.design.frequency import frequencies, on_circle, rounding
-from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY
+from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import NotProved, Requirement, refusal
 
@@ -286,12 +286,13 @@ def condition_of(certificate: Certificate, own: Condition | None = None) -> Cond
     base = named(own or certificate.condition)
     if not certificate.limiter:
         return base
-    if not base.extensible:
+    if not (base.extensible or base is KNOWN_DEVICE):
         raise ValueError(f"facts: {certificate.condition} needs no multiplier for limited forces, and one is on file")
     rho, c = (certificate.multipliers.get(name, ()) for name in ("rho", "c"))
     if not rho or len(rho) > len(certificate.available) or len(c) % len(rho):
         raise ValueError(f"multipliers: rho has {len(rho)} numbers and c {len(c)}, expected as many for each device")
-    return LimitedForces(lags=len(c) // len(rho), held=rho)
+    limiter = LimitedForces(lags=len(c) // len(rho), held=rho)
+    return LimitedKnownDevice(limiter) if base is KNOWN_DEVICE else limiter
 
 
 def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
@@ -406,7 +407,7 @@ def _on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[flo
 _NAMED: dict[str, Condition] = {
     each.name: each for each in (ANY_ENVIRONMENT, THIS_ENVIRONMENT, KNOWN_DEVICE, KNOWN_DEVICE_ANY)
 }
-_PARTS = SwitchingDelays, LimitedForces  # conditions that are facts of a certificate of this-environment
+_PARTS = SwitchingDelays, LimitedForces, LimitedKnownDevice  # conditions that are facts in a certificate
 
 
 def _is_ours(condition: Condition) -> bool:

@@ -387,7 +387,7 @@ class Limiter(Fact):
 
     def enter(self, block: Collected[Any], loop: Loop, values: Values) -> None:
         for i, d in enumerate(loop.per_channel(range(len(loop.devices)))):
-            for part, _ in block.moving(i)[-2:]:  # the displacement that the slip is taken off, and the slip
+            for part in block.slipping(i):
                 block.keep(part, _SPARE * self.rho[d])
             c = [numbers(v, block.T) for v in values["c"][d * self.lags : (d + 1) * self.lags]]
             e, rho = block.slip(i), numbers(self.rho[d], block.T)

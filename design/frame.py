@@ -176,6 +176,11 @@ class Collected(Generic[AnyBlock]):
         ]
         return parts + ([(self.slip(channel), (1,))] if ("de", channel) in self.places else [])
 
+    def slipping(self, channel: int) -> tuple[int, int]:
+        """Return the displacement off which the limiter's slip is taken, and the slip."""
+        (own,) = (self.places[i.name, channel] for i in self.hands if i.channel == channel and i.slips)
+        return own, self.slip(channel)
+
     @property
     def size(self) -> int:
         return len(self.places)

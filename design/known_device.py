@@ -15,6 +15,7 @@ docs/theory.md has the proof. The blocks below say that the environment's side g
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -31,9 +32,19 @@ from haptic_loop.controller.loop import DeviceBounds, Loop
 from haptic_loop.controller.lti import Array, Block, Complex, Lti, constant_like
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design.conditions import BEYOND, FULL_LEVELS, Condition, Demand, even_damping, v_hat
-from haptic_loop.design.environments import THIS_ENVIRONMENT, Multiplied, named_parts
+from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT, LimitedForces, Multiplied, named_parts
 from haptic_loop.design.exact import require_size
-from haptic_loop.design.facts import KnownMotor, PeriodCost, Unknowns, Values, Walls, compose, compose_any
+from haptic_loop.design.facts import (
+    Fact,
+    KnownMotor,
+    Limiter,
+    PeriodCost,
+    Unknowns,
+    Values,
+    Walls,
+    compose,
+    compose_any,
+)
 from haptic_loop.design.frame import signals_of
 from haptic_loop.design.frequency import Response, frequencies, hermitian, largest_eigenvalue, on_circle, supremum
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
@@ -406,22 +417,23 @@ class AnyEnvironmentSweep(Sweep):
         return here.own - chi(here.z, theta, cost, beta)[..., None] * np.eye(beta.shape[-1])
 
 
-class WallsSweep(Sweep):
-    """Theorem B before walls that make and break contact, at given multipliers of their facts."""
+class FactsSweep(Sweep):
+    """Theorem B with facts of the environment's side (walls, the limiter), at given multipliers."""
 
     scanned, sections = _SCANNED[::2], 8  # beta and the multipliers are searched in turn, several times
 
-    def __init__(self, G: Lti, loop: Loop, values: Values) -> None:
+    def __init__(self, G: Lti, loop: Loop, facts: Sequence[Fact], values: Values) -> None:
         """Take G from [x; p] to [f_e; y]; the block is affine in beta and in L."""
-        self._speeds, m = slice(loop.channels, 2 * loop.channels), loop.channels
+        m = loop.channels
         none = PeriodCost(*np.zeros((4, m)))
-        each = [compose(G, loop, (Walls(),), values, hands=KnownMotor(none, b)).free for b in (np.zeros(m), *np.eye(m))]
-        self._idle, self._by_beta = each[0], each[1:]
+        each = [compose(G, loop, facts, values, hands=KnownMotor(none, b)).free for b in (np.zeros(m), *np.eye(m))]
+        self._idle, self._by_beta, self._moves = each[0], each[1:], _moves(m, facts)
         super().__init__(loop, each[0])
         size = np.abs(np.diagonal(self._all.own, axis1=1, axis2=2)).max(axis=0)
         cost = period_cost(loop, np.ones(1), largest_beta(loop) / 2)
-        size[:m] += cost.move[0]
-        size[self._speeds] += cost.step[0]
+        for parts in self._moves:
+            size[parts] += cost.move[0]
+        size[m : 2 * m] += cost.step[0]
         self._root = 1 / np.sqrt(size)
 
     def sampled(self, w: Array) -> _Sampled:
@@ -432,12 +444,20 @@ class WallsSweep(Sweep):
     def room(self, here: _Sampled, cost: PeriodCost, beta: Array) -> Complex:
         own, cross, speed = device_rows(here.z, cost)
         room, m = here.own + np.tensordot(here.forces, beta, axes=(1, 0)), beta.size
+        for i, part in itertools.product(range(m), self._moves):
+            room[:, m + i, part[i]] += cross[:, i] / 2
+            room[:, part[i], m + i] += np.conj(cross[:, i]) / 2
+            for other in self._moves:
+                room[:, part[i], other[i]] += own[:, i]
         for i in range(m):
-            room[:, i, i] += own[:, i]
             room[:, m + i, m + i] += speed[:, i]
-            room[:, m + i, i] += cross[:, i] / 2
-            room[:, i, m + i] += np.conj(cross[:, i]) / 2
         return room
+
+
+def _moves(m: int, facts: Sequence[Fact]) -> list[NDArray[np.intp]]:
+    """Return the inputs that add up to dx, (m,) each: dx, or dx less the limiter's slip and the slip."""
+    dx = np.arange(m)
+    return [dx, 2 * m + dx] if any(isinstance(fact, Limiter) for fact in facts) else [dx]
 
 
 class _AtBeta(Multiplied):
@@ -445,22 +465,24 @@ class _AtBeta(Multiplied):
 
     name, covers = "known-device", BEYOND
 
-    def __init__(self, cost: PeriodCost, beta: Array) -> None:
-        self.cost, self.beta = cost, beta
+    def __init__(self, cost: PeriodCost, beta: Array, facts: Sequence[Fact]) -> None:
+        self.cost, self.beta, self.facts = cost, beta, facts
 
     def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
-        return Walls().unknowns(loop)
+        return tuple(each for fact in self.facts for each in fact.unknowns(loop))
 
     def map(self, loop: Loop, coupling: Coupling, exact: bool = False) -> Lti:
         return loop.walled_before_delay(coupling, exact)
 
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
         """The block less the diagonal of L, which s multiplies: it holds where s < 1 is enough."""
-        made = compose(G, loop, (Walls(),), self.named(loop, multiplier), hands=KnownMotor(self.cost, self.beta))
-        diagonal = np.zeros(signals_of(made.free))
-        diagonal[: 2 * len(self.beta)] = *self.cost.move, *(self.cost.mean / 2 + 2 * self.cost.step)
+        made = compose(G, loop, self.facts, self.named(loop, multiplier), hands=KnownMotor(self.cost, self.beta))
+        diagonal, m = np.zeros(signals_of(made.free)), len(self.beta)
+        diagonal[m : 2 * m] = self.cost.mean / 2 + 2 * self.cost.step
+        for parts in _moves(m, self.facts):
+            diagonal[parts] = self.cost.move
         gain = np.diag(_SPARED * diagonal)
-        return Demand(made.free - gain, constant_like(G, gain), made.static, made.semidefinite)
+        return Demand(made.free - gain, constant_like(G, gain), made.static, made.semidefinite, made.spare)
 
     def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
         return None  # this-environment has looked at it
@@ -503,6 +525,13 @@ class KnownDevice(Condition):
             return f"levels: {self.name} {FULL_LEVELS}"
         return _NO_SHORTEST if shortest_period(loop) is None else super().beyond(loop)
 
+    def facts(self, loop: Loop) -> tuple[Fact, ...]:
+        """Return the facts of the environment's side that need multipliers."""
+        return (Walls(),) if loop.environment.walls else ()
+
+    def unknowns(self, loop: Loop) -> tuple[Unknowns, ...]:
+        return tuple(each for fact in self.facts(loop) for each in fact.unknowns(loop))
+
     def without(self, coupling: Coupling) -> str | None:
         """Return why the condition says nothing of this coupling, or None."""
         return None
@@ -517,11 +546,11 @@ class KnownDevice(Condition):
             multiplier = self.required(loop, coupling).multiplier or (0.0,) * 3 * loop.channels
         m = loop.channels
         beta, below, above = (multiplier[i : i + m] for i in (0, m, 2 * m))
-        own, walls = tuple(multiplier[3 * m :]), Walls().unknowns(loop) if loop.environment.walls else ()
+        own, unknowns = tuple(multiplier[3 * m :]), self.unknowns(loop)
         if not any(beta):
             return self.plain.demand(loop, coupling, exact, own) if own else self.plain.demand(loop, coupling, exact)
-        values = named_parts(walls, own)
-        for each in walls:
+        values = named_parts(unknowns, own)
+        for each in unknowns:
             each.check(values[each.name])
         if not exact:
             hands = KnownMotor(period_cost(loop, 1.0, np.array(beta, dtype=float)), beta)
@@ -531,11 +560,11 @@ class KnownDevice(Condition):
         return self._block(loop, coupling, KnownMotor(exact_cost(loop, *rationals), rationals[0]), values, exact)
 
     def _block(self, loop: Loop, coupling: Coupling, hands: KnownMotor, values: Values, exact: bool) -> Demand[Lti]:
-        walls = bool(loop.environment.walls)
-        G = loop.walled_before_delay(coupling, exact) if walls else loop.F(coupling, exact)
+        facts = self.facts(loop)
+        G = THIS_ENVIRONMENT.map(loop, coupling, exact) if facts else loop.F(coupling, exact)
         if exact:
-            require_size(G.order + loop.channels + (sum(loop.theta) if walls else 0))
-        return compose(G, loop, (Walls(),) if walls else (), values, late=walls, hands=hands)
+            require_size(G.order + loop.channels + (sum(loop.theta) if facts else 0))
+        return compose(G, loop, facts, values, late=bool(facts), hands=hands)
 
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """Return the least damping over beta, or that of the beta given, the most of all members of the ranges.
@@ -544,8 +573,8 @@ class KnownDevice(Condition):
         """
         if reason := self.without(coupling):
             return refusal(self.name, loop.delta, reason)
-        if loop.environment.walls and type(self) is KnownDevice:
-            return self._before_walls(loop, coupling, multiplier)
+        if self.facts(loop):
+            return self._with_facts(loop, coupling, multiplier)
         loops, m = self._loops(loop), loop.channels
         if multiplier is not None and len(multiplier) != 3 * m:
             reason = f"the multiplier has {len(multiplier)} numbers, expected beta and two bounds of q for {m} channels"
@@ -578,8 +607,10 @@ class KnownDevice(Condition):
         requirement = from_ratio(self.name, share, loop.delta, w / (2 * np.pi * loop.T))
         return replace(requirement, multiplier=(*beta, *bounds))
 
-    def _before_walls(self, loop: Loop, coupling: Coupling, multiplier: Any) -> Requirement:
-        """Before walls: beta and the multipliers of the walls in turn, or those given."""
+    def _with_facts(self, loop: Loop, coupling: Coupling, multiplier: Any) -> Requirement:
+        """Before walls or with a limiter: search beta and the facts' multipliers in turn, or take those given."""
+        if reason := self.beyond(loop):
+            return refusal(self.name, loop.delta, reason)
         m, expected = loop.channels, sum(self.multiplier_sizes(loop).values())
         if multiplier is not None and len(multiplier) != expected:
             reason = f"the multiplier has {len(multiplier)} numbers, expected {expected}"
@@ -589,9 +620,10 @@ class KnownDevice(Condition):
         plain = self.plain.required(loop, coupling, own if own and not any(beta) else None)
         if plain.reason or (own and not any(beta)):
             return replace(plain, condition=self.name, multiplier=(*(0.0,) * 3 * m, *(plain.multiplier or ())))
-        G, unknowns = loop.walled_before_delay(coupling), Walls().unknowns(loop)
+        G, unknowns, facts = THIS_ENVIRONMENT.map(loop, coupling), self.unknowns(loop), self.facts(loop)
         if own:
-            share, w = WallsSweep(G, loop, named_parts(unknowns, own)).required(np.array(beta), _MOST_SHARE)
+            sweep = FactsSweep(G, loop, facts, named_parts(unknowns, own))
+            share, w = sweep.required(np.array(beta), _MOST_SHARE)
             if not np.isfinite(share):
                 reason = f"beta = {list(beta)} s proves nothing for these devices, whatever the damping"
                 return replace(refusal(self.name, loop.delta, reason), multiplier=numbers_on_file)
@@ -600,7 +632,7 @@ class KnownDevice(Condition):
         best, own = Best(min(plain.ratio, _MOST_SHARE), 0.0, ()), plain.multiplier or ()
         values, high = own, best.share
         for _ in range(_ROUNDS):
-            found = WallsSweep(G, loop, named_parts(unknowns, values)).best(high)
+            found = FactsSweep(G, loop, facts, named_parts(unknowns, values)).best(high)
             if not found.share < best.share:
                 break
             enough = found.share < best.share * (1 - _GAIN)
@@ -609,7 +641,7 @@ class KnownDevice(Condition):
                 break
             at = np.array(found.beta)
             cost = PeriodCost(*(part[0] for part in period_cost(loop, np.array([found.share]), at)))
-            values = _AtBeta(cost, at).required_of(G, loop).multiplier or values
+            values = _AtBeta(cost, at, facts).required_of(G, loop).multiplier or values
         if not best.beta:
             return replace(plain, condition=self.name, multiplier=(*(0.0,) * 3 * m, *own))
         bounds = (0.0,) * 2 * m
@@ -620,12 +652,12 @@ class KnownDevice(Condition):
         return replace(requirement, multiplier=(*best.beta, *bounds, *own))
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
-        if loop.environment.walls and type(self) is KnownDevice:
+        if self.facts(loop):
             return None, "before walls every coupling would need a search for its own beta and multipliers"
         return super().least_multiplier(loop)
 
     def words(self, loop: Loop) -> str:
-        return MAKING if loop.environment.walls and type(self) is KnownDevice else super().words(loop)
+        return MAKING if loop.environment.walls and self.facts(loop) else super().words(loop)
 
     def _may_help(self, plain: Requirement) -> bool:
         """Whether the condition may hold where the plain one is refused."""
@@ -635,7 +667,7 @@ class KnownDevice(Condition):
         if multiplier is None:
             multiplier = self.required(loop, coupling).multiplier
         beta = np.array((multiplier or (0.0,))[: loop.channels], dtype=float)
-        if loop.environment.walls and type(self) is KnownDevice:
+        if self.facts(loop):
             return None
         if not beta.any():
             return self.plain.over_frequency(loop, coupling)
@@ -680,9 +712,30 @@ class KnownDevice(Condition):
         return "every variation would need a search for its own beta: not searched"
 
     def multiplier_sizes(self, loop: Loop) -> dict[str, int]:
-        walls = Walls().unknowns(loop) if loop.environment.walls and type(self) is KnownDevice else ()
         own = dict.fromkeys(("beta", "q_below", "q_above"), loop.channels)
-        return own | {each.name: len(each.units) for each in walls}
+        return own | {each.name: len(each.units) for each in self.unknowns(loop)}
+
+
+class LimitedKnownDevice(KnownDevice):
+    """known-device also while forces are limited, by the limiter of `limiter` (design.environments.LimitedForces)."""
+
+    name, covers = "limiter", ("psi", "T_max", "walls")
+
+    def __init__(self, limiter: LimitedForces = LIMITER) -> None:
+        self.plain = self.limiter = limiter
+
+    @property
+    def base(self) -> str:
+        return KnownDevice.name
+
+    def beyond(self, loop: Loop) -> str | None:
+        return self.limiter.beyond(loop) or super().beyond(loop)
+
+    def facts(self, loop: Loop) -> tuple[Fact, ...]:
+        return (*super().facts(loop), Limiter(self.limiter.rho(loop), self.limiter.lags))
+
+    def parameters(self, loop: Loop) -> dict[str, tuple[float, ...]]:
+        return self.limiter.parameters(loop)
 
 
 class KnownDeviceAny(KnownDevice):
@@ -690,6 +743,9 @@ class KnownDeviceAny(KnownDevice):
 
     name, covers = "known-device-any", ("T_max", "walls", "ranges")
     plain: Condition = ANY_ENVIRONMENT
+
+    def facts(self, loop: Loop) -> tuple[Fact, ...]:
+        return ()  # only passivity of the environment is used
 
     def without(self, coupling: Coupling) -> str | None:
         if coupling.compliance(1.0) is None:

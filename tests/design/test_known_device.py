@@ -22,13 +22,15 @@ from haptic_loop.design.api import design_coupling
 from haptic_loop.design.audit import audit
 from haptic_loop.design.certificate import named, prove, required_damping, verify
 from haptic_loop.design.coupling_file import Stored, sealed
+from haptic_loop.design.environments import LimitedForces
 from haptic_loop.design.exact import find_storage, prove_positive_real
-from haptic_loop.design.facts import KnownMotor, compose, compose_any
+from haptic_loop.design.facts import KnownMotor, Limiter, compose, compose_any
 from haptic_loop.design.files import InputError
 from haptic_loop.design.gain_search import KnownDeviceLoop
 from haptic_loop.design.known_device import (
     AnyEnvironmentSweep,
     Best,
+    LimitedKnownDevice,
     ThisEnvironmentSweep,
     alias_sums,
     check_q,
@@ -811,7 +813,7 @@ def test_a_damped_wall_needs_less_than_the_known_figure(k, damping, theta, known
     assert touched * (1 - 1e-4) < wall_needs(k, damping, theta) < known
 
 
-def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3):
+def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3, coupling=None, **limiter):
     """How many lossless hands behind the transmission have more energy at the end than in the middle."""
     rng = np.random.default_rng(seed)
     M, k = 10 ** rng.uniform(-3.5, 0.5, hands), 10 ** rng.uniform(0, 5, hands)
@@ -821,7 +823,7 @@ def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3):
     A[:, 1, :] = np.array([-kt, -delta - b, kt, b, -1]) / m
     A[:, 3, :4] = np.stack([kt + 0 * k, b + 0 * k, -kt - k, -b + 0 * k], axis=1) / M[:, None]
     step = expm(A * loop.T)[:, :4]
-    law = loop.law(NoCoupling())
+    law = loop.delayed((0,)).law(coupling or NoCoupling(), **limiter)
     tick, state = law.transition(), rng.standard_normal((hands, 4)) * (1e-2, 0.1, 1e-2, 0.1)
     before, after = np.zeros((2, law.open.order + 1, hands))
     late, energy = [np.zeros(hands)] * (loop.theta[0] + 1), np.zeros((2, hands))
@@ -858,3 +860,81 @@ def test_a_wall_on_a_known_device_is_proved_from_its_file():
     assert verify(msgspec.json.decode(msgspec.json.encode(stored), type=Stored)).proved
     less = {name: values for name, values in stored.certificate.multipliers.items() if name != "d"}
     assert not verify(change(stored, certificate=sealed(change(stored.certificate, multipliers=less)))).proved
+
+
+# ----------------------------------------------------------------------------------------------------
+# Limited forces on known devices.
+
+COUPLING, RHO = SpringDamper([1000.0], [0.5]), 13.0
+LIMITED = LimitedKnownDevice(LimitedForces(held=(RHO,)))
+
+
+def limited(theta, *walls):
+    """50 g on 20 N/m and 0.3 N s/m behind a known device, with walls."""
+    network = Network(("tip",), (Spring(("tip", GROUND), 20.0, 0.3),), {"tip": 0.05}, walls)
+    return Loop(1e-3, (theta,), (0,), (0,), (1.37,), network, known_devices=(DEVICE,))
+
+
+LIMITED_LOOPS = {"linear": limited(1), "wall": limited(1, Wall(("tip", GROUND), 3000.0, 2.0))}
+
+
+@cache
+def limited_needs(name):
+    return required_damping(LIMITED_LOOPS[name], COUPLING, LIMITED).required[0]
+
+
+@pytest.mark.parametrize("name", LIMITED_LOOPS)
+def test_limited_forces_cost_little_on_known_devices(name):
+    """More than unlimited ones, and less than on a device of which only the damping is known."""
+    loop = LIMITED_LOOPS[name]
+    unlimited = required_damping(loop, COUPLING, "known-device").required[0]
+    plain = required_damping(loop, COUPLING, LimitedForces(held=(RHO,))).required[0]
+    assert unlimited <= limited_needs(name) * (1 + 1e-6)
+    assert limited_needs(name) < plain
+
+
+@pytest.mark.parametrize("name", LIMITED_LOOPS)
+def test_no_hand_gains_energy_from_limited_forces(name):
+    """Of lossless hands behind the transmission, with limits that many ticks reach."""
+    loop, bound = LIMITED_LOOPS[name], {"limit": [1.0], "rho": [RHO], "coupling": COUPLING}
+    assert hands_on_a_wall(loop, 1.01 * limited_needs(name), **bound) == 0
+    assert hands_on_a_wall(loop, 0.1 * limited_needs(name), **bound) > 0
+
+
+def test_the_block_is_the_energy_of_limited_periods():
+    """x'block x, summed over a motion that ends, is sum f'(dx + beta dv) + sum L - sum (M f_e)'de, from rest."""
+    rng, N, active, T, K, B = np.random.default_rng(6), 300, 40, 1e-3, 900.0, 0.7
+    loop, beta, c = one(T, 1.3, 1), np.array([3e-5]), 0.4
+    G = taps([K + B / T, -B / T], T)
+    cost = period_cost(loop, 1.0, beta)
+    made = compose(G, loop, (Limiter((RHO,)),), {"c": (c,)}, hands=KnownMotor(cost, beta)).free
+    free, v, de = np.zeros((3, N))  # dx - de, v, de
+    free[:active], de[:active] = 1e-3 * rng.normal(size=(2, active))
+    v[1:active] = rng.normal(size=active - 1)
+    free[active - 1] -= free.sum()  # the contact returns, so that nothing stays stored
+    inputs, state, paid = np.stack([free, v, de], axis=1), np.zeros(made.order), 0.0
+    for k in range(N):
+        paid += inputs[k] @ (made.C @ state + made.D @ inputs[k])
+        state = made.A @ state + made.B @ inputs[k]
+    contact = np.concatenate([[0.0], np.cumsum(free)])
+    before = np.concatenate([[0.0], contact[:-1]])
+    slip = np.concatenate([[0.0], de])
+    fe = K * contact + B / T * (contact - before) - RHO * slip  # slip[k] is the step e[k] - e[k-1]
+    f = np.concatenate([[0.0], fe[:N]])[:N]  # one sample late
+    after, dx = np.append(v[1:], 0.0), free + de
+    c0, c2 = 1.3 - beta[0] ** 2 * 14500**2 / 2, beta[0] * 0.06 - beta[0] ** 2 * 0.5 / 4
+    cost_of = [discretised_cost(c0, c2, T, dx[k], v[k], after[k], 300) for k in range(active + 1)]
+    M = fe[1 : N + 1] + c * (fe[1 : N + 1] - fe[:N])  # z + c_1 (z - 1)
+    assert paid == pytest.approx(f @ (dx + beta[0] * (after - v)) + sum(cost_of) - M @ de, rel=1e-4)
+
+
+def test_limited_forces_on_known_devices_are_proved_from_files():
+    loop = change(KNOWN, delta=(1.0, 1.0))  # the published gains need 0.966 with the limiter
+    certificate = prove(loop, PUBLISHED["I"], LimitedKnownDevice())
+    assert (certificate.condition, certificate.facts) == ("known-device", ("limiter",))
+    stored = Stored.of(loop, PUBLISHED["I"], certificate)
+    assert verify(msgspec.json.decode(msgspec.json.encode(stored), type=Stored)).proved
+    known = certificate.multipliers
+    for name in ("rho", "beta", "q_below"):
+        forged = known | {name: tuple(3 * v for v in known[name])}
+        assert not verify(change(stored, certificate=sealed(change(certificate, multipliers=forged)))).proved
