@@ -24,6 +24,7 @@ from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.trace import Growth, Trace, growths
 from haptic_loop.sim.world import WorldRecord
 
+_AT_CAP = 1 - 1e-6  # part of the cap: a limiter stops at it
 _PERCENTILES = (50, 90, 99, 100)
 
 
@@ -188,7 +189,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     worlds = WorldSession.all_of(session, trace, recorder.link()["arming"]) if trace and session.worlds else None
     grown = growths(trace) if trace and not worlds else []  # the motion of a scene is no oscillation of the loop
     stage, cause = str(session.stage), session.cause
-    if session.stage == Stage.FINISHED and (doubt := _doubt(session, grown, ticks)):
+    if session.stage == Stage.FINISHED and (doubt := _doubt(session, grown, recorder)):
         stage, cause = str(Stage.STOPPED), f"{cause}, but {doubt}"
         log.append(_Event(log[-1].t_s, stage, cause))
     return SessionReport(
@@ -207,11 +208,17 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     )
 
 
-def _doubt(session: Session, growths: list[Growth], ticks: int) -> str | None:
+def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str | None:
     """Why a session that came to its end has not finished; None where forces acted as they were asked for."""
-    clipped = max(session.counters.clipped, session.counters.slowed)
-    if 2 * clipped > ticks > 0:
-        return f"{100 * clipped / ticks:.0f} % of its forces were cut: raise --force-cap, or ask for less"
+    ticks, link = len(recorder), recorder.link()
+    if 2 * session.counters.slowed > ticks > 0:
+        return f"{100 * session.counters.slowed / ticks:.0f} % of its forces were cut by the slew rate"
+    second = min(ticks, round(1 / session.scenario.T))
+    capped = np.abs(link["gain"][:, None] * link["asked"]) >= _AT_CAP * np.array(session.limits.cap)
+    cut = np.convolve(capped.any(axis=1), np.ones(second) / second, "valid").max() if ticks else 0.0
+    if cut > 0.5:
+        advice = "raise --force-cap, or ask for less; or a sign has changed"
+        return f"{100 * cut:.0f} % of its forces were cut in a second: {advice}"
     for i, growth in enumerate(growths, start=1):
         if growth.trend == "grows":
             return f"an oscillation grew in arming {i}"

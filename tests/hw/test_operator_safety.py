@@ -18,6 +18,7 @@ from haptic_loop.cli import bridge, replay
 from haptic_loop.cli.bridge import _parser
 from haptic_loop.cli.session_cli import limits_from, touched
 from haptic_loop.hw import transport
+from haptic_loop.hw.control import TraceRow
 from haptic_loop.hw.driver import Driver, Operator
 from haptic_loop.hw.emulator import Emulator, FaultInjection
 from haptic_loop.hw.haptic_device import SerialDevice
@@ -146,6 +147,14 @@ def test_a_live_device_asks_for_a_deadman(scenario, monkeypatch):
         assert args.deadman == asked
 
 
+def rehearsal_until_finished(scenario, rungs):
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs)
+    rehearsal.run_until_armed(0.01)
+    session.stop("enough", session.now)
+    return session
+
+
 def test_sessions_with_clipped_forces_have_not_finished(scenario, rungs):
     """A cap of 10 mN: more than half of the forces at full gain are at it."""
     recorder, session = Recorder(2), Session(scenario, SafetyLimits((0.01, 0.01)), LinkSettings(measure=60))
@@ -158,6 +167,17 @@ def test_sessions_with_clipped_forces_have_not_finished(scenario, rungs):
     assert session.stage == Stage.FINISHED
     assert report.session.stage == "stopped"
     assert "% of its forces were cut" in report.session.cause
+
+
+@pytest.mark.parametrize(("cut", "stage"), [(400, "finished"), (450, "stopped")])
+def test_a_second_of_clipped_forces_counts(scenario, rungs, cut, stage):
+    """As after a sign that changed: of 833 ticks in a second more than half, however long the session was."""
+    recorder, session = Recorder(2), rehearsal_until_finished(scenario, rungs)
+    state = session.link.last
+    for k in range(4000):
+        asked = (12.0, 0.0) if 2000 <= k < 2000 + cut else (0.1, 0.0)
+        recorder(TraceRow(k, (1e-5 * (k % 7), 0.0), asked, 1.0, (0, 0), state))
+    assert outcome("I", session, recorder, 0).session.stage == stage
 
 
 @pytest.mark.parametrize(
