@@ -499,11 +499,22 @@ def _default_starts(loop: Loop) -> list[SpringDamper]:
     return starts
 
 
+_SPARE_OF_SLOW_WORLDS = 0.25  # the force rings with 0.5 (theta = 1) or 0.55 (theta = 2) of itself from tick to tick
+
+
+def _spare(loop: Loop) -> float:
+    """Return e of moving_average: a reserve, or what damps the force before a world that stands still between steps."""
+    world = loop.environment.world
+    return _SPARE_OF_SLOW_WORLDS if world and world.every > 1 else RESERVE / (1 - RESERVE)
+
+
 def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
     """Return the stiffest linear coupling that Theorem 4 or known-device-any admits; the objective is in N/m.
 
     V = T/(2 delta) (1 + ... + z^-theta) needs exactly delta at every frequency. With the constant e n^2 T/(2 delta)
-    added, n = theta + 1, it needs delta/(1 + e) where the sum is largest, and less elsewhere.
+    added, n = theta + 1, it needs delta/(1 + e) where the sum is largest, and less elsewhere. The zeros of the sum lie
+    on the unit circle, so that the force rings for ever before an object that stands still. A world that steps every
+    n ticks stands still in between: e is larger there.
     """
     if condition == KNOWN_DEVICE_ANY.name:
         return _stiffest_linear(loop)
@@ -514,7 +525,7 @@ def moving_average(loop: Loop, condition: str = "any-environment") -> Design:
     if loop.levels:
         return _moving_average_of_levels(loop, started)
     weight, terms = loop.T / (2 * even_damping(loop)), np.array(loop.theta) + 1
-    coupling = MovingAverage(weight, terms.tolist(), RESERVE / (1 - RESERVE) * terms**2 * weight)
+    coupling = MovingAverage(weight, terms.tolist(), _spare(loop) * terms**2 * weight)
     return _verified(loop, coupling, phi, "stiffness", float(coupling.stiffness.sum()), 0, started)
 
 
@@ -599,7 +610,7 @@ def _moving_average_of_levels(loop: Loop, started: float) -> Design:
     weight = np.array([[float(f"{v:.{_TAP_DIGITS}g}") for v in row] for row in (inverses + inverses.T) / 2])
     terms = np.array(loop.theta) + 1
     late = moving_sum(loop.theta, loop.T)
-    constant = RESERVE / (1 - RESERVE) * terms**2 * weight
+    constant = _spare(loop) * terms**2 * weight
     V = Lti(late.A, late.B, weight @ late.C, weight @ late.D + (constant + constant.T) / 2, loop.T)
     stiffness = float(np.trace(np.linalg.inv(V.dc())))
     return _verified(loop, Compliance(V), least_phi(loop), "stiffness", stiffness, 0, started)

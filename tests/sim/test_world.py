@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hands import Hands
+from msgspec.structs import replace
 
 from haptic_loop import design_coupling, simulate
 from haptic_loop.controller.budget import Shell
@@ -440,6 +441,19 @@ def test_a_world_becomes_a_network_for_a_design(tmp_path):
         simulate(loop, design_coupling(linear.loop("I"), "optimal", seconds=0.0))
     assert THIS_ENVIRONMENT.judge(linear.loop("I"), certified(linear).coupling).reason is None
     assert [contact.body for contact in contacts_of(loop.environment)] == ["left", "right"]
+
+
+@pytest.mark.parametrize("every", [2, 4])
+def test_the_default_coupling_of_a_slow_world_does_not_ring(every):
+    """Between its steps the scene is a wall: what alternates from tick to tick, (f - 2 f_- + f_--)/4, dies away."""
+    loop = load("world-cube").replace(duration=1.5)
+    world = replace(loop.environment.world, every=every)
+    slow = loop.replace(environment=replace(loop.environment, world=world))
+    trace = simulate(slow, certified(slow), engine="exact")
+    alternating = np.diff(trace.f, 2, axis=0) / 4
+    assert trace.meta["guaranteed"]
+    assert np.abs(trace.f).max() > 1
+    assert np.sqrt((alternating**2).mean(axis=0)).max() < 0.1
 
 
 def test_a_slow_world_keeps_the_account(tmp_path):
