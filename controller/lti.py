@@ -194,11 +194,11 @@ class Lti(ReadOnly):
         points = z.ravel()
         step = min(_POINTS, max(_CELLS // max(self.inner_order * self.inputs, 1), 64))
         parts = [self._resolved(points[i : i + step]) for i in range(0, max(points.size, 1), step)]
-        G = parts[0] if len(parts) == 1 else np.concatenate(parts)
-        return (G + self.D).reshape(*z.shape, self.outputs, self.inputs)
+        G = (parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)) + self.D[:, :, None]
+        return np.moveaxis(G, -1, 0).reshape(*z.shape, self.outputs, self.inputs)
 
     def _resolved(self, points: Complex) -> Complex:
-        """Return C (z I - A)^-1 B, shape (points, p, m).
+        """Return C (z I - A)^-1 B, shape (p, m, points).
 
         Delay lines at the outputs are not part of the core: their states are core states times powers of 1/z.
         """
@@ -206,21 +206,21 @@ class Lti(ReadOnly):
         p, m = self.outputs, self.inputs
         spend(_response_cost(core.size, m, points.size))
         if not core.size:
-            return np.zeros((points.size, p, m), dtype=np.complex128)
+            return np.zeros((p, m, points.size), dtype=np.complex128)
         terms = self._terms
         if terms is None or (np.abs(points.real**2 + points.imag**2 - 1) > _OFF_CIRCLE).any():
             rows = self._substituted(points)
         else:
-            rows = _summed(*terms, points).reshape(points.size, p + len(lines), m)
-        G = rows[:, :p]
-        for (_, states, late), head in zip(lines, range(p, rows.shape[1]), strict=True):
+            rows = _summed(*terms, points).reshape(p + len(lines), m, points.size)
+        G = rows[:p]
+        for (_, states, late), head in zip(lines, rows[p:], strict=True):
             read = np.flatnonzero(self.C[:, states].any(axis=1))
-            powers = np.cumprod(np.broadcast_to(1 / points, (late.max(), points.size)), axis=0)[late - 1]
-            G[:, read] += (self.C[np.ix_(read, states)] @ powers).T[:, :, None] * rows[:, head, None]
+            powers = _powers(1 / points, late.max())[late - 1]
+            G[read] += (self.C[np.ix_(read, states)] @ powers)[:, None] * head
         return G
 
     def _substituted(self, points: Complex) -> Complex:
-        """Return the outputs and the heads of the delay lines, (points, p + lines, m), in blocks of _ROWS rows."""
+        """Return the outputs and the heads of the delay lines, (p + lines, m, points), in blocks of _ROWS rows."""
         S, U = self._schur
         core, lines = self._lines
         at, X = np.tile(points, self.inputs), np.repeat(U.conj().T @ self.B[core], points.size, axis=1)
@@ -230,13 +230,13 @@ class Lti(ReadOnly):
                 X[i] = (X[i] + S[i, i + 1 : end] @ X[i + 1 : end]) / (at - S[i, i])
             X[:first] += S[:first, first:end] @ X[first:end]
         read = np.concatenate([self.C[:, core], np.eye(core.size)[[head for head, *_ in lines]]])
-        return np.moveaxis((read @ U @ X).reshape(len(read), self.inputs, points.size), -1, 0)
+        return (read @ U @ X).reshape(len(read), self.inputs, points.size)
 
     @cached_property
     def _terms(self) -> tuple[Complex, Complex, Array] | None:
         """Split the response of outputs and heads into poles, residues, and weights of z^-1, z^-2, ..
 
-        Return (poles (k,), residues (k, (p + lines) m), weights (j, (p + lines) m)), or None where their error may
+        Return (poles (k,), residues ((p + lines) m, k), weights ((p + lines) m, j)), or None where their error may
         exceed _ERROR. Poles with |z| > _SHORT are taken one by one, with their right and left eigenvectors V and W:
         P = V W projects on them. The rest N = (I - P) A has the many poles at or near 0 of delays, which have no
         eigenvectors of their own; its powers fade within 2^_DOUBLINGS samples, so that its response is a finite sum.
@@ -272,8 +272,8 @@ class Lti(ReadOnly):
         n, m, p, taps = core.size, self.inputs, len(C), 2**_DOUBLINGS
         out, into, missed = C @ V, W @ B, A @ Y
         missed[:, :-m] -= Y[:, m:]
-        weights = np.ascontiguousarray((C @ Y).reshape(p, taps, m).swapaxes(0, 1)).reshape(taps, p * m)
-        terms = poles, (out.T[:, :, None] * into[:, None]).reshape(poles.size, p * m).astype(np.complex128), weights
+        weights = (C @ Y).reshape(p, taps, m).swapaxes(1, 2).reshape(p * m, taps)
+        residues = (out[:, None] * into.T).reshape(p * m, poles.size).astype(np.complex128)
         points = np.exp(1j * np.concatenate([_ANYWHERE, np.angle(poles)]))
         with np.errstate(all="ignore"):  # what is not finite is refused
             peak = 1 / np.abs(1 - np.abs(poles))
@@ -281,13 +281,11 @@ class Lti(ReadOnly):
             wrong = np.abs(A @ V - V * poles) @ driven + np.abs(missed).reshape(n, taps, m).sum(axis=1)
             error = ((np.abs(out) * peak) @ np.abs(W) + np.abs(rows).reshape(taps, p, n).sum(axis=0)) @ wrong
             error += _UNIT * np.abs(C) @ (np.abs(V) @ driven + np.abs(Y).reshape(n, taps, m).sum(axis=1))
-            size = np.abs(_summed(*terms, points)).max(axis=0).reshape(p, m).max(axis=1, keepdims=True)
+            size = np.abs(_summed(poles, residues, weights, points)).reshape(p, -1).max(axis=1)[:, None]
             if not (error <= _ERROR * size).all():
                 return None
-        count = 1 + np.flatnonzero((np.abs(weights).reshape(taps, p, m) > _UNSEEN * size).any(axis=(1, 2))).max(
-            initial=-1
-        )
-        return *terms[:2], weights[:count]
+        seen = (np.abs(weights).reshape(p, m, taps) > _UNSEEN * size[:, None]).any(axis=(0, 1))
+        return poles, residues, weights[:, : np.append(0, 1 + np.flatnonzero(seen))[-1]].copy()
 
     def at_rest(self, x: Array) -> Array:
         """Return the equilibrium state z = A z + B x for constant inputs x.
@@ -467,13 +465,24 @@ def _is_lower(A: Array) -> bool:
 
 
 def _summed(poles: Complex, residues: Complex, weights: Array, points: Complex) -> Complex:
-    """Return sum residues/(z - poles) + sum_j weights_j z^-j-1 at points z, (points, entries)."""
-    total = (1 / (points[:, None] - poles)) @ residues
-    if len(weights):
-        late = np.cumprod(np.broadcast_to(1 / points, (len(weights), points.size)), axis=0).T
-        total.real += late.real @ weights
-        total.imag += late.imag @ weights
+    """Return sum residues/(z - poles) + sum_j weights_j z^-j-1 at points z, (entries, points)."""
+    total = residues @ (1 / (points - poles[:, None]))
+    if weights.size:
+        late = _powers(1 / points, weights.shape[1])
+        total.real += weights @ late.real.copy()  # OpenBLAS takes 50 times as long for complex matrices of few rows
+        total.imag += weights @ late.imag.copy()
     return total
+
+
+def _powers(z: Complex, count: int) -> Complex:
+    """Return z, z^2, .. of points z, (count, points)."""
+    powers = np.empty((count, z.size), dtype=np.complex128)
+    powers[:1], known = z, 1
+    while known < count:
+        more = min(known, count - known)
+        np.multiply(powers[:more], powers[known - 1], out=powers[known : known + more])
+        known += more
+    return powers
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,9 @@ by channel, so these responses determine all its values and slopes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from haptic_loop.controller.lti import Array, Complex, Sampled
 from haptic_loop.design import budgets
 from haptic_loop.design.conditions import Demand, even_damping, this_environment, this_environment_demand
 from haptic_loop.design.environments import LIMITER, SWITCHING
-from haptic_loop.design.frequency import frequencies, hermitian, on_circle
+from haptic_loop.design.frequency import frequencies, hermitian, least_eigenpair, on_circle
 from haptic_loop.design.known_device import KNOWN_DEVICE, device_rows, largest_beta, period_cost
 from haptic_loop.design.lmi import RESERVE
 from haptic_loop.design.result import Requirement
@@ -82,6 +83,12 @@ class SampledLoop:
         self._known: dict[str, _Around] = {}
         self._delayed = {"band": self._responses(self.band)}
         self._impose(frequencies(self.E, low=1e-3, points=80))
+
+    def fresh(self) -> Self:
+        """Return a copy to which another search may add frequencies: responses that both share are sampled once."""
+        other = copy(self)
+        other._known, other._delayed = {}, dict(self._delayed)
+        return other
 
     def coupling(self, x: Array) -> SpringDamper:
         log_k, b = np.split(self._gains(x), 2)
@@ -228,10 +235,10 @@ class SampledLoop:
             first, below, corner = self.parts(x)
             follows = -below / corner[:, :, None]
             schur = first + np.conj(np.swapaxes(below, 1, 2)) @ follows
-            values, vectors = np.linalg.eigh(self.root[:, None] * schur * self.root)
-            v = vectors[:, :, 0] * self.root
+            values, v = least_eigenpair(self.root[:, None] * schur * self.root)
+            v = v * self.root
             whole = np.concatenate([v, np.einsum("kij,kj->ki", follows, v)], axis=1)
-            self._last = x.copy(), values[:, 0].astype(float), whole
+            self._last = x.copy(), values, whole
         return self._last[1], self._last[2]
 
     def stability(self, x: Array) -> float:
@@ -371,9 +378,9 @@ class KnownDeviceLoop(SampledLoop):
         M = -beta[:, None] * F / z[:, None, None] + cross[..., None] * one
         schur = hermitian(F / (z - 1)[:, None, None]) + own[..., None] * one
         schur = schur - np.conj(np.swapaxes(M, 1, 2)) @ (M / (4 * speed[..., None]))
-        values, vectors = np.linalg.eigh(self.root[:, None] * schur * self.root)
-        v = vectors[:, :, 0] * self.root
-        return values[:, 0].astype(float), v, np.einsum("kij,kj->ki", M, v) / (4 * speed)
+        values, v = least_eigenpair(self.root[:, None] * schur * self.root)
+        v = v * self.root
+        return values, v, np.einsum("kij,kj->ki", M, v) / (4 * speed)
 
     def room(self, x: Array) -> Array:
         room = self._complement(x)[0]
@@ -419,12 +426,13 @@ def least_rms(
 ) -> tuple[SpringDamper | None, float, int, Sequence[Sequence[float]] | None]:
     """Return (gains or None, rms mismatch as a ratio, number of searches, multiplier) of the best local optimum.
 
-    `sampled` makes the loop anew for every start. For more than FEW devices, for which starts hardly matter and steps
-    are expensive, the first optimum is returned (`likeliest_first`).
+    `sampled` makes the loop, of which every start gets its own copy. For more than FEW devices, for which starts hardly
+    matter and steps are expensive, the first optimum is returned (`likeliest_first`).
     """
+    first = sampled()
     best, least, searches, multiplier = None, np.inf, 0, None
     for start in starts:
-        loop = (condition := sampled()).loop
+        loop = (condition := first.fresh()).loop
         x, runs = _optimum(condition, start)
         searches += runs
         if x is None:
