@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -51,6 +52,29 @@ def test_every_frequency_is_decided_without_a_grid(seed, n):
     assert Impedance(A, B, C, [[-least + 1e-3 * size]]).order == n
     with pytest.raises(ValueError, match="not passive, Re Z is -"):
         Impedance(A, B, C, [[-least - 1e-2 * size]])
+
+
+@pytest.mark.parametrize("width", [1e-3, 1e-5, 1e-7])
+@pytest.mark.parametrize("depth", [1e-2, 1.0])
+def test_a_narrow_active_resonance_is_refused(width, depth):
+    """Z = D - c 2 h w0 s/(s^2 + 2 h w0 s + w0^2) has Re Z = D - c < 0 at w0 alone; beside it are broad passive ones."""
+    rng = np.random.default_rng(7)
+    w = 90.0 * 10 ** np.array([0.0, -1.0, 0.5, 1.2])
+    h = np.array([width, 0.3, 0.05, 0.7])
+    gain = np.array([-2.0 * (1 + depth), 3.0, 0.4, 1.0])  # the last three add what is not negative
+    blocks = [w * np.array([[0.0, 1.0], [-1.0, -2 * h]]) for w, h in zip(w, h, strict=True)]
+    A, B = scipy.linalg.block_diag(*blocks), np.tile([[0.0], [1.0]], (4, 1))
+    C = np.ravel([[0.0, g * 2 * h * w] for g, h, w in zip(gain, h, w, strict=True)])[None]
+    turn = np.linalg.qr(rng.normal(size=A.shape))[0]
+    beside = (C @ np.linalg.solve(1j * w[0] * np.eye(8) - A, B)).item().real - gain[0]
+    for sign, passive in ((1.0, False), (-1.0, True)):
+        D = [[0.5 if passive else 2.0 - beside]]
+        parts = turn.T @ A @ turn, turn.T @ B, C * np.where(np.arange(8) < 2, sign, 1.0) @ turn, D
+        if passive:
+            assert Impedance(*parts).order == 8
+        else:
+            with pytest.raises(ValueError, match=r"not passive|cannot be decided"):
+                Impedance(*parts)
 
 
 def test_one_lag_is_passive_two_are_not():
