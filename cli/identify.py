@@ -25,7 +25,18 @@ from haptic_loop.cli.session_cli import (
 )
 from haptic_loop.design.files import off_table, plain, write
 from haptic_loop.hw.emulator import nobody
-from haptic_loop.hw.identify import Estimate, Excitation, Swing, capped, chirp, estimate, held, records_of, settled
+from haptic_loop.hw.identify import (
+    Estimate,
+    Excitation,
+    Swing,
+    capped,
+    chirp,
+    estimate,
+    held,
+    records_of,
+    settled,
+    unbounded,
+)
 from haptic_loop.hw.limits import Stage
 from haptic_loop.hw.monitor import Ages, LinkSettings
 from haptic_loop.hw.recording import Recorder
@@ -39,10 +50,10 @@ _LIMITS = (
     "The bound is a statement about these records: the least viscous friction of all laws that fit, less its scatter "
     "between parts of a record (95 %), a part for what is left unexplained and 0.5 % for the encoder's scale; of all "
     "sittings the least. It does not see friction that changes with temperature or wear, nor that of a handle behind "
-    "its transmission apart from the motor's. A dashpot behind a spring whose memory is short or faint (below 2 N s/m "
-    "at 3 ms, below 0.5 N s/m at 10 ms) is taken for damping, though it damps nothing at high frequency. A hand that "
-    "rests on the handle springs it: refused from 5 N/m on. One "
-    "that only damps is not in the bound if nobody touched the handle in one of the sittings. Dry friction is left out "
+    "its transmission apart from the motor's. What may be a dashpot behind a spring with 2 ms of memory or more is not "
+    "in delta, for it damps nothing at high frequency; a shorter memory counts as damping. A hand that rests on the "
+    "handle springs it: refused from 5 N/m on. One that only damps is not in the bound if nobody touched the handle in "
+    "one of the sittings. Dry friction is left out "
     "of delta: it dissipates too, but ever less than a viscous damper as speed grows. Lag of the amplifier is not in "
     "delta: it belongs to the delay. The bound holds up to the speed of the records; hw.bridge stops a handle there."
 )
@@ -223,7 +234,8 @@ def _identified(scenario: Scenario, sittings: list[_Sitting]) -> _Report:
         reason, warnings = str(error), left_out
     suspicious = [] if reason else held(axes, scenario, session)
     axes = capped(axes, scenario, session)
-    bounded = not reason and not suspicious and all(e.delta > 0 for e in axes)
+    reason = reason or unbounded(axes)
+    bounded = not reason and not suspicious
     return _Report(sittings[-1].report, axes, sittings, bounded, warnings + suspicious, reason or None)
 
 
@@ -290,7 +302,7 @@ def _figures(report: _Report) -> render.Table:
         mode = "-" if axis.transmission is None else f"{axis.transmission.mode_hz:.2f}"
         names = ("mass", "viscous", "coulomb", "stiffness")
         figures = [f"{getattr(found, name):.5g} ± {2 * found.errors[name]:.2g}" for name in names]
-        bound = f"{found.delta:.4f}" if report.bounded else "-"
+        bound = f"{axis.delta:.4f}" if report.bounded else "-"
         cells.append((str(i), *figures, mode, bound, f"{axis.viscosity.speed:.2f}"))
     heads = (
         *("axis", "mass [kg]", "viscous [N s/m]", "dry [N]", "to ground [N/m]", "mode [Hz]", "delta at least"),

@@ -46,7 +46,7 @@ _SLOW, _WEAK = 0.2, 0.05  # part of a force that the window has to pass, unless 
 _SLIP = 0.002  # [m/s] of dry friction where its law is of another kind
 _BLOCKS = 10  # of the record, that are left out in turn
 _HIDDEN = 0.03  # of what is left unexplained, that may be damping in disguise
-_SCALE = 5e-3  # of the encoder, that nobody can tell: 20 um of eccentricity over a part of a turn of 40 mm are 3e-3
+SCALE = 5e-3  # of the encoder, that nobody can tell: 20 um of eccentricity over a part of a turn of 40 mm are 3e-3
 _QUANTILE = 1.833  # of Student's t with 9 degrees of freedom, 95 % to one side
 _FEW = 200  # rows
 _ALMOST = 4.0  # by which a log likelihood ratio may be worse than the best law's
@@ -68,7 +68,11 @@ class Friction:
     coulomb: float  # [N]
     stiffness: float  # [N/m] to ground
     constant: float  # [N]
-    slip: float  # [m/s] of dry friction's law that fits best
+    drift: float  # [N/s] of it
+    static: float  # [N] of it that is gone at speed
+    drag: float  # [N s2/m2]
+    slip: float  # [m/s] of dry friction's law that fits best; 0 where it reverses by position
+    reach: float  # [m] over which it does; 0 where it reverses by speed
     periods: tuple[float, ...]  # [m] of periodic disturbances that were found
     errors: dict[str, float]  # standard errors of mass, viscous, coulomb, stiffness
     delta: float  # [N s/m] lower bound of b
@@ -147,8 +151,7 @@ class _Balance:
         self.rows = rows[:: max(1, int(_SPACING * self.sigma / T))]
         self._length = scipy.fft.next_fast_len(len(x) + 2 * self._reach)
         self._filters = {n: np.fft.fft(_window(n, self.sigma, T), self._length) for n in range(5)}
-        short = (step**2 / 12 * T / (4 * np.sqrt(np.pi) * _SPEED_NOISE**2)) ** (1 / 3)
-        self.speed = _filtered(self.x, 1, float(np.clip(short, T, self.sigma / 2)), T)
+        self.speed = _filtered(self.x, 1, min(_speed_window(step, T), self.sigma / 2), T)
         applied, rate, bend = _held(force, self.sigma, T)
         self.applied = applied[self.rows]
         t = np.arange(len(x)) * T
@@ -167,10 +170,10 @@ class _Balance:
     def _of(self, signal: Array, *orders: int) -> list[Array]:
         return [one.real for one in self._complex(signal, *orders)]
 
-    def laws(self, step: float) -> list[tuple[float, Array]]:
-        """Dry friction (N,) within +-1 by every law, and the speed [m/s] at which it is at 3/4 (0: by position)."""
-        bristles = [(0.0, _bristle(self.x, reach)) for reach in _BRISTLES if reach > step]
-        return [(slip, np.tanh(self.speed / slip)) for slip in _SLIPS] + bristles
+    def laws(self, step: float) -> list[tuple[float, float, Array]]:
+        """Slip [m/s], reach [m] and dry friction (N,) within +-1 of every law; it has one of the two lengths."""
+        bristles = [(0.0, reach, _bristle(self.x, reach)) for reach in _BRISTLES if reach > step]
+        return [(slip, 0.0, np.tanh(self.speed / slip)) for slip in _SLIPS] + bristles
 
     def matrix(self, dry: Array, periodic: list[_Pair]) -> Callable[[float], Array]:
         """Columns (rows, p) of the balance, by how much of friction's second derivative is in it."""
@@ -287,17 +290,35 @@ def dry_friction(x: Array, T: float, found: Friction) -> Array:
     return found.coulomb * np.tanh(np.diff(x, append=x[-1]) / T / (found.slip or _SLIP))
 
 
+def nonviscous(x: Array, T: float, step: float, found: Friction) -> Array:
+    """Return dry friction, drag, spring and drift [N] during each tick after x (N,) [m], by the law that fits best."""
+    x, edge = x - x[0], round(_REACH * _speed_window(step, T) / T)
+    speed = _filtered(np.pad(x, edge, mode="edge"), 1, _speed_window(step, T), T)[edge : edge + len(x)]
+    speed = (speed + np.append(speed[1:], speed[-1])) / 2
+    steps = np.diff(x, append=x[-1]) / T
+    dry = np.tanh(steps / found.slip) if found.slip else _bristle(x, found.reach)
+    dry = dry * (found.coulomb + found.static * np.exp(-((speed / _STRIBECK) ** 2)))
+    return dry + found.drag * speed * np.abs(speed) + found.stiffness * x + found.drift * T * np.arange(len(x))
+
+
+def _speed_window(step: float, T: float) -> float:
+    """Standard deviation [s] of the shortest window in which rounding leaves _SPEED_NOISE."""
+    return max(T, (step**2 / 12 * T / (4 * np.sqrt(np.pi) * _SPEED_NOISE**2)) ** (1 / 3))
+
+
 def friction(x: Array, force: Array, T: float, step: float) -> Friction:
     """Of displacements x (N,) [m] under forces (N,) [N] held for T [s]; `step` [m] is the encoder's."""
     balance = _Balance(x, force, T, step)
     laws = balance.laws(step)
-    plain = min((_fitted(balance, dry, []) for _, dry in laws), key=lambda fit: fit.squares)
+    plain = min((_fitted(balance, dry, []) for *_, dry in laws), key=lambda fit: fit.squares)
     periodic = _disturbances(balance, plain)
-    fits = [(slip, _fitted(balance, dry, periodic)) for slip, dry in laws]
-    least = min(fit.squares for _, fit in fits)
-    slip, best = min(fits, key=lambda entry: balance.independent * np.log(entry[1].squares / least) + entry[1].price)
+    fits = [(slip, reach, _fitted(balance, dry, periodic)) for slip, reach, dry in laws]
+    least = min(fit.squares for *_, fit in fits)
+    slip, reach, best = min(
+        fits, key=lambda entry: balance.independent * np.log(entry[2].squares / least) + entry[2].price
+    )
     delta, covariance = np.inf, np.zeros(0)
-    for _, fit in fits:
+    for *_, fit in fits:
         if balance.independent * np.log(fit.squares / least) > _ALMOST:
             continue
         spread = _scatter(fit, fit.residual + fit.columns @ fit.p)
@@ -313,9 +334,13 @@ def friction(x: Array, force: Array, T: float, step: float) -> Friction:
         coulomb=float(p[_DRY]),
         stiffness=float(p[_SPRING]),
         constant=float(p[_CONSTANT]),
+        drift=float(p[_SLOPE]),
+        static=float(p[_STATIC]),
+        drag=float(p[_DRAG]),
         slip=slip,
+        reach=reach,
         periods=tuple(pair.period for pair in periodic),
         errors={name: float(np.sqrt(covariance[i, i])) for name, i in names.items()},
-        delta=max(0.0, (1 - _SCALE) * float(delta)),
+        delta=max(0.0, (1 - SCALE) * float(delta)),
         rms=float(np.sqrt(best.squares / len(best.residual))),
     )

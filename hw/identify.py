@@ -1,9 +1,10 @@
 """Mass, friction and transmission of one axis from a record of forces and displacements, and a bound on its friction.
 
-The excitation is a chirp of a small force, slow motion at half of it, a swing that reaches the speed of a session, then
-silence: a force that does not depend on the motion closes no loop, so no certificate is needed. Mass and friction come
-from the balance of forces (hw/friction.py), which must be one of viscous friction (hw/viscosity.py); the transmission
-comes from the spectra of what force is left and of the motion: least squares over the chirp's frequencies.
+The excitation is a chirp of a small force, slow motion at half of it, a swing that reaches the speed of a session, a
+chirp of the swing's force, then silence: a force that does not depend on the motion closes no loop, so no certificate
+is needed. Mass and friction come from the balance of forces (hw/friction.py), which must be one of viscous friction
+(hw/viscosity.py); the transmission comes from the spectra of what force is left and of the motion: least squares over
+the chirp's frequencies.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from haptic_loop.hw.viscosity import Viscosity, doubt, viscosity
 from haptic_loop.sim.scenario import Scenario
 
 _SLOW_SPAN = 4.0  # of the slow sweeps' frequencies
+_LOUD_HZ, _LOUD_LENGTH = (10.0, 130.0), 4  # band of the sweep at the swing's force; it takes so many times `seconds`
 _LEVELS = (0.4, 0.6, 0.8, 1.0)  # amplitudes of the swing, as parts of its largest
 _CYCLES = 3  # of each of them
 _LEAD = 0.3  # [s] of zero force, in which the gain comes up
@@ -129,23 +131,23 @@ def chirp(
 
     The first cosine passes through `band` [Hz]; the second and the last are slow, the last at half the force. Each
     takes `seconds`, the silence half of that. Two slow motions at two levels of force show friction that is not
-    viscous, and the swing between them shows it at the speed of a session. Each part ends at a whole cycle, so that a
-    free mass does not drift away; the last one ends a quarter of a cycle later, so that the device is released with a
-    speed.
+    viscous, and the swing between them shows it at the speed of a session. A long cosine of the swing's force follows,
+    which shows how damping changes with frequency. Each part ends at a whole cycle, so that a free mass does not drift
+    away; the last one ends a quarter of a cycle later, so that the device is released with a speed.
     """
-    t = np.arange(round(seconds / T)) / round(seconds / T)
 
-    def sweep(low: float, high: float, further: float = 0.0) -> Array:
-        ratio = high / low
-        cycles = max(1, round(seconds * (high - low) / np.log(ratio))) + further
-        wave = amplitude * np.cos(2 * np.pi * cycles * (ratio**t - 1) / (ratio - 1))
-        return np.tile(wave[:, None], channels)
+    def sweep(low: float, high: float, further: float = 0.0, times: int = 1) -> Array:
+        ratio, ticks = high / low, round(times * seconds / T)
+        cycles = max(1, round(times * seconds * (high - low) / np.log(ratio))) + further
+        wave = np.cos(2 * np.pi * cycles * (ratio ** (np.arange(ticks) / ticks) - 1) / (ratio - 1))
+        return np.tile(amplitude * wave[:, None], channels)
 
     low, high = band
     slower, span = low / np.sqrt(2.0), min(_SLOW_SPAN, high / low)
     parts = [sweep(low, high), sweep(low, span * low)]
     if swing:
-        parts.append(swing.signal(T))
+        loud = sweep(_LOUD_HZ[0], min(_LOUD_HZ[1], 0.3 / T), times=_LOUD_LENGTH)
+        parts += [swing.signal(T), loud / amplitude * np.array(swing.force)]
     parts.append(sweep(slower, span * slower, 0.25) / 2)
     lead, tail = (np.zeros((round(s / T), channels)) for s in (_LEAD, seconds / 2))
     return Excitation(np.concatenate([lead, *parts, tail]), T, link)
@@ -175,7 +177,8 @@ class Estimate:
 
     @property
     def delta(self) -> float:
-        return self.friction.delta
+        """The bound [N s/m] at every speed and frequency."""
+        return min(self.friction.delta, self.viscosity.lasting)
 
 
 def identify(x: Array, force: Array, T: float, step: float, rigid: bool) -> Estimate:
@@ -198,7 +201,7 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool) -> Esti
             f"the record does not tell viscous from dry friction: {found.viscous:.3g} N s/m viscous, "
             f"{found.coulomb:.3g} N dry, {1e3 * found.rms:.2g} mN unexplained; take one with more force or a longer one"
         )
-    examined = viscosity(x, force, T, found)
+    examined = viscosity(x, force, T, step, found)
     if reason := doubt(examined, found):
         raise ValueError(reason)
     return Estimate(found, None if rigid else _transmission(x, force, T, found), examined)
@@ -314,6 +317,17 @@ def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], lis
         bound = replace(least.friction, delta=min(e.delta for e in axis))
         found.append(replace(least, friction=bound, viscosity=slowest))
     return found, words
+
+
+def unbounded(estimates: Sequence[Estimate]) -> str:
+    """Why a record gives no bound, for the first axis without one; "" where all have one."""
+    for i, e in enumerate(estimates, start=1):
+        if e.delta <= 0:
+            return (
+                f"axis {i}: the record does not exclude that all damping is gone beyond "
+                f"{1 / (2 * np.pi * e.viscosity.memory):.2g} Hz: take a longer one (--seconds), or use a finer encoder"
+            )
+    return ""
 
 
 def _more_damped(one: Estimate, least: Estimate) -> bool:

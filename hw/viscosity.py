@@ -9,34 +9,42 @@ motor is dissipated: W = b S2 + c S1 + q S3 + f0 dx + k d(x^2)/2 + l int f' v dt
 of an amplifier. For viscous and dry friction q = 0, whatever the amplitude; where friction thins, q < 0, and at the
 speed v the damping is b + q v.
 
-Frequency: the motion that the motor's spectrum causes, with a transmission, an amplifier's lag and dry friction taken
-into account, is compared with and without a Maxwell element (c, tau) beside b. Its damping c/(1 + (w tau)^2) is in the
-record's slow strokes, and gone at high frequency, where b alone is left.
+Frequency: the motion that the force's spectrum causes, with a transmission, an amplifier's lag and dry friction taken
+into account, is fitted with a Maxwell element (c, tau) beside b, for each of several tau. Its damping c/(1 + (w tau)^2)
+is in the record's slow strokes, and gone at high frequency, where b alone is left. A certificate charges the damping at
+every frequency, so only b counts. The bound is the least lower end of b over all tau: what a record cannot exclude, as
+because the encoder is coarse, it does not credit.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array
-from haptic_loop.hw.friction import Friction, dry_friction
+from haptic_loop.hw.friction import SCALE, Friction, nonviscous
 
 _FAST = 0.25  # part of the highest speed from which on a stroke counts: dry friction has reached its level there
 _FEW = 8  # strokes
 _SIGMAS = 2.0  # standard errors
-_TAUS = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3)  # [s] of a memory: shorter than a tick it acts as viscous friction
+#: [s] of a memory; a shorter one counts as damping: an encoder of 5 um on a rigid 0.25 kg would exclude 1 ms nowhere
+_TAUS = (2e-3, 3e-3, 4e-3, 8e-3, 16e-3, 32e-3, 64e-3)
 _BAND_HZ = (6.0, 130.0)  # below, cables and drift act; above, an encoder of 5 um sees nothing of 1 N
 _LOUD = 0.05  # part of the strongest force in the band that a frequency must have
-_POINTS = 200  # frequencies that are compared
+_POINTS = 200  # frequencies at which a fit begins
 _ALIASES = (-1, 0, 1)  # sampling adds what is whole multiples of 1/T away; the next are below 1e-3
 _MODES_HZ = np.geomspace(25.0, 300.0, 40)  # where a transmission's mode is looked for first
 _PARTS = (0.15, 0.3, 0.5)  # of the mass, that the motor may have
 _STEPS = 30  # of a fit
-_SURE = 30.0  # log likelihood ratio from which on a memory is not chance: 6 values of tau, some unmodelled motion
+_VAGUE = 3.0  # standard deviation of a logarithm before the record is seen
+_MUCH = 0.15  # part of the damping that a memory may have where the fit is linear in it
+_QUANTILE = 2.0  # of the normal distribution, 97.7 % to one side
+_SURE = 100.0  # log likelihood ratio from which on a memory is not chance, nor friction that is modelled badly
 
 
 @dataclass(frozen=True)
@@ -46,15 +54,18 @@ class Viscosity:
     speed: float  # [m/s] highest speed of the record
     thinning: float  # [N s/m] damping that is lost from slow motion to that speed; 0 where friction does not thin
     thinning_error: float  # [N s/m] its standard error
-    lasting: float | None  # [N s/m] damping that is left at high frequency; None where no memory was found
-    memory: float  # [s] time constant of that memory
+    lasting: float  # [N s/m] lower bound (97.7 %) of the damping that is left beyond a memory
+    memory: float  # [s] time constant of the memory that this bound allows for
+    remembers: bool  # whether the record shows a memory, rather than not excluding it
 
 
-def viscosity(x: Array, force: Array, T: float, friction: Friction) -> Viscosity:
-    """Examine displacements x (N,) [m] under forces (N,) [N] held for T [s], of an axis with this `friction`."""
-    speed, thinning, error = _thinning(x, force, T)
-    lasting, tau = _memory(x, force, T, friction)
-    return Viscosity(speed, thinning, error, lasting, tau)
+def viscosity(x: Array, force: Array, T: float, step: float, friction: Friction) -> Viscosity:
+    """Examine displacements x (N,) [m] under forces (N,) [N] held for T [s], of an axis with this `friction`.
+
+    `step` [m] is the encoder's.
+    """
+    driving = force - nonviscous(x, T, step, friction)
+    return Viscosity(*_thinning(x, force, T), *_lasting(x, driving, T, friction))
 
 
 def doubt(found: Viscosity, friction: Friction) -> str | None:
@@ -65,7 +76,7 @@ def doubt(found: Viscosity, friction: Friction) -> str | None:
             "the energy of a stroke does not grow with the square of its speed: the damping falls by "
             f"{found.thinning:.2g} N s/m up to {found.speed:.2g} m/s, the bound's error is {error:.2g}"
         )
-    if found.lasting is not None and found.lasting < friction.delta:
+    if found.remembers and found.lasting < friction.delta:
         return (
             f"the damping falls with frequency, from {friction.viscous:.3g} N s/m to {found.lasting:.3g} beyond "
             f"{1 / (2 * np.pi * found.memory):.2g} Hz: friction with a memory has no viscous bound"
@@ -120,33 +131,42 @@ class Spectra:
     """The spectrum of a motion, and of what a model makes of the force's."""
 
     def __init__(
-        self, x: Array, force: Array, T: float, held: bool = False, band: tuple[float, float] = _BAND_HZ
+        self,
+        x: Array,
+        force: Array,
+        T: float,
+        held: bool = False,
+        band: tuple[float, float] = _BAND_HZ,
+        points: int = _POINTS,
     ) -> None:
-        """Compare within `band` [Hz]; `held` where the handle is clamped."""
+        """Compare at about `points` frequencies within `band` [Hz]; `held` where the handle is clamped."""
         self.T, self.ticks, self.held = T, len(x), held
         F, hz = np.fft.rfft(force), np.fft.rfftfreq(len(x), T)
         steps = np.fft.rfft(np.diff(x, append=x[-1]))
         heard = (hz > band[0]) & (hz < min(band[1], 0.35 / T))
         heard &= np.abs(F) > _LOUD * np.abs(F[heard]).max()
         chosen = np.flatnonzero(heard)
-        chosen = chosen[:: max(1, len(chosen) // _POINTS)]
+        chosen = chosen[:: max(1, len(chosen) // points)]
         self.hz = hz[chosen]
         w = 2 * np.pi * self.hz
         self.force, self.motion = F[chosen], steps[chosen] / (np.exp(1j * w * T) - 1)
         self._s = 1j * (w + 2 * np.pi / T * np.array(_ALIASES)[:, None])
         self._hold = -np.expm1(-self._s * T) / (self._s * T)
 
-    def model(self, p: Array, tau: float) -> NDArray[np.complex128]:
-        """The motion by p = [log m1, log m2, log k, log d, b, lag, delay, c] and a memory of `tau` [s]."""
+    def model(self, p: Array, tau: float, end: float = 0.0) -> NDArray[np.complex128]:
+        """The motion by p = [log m1, log m2, log k, log d, b, lag, delay, c] and a memory of `tau` [s].
+
+        `end` [N] is the force of one tick that would stop what still moves when the record ends.
+        """
         (m1, m2, k, d), (b, lag, late, c), s = np.exp(p[:4]), p[4:], self._s
         link = k + d * s
         handle = link / s if self.held else m2 * s * link / (m2 * s * s + link)
         impedance = m1 * s + b + c / (1 + tau * s) + handle
-        return (self._hold * np.exp(-s * late) / (1 + lag * s) / (s * impedance)).sum(axis=0) * self.force
+        return (self._hold * np.exp(-s * late) / (1 + lag * s) / (s * impedance)).sum(axis=0) * (self.force + end)
 
-    def error(self, p: Array, tau: float) -> Array:
+    def error(self, p: Array, tau: float, end: float = 0.0) -> Array:
         """Motion less model: real and imaginary parts."""
-        error = self.motion - self.model(p, tau)
+        error = self.motion - self.model(p, tau, end)
         return np.concatenate([error.real, error.imag]) / np.abs(self.motion).max()
 
     def starts(self, friction: Friction) -> list[Array]:
@@ -161,31 +181,49 @@ class Spectra:
         return [p for *_, p in sorted(tried)[:2]]
 
 
-def _memory(x: Array, force: Array, T: float, friction: Friction) -> tuple[float | None, float]:
-    """The damping [N s/m] beside the memory that explains a record best, and its time constant; None without one."""
+def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[float, float, bool]:
+    """The least lower end of b [N s/m] over all tau, that tau [s], and whether the record shows a memory.
+
+    `force` is that of the motor less dry friction. The model without memory is fitted to all frequencies. Beside the
+    mass a Maxwell element changes little, so its part is linear in c, and each tau takes one linear fit.
+    """
     import scipy
 
-    spectra = Spectra(x, force - dry_friction(x, T, friction), T)
-    low = np.array([-20.0] * 4 + [0.0] * 4)
+    few, every = Spectra(x, force, T), Spectra(x, force, T, points=len(x))
+    low = np.array([-20.0] * 4 + [0.0, 0.0, -T, -np.inf])  # an encoder may be read later than forces latch
     high = np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T, np.inf])
 
-    def fitted(start: Array, tau: float, memory: bool) -> tuple[float, Array]:
-        most = high.copy()
-        most[7] = np.inf if memory else 1e-12
-        begin = np.clip(start, low + 1e-13, most - 1e-13)
-        fit = scipy.optimize.least_squares(
-            spectra.error, begin, bounds=(low, most), x_scale="jac", args=(tau,), max_nfev=_STEPS
-        )
-        return float(2 * fit.cost), fit.x
+    def error_of(spectra: Spectra, p: Array, c: float = 0.0, tau: float = 1.0) -> Array:
+        """Errors by p = [log m1, log m2, log k, log d, b, lag, delay, end]."""
+        return spectra.error(np.append(p[:7], c), tau, p[7])
 
-    plain, p = min((fitted(start, 1.0, False) for start in spectra.starts(friction)), key=lambda fit: fit[0])
-    best, tau, q = plain, 0.0, p
-    for candidate in _TAUS:
-        start = p.copy()
-        start[4], start[7] = p[4] / 2, p[4] / 2
-        squares, parameters = fitted(start, candidate, True)
-        if squares < best:
-            best, tau, q = squares, candidate, parameters
-    if len(spectra.force) * np.log(plain / best) < _SURE:
-        return None, 0.0
-    return float(q[4]), tau
+    def fitted(spectra: Spectra, start: Array) -> Any:
+        begin = np.clip(start, low + 1e-13, high - 1e-13)
+        how: dict[str, Any] = {"bounds": (low, high), "x_scale": "jac", "max_nfev": _STEPS}
+        return scipy.optimize.least_squares(partial(error_of, spectra), begin, **how)
+
+    rough = min((fitted(few, start[:8]) for start in few.starts(friction)), key=lambda fit: fit.cost)
+    plain = fitted(every, rough.x)
+    left, points = plain.fun, len(every.force)
+    noise = np.sqrt(float(left @ left) / len(left))
+    # a rigid device tells nothing of a transmission, and a delay acts like a lag
+    vague = noise * np.diag([1 / _VAGUE] * 4 + [0.0] + [1 / T] * 2 + [0.0] * 2)
+    least, memory, best, part = np.inf, 0.0, float(left @ left), 0.0
+    for tau in _TAUS:
+        step = 1e-3 * max(friction.viscous, 1e-3)
+        column = (error_of(every, plain.x, step, tau) - left) / step
+        columns = np.vstack([np.column_stack([plain.jac, column]), vague])
+        size = np.linalg.norm(columns, axis=0) + 1e-300
+        q, r = np.linalg.qr(columns / size)
+        known = np.append(left, np.zeros(len(vague)))
+        change = -scipy.linalg.solve_triangular(r, q.T @ known) / size
+        rest = known - q @ (q.T @ known)
+        spread = scipy.linalg.solve_triangular(r, np.eye(len(r)))[4] / size[4]
+        error = float(np.linalg.norm(spread) * np.linalg.norm(rest)) / np.sqrt(len(left) - len(r))
+        b = float(plain.x[4] + min(change[4], 0.0))
+        if b - _QUANTILE * error < least:
+            least, memory = b - _QUANTILE * error, tau
+        if float(rest @ rest) < best:
+            best, part = float(rest @ rest), float(change[-1] / max(b + change[-1], 1e-9))
+    remembers = part > _MUCH and points * np.log(float(left @ left) / best) > _SURE
+    return max(0.0, (1 - SCALE) * least), memory, bool(remembers)

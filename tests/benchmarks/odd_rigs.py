@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from haptic_loop.controller.lti import Array
-from haptic_loop.hw.friction import Friction
-from haptic_loop.hw.identify import Swing, chirp, identify
+from haptic_loop.hw.identify import Estimate, Swing, chirp, identify
 from haptic_loop.sim.scenario import load as scenario_of
 
 #: what the fit of before, one mass and Coulomb friction by output error, made of these; "none" of all others
@@ -173,12 +172,12 @@ def excitation() -> Array:
     return FORCE_STEP * np.round(signal / FORCE_STEP)
 
 
-def judged(rig: Rig, x: Array, signal: Array) -> tuple[Friction | str, float]:
+def judged(rig: Rig, x: Array, signal: Array) -> tuple[Estimate | str, float]:
     """What comes of a record, and how long it takes [s]."""
     begin = time.perf_counter()
-    found: Friction | str
+    found: Estimate | str
     try:
-        found = identify(x, signal, T, rig.step, rigid=True).friction
+        found = identify(x, signal, T, rig.step, rigid=True)
     except ValueError as error:
         found = str(error)
     return found, time.perf_counter() - begin
@@ -203,8 +202,8 @@ def main() -> None:
         off.append(100 * (found.delta / rig.viscous - 1))
         b = 100 * (found.viscous / rig.viscous - 1)
         print(f"{i:2d} {rig.name}: {rig.viscous:.3f} N s/m, b {b:+.2f} %, bound {off[-1]:+.2f} %{before}")
-    above, near = sum(part > 0 for part in off), sum(-10 <= part <= 0 for part in off)
-    print(f"{len(many)} rigs: {len(off)} bounds, {above} above the truth, {near} within 10 % below it")
+    above, none = sum(part > 0 for part in off), sum(part == -100 for part in off)
+    print(f"{len(many)} rigs: {len(off)} bounds, {above} above the truth, {none} of them 0")
     print(f"median {np.median(off):.2f} %, least {min(off):.1f} %; {longest:.1f} s for the slowest")
 
 
