@@ -1,8 +1,8 @@
-"""Loops drawn at random, against two laws: `make validate`.
+"""Loops drawn at random, against three laws: `make validate`.
 
 An exact proof succeeds where the sweep asks for less damping than there is, and nowhere else. The verdict that is read
 from a simulated trace is never the opposite of the eigenvalues'; where nothing excites the mode that decides, it says
-so.
+so. A trace of a crowd votes on a slow loop only where it decides, and then as the eigenvalues do.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from haptic_loop.design.result import NotProved
 from haptic_loop.models.device import CompliantDevice, RigidDevice
 from haptic_loop.models.human import Human, Population, Voluntary
 from haptic_loop.sim.accuracy import settle
+from haptic_loop.sim.crowds import Validation, validate
 from haptic_loop.sim.run import assemble, make_engine, run
-from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.scenario import InputError, Scenario, load
 from haptic_loop.sim.stability import _NOT_EXCITED, disagree, stability_of
 
 _TOO_CLOSE = 1e-4  # of the damping: a proof needs some room
@@ -152,3 +153,32 @@ def traces(seed: int, count: int = 460) -> Iterator[_TraceVerdict]:
         opposite = other or (growth is None and part.verdict not in (None, part.exact_verdict))
         yield _TraceVerdict(number, engine, exact, growth, part.verdict, part.reason, silent, not opposite)
         number += 1
+
+
+@dataclass(frozen=True)
+class _Slow:
+    """Fifty hands on one network that decays in seconds: their traces of 2 s beside the eigenvalues."""
+
+    network: int
+    decided: int  # traces whose rate is larger than its error
+    contradicted: int  # of these
+    worst: float  # |rate - eigenvalue's| over the error that the trace states
+    holds: bool
+
+
+def slow(seed: int, count: int = 2000) -> Iterator[_Slow]:
+    """Whether no trace contradicts the eigenvalues of `count` loops of three devices with a mass between springs."""
+    for number in range(count // 50):
+        rng = np.random.default_rng((seed, number))
+        stiffness, damping = np.exp(rng.uniform(2.5, 7.0, 3)), rng.choice([0.0, 0.3], 3) * rng.random(3)
+        springs = tuple(
+            Spring((end, "m"), float(k), float(b)) for end, k, b in zip("abc", stiffness, damping, strict=True)
+        )
+        network = Network(("a", "b", "c"), springs, {"m": float(np.exp(rng.uniform(-3.0, 0.5)))})
+        theta = tuple(rng.integers(0, 5, 3).tolist())
+        scenario = load("three-rigid").replace(environment=network, theta=theta)
+        found = validate(Validation(scenario, NoCoupling(), number, 50, 1, "exact", 2.0))
+        decided = found.trace_decides
+        contradicted = int((decided & ((found.trace > 0) != (found.exact > 0))).sum())
+        worst = float(np.max(np.abs(found.trace - found.exact)[decided] / found.trace_error[decided], initial=0.0))
+        yield _Slow(number, int(decided.sum()), contradicted, worst, not contradicted and worst < 1)

@@ -9,7 +9,7 @@ from tests.checks.challenges import challenges
 from tests.checks.endurance import endurance
 from tests.checks.faults import rehearse_faults
 from tests.checks.hard import hard_loops
-from tests.checks.random_loops import proofs, traces
+from tests.checks.random_loops import proofs, slow, traces
 from tests.checks.tightness import delayed, known, usual
 from tests.checks.uneven import uneven_ticks
 
@@ -39,6 +39,7 @@ MEASURED = {
     "numerically hard loops": hard_loops,
     "random networks": proofs,
     "traces and eigenvalues": traces,
+    "traces of slow loops": slow,
     "uneven ticks": uneven_ticks,
     "guarantees at their edge": challenges,
     "faults of a link": lambda seed: rehearse_faults(),

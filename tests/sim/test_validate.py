@@ -38,6 +38,7 @@ from haptic_loop.sim.stability import (
     unstable,
 )
 from haptic_loop.sim.verdicts import Traces, disagreement_words
+from tests.checks.random_loops import slow
 
 SCENARIO = load()
 TWO = "[[human]]\nlinks = [{mass = 1.0, damping = 0, stiffness = 0}]\n" * 2
@@ -477,6 +478,13 @@ def test_no_trace_contradicts_the_eigenvalues_of_slow_loops():
     np.testing.assert_array_equal(found.trace[decided] > 0, found.exact[decided] > 0)
     assert (np.abs(found.trace[decided] - found.exact[decided]) < found.trace_error[decided]).all()
     assert (np.abs(found.trace[decided]) * 1.5 >= 4 - 1e-9).all()  # four times of decay or growth
+
+
+def test_traces_decide_only_what_eigenvalues_say():
+    """150 of the 2,000 slow loops of `make validate`."""
+    rows = list(slow(0, 150))
+    assert all(row.holds for row in rows)
+    assert 0 < sum(row.decided for row in rows) < 150
 
 
 def test_short_traces_do_not_vote():
