@@ -53,7 +53,7 @@ def assessment_of(
 #: environments of a guarantee -> what a user touches
 _OBJECTS = {
     ANY: "any passive object",
-    RANGES: "every object of the ranges",
+    RANGES: "every vertex of the ranges (between them searched, not proved)",
     HERE: "this object",
     RIGID_WALL.here: "a rigid wall",
     MAKING: "this object, whose walls may be touched and left",
@@ -78,7 +78,8 @@ def verdict(
     if guarantee is None:
         return f"[red]Not certified[/]: {_sentence(assessment.reason or assessment.decisive.shortfall)}"
     if guarantee.energy_J is not None:
-        return f"[green]Safe by an energy account[/]: {_sentence(guarantee.words)}"
+        swept = " By a refined sweep, without an exact proof." if guarantee.proof == "sampled" else ""
+        return f"[green]Safe by an energy account[/]: {_sentence(guarantee.words)}{swept}"
     felt = _felt(assessment, force_error)
     words = [f"[green]Stable[/] for {_who(guarantee)}{': ' + felt if felt else ''}."]
     if not assessment.holds:

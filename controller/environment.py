@@ -229,6 +229,17 @@ class Environment:
         """Raise ValueError if no loop with this environment makes sense."""
         self.E(T)
 
+    def active(self, T: float) -> str | None:
+        """Return why E(z) may feed power in at some frequency, or None; a network does not, by its parameters."""
+        what = type(self).__name__
+        try:
+            lift = _correction(Block.of(self.E(T)))
+        except ValueError as error:
+            return f"environment {what}: {str(error).removeprefix('block: ')}"
+        if lift.any():
+            return f"environment {what}: passive within rounding only; Network(contacts, block=Block.of(E)) mends that"
+        return None
+
     def as_network(self) -> Network:
         """Return itself if it is a network. Raises ValueError otherwise."""
         raise ValueError(f"{self.here} is no network of springs, dampers and masses")
@@ -267,6 +278,9 @@ class RigidWall(Environment, enum.Enum):
         if any(psi):
             shown = ", ".join(map(str, psi))
             raise ValueError(f"psi is {shown}: behind a rigid wall no loop with a delayed environment is stable")
+
+    def active(self, T: float) -> None:
+        return None
 
     def E(self, T: Number) -> Lti:
         raise ValueError("a rigid wall has no E(z): its force is whatever the coupling in front of it makes")
@@ -379,6 +393,9 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         elif any(psi):
             raise ValueError(f"psi is {list(psi)}: a world answers within the tick, so psi must be 0")
 
+    def active(self, T: float) -> None:
+        return None
+
     @property
     def one_period(self) -> bool:
         return self.block is not None
@@ -474,6 +491,9 @@ class Networks(Environment):
 
     def __init__(self, contacts: tuple[str, ...], matrices: _Matrices) -> None:
         self.contacts, self.matrices = contacts, matrices
+
+    def active(self, T: float) -> None:
+        return None
 
     def E(self, T: Number) -> Lti:
         return Lti(*_realise(self.matrices, len(self.contacts), T), T)

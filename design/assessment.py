@@ -38,7 +38,7 @@ from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.environments import LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
 from haptic_loop.design.frequency import too_long
-from haptic_loop.design.guarantees import ANY, RANGES
+from haptic_loop.design.guarantees import ANY, AT_VERTICES, RANGES
 from haptic_loop.design.known_device import KNOWN_DEVICE, LimitedKnownDevice, described
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Design, NotProved, Requirement, suffices
@@ -344,7 +344,7 @@ class Guarantee:
             join = "" if self.environments.startswith("and ") else ","
             amount = f"more than {self.energy_J:g} J" if self.energy_J else "any energy"
             return f"{self.hands} is given {amount} beyond what the devices dissipate{join} {self.environments}"
-        return self.environments
+        return AT_VERTICES if self.environments == RANGES else self.environments
 
     def part(self) -> dict[str, Any]:
         """Return the fields of its JSON."""

@@ -39,6 +39,7 @@ from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay, moving_sum
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Block, Complex, Lti, Sampled, as_like, constant_like, hstack, vstack
+from haptic_loop.controller.passivity import hermitian_floor
 from haptic_loop.controller.ranges import Member
 from haptic_loop.design.arguments import shown
 from haptic_loop.design.facts import compose
@@ -131,7 +132,7 @@ def delayed_environment_demand(delayed: Lti, phi: Sequence[Any] | Array) -> Dema
 
 
 def uncovered(environment: Lti, psi: Sequence[int], phi: Sequence[float] | Array) -> tuple[float, float]:
-    """Return the largest shortage of passivity of E-hat + Phi [N s/m] and its frequency w [rad/sample].
+    """Return the largest shortage of passivity of E-hat + Phi [N s/m] by a sweep, and its frequency w [rad/sample].
 
     The shortage is positive where phi (m,) is too small.
     """
@@ -142,6 +143,13 @@ def uncovered(environment: Lti, psi: Sequence[int], phi: Sequence[float] | Array
         return largest_eigenvalue(-hermitian(block.at(on_circle(w))))
 
     return supremum(short, np.concatenate([[0.0], frequencies(block)]))
+
+
+def covers(loop: Loop, phi: Sequence[float] | Array) -> bool:
+    """Return whether phi (m,) [N s/m] makes E-hat + Phi passive at all frequencies, within _ROUNDING of the damping."""
+    demand = delayed_environment_demand(delay(loop.psi, loop.T) @ loop.E(), phi)
+    slack = _ROUNDING * float(max(even_damping(loop)))
+    return hermitian_floor(demand.free + demand.gain, -slack / 2, -slack)[0] >= -slack
 
 
 #: A pair is singular if its determinant is below _SINGULAR times the diagonal's product; smaller entries are rounding.
@@ -303,7 +311,9 @@ class Condition(ABC):
         named = vars(type(self)).get("covers", ())
         missing = [name for name, there in zip(BEYOND, has, strict=True) if there and name not in named]
         left = f"the loop has {', '.join(missing)}, which the condition {self.name} does not name in covers"
-        return left if missing else None
+        if missing or self.guarantee(loop) != "any passive environment":
+            return left if missing else None
+        return loop.environment.active(loop.T)
 
     @property
     def base(self) -> str:
@@ -488,8 +498,8 @@ def any_environment(V: Lti, loop: Loop, phi: Array | None = None) -> Requirement
     demand = any_environment_demand(V, loop, phi)
     if reason := asymmetric(demand.static["V(1)"]):
         return refused(reason)
-    if phi is not None and uncovered(loop.E(), loop.psi, phi)[0] > _ROUNDING * max(even_damping(loop)):
-        return refused("E-hat + Phi is not passive for this multiplier")
+    if phi is not None and not covers(loop, phi):
+        return refused("E-hat + Phi is not passive for this multiplier, or its passivity cannot be decided")
     least = partial(least_scale, demand) if phi is not None else partial(_scale_beside_zeros, V, demand)
     ratio, w = supremum(least, np.concatenate([[0.0], frequencies(V)]))
     if ratio > _NEVER:

@@ -12,6 +12,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.design.conditions import encoder_friction
 
 ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
+AT_VERTICES = "these ranges: proved at the vertices, searched between them"  # RANGES in words
 
 
 #: limits of every certificate

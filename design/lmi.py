@@ -30,6 +30,7 @@ from haptic_loop.design import conditions
 from haptic_loop.design.conditions import (
     Demand,
     asymmetric,
+    covers,
     delayed_environment_demand,
     even_damping,
     uncovered,
@@ -69,21 +70,6 @@ def _low_pass(channels: int, T: float, f0: float = 80.0) -> Lti:
     return Lti(pole * one, one, gain * pole * one, gain * one, T)
 
 
-def check_passive(E: Lti, tolerance: float = 1e-9) -> None:
-    """Raise ValueError unless E z/(z-1), from displacement, is positive real and E(1) symmetric and >= 0."""
-    if not E.is_stable():
-        raise ValueError("environment is not passive: it has a pole on or outside the unit circle")
-    static = E.dc()
-    scale = np.abs(static).max() + np.abs(E.D).max()
-    if np.abs(static - static.T).max() > tolerance * scale:
-        raise ValueError("environment is not passive: its static stiffness E(1) is not symmetric")
-    if np.linalg.eigvalsh((static + static.T) / 2)[0] < -tolerance * scale:
-        raise ValueError("environment is not passive: its static stiffness E(1) has a negative direction")
-    worst, w = uncovered(E, (0,) * E.inputs, np.zeros(E.inputs))
-    if worst > tolerance * scale * E.T:
-        raise ValueError(f"environment is not passive: it produces energy at {w / (2 * np.pi * E.T):.4g} Hz")
-
-
 def _check_weights(W1: Lti, W2: Lti, channels: int) -> None:
     if W1.inputs != channels or (W2.inputs, W2.outputs) != (channels, channels):
         raise ValueError(f"W1 and W2 must fit the {channels} channels on the inside, W2 also on the outside")
@@ -116,7 +102,8 @@ class Shaping:
         self.loop, self.usable = loop, usable(loop)
         self.W1, self.W2 = W1 or one, W2 or _low_pass(N, T)
         _check_weights(self.W1, self.W2, N)
-        check_passive(E)
+        if reason := loop.environment.active(T):
+            raise ValueError(reason)
         advance = [t + p - n for t, p, n in zip(loop.theta, loop.psi, loop.lam, strict=True)]
         self.late = one - delay(advance, T)  # I - Psi Lambda^-1 Theta
         self.environment = delay(loop.psi, T) @ E  # Psi E
@@ -240,13 +227,12 @@ _ROOM = 1e-6
 
 
 def least_phi(loop: Loop) -> Array | None:
-    """Return `least_multiplier`, verified on a refined sweep, or None for psi = 0, which needs none."""
+    """Return `least_multiplier`, verified at every frequency, or None for psi = 0, which needs none."""
     if not any(loop.psi):
         return None
     phi = least_multiplier(loop) + _ROOM * even_damping(loop)
-    short, _ = uncovered(loop.E(), loop.psi, phi)
-    if short > 0:
-        raise DesignFailed(None, (), f"the multiplier Phi = {phi.tolist()} leaves {short:.2e} N s/m uncovered")
+    if not covers(loop, phi):
+        raise DesignFailed(None, (), f"the multiplier Phi = {phi.tolist()} may leave some frequency uncovered")
     return phi
 
 
@@ -353,7 +339,7 @@ class _AnyEnvironment(Multiplied):
         if _in_frame(loop) and any(loop.psi):
             what = "a latency" if loop.latency else "delays that switch"
             return f"with delay in the environment its multiplier is of whole, constant samples: no {what}"
-        return None
+        return None if any(loop.psi) else loop.environment.active(loop.T)
 
     def not_varied(self, loop: Loop) -> str | None:
         return (

@@ -10,12 +10,12 @@ import cvxpy as cp
 import numpy as np
 
 from haptic_loop.controller.delay import delay
+from haptic_loop.controller.environment import Block
 from haptic_loop.controller.lti import Array, Lti, taps
 from haptic_loop.design.conditions import dampings, regular_part
 from haptic_loop.design.lmi import (
     Ports,
     balanced,
-    check_passive,
     lemma1,
     symmetric,
     unit_environment,
@@ -76,7 +76,7 @@ def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int],
     Minimises s over E-hat + Phi passive, V-hat + s passive with excess Delta_V, (14) + s I >= 0 and
     Delta_V + s >= 0; the margin is -s. Raises ValueError for an environment that is not passive.
     """
-    check_passive(environment)
+    Block.of(environment)
     delta = dampings(delta, environment.inputs)
     if not V.is_stable():
         return Analysis(-np.inf, reason="the coupling V has a pole on or outside the unit circle")

@@ -14,11 +14,15 @@ from driven import driven
 from scipy.signal import dlsim, lfilter
 from worlds import FIGURE_4, SOFT, STIFF, force_map
 
+from haptic_loop.controller.arithmetic import numbers
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
-from haptic_loop.controller.environment import GROUND, Network, Spring, environment
+from haptic_loop.controller.environment import GROUND, Environment, Network, Spring, environment
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
+from haptic_loop.design.assessment import Guarantee, assess
+from haptic_loop.design.conditions import covers
 from haptic_loop.design.environments import LimitedForces
+from haptic_loop.design.guarantees import RANGES
 from haptic_loop.design.lmi import Infeasible, Shaping, least_multiplier
 from haptic_loop.design.spring_damper import GainSet, step
 from haptic_loop.models.device import RigidDevice
@@ -436,3 +440,57 @@ def test_every_step_of_the_convex_sequence_improves():
         assert bound <= norms[-1] * (1 + 1e-6)
     assert all(after <= before * (1 + 1e-6) for before, after in itertools.pairwise(norms))
     assert norms[-1] < 0.8 * norms[0]
+
+
+class Resonant(Environment):
+    """H (1 - 1/z) with H = 500 + 2 Re r/(1 - p/z): it feeds power in within a millionth of one frequency."""
+
+    contacts = ("tip",)
+
+    def __init__(self, size: float, angle: float) -> None:
+        self.size, self.angle = size, angle
+
+    def E(self, T):
+        p, r = (1 - 1e-6) * np.exp(1.2j), self.size * np.exp(1j * self.angle)
+        A = np.array([[p.real, -p.imag], [p.imag, p.real]])
+        C = 2 * np.array([[r.real, -r.imag]])
+        A, B, C, D = (numbers(part, T) for part in (A, A[:, :1], C, np.array([[500.0 + 2 * r.real]])))
+        step = Lti(*(numbers(np.array([[n]]), T) for n in (0.0, 1.0, -1.0, 1.0)), T)
+        return Lti(A, B, C, D, T) @ step
+
+
+def test_an_active_object_of_ones_own_is_not_any_passive():
+    """Behind the issue's coupling of K = 900, B = 0.6; a passive resonance as narrow keeps the guarantee."""
+    coupling = SpringDamper([900.0], [0.6])
+    for size, angle, passive in ((1.5, 1.536, False), (-0.2, 0.0, False), (1e-4, 0.0, True)):
+        loop = Loop(1e-3, (0,), (0,), (0,), (1.37,), Resonant(size, angle))
+        found = assess(loop, coupling)
+        needs = found.requirements["any-environment"]
+        if passive:
+            assert needs.certified
+        else:
+            assert not needs.certified
+            assert "Resonant: not passive" in needs.reason
+            assert found.guarantee is None or not found.guarantee.any_environment
+
+
+def test_a_multiplier_covers_narrow_resonances():
+    """A mass between springs that hardly decays, a sample late: the peak by a dense sweep around its own pole."""
+    network = Network(("tip",), (Spring(("tip", "m"), 300.0, 0.0), Spring(("m", GROUND), 50.0, 1e-4)), {"m": 0.2})
+    E = environment(network, 1e-3)
+    pole = max(E.poles(), key=lambda p: abs(p.imag))
+    w = abs(np.angle(pole)) + (1 - abs(pole)) * np.linspace(-30, 30, 20_001)
+    w = np.concatenate([w, W])
+    z = np.exp(1j * w)
+    least = float(np.max(-(1e-3 * z / (z - 1) / z * E.at(z)[:, 0, 0]).real))
+    loop = Loop(1e-3, (0,), (1,), (0,), (2 * least,), network)
+    assert covers(loop, (1.001 * least,))
+    assert not covers(loop, (0.999 * least,))
+
+
+def test_a_guarantee_over_ranges_names_its_vertices():
+    """Between them a search supports it, and no proof."""
+    scenario = load("omega-pair-ranges")
+    delays = scenario.loop("I").delays
+    words = Guarantee("this-environment", "rational", (), "every passive hand", RANGES, "", delays, 1e-3).words
+    assert "proved at the vertices, searched between them" in words

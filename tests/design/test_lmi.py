@@ -254,7 +254,7 @@ def test_what_no_inequality_is_needed_to_refuse(V, word):
 
 def test_an_active_environment_is_refused_by_name():
     active = Lti.constant([[-5.0]], T)
-    with pytest.raises(ValueError, match="environment is not passive"):
+    with pytest.raises(ValueError, match="not passive"):
         analysis(Lti.constant([[1e-3]], T), active, [0], [0], [1.0])
 
 

@@ -14,7 +14,7 @@ from worlds import DELTA, FIGURE_4, SOFT_NETWORK, T, force_map
 
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import delay
-from haptic_loop.controller.environment import Network, Spring
+from haptic_loop.controller.environment import Environment, Network, Spring
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.design import conditions, gain_search, spring_damper
@@ -22,7 +22,7 @@ from haptic_loop.design.api import instead, transparency_of
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.frequency import hermitian
 from haptic_loop.design.gain_search import LimiterLoop, SampledLoop, SwitchingLoop
-from haptic_loop.design.lmi import RESERVE, Shaping, check_passive
+from haptic_loop.design.lmi import RESERVE, Shaping
 from haptic_loop.design.result import DesignFailed, Infeasible
 from haptic_loop.design.spring_damper import GainSet, design
 from haptic_loop.design.transparency import decibels
@@ -265,9 +265,16 @@ def test_a_bad_request_gets_one_line(change, message):
     assert "\n" not in str(caught.value)
 
 
+class Late(Environment):
+    contacts = ("tip",)
+
+    def E(self, T):
+        return Lti.constant([[100.0]], T) @ delay([1], T)
+
+
 def test_an_active_environment_is_refused():
-    with pytest.raises(ValueError, match=r"environment is not passive.*at .* Hz"):
-        check_passive(Lti.constant([[100.0]], T) @ delay([1], T))
+    with pytest.raises(ValueError, match=r"environment Late: not passive.*at .* Hz"):
+        Shaping(Loop(T, (0,), (0,), (0,), (1.0,), Late()))
 
 
 def test_an_unknown_condition_is_refused():
