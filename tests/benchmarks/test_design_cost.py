@@ -3,9 +3,12 @@
 make bench
 """
 
+import time
+
+import numpy as np
 import pytest
 
-from haptic_loop.controller.coupling import PUBLISHED
+from haptic_loop.controller.coupling import PUBLISHED, SpringDamper
 from haptic_loop.design import fixed_order as ccl
 from haptic_loop.design import optimal, spring_damper
 from haptic_loop.design.audit import audit
@@ -13,7 +16,7 @@ from haptic_loop.design.certificate import prove, requirements_of, verify
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.program import BASES, Options
 from haptic_loop.design.transparency import decibels
-from haptic_loop.sim.scenario import load
+from haptic_loop.sim.scenario import load, parse
 
 pytestmark = pytest.mark.benchmark(group="design")
 LOOP = load().loop("I")
@@ -71,3 +74,21 @@ def test_audit(benchmark):
     needs = outcome.conditions["this-environment"].certificate["required_damping"][0]
     print(f"\naudit of (27): this-environment needs {needs:.6f} N s/m")
     assert abs(needs - 1.39871) < 1e-5
+
+
+@pytest.mark.parametrize("devices", [1, 2, 4, 8])
+def test_audit_of_devices_with_three_axes(benchmark, devices):
+    """Full levels around one block; every device alone decides any-environment, so that the ratio does not change."""
+    level, tips = "[[1.5, 0.4, 0.1], [0.4, 1.2, -0.2], [0.1, -0.2, 1.2]]", [f"tip {i}" for i in range(devices)]
+    springs = [f'{{ between = ["{tip}", "block"], stiffness = 300.0, damping = 0.5 }}' for tip in tips]
+    text = f'name = "star"\nT = 1e-3\ntheta = {[1] * devices}\n'
+    text += f'[[device]]\nkind = "rigid"\naxes = 3\ndamping = {level}\n' * devices
+    text += f"[environment]\ncontacts = {tips}\nmasses = {{ block = 0.3 }}\nsprings = [{', '.join(springs)}]\n"
+    loop, m = parse(text).loop("I"), 3 * devices
+    begin = time.process_time()
+    coupling = SpringDamper([600.0] * m, [0.3] * m)
+    found = benchmark.pedantic(lambda: audit(loop, coupling), rounds=1)
+    ratios = {name: round(needs.ratio, 6) for name, needs in found.assessment.requirements.items()}
+    print(f"\naudit of {m} channels ({devices} x 3): {time.process_time() - begin:.2f} CPU s; {ratios}")
+    least = np.linalg.eigvalsh(loop.Delta()[:3, :3])[0]
+    assert ratios["any-environment"] == pytest.approx(0.8 / least, rel=1e-4)  # 0.8 N s/m for one axis, by a dense sweep
