@@ -946,19 +946,22 @@ def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None)
 
     `proved` is what known-device asks, if it has been asked already.
     """
-    if KNOWN_DEVICE.beyond(loop) or loop.ranges or loop.environment.walls or loop.T_max not in (None, loop.T):
+    if KNOWN_DEVICE.beyond(loop) or loop.ranges or loop.T_max not in (None, loop.T):
         return None
+    equal, walls = len(set(zip(loop.known_devices or (), loop.delta, strict=True))) == 1, bool(loop.environment.walls)
+    if walls and not equal:
+        return None  # touched walls give a lower bound, unlike devices a sufficient figure: together neither
     try:
-        F = loop.F(coupling)
+        maps = loop.law(coupling).frozen().values() if walls else [loop.F(coupling)]
     except SingularLoop:
         return None
-    if not F.is_stable():
+    if not all(F.is_stable() for F in maps):
         return None
-    found, proved = necessary_share(F, loop), proved or KNOWN_DEVICE.judge(loop, coupling)
-    if not (found.held and np.isfinite(found.share)):
+    each, proved = [necessary_share(F, loop) for F in maps], proved or KNOWN_DEVICE.judge(loop, coupling)
+    found = max(each, key=lambda one: one.share)
+    if not (all(one.held for one in each) and np.isfinite(found.share)):
         return None
     needed = tuple(found.share * d for d in loop.delta)
-    equal = len(set(zip(loop.known_devices or (), loop.delta, strict=True))) == 1
     asked = proved.required if np.isfinite(proved.ratio) else None
     return LeftOver(needed, found.w / (2 * np.pi * loop.T), equal, asked)
 

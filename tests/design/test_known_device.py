@@ -849,6 +849,21 @@ def test_no_hand_behind_the_transmission_grows_on_a_wall(k, damping, theta, know
     assert hands_on_a_wall(loop, 1.01 * wall_needs(k, damping, theta)) == 0
 
 
+def test_the_audit_says_what_is_left_before_walls():
+    """A hand that presses the wall for ever holds a spring-damper: some lossless one grows below the figure."""
+    loop, F = on_a_wall(800.0, 0.6, 1), wall(800.0, 0.6, 1, 1e-3)
+    left = left_over(loop, NoCoupling(), required_damping(loop, NoCoupling(), "this-environment"))
+    assert left.attained
+    assert left.required_damping[0] == pytest.approx(1.37 * necessary_share(F, one(1e-3, 1.37, 1)).share, rel=1e-4)
+    assert left.required_damping[0] < left.proved_damping[0]
+    drawn = ladders(np.random.default_rng(2), 400, 1, 1e-3)
+    assert radii(F, loop, 0.9 * left.required_damping[0], drawn).max() > 1
+    unlike = change(DEVICE, motor_mass_min=0.1)
+    two = Network(("a", "b"), walls=tuple(Wall((tip, GROUND), 1000.0, 5.0) for tip in ("a", "b")))
+    pair = Loop(1e-3, (0, 0), (0, 0), (0, 0), (1.37, 1.37), two, known_devices=(DEVICE, unlike))
+    assert left_over(pair, NoCoupling()) is None
+
+
 def test_some_hands_grow_on_a_wall_far_below():
     assert hands_on_a_wall(on_a_wall(3000.0, 2.0, 1), 0.3) > 0
 
