@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT
+from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice
+from haptic_loop.design.lmi import ANY_ENVIRONMENT
+
 ROOT = Path(__file__).parents[2]
 MENTION = re.compile(r"tests/(?:\w+/)*(test_\w+\.py)::(\w+)")
 DOCS = ("theory.md", "reproducibility.md")
@@ -51,3 +55,28 @@ def test_documented_commands_leave_the_repository_clean():
     assert len(files) >= 5
     done = subprocess.run(["git", "check-ignore", *files], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.stdout.split() == files
+
+
+def test_the_table_of_guarantees_agrees_with_the_code():
+    """A cell says "proved" exactly where the condition of its column names the row's extension in `covers`."""
+    text = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8").split("## What is guaranteed")[1]
+    table = {cells[1].strip(): cells[2:] for line in text.splitlines() if len(cells := line.split("|")) > 5}
+    rows = {
+        "periods up to `T_max`": "T_max",
+        "latency of part of a sample": "latency",
+        "walls that make and break contact": "walls",
+        "delays that switch": "varying_delay",
+        "ranges of parameters": "ranges",
+    }
+    for row, name in rows.items():
+        for condition, cell in ((ANY_ENVIRONMENT, table[row][0]), (THIS_ENVIRONMENT, table[row][2])):
+            assert cell.strip().startswith("proved") == (name in condition.covers), (row, condition.name)
+    assert "proved" in table["forces limited by the limiter"][2]
+    assert "ranges" not in LIMITER.covers
+    known = table["devices whose motor and transmission are known"]
+    words = {"T_max": "periods in", "walls": "walls", "ranges": "ranges with one beta"}
+    for name, word in words.items():
+        assert (word in known[2]) == (name in KNOWN_DEVICE.covers), name
+    assert ("walls and limiter" in known[2]) == ("walls" in LimitedKnownDevice.covers)
+    assert ("latency breaks" in known[2]) == ("latency" not in KNOWN_DEVICE.covers)
+    assert ("walls included" in known[0]) == ("walls" in KNOWN_DEVICE_ANY.covers)
