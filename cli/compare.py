@@ -207,7 +207,8 @@ def _mismatch(coupling: ComparedCoupling, of: str) -> str:
 
 
 def _binds(part: ConditionCurve) -> str:
-    return render.optional(part.requirement.frequency_hz, "{:.4g}")
+    hz = part.requirement.frequency_hz
+    return render.optional(hz and round(hz, 3), "{:.4g}")  # A sweep cannot tell lower frequencies from 0.
 
 
 def _needs(part: ConditionCurve, scale: float) -> str:
