@@ -221,6 +221,7 @@ def exact_cost(
 _LARGEST_ETA = 0.9999  # of the largest beta, at which c0 or c2 would be zero
 _SCANNED = np.concatenate([np.geomspace(1e-4, 0.6, 36), 1 - np.geomspace(0.35, 1e-4, 14)])  # shares of the largest beta
 _BISECTIONS = 52  # of an interval of shares: to 2e-16 of its length
+_TOGETHER = 100  # matrices that take hardly longer together than one alone: few frequencies get several halvings at once
 _THIN = 5  # every so many frequencies of the grid are looked at while the best beta is located
 _WORST = 6  # frequencies of least room at which the least share is found at once
 _IN_A_CUT, _MOST_CUTS = 28, 40  # bisections of a cut, whose result is from above
@@ -272,12 +273,18 @@ class Sweep(ABC):
 
     def shares(self, here: _Sampled, beta: Array, low: float, high: float, steps: int = _BISECTIONS) -> Array:
         """Return the least share (k,) in [low, high] at each frequency, inf where `high` is too little."""
-        least, most = np.full(here.z.size, low), np.full(here.z.size, high)
+        k = here.z.size
+        least, most = np.full(k, low), np.full(k, high)
         enough, plenty = (self._least_room(here, share, beta) > 0 for share in (least, most))
-        for _ in range(steps):
-            middle = (least + most) / 2
-            holds = self._least_room(here, middle, beta) > 0
-            least, most = np.where(holds, least, middle), np.where(holds, middle, most)
+        bits = int(np.clip(np.log2(_TOGETHER / k + 1), 1, 5))
+        inner = np.arange(1, 2**bits) / 2**bits
+        many = _Sampled(*(np.repeat(part, inner.size, axis=0) for part in here))
+        for _ in range(-(-steps // bits)):
+            tried = least[:, None] + (most - least)[:, None] * inner
+            holds = self._least_room(many, tried.ravel(), beta).reshape(tried.shape) > 0
+            first = np.where(holds.any(axis=1), holds.argmax(axis=1), inner.size)
+            ends = np.column_stack([least, tried, most])
+            least, most = ends[np.arange(k), first], ends[np.arange(k), first + 1]
         return np.where(enough, low, np.where(plenty, most, np.inf))
 
     def _least_room(self, here: _Sampled, share: Any, beta: Array) -> Array:
@@ -303,6 +310,8 @@ class Sweep(ABC):
             if not worst.size:
                 return share
             at = _Sampled(*(part[worst] for part in here))
+            if (self._least_room(at, high, beta) <= 0).any():
+                return np.inf
             share = float(self.shares(at, beta, share, high, _IN_A_CUT).max())
         return share
 
@@ -322,9 +331,11 @@ class Sweep(ABC):
 
         etas = _LARGEST_ETA * self.scanned
         logs = np.log(etas)
-        values = [self.least(eta * scale, high, thin=True) for eta in etas]
-        at = int(np.argmin(values))
-        if not np.isfinite(values[at]):
+        at, least = 0, high
+        for i, eta in enumerate(etas):
+            if (share := self.least(eta * scale, least, thin=True)) < least:
+                at, least = i, share
+        if not least < high:
             return Best(np.inf, 0.0, ())
         beta = np.exp(_golden(along, logs[max(at - 1, 0)], logs[min(at + 1, logs.size - 1)], self.sections)) * scale
         if self.loop.channels > 1:
@@ -335,15 +346,15 @@ class Sweep(ABC):
 
     def _each_channel(self, beta: Array, high: float) -> Array:
         """Return a better beta where the channels' own differ, by a pattern search in log beta."""
-        best = self.least(beta, high)
+        best = min(self.least(beta, high), high)
         for step in _STEPS:
             for i in range(beta.size):
                 for factor in (np.exp(step), np.exp(-step)):
                     for _ in range(_MOST_MOVES):
                         trial = beta.copy()
                         trial[i] *= factor
-                        share = self.least(trial, high)
-                        if not share < best * (1 - _SAME):
+                        share = self.least(trial, best * (1 - _SAME))
+                        if not np.isfinite(share):
                             break
                         best, beta = share, trial
         return beta
@@ -394,7 +405,10 @@ class ThisEnvironmentSweep(Sweep):
         own, cross, speed = device_rows(here.z, cost)
         one = np.eye(beta.shape[-1])
         M = -beta[..., None] * here.forces / here.z[:, None, None] + cross[..., None] * one
-        return here.own + own[..., None] * one - np.conj(np.swapaxes(M, 1, 2)) @ (M / (4 * speed[..., None]))
+        scaled = M / (4 * speed[..., None])
+        rows = zip(np.conj(M).swapaxes(0, 1), scaled.swapaxes(0, 1), strict=True)
+        # M* scaled, row by row: `@` takes five times as long for stacks of 2 by 2
+        return here.own + own[..., None] * one - sum(left[..., None] * right[:, None] for left, right in rows)
 
 
 class AnyEnvironmentSweep(Sweep):
