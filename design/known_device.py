@@ -221,7 +221,7 @@ def exact_cost(
 _LARGEST_ETA = 0.9999  # of the largest beta, at which c0 or c2 would be zero
 _SCANNED = np.concatenate([np.geomspace(1e-4, 0.6, 36), 1 - np.geomspace(0.35, 1e-4, 14)])  # shares of the largest beta
 _BISECTIONS = 52  # of an interval of shares: to 2e-16 of its length
-_TOGETHER = 100  # matrices that take hardly longer together than one alone: few frequencies get several halvings at once
+_TOGETHER = 100  # matrices that take hardly longer together than one alone: few frequencies get several halvings
 _THIN = 5  # every so many frequencies of the grid are looked at while the best beta is located
 _WORST = 6  # frequencies of least room at which the least share is found at once
 _IN_A_CUT, _MOST_CUTS = 28, 40  # bisections of a cut, whose result is from above

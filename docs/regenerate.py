@@ -46,7 +46,7 @@ PICTURE = re.compile(r"<!-- picture: (\S+) (\S+) -->")
 #: a design that a sentence names
 IN_SENTENCES = re.compile(r"`(python -m design -[^`]*)`")
 #: commands that take most of a minute
-SLOW = re.compile(r"--coupling optimal --(grid 10|varying-delay)|ranges")
+SLOW = re.compile(r"--coupling optimal --(grid 10|varying-delay)|ranges|zwidth --rigid --scenario omega-pair-known")
 
 
 class Step(NamedTuple):

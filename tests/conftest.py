@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import time
 
 # `make test &` has SIGINT ignored, and whoever is started inherits that: tests that send it would wait for ever.
@@ -12,10 +13,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
-# Hundreds of tests start commands: without bytecode each of them would compile a hundred files.
+# Hundreds of tests start commands: without bytecode each of them would compile a hundred files, and every worker would
+# rewrite the assertions of all tests, which takes eight seconds.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-
-# What a test finds does not depend on what ran before it.
+sys.dont_write_bytecode = False
 
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402

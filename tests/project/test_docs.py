@@ -17,14 +17,18 @@ _spec.loader.exec_module(regenerate)
 
 PAGES = [*regenerate.PAGES, ROOT / "CHANGELOG.md", ROOT / "NOTATION.md"]
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
+#: commands that take most of a minute: `make validate` runs them, and `make figures` writes what they print
+SLOW = regenerate.SLOW
 #: a command that several pages have runs once
 COMMANDS = {s.text: page.name for page in reversed(PAGES) for s in regenerate.steps(TEXTS[page]) if s.kind == "command"}
 IN_ORDER = list(dict.fromkeys(s.text for page in PAGES for s in regenerate.steps(TEXTS[page]) if s.kind == "command"))
+IN_ORDER = [command for command in IN_ORDER if not SLOW.search(command)]
 # code that a page shows of our own files needs their imports
 SNIPPETS = {
     p: [s.text for s in regenerate.steps(regenerate.SOURCE.sub("", TEXTS[p])) if s.kind == "python"] for p in PAGES
 }
 SHOWN = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.SHOWN.finditer(TEXTS[page])]
+QUICK = [block for block in SHOWN if not SLOW.search(block[1])]
 MEASURED = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.MEASURED.finditer(TEXTS[page])]
 #: within a sentence; those of other modules need a port, a display or minutes
 IN_TEXT = sorted(
@@ -32,11 +36,9 @@ IN_TEXT = sorted(
         c
         for text in TEXTS.values()
         for c in regenerate.IN_SENTENCES.findall(text)
-        if "FILE" not in c and not regenerate.SLOW.search(c)
+        if "FILE" not in c and not SLOW.search(c)
     }
 )
-#: commands that take most of a minute: `make validate` runs them, and `make figures` writes what they print
-SLOW = regenerate.SLOW
 
 
 @pytest.fixture(scope="module")
@@ -58,19 +60,15 @@ def printed():
 @pytest.mark.parametrize("command", IN_ORDER)
 def test_every_command_runs(command, place, printed):
     """0 or 1 (done, and it holds or does not): never bad input, never a traceback."""
-    if SLOW.search(command):
-        pytest.skip("most of a minute: python docs/regenerate.py --check runs it")
     done = run(command, place)
     assert done.returncode in (0, 1), f"{COMMANDS[command]}: {done.stderr}"
     assert "Traceback" not in done.stderr
     printed[command] = done.stdout
 
 
-@pytest.mark.parametrize(("page", "command", "pattern", "shown"), SHOWN, ids=[block[1] for block in SHOWN])
+@pytest.mark.parametrize(("page", "command", "pattern", "shown"), QUICK, ids=[block[1] for block in QUICK])
 def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown, place, printed):
     """`python docs/regenerate.py` writes it anew."""
-    if SLOW.search(command):
-        pytest.skip("most of a minute: python docs/regenerate.py --check runs it")
     output = printed.get(command) or run(command, place).stdout
     fresh = regenerate.kept(output, pattern).splitlines()
     assert shown.splitlines()

@@ -447,6 +447,19 @@ def test_a_seed_gives_the_same_map_again(audit, tmp_path):
         assert again[part] == report[part]
 
 
+def test_maps_show_what_known_devices_allow(tmp_path):
+    """With guaranteed bounds of the devices, damped walls are certified that the plain condition refuses."""
+    file, known = tmp_path / "r.json", ["--rigid", "--scenario", "omega-pair-known", "--T", "1e-3", "--theta", "0"]
+    part = ["--K-range", "500,1000", "--B-range", "1.4,2", "--grid", "4", "--points", "0", "--humans", "20"]
+    zwidth.main([*known, *part, "--out", str(tmp_path), "--no-plot", "--json", str(file)])
+    report = json.loads(file.read_text())
+    for name in ("known-device", "known-device-any"):
+        ratio = np.array(report[name]["required_over_available"])
+        assert (ratio < 1).all()
+    assert (np.array(report["this-environment"]["required_over_available"]) > 1).all()
+    assert (np.array(report["population"]["growth_rate_per_s"]) < 0).all()
+
+
 @pytest.mark.parametrize("stage", ["certificates", "population", "MuJoCo"])
 def test_the_keyboard_keeps_what_is_done(stage, tmp_path, monkeypatch, capsys):
     def draw(*arguments):

@@ -1,7 +1,6 @@
 """Design the same couplings under different conditions of the machine, and compare the stored files byte for byte.
 
-    python tests/tools/same_designs.py           six designs: idle, under load, on one core, twice at once (ten minutes)
-    python tests/tools/same_designs.py --quick   two designs: under load and on one core
+    python tests/tools/same_designs.py     six designs: idle, under load, on one core, twice at once (ten minutes)
 
 Exit code 1 if a file differs. Designs run through the public command, so each file is what a user stores.
 """
@@ -20,10 +19,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 LOOPS = ROOT / "benchmarks" / "loops"
-QUICK = {
-    "n3": ("--scenario", str(LOOPS / "n3-free1.toml"), "--coupling", "optimal"),
-    "n3 with ranges": ("--scenario", str(LOOPS / "n3-free1.toml"), "--coupling", "optimal", "--ranges", "10"),
-}
 DESIGNS = {
     "case I": ("--case", "I", "--coupling", "optimal"),
     "case II": ("--case", "II", "--coupling", "optimal"),
@@ -59,7 +54,7 @@ def busy(count: int) -> Iterator[None]:
         yield
 
 
-def files(words: tuple[str, ...], folder: Path, quick: bool) -> dict[str, bytes]:
+def files(words: tuple[str, ...], folder: Path) -> dict[str, bytes]:
     """What the design stores under each condition of the machine."""
     found = {}
 
@@ -68,25 +63,22 @@ def files(words: tuple[str, ...], folder: Path, quick: bool) -> dict[str, bytes]
         found[name] = stored(begun(words, out, core), out)
 
     core = min(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else None
-    if not quick:
-        once("idle")
-    with busy(2 if quick else 8):
+    once("idle")
+    with busy(8):
         once("under load")
     once("on one core", core)
-    if not quick:
-        outs = [folder / f"twice-{i}.json" for i in range(2)]
-        both = [begun(words, out) for out in outs]
-        found |= {f"at once, {i + 1}": stored(one, out) for i, (one, out) in enumerate(zip(both, outs, strict=True))}
+    outs = [folder / f"twice-{i}.json" for i in range(2)]
+    both = [begun(words, out) for out in outs]
+    found |= {f"at once, {i + 1}": stored(one, out) for i, (one, out) in enumerate(zip(both, outs, strict=True))}
     return found
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true")
-    quick, differ = parser.parse_args().quick, False
-    for name, words in (QUICK if quick else DESIGNS).items():
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    differ = False
+    for name, words in DESIGNS.items():
         with tempfile.TemporaryDirectory() as folder:
-            found = files(words, Path(folder), quick)
+            found = files(words, Path(folder))
         same = len(set(found.values())) == 1
         differ |= not same
         digests = ", ".join(f"{how}: {sha256(data).hexdigest()[:12]}" for how, data in found.items())
