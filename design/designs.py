@@ -179,6 +179,9 @@ class _Turned(Environment):
         Q = numbers(self.Q, T)
         return Q.T @ self.of.E(T) @ Q
 
+    def active(self, T: float) -> str | None:
+        return self.of.active(T)  # an orthogonal Q moves no power
+
 
 _ROUNDED = 1e-9  # of the damping: turned levels leave more than the rounding of their eigenvalues
 
