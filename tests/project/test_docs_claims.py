@@ -39,11 +39,6 @@ def test_reproducibility_rows_name_their_evidence():
     assert [row for row in rows[1:] if not MENTION.search(row)] == []
 
 
-def test_every_claim_test_is_used_by_the_documentation():
-    used = {test for name in DOCS for _, test in MENTION.findall((ROOT / "docs" / name).read_text(encoding="utf-8"))}
-    assert sorted(defined_in("test_claims.py") - used) == []
-
-
 def test_documented_commands_leave_the_repository_clean():
     """What they write into the folder that they are run in is ignored by git."""
     if shutil.which("git") is None or not (ROOT / ".git").exists():
