@@ -315,6 +315,13 @@ def with_body(body: str, more: str = "") -> str:
             ),
             "contact 'left' is welded (w)",
         ),
+        (
+            with_body(
+                f'<body name="left"><body>{FREE}<site name="tip"/></body></body><site name="nail"/>',
+                '<equality><weld name="w" site1="nail" site2="tip"/></equality>',
+            ),
+            "contact 'left' is welded (w)",
+        ),
         (with_body(f'<body name="left">{FREE}</body>', '<option><flag spring="disable"/></option>'), "flag spring"),
         ("<mujoco><worldbody>", "not a valid XML file"),
         ("<mujoco><nonsense/></mujoco>", "nonsense"),
@@ -354,6 +361,48 @@ def test_the_digest_covers_what_a_scene_includes(tmp_path):
     for file in (main, part):
         (elsewhere / file.name).write_text(file.read_text())
     assert digest_of(elsewhere / "main.xml") == digest_of(main)
+
+
+def test_the_digest_covers_every_mesh_that_mujoco_reads(tmp_path):
+    """A mesh beside a file of the same name, a mesh whose path is stripped, and the files of an attached model."""
+    for name in ("a.obj", "meshes/a.obj", "part/meshes/b.obj", "part/c.xml"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("<mujocoinclude/>")
+    assets = '<compiler meshdir="meshes"/><asset><mesh file="{}"/>{}</asset>'
+    model = '<model name="m" file="part/part.xml"/>'
+    (tmp_path / "part" / "part.xml").write_text(
+        f'<mujoco>{assets.format("elsewhere/b.obj", "")}<include file="c.xml"/></mujoco>'
+    )
+    main = tmp_path / "main.xml"
+    main.write_text(f"<mujoco>{assets.format('a.obj', model)}</mujoco>")
+    covered = {file.relative_to(tmp_path).as_posix() for file in files_of(main)}
+    assert covered >= {"main.xml", "meshes/a.obj", "part/part.xml", "part/c.xml", "part/meshes/b.obj"}
+
+
+@pytest.mark.parametrize(
+    ("joint", "more", "part"),
+    [
+        ('damping="-5"', "", "springs and dampers of negative constants"),
+        ('stiffness="10 -50"', "", "springs and dampers that are not linear"),
+        ("", '<option wind="1 0 0" density="1.2"/>', "wind"),
+        ("", "", None),
+    ],
+)
+def test_parts_that_may_drive_are_listed(tmp_path, joint, more, part):
+    bodies = f'<body name="left">{FREE}</body><body><joint type="slide" {joint}/>{FREE}</body>'
+    known = {each.what: each.at_the_port for each in world(tmp_path, with_body(bodies, more)).parts()}
+    assert [what for what, at_the_port in known.items() if at_the_port == "the shell only"] == [part] * bool(part)
+
+
+@pytest.mark.parametrize("more", ["margin='0.01'", "solreffriction='-100 -3000'", ""])
+def test_the_lemma_is_named_for_its_contacts_only(tmp_path, more):
+    bodies = "".join(
+        f'<body name="{name}"><geom name="{name}" size="0.01" solimp="0.9 0.9"/></body>' for name in ("left", "right")
+    )
+    pair = f'<contact><pair geom1="left" geom2="right" solimp="0.9 0.9" {more}/></contact>'
+    scene = world(tmp_path, f"<mujoco><worldbody>{bodies}</worldbody>{pair}</mujoco>")
+    said = {part.what: part.at_the_port for part in scene.parts()}
+    assert any(at_the_port.startswith("lemma") for at_the_port in said.values()) == (not more)
 
 
 def test_an_active_scene_is_listed(tmp_path):
