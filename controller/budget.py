@@ -46,6 +46,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from haptic_loop.controller.lti import Array, Lti
 
+START_J = 2e-3  # [J] W0 of a MuJoCo world, unless a run says otherwise
 EPS = 0.05  # share of the damping that a budget does not use
 _UNTOLD = 4096  # ticks that wait for the device's report; older ones stay booked with their largest loss
 _HUGE = 1e12  # [N] larger forces count as errors

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.controller.budget import START_J
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.environment import Environment
 from haptic_loop.controller.loop import DelayRange, Loop
@@ -463,7 +464,8 @@ def assess(
         coupling: The coupling as it runs; a Design also brings its condition, proof and search.
         environment: The environment that runs, if it is not the loop's: a network, or a function that is plugged in
             behind the coupling and a shell that makes it passive.
-        energy_budget: W0 [J] of the shell before a function, else of an energy budget before the delays.
+        energy_budget: W0 [J] of the shell before a function (by default 0) or a MuJoCo world (by default 2 mJ), else of
+            an energy budget before the delays.
         certificate: A proof on file. It counts only if it belongs to exactly this loop and coupling and was verified
             here or made in this process.
         condition: The condition that must hold, by name or of the user's own; by default this-environment, and
@@ -505,8 +507,10 @@ def assess(
     else:
         where = loop if environment is None else here
         limits = _force_limits(where, coupling, requirements, limiter, limiter_proof, known)
-    if plugged or energy_budget is not None:
-        limits = replace(limits, energy_budget=energy_budget or 0.0)
+    if plugged and energy_budget is None:
+        energy_budget = 0.0 if callable(environment) else START_J
+    if energy_budget is not None:
+        limits = replace(limits, energy_budget=energy_budget)
     assessment = Assessment(
         loop,
         coupling,

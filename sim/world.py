@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from haptic_loop.controller.budget import Shell, ShellFigures
+from haptic_loop.controller.budget import START_J, Shell, ShellFigures
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.environment import Block, Network
 from haptic_loop.controller.lti import Array, Lti
@@ -35,7 +35,6 @@ from haptic_loop.sim.scenario import Scenario
 if TYPE_CHECKING:  # MuJoCo, for which no other scenario and no help has to wait
     from haptic_loop.models.world import Contact, Port, World
 
-START_J = 2e-3  # W0, unless a run says otherwise
 _ROUNDING = 1e-9  # of differences of 1e-6 m
 _APART = 1e-12  # of D_V relatively: a smaller entry between two devices is rounding
 

@@ -360,6 +360,8 @@ def test_a_design_for_a_world_is_proved_exactly(tmp_path, capsys):
     assert "proof: rational" in shown
     stored = read_coupling(tmp_path / "door.json")
     assert stored.loop.environment.world.file == "door.xml"
+    _, shown = command(capsys, "check", str(tmp_path / "door.json"))
+    assert "no passive hand is given more than 0.002 J" in " ".join(shown.split())
 
 
 @pytest.mark.parametrize("words", ["zwidth", "compare", "accuracy"])
@@ -378,6 +380,7 @@ def test_other_commands_refuse_a_world_in_one_line(words):
     [
         (('"scene.xml"', '"other.xml"'), "other.xml: No such file"),
         (('["left", "right"]', '["left", "middle"]'), "contact 'middle': the world has no such body"),
+        (('["left", "right"]', '["left", "world"]'), "contact 'world': the world has no such body"),
         (('["left", "right"]', '["left", "left"]'), "contact 'left' is named twice"),
         (("contacts", "springs = []\ncontacts"), None),
         (("contacts", "masses = { a = 1.0 }\ncontacts"), "world and masses"),
