@@ -187,7 +187,8 @@ def _print_session(report: SessionReport, console: render.Screen, details: bool)
     link = report.link
     if link.age_us:
         ages = ", ".join(f"{name} {us / 1000:.2f} ms" for name, us in link.age_us.items())
-        console.print(f"link: {link.rate_hz:.0f} answers a second, {link.missed_percent:.2f} % missed; age {ages}")
+        rate = f"{link.rate_hz:.0f} answers a second, {link.missed_percent:.2f} % of ticks missed"
+        console.print(f"link while forces acted: {rate}; age {ages}")
     for i, growth in enumerate(report.growth, start=1):
         console.print(f"growth at full gain, arming {i}, {growth.words(report.run.T_s)}")
     for i, part in enumerate(report.energy_budget or [], start=1):
@@ -202,7 +203,7 @@ def _print_session(report: SessionReport, console: render.Screen, details: bool)
             took = f"{part.step_us['p50']:.0f} us at the median, {part.step_us['p99']:.0f} at 99 %"
             console.print(f"  a step of the scene took {took} of the processor, of {1e6 * report.run.T_s:.0f} us")
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link.counters.items() if n)
-    console.print(f"counted: {counted or 'nothing'}")
+    console.print(f"counted from the first message on, measuring included: {counted or 'nothing'}")
     if details:
         console.print(f"[dim]·[/] {CAVEATS}")
 

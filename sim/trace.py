@@ -335,8 +335,10 @@ def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
     if not lines.found:
         begin = begin if lines.brief else n // 2
         lines = lines if lines.brief else _lines(x[begin:], T, encoder_step)
-        what = "something oscillates, too briefly for a rate," if lines.brief else "nothing oscillates"
-        reason = f"{what} above {1e6 * lines.floor:.2g} um"
+        floor = f"above {1e6 * lines.floor:.2g} um"
+        gone = "and was gone at the end" if lines.gone else "and was still there at the end"
+        brief = f"an oscillation {floor} was seen too briefly for a rate, {gone}"
+        reason = brief if lines.brief else f"nothing oscillates {floor}"
         return Growth(first + begin, stop, slowest_hz=lines.slowest, reason=reason)
     growing = [one for one in lines.found if one[0] > _CLEAR * one[1]]
     rate, error, frequency, size = max(growing or lines.found, key=lambda one: one[3])
@@ -349,6 +351,7 @@ class _Lines(NamedTuple):
 
     found: list[tuple[float, float, float, float]]  # rate and its error [1/s], frequency [Hz], amplitude [m], by octave
     brief: bool  # an oscillation is seen in too few windows
+    gone: bool  # none is seen in the last window
     floor: float  # [m]
     slowest: float  # [Hz]
 
@@ -367,7 +370,8 @@ def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
             rate, error = _slope(np.log(seen[at, k]), hop * T)
             strongest = np.argmax(amplitude[at[-1], k, :, 0])
             found.append((rate, error, float(line[at[-1], k, strongest, 0]), float(seen[at[-1], k])))
-    return _Lines(found, bool((seen > floor).any()), float(floor.max()), _PERIODS / (2 * hop * T))
+    on = (seen > floor).any(axis=1)
+    return _Lines(found, bool(on.any()), not on[-1], float(floor.max()), _PERIODS / (2 * hop * T))
 
 
 def _longest(on: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -464,9 +464,12 @@ def test_a_rehearsed_wall_pushes_and_never_pulls():
     np.testing.assert_allclose(felt, pushes[399:-121], atol=6e-4)  # the force is rounded to steps of 0.5 mN
 
 
-def test_a_wall_on_the_bridge_replays_bit_by_bit(tmp_path):
+def test_a_wall_on_the_bridge_replays_bit_by_bit(tmp_path, capsys):
     words = ["--scenario", "one-wall", "--duration", "1", "--out", str(tmp_path), "--no-plot"]
     assert bridge.main(["--rehearse", *words]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"link while forces acted: \d+ answers a second, 0\.00 % of ticks missed", shown)
+    assert re.search(r"counted from the first message on, measuring included: states \d+, misses 14", shown)
     assert replay_command.main([str(tmp_path / "trace.npz")]) == 0
     with pytest.raises(ValueError, match="cannot face walls"):
         bridge.main(["--rehearse", "--coupling", "optimal", *words])

@@ -55,10 +55,11 @@ def test_a_person_and_an_encoder_are_no_oscillation():
     assert found.reason == "nothing oscillates above 1.1 um"
 
 
-def test_late_oscillations_are_reported():
-    found = growth(motion(6.0, (2e-5, 84.0, 60.0)), T, STEP)
+@pytest.mark.parametrize(("size", "rate", "end"), [(2e-5, 60.0, "still there"), (4e-10, -4.0, "gone")])
+def test_brief_oscillations_say_how_they_ended(size, rate, end):
+    found = growth(motion(6.0, (size, 84.0, rate)), T, STEP)
     assert found.growth_rate_per_s is None
-    assert found.reason.startswith("something oscillates, too briefly for a rate, above")
+    assert found.reason.endswith(f"was seen too briefly for a rate, and was {end} at the end")
 
 
 def test_decaying_modes_do_not_hide_growing_ones():
