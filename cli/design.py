@@ -386,7 +386,7 @@ class _Report:
     delays: str | None = render.figure("guarantee, delays", json="left out")
     objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
     nearby: Nearby = render.several(render.robustness_rows, "inlined")
-    ringing: Ringing | None = render.figure("slowest mode decays", "{.words}", default=None, json="if given")
+    ringing: Ringing | None = render.figure("slowest mode", "{.words}", default=None, json="if given")
     best: _Best | None = render.several(_Best.rows, "inlined")
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
     stored: Filed = render.several(_stored_rows)

@@ -237,7 +237,7 @@ def _rows(report: RunReport) -> render.Rows:
     yield from _net_rows(report.energy_budget)
     yield "growth, eigenvalues", _growth(stability)
     yield f"growth, {how}", f"{measured}: {render.verdict(stability.verdict)}"
-    yield "slowest mode decays", report.ringing and report.ringing.words
+    yield "slowest mode", report.ringing and report.ringing.words
     yield render.timing_row(run.timing)
     yield from render.delay_rows(report.varying_delay) if report.varying_delay else ()
     if contact := stability.contact:

@@ -201,7 +201,8 @@ class Ringing:
     @property
     def words(self) -> str:
         """One row of a report."""
-        slowest = f"{self.decay_per_s:.4g} 1/s at {self.frequency_hz:.2f} Hz, damping ratio {self.damping_ratio:.4f}"
+        speed = f"{'grows' if self.decay_per_s < 0 else 'decays'} {abs(self.decay_per_s):.4g} 1/s"
+        slowest = f"{speed} at {self.frequency_hz:.2f} Hz, damping ratio {self.damping_ratio:.4f}"
         if self.least_damping_ratio == self.damping_ratio:
             return slowest
         return f"{slowest}; least ratio {self.least_damping_ratio:.4f} at {self.least_frequency_hz:.2f} Hz"

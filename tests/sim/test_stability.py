@@ -1,6 +1,7 @@
 """Growth rates: the agreed figures, and what a trace may be asked."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -98,6 +99,8 @@ springs = [{ between = ["a", "ground"], stiffness = 900.0 }]
     said = ringing(assemble(parse(text), NoCoupling()))
     assert said.decay_per_s == pytest.approx(-pair.real, rel=1e-9)
     assert said.frequency_hz == pytest.approx(abs(pair.imag) / (2 * np.pi), rel=1e-9)
+    assert said.words.startswith("decays ")
+    assert replace(said, decay_per_s=-1.5).words.startswith("grows 1.5 1/s at ")
     assert said.damping_ratio == said.least_damping_ratio == pytest.approx(-pair.real / abs(pair), rel=1e-9)
 
 
