@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.lti import Array
-from haptic_loop.design.arguments import number, of_kind, one_of, whole
+from haptic_loop.design.arguments import number, of_kind, one_of, shown, whole
 from haptic_loop.design.files import plain
 from haptic_loop.design.result import Chosen, Design
 from haptic_loop.sim.accuracy import MOST, EngineChoice, compare_engines, pick, settle
@@ -149,6 +149,9 @@ def simulate(
     if substeps is not None:
         substeps = whole("substeps", substeps, 1, MOST)
     world = is_world(scenario)
+    if environment is not None and not callable(environment):
+        expected = "a function of one array: from positions (m,) [m] to forces (m,) [N]"
+        raise TypeError(f"environment is {shown(environment)}, expected {expected}")
     if environment is not None and world:
         raise InputError("environment= with a scenario that has environment.world: give one of them")
     if world and energy_budget is None:

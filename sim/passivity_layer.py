@@ -177,7 +177,7 @@ class _Budgeted(_InLoop):
 def _answer(forces: Any, channels: int) -> Array:
     """Check the answer of a user's environment function: one finite force [N] per channel. Raises InputError."""
     try:
-        answer = np.asarray(forces, dtype=float)
+        answer = np.empty(0) if np.iscomplexobj(forces) else np.asarray(forces, dtype=float)
     except (TypeError, ValueError):
         answer = np.empty(0)
     if answer.shape != (channels,) or not np.isfinite(answer).all():

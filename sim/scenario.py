@@ -780,7 +780,9 @@ def _network(own: Any, T: Any) -> Network:
     if known:
         E = called(f"{what}.E(T)", own.E, T)
         if not isinstance(E, Lti):
-            raise InputError(f"{what}.E(T) is {E!r}, expected a controller.lti.Lti")
+            m, text = len(contacts), " ".join(repr(E).split())
+            expected = f"a haptic_loop.controller.lti.Lti with {m} inputs and {m} outputs"
+            raise InputError(f"{what}.E(T) is {text[:60]}, expected {expected}")
         block = called(what, Block.of, E)
     elements = (own,) if hasattr(own, "parts") else ()
     return called(what, Network, tuple(contacts), block=block, elements=elements)

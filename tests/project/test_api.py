@@ -227,6 +227,7 @@ LOOP = SHORT.loop("I")
         (lambda: simulate(SHORT, "spring-damper"), "coupling is 'spring-damper' (str), expected a coupling"),
         (lambda: simulate(SHORT, substeps=1.5), "substeps is 1.5 (float), allowed are whole numbers, 1 to 10000"),
         (lambda: simulate(SHORT, substeps=True), "substeps is True (bool), allowed are whole numbers"),
+        (lambda: simulate(SHORT, environment=3), "environment is 3 (int), expected a function of one array"),
         (lambda: simulate(SHORT, seed="x"), "seed is 'x' (str), allowed are whole numbers, 0 or more"),
         (lambda: validate("omega-pair"), "scenario is 'omega-pair' (str), expected a Scenario"),
         (lambda: validate(SHORT, {"K": 1}), "coupling is {'K': 1} (dict), expected a coupling"),
@@ -318,6 +319,7 @@ def test_a_trace_draws_itself(tmp_path):
         ("ab", "returned 'ab',"),
         (np.zeros(3), r"shape \(3,\),"),
         (np.zeros((2, 1)), r"shape \(2, 1\),"),
+        (np.zeros(2, complex), r"shape \(2,\),"),
         (np.full(2, np.nan), r"array\(\[nan, nan\]\), shape \(2,\),"),
     ],
 )
