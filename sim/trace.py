@@ -370,7 +370,7 @@ def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
             rate, error = _slope(np.log(seen[at, k]), hop * T)
             strongest = np.argmax(amplitude[at[-1], k, :, 0])
             found.append((rate, error, float(line[at[-1], k, strongest, 0]), float(seen[at[-1], k])))
-    on = (seen > floor).any(axis=1)
+    on = (seen > floor.max()).any(axis=1)  # the size that a reason names
     return _Lines(found, bool(on.any()), not on[-1], float(floor.max()), _PERIODS / (2 * hop * T))
 
 

@@ -55,6 +55,12 @@ def test_a_person_and_an_encoder_are_no_oscillation():
     assert found.reason == "nothing oscillates above 1.1 um"
 
 
+def test_brief_flicker_below_the_named_size_is_nothing():
+    """0.6 um at 5 Hz that decays within a second: above the floor of its own octave, below the 1.1 um that is named."""
+    found = growth(motion(6.0, (0.6e-6 * np.exp(-4 * 2.5), 5.0, -4.0)), T, STEP)
+    assert found.reason == "nothing oscillates above 1.1 um"
+
+
 @pytest.mark.parametrize(("size", "rate", "end"), [(2e-5, 60.0, "still there"), (4e-10, -4.0, "gone")])
 def test_brief_oscillations_say_how_they_ended(size, rate, end):
     found = growth(motion(6.0, (size, 84.0, rate)), T, STEP)
