@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.arithmetic import spend
 from haptic_loop.controller.lti import Array, Complex
+from haptic_loop.design import budgets
 from haptic_loop.design.frequency import hermitian
 
 _CENTRED = 0.5  # Newton decrement squared at which a point counts as central: 0.05/t above the best value
-_MOST_STEPS = 60
 _STEP, _PRODUCT = 3e-4, 1e-10  # units of counted work of a Newton step, and of each of its products
 _KEPT = 0.3  # of an eigenvalue, at least, after a step
 _LONGEST = 1e3  # times the Newton step
@@ -217,7 +217,7 @@ class Program:
 def centre(program: Program, x: Array, t: float) -> Array:
     """The minimiser of t (|A x - b|^2 + c'x) - sum log det S, from a strictly feasible x."""
     cost = program.step_cost
-    for _ in range(_MOST_STEPS):
+    for _ in range(budgets.CENTRING_STEPS):
         spend(cost)
         gradient = t * (2 * program.A.T @ (program.A @ x - program.b) + program.c)
         hessian = 2 * t * program.square

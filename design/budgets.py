@@ -61,9 +61,31 @@ PROGRAM_SWEEPS = 6
 #: The same of the bound on linear couplings; sums of coefficients that it uses; intervals of its integral. Cases I
 #: and II take 2 rounds and 568 intervals; a sum is a step of a delay in one row.
 BOUND_SWEEPS, BOUND_SUMS, BOUND_INTERVALS = 6, 240, 20_000
+#: Problems of a coupling of fixed order: in all, for one norm by complementarity, and cuts for one choice of poles.
+#: Case I takes 32 in all by inner approximation; fixed poles (105) and complementarity (103, 20 for one norm) spend
+#: them; a choice of poles takes 2 cuts.
+FIXED_ORDER_PROBLEMS, COMPLEMENTARITY_PROBLEMS, FIXED_POLE_CUTS = 100, 20, 20
+#: Cuts of the least share of a known device, moves of beta on one channel, and turns of beta and multipliers. The
+#: pair of omega.3 with known transmissions takes 4, 2 and 3.
+BETA_CUTS, BETA_MOVES, BETA_TURNS = 40, 12, 6
 #: Points between the vertices of ranges: on all edges, least and most on one, on faces and inside, starts uphill.
 #: These are the some 500 sweeps of RANGES.
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4
+
+# Steps of iterations that converge: in brackets the most that the optimal and the default designs of cases I and II
+# and of 16 loops of benchmarks/loops (n0 to o09) took -----------------------------------------------------------------
+
+#: Newton steps to the centre of a barrier (spent in 9 centrings, whose last points are kept), and of the primal-dual
+#: method (spent twice, where rounding stops it).
+CENTRING_STEPS, CONE_STEPS = 60, 60
+#: Passes of the exact test of definiteness (2): one is enough for a condition number below 1e14, and each further one
+#: takes as much off what is left. Doublings of a Riccati or Lyapunov equation (21), and Newton steps after them (1).
+DEFINITE_PASSES, DOUBLINGS, RICCATI_STEPS = 4, 60, 4
+#: Rounds of halving of an integral (3), and intervals that are halved in one round.
+INTEGRAL_ROUNDS, INTEGRAL_INTERVALS = 20, 1000
+#: Blocks of 256 ticks over which an impulse response is summed, up to 1e-9 of the sum; the bound counts the rest.
+#: Only a mode that takes 250,000 ticks to fall to 1/e spends them.
+GAIN_CHUNKS = 20_000
 
 _Value = TypeVar("_Value")
 

@@ -41,6 +41,7 @@ from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Block, Complex, Lti, Sampled, as_like, constant_like, hstack, vstack
 from haptic_loop.controller.passivity import hermitian_floor
 from haptic_loop.controller.ranges import Member
+from haptic_loop.design import budgets
 from haptic_loop.design.arguments import shown
 from haptic_loop.design.facts import compose
 from haptic_loop.design.files import InputError
@@ -563,7 +564,7 @@ def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
 
 
 _SMALL_TAIL = 1e-9  # bound of the remaining sum, relative to the sum, at which the summation ends
-_CHUNK, _MOST_CHUNKS = 256, 20_000  # number of ticks summed at once; largest number of chunks
+_CHUNK = 256  # ticks summed at once
 
 
 def l1_gain(F: Lti) -> Array:
@@ -590,7 +591,7 @@ def l1_gain(F: Lti) -> Array:
         powers.append(powers[-1] @ A)
     rows, ahead = np.stack(powers), np.linalg.matrix_power(A, _CHUNK)
     tail = np.full_like(total, np.inf)
-    for _ in range(_MOST_CHUNKS):
+    for _ in range(budgets.GAIN_CHUNKS):
         total = total + np.abs(rows @ X).sum(axis=0)
         X = ahead @ X
         tail = np.outer(reach, np.sqrt(np.maximum(np.einsum("nj,nk,kj->j", X, P, X), 0.0))) / (1 - r)

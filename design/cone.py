@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from haptic_loop.controller.lti import Array, Complex
+from haptic_loop.design import budgets
 from haptic_loop.design.result import DesignFailed, Infeasible
 
 #: Largest negative eigenvalue that counts as rounding. Problems are scaled so that 1 is large.
@@ -202,7 +203,6 @@ def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, 
 
 _GAP = 1e-8  # relative gap and violation at which the iteration ends
 _ENOUGH = 1e-6  # the best point counts as solved below this error if rounding stops the iteration
-_MOST_STEPS = 60
 _KEPT = 0.98  # share of the way to the boundary that a step may go
 _SHORT, _CENTRING = 0.2, 0.8  # a predictor step shorter than _SHORT is replaced by one towards _CENTRING mu
 
@@ -216,7 +216,7 @@ def _interior(problem: ConeProgram) -> tuple[Array, str]:
     size = max(np.abs(part).max(initial=1.0) for block in blocks for part in (block.constant, block.slopes, cost))
     S: _Parts = [10 * size * (np.zeros_like(block.constant) + np.eye(block.constant.shape[-1])) for block in blocks]
     Z, best, least = S, x, np.inf
-    for _ in range(_MOST_STEPS):
+    for _ in range(budgets.CONE_STEPS):
         missing = [block.at(x) - s for block, s in zip(blocks, S, strict=True)]
         wrong = cost - _inner(problem, Z)
         gap = abs(cost @ x + sum(_product(block.constant, z) for block, z in zip(blocks, Z, strict=True)))

@@ -156,7 +156,6 @@ def definiteness(S: Matrix) -> _Definiteness:
 
 BITS = 192  # of the rounded matrix whose definiteness is tested
 _FACTOR_BITS = 46  # of the entries of R, relative to the largest
-_PASSES = 4  # one is enough for a condition number below 1e14; each further one takes as much off what is left
 GROWTH = 2.0**-40  # part of the identity that is added where rounding has made the factorisation fail
 
 
@@ -208,7 +207,7 @@ def _definite(W: _Integers, bits: int) -> bool:
     Between passes the entries are shortened to about 32 bits more than `bits`: each entry then changes by less than one
     unit, and the matrix by less than n units in norm, which are subtracted from the diagonal.
     """
-    for _ in range(_PASSES):
+    for _ in range(budgets.DEFINITE_PASSES):
         floats = _floats(W)
         if _dominates(floats):
             return True
@@ -282,8 +281,7 @@ _MOST_BITS = 4000  # of the common denominator of a stored P, a power of two of 
 _STORED_BITS = 48  # of each entry of P, relative to its diagonal
 _EXTENDED_BITS = 96  # of what is multiplied exactly, relative to the largest entry: more than extended precision has
 _LEAST_MOVED = 1e-10  # of the largest: a smaller variance of states that move by as much each is taken for this
-_MOST_DOUBLINGS = 60
-_MOST_STEPS, _LEFT = 4, 0.02  # of Newton, and part of the drive that rounding may leave of the Riccati equation
+_LEFT = 0.02  # part of the drive that rounding may leave of the Riccati equation
 _UNIT = 2.0**-53  # of double precision
 _ACCURACIES = (48, 112), (192, 192)  # binary digits of P, and of A, B, C and D, that a proof is tried with
 _MOST_UNITS = 2.0**50
@@ -525,7 +523,7 @@ def _riccati(parts: _Parts, margin: float, share: float) -> Array:
     BR = np.linalg.solve(R, G.B.T).T
     P = -_doubled(G.A - BR @ G.C, -drive * one - G.C.T @ np.linalg.solve(R, G.C), BR @ G.B.T)
     P = P.astype(np.longdouble)
-    for _ in range(_MOST_STEPS):
+    for _ in range(budgets.RICCATI_STEPS):
         PA = P @ A
         cross, gap = C - B.T @ PA, R - B.T @ P @ B
         feedback = np.linalg.solve(gap.astype(float), cross.astype(float))  # at the best one its error counts squared
@@ -543,7 +541,7 @@ def _doubled(A: Array, H: Array, S: Array | None = None) -> Array:
     Raises LinAlgError where it grows without limit.
     """
     one = np.eye(len(A))
-    for _ in range(_MOST_DOUBLINGS):
+    for _ in range(budgets.DOUBLINGS):
         if S is None:
             step, A = A @ H @ A.T, A @ A
         else:

@@ -21,7 +21,7 @@ from haptic_loop.controller.coupling import Compliance, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
-from haptic_loop.design import lmi, spring_damper
+from haptic_loop.design import budgets, lmi, spring_damper
 from haptic_loop.design.arguments import of_kind, one_of, whole
 from haptic_loop.design.conditions import any_environment, any_environment_demand
 from haptic_loop.design.cone import ConeProgram, Inequality
@@ -283,8 +283,7 @@ def _step(lemmas: _Lemmas) -> tuple[Array, Array, Array]:
 # again; mu is found by bisection. The sequence stalls far from the optimum, which is why `descend` exists.
 
 
-#: Linearised problems per value of mu, and the relative width at which bisection ends.
-_PATIENCE = 20
+#: Relative width at which bisection ends.
 _WIDTH = 5e-3
 
 
@@ -295,7 +294,7 @@ def _bisect(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: in
     low, high, best, sdps = 0.5 * norm, norm, p, 0
     while high - low > _WIDTH * high and sdps < budget:
         mu = (low + high) / 2
-        found, spent = _complementary(lemmas, mu, holds, min(_PATIENCE, budget - sdps))
+        found, spent = _complementary(lemmas, mu, holds, min(budgets.COMPLEMENTARITY_PROBLEMS, budget - sdps))
         sdps += spent
         if found is None:
             low = mu
@@ -344,7 +343,6 @@ def _complementary(lemmas: _Lemmas, mu: float, holds: _Judge, patience: int) -> 
 
 #: Relative gap between the norm on a refined sweep and the bound at the sampled frequencies.
 _GAP = 1e-5
-_MOST_CUTS = 20
 
 
 class FixedPoles:
@@ -361,7 +359,7 @@ class FixedPoles:
         while True:
             V, bound = self._solve(poles)
             (norm, peak), cuts = self.shaping.norm(V), cuts + 1
-            if norm <= bound * (1 + _GAP) or cuts == _MOST_CUTS:
+            if norm <= bound * (1 + _GAP) or cuts == budgets.FIXED_POLE_CUTS:
                 return V, norm
             self.frequencies.append(peak)
 
@@ -424,7 +422,13 @@ class FixedPoles:
 _START_ROOM = 1e-3
 
 
-def design(loop: Loop, order: int = 1, diagonal: bool = True, method: str = "inner", most_sdps: int = 100) -> Design:
+def design(
+    loop: Loop,
+    order: int = 1,
+    diagonal: bool = True,
+    method: str = "inner",
+    most_sdps: int = budgets.FIXED_ORDER_PROBLEMS,
+) -> Design:
     """Design a coupling with `order` states per channel by `method`, from strictly feasible spring-damper gains.
 
     Raises Infeasible if Theorem 4 admits no spring-damper to start from, DesignFailed if no result is certified.

@@ -18,7 +18,6 @@ from haptic_loop.design import budgets
 
 _ERROR = 1e-6  # relative, of the sum
 _ROUNDING = 1e-20  # of the mean: what is left of two responses that agree to ten digits, squared
-_MOST_ROUNDS, _MOST_INTERVALS = 20, 1000  # of halving; in one round
 _NODES, _WEIGHTS = np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0, 5.0]) / 9
 
 
@@ -32,15 +31,15 @@ def integral(response: Callable[[Array], Array], grid: Array, error: float = _ER
     left, right = grid[:-1], grid[1:]
     length = grid[-1] - grid[0]
     coarse, done = _gauss(response, left, right), 0.0
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(budgets.INTEGRAL_ROUNDS):
         middle = (left + right) / 2
         first, second = np.split(_gauss(response, np.append(left, middle), np.append(middle, right)), 2)
         fine = first + second
         share = max(error * (done + fine.sum()) / length, _ROUNDING) * (right - left)
         excess = np.abs(fine - coarse) - share
         rough = excess > 0
-        if rough.sum() > _MOST_INTERVALS:
-            rough &= excess > np.sort(excess)[-_MOST_INTERVALS - 1]
+        if rough.sum() > budgets.INTEGRAL_INTERVALS:
+            rough &= excess > np.sort(excess)[-budgets.INTEGRAL_INTERVALS - 1]
         done += fine[~rough].sum()
         left, right = np.append(left[rough], middle[rough]), np.append(middle[rough], right[rough])
         coarse = np.append(first[rough], second[rough])

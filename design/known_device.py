@@ -31,6 +31,7 @@ from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.loop import DeviceBounds, Loop
 from haptic_loop.controller.lti import Array, Block, Complex, Lti, constant_like
 from haptic_loop.controller.ranges import Member
+from haptic_loop.design import budgets
 from haptic_loop.design.conditions import BEYOND, FULL_LEVELS, Condition, Demand, even_damping, v_hat
 from haptic_loop.design.environments import LIMITER, THIS_ENVIRONMENT, LimitedForces, Multiplied, named_parts
 from haptic_loop.design.exact import require_size
@@ -224,10 +225,9 @@ _BISECTIONS = 52  # of an interval of shares: to 2e-16 of its length
 _TOGETHER = 100  # matrices that take hardly longer together than one alone: few frequencies get several halvings
 _THIN = 5  # every so many frequencies of the grid are looked at while the best beta is located
 _WORST = 6  # frequencies of least room at which the least share is found at once
-_IN_A_CUT, _MOST_CUTS = 28, 40  # bisections of a cut, whose result is from above
+_IN_A_CUT = 28  # bisections of a cut, whose result is from above
 _GOLDEN = (5**0.5 - 1) / 2
 _STEPS = 0.2, 0.05, 0.0125, 0.003  # of log beta, channel by channel
-_MOST_MOVES = 12  # per channel and step
 _DIGITS = 7  # of beta, which the exact proof takes as it is printed
 
 
@@ -301,7 +301,7 @@ class Sweep(ABC):
     def least(self, beta: Array, high: float, thin: bool = False) -> float:
         """Return the least share on the grid for this beta, from below by cuts; inf where it is not below `high`."""
         share, here = self.floor(beta), self._few if thin else self._all
-        for _ in range(_MOST_CUTS):
+        for _ in range(budgets.BETA_CUTS):
             if not share < high:
                 return np.inf
             room = self._least_room(here, share, beta)
@@ -350,7 +350,7 @@ class Sweep(ABC):
         for step in _STEPS:
             for i in range(beta.size):
                 for factor in (np.exp(step), np.exp(-step)):
-                    for _ in range(_MOST_MOVES):
+                    for _ in range(budgets.BETA_MOVES):
                         trial = beta.copy()
                         trial[i] *= factor
                         share = self.least(trial, best * (1 - _SAME))
@@ -516,7 +516,7 @@ def chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Arra
 # The conditions.
 
 _SPARED = 0.1  # of the diagonal of L: what multipliers are searched to leave unused
-_ROUNDS, _GAIN = 6, 1e-3  # of beta and multipliers in turn, before walls; the least gain of the share that goes on
+_GAIN = 1e-3  # the least gain of the share, from beta and multipliers in turn, that goes on
 _NONE = "the devices have no guaranteed bounds: declare [device.guaranteed] of every device, or give --known-device"
 _NO_SHORTEST = "periods up to T_max need a shortest one, T_min, for a known device"
 _MOST_SHARE = 1e3  # of the damping, up to which a beta on file is swept
@@ -645,7 +645,7 @@ class KnownDevice(Condition):
             return replace(found, multiplier=(*beta, *bounds, *own))
         best, own = Best(min(plain.ratio, _MOST_SHARE), 0.0, ()), plain.multiplier or ()
         values, high = own, best.share
-        for _ in range(_ROUNDS):
+        for _ in range(budgets.BETA_TURNS):
             found = FactsSweep(G, loop, facts, named_parts(unknowns, values)).best(high)
             if not found.share < best.share:
                 break
