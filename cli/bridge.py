@@ -202,6 +202,8 @@ def _print_session(report: SessionReport, console: render.Screen, details: bool)
         if part.step_us:
             took = f"{part.step_us['p50']:.0f} us at the median, {part.step_us['p99']:.0f} at 99 %"
             console.print(f"  a step of the scene took {took} of the processor, of {1e6 * report.run.T_s:.0f} us")
+    if report.scene and report.scene.active:
+        console.print(f"active parts: {', '.join(report.scene.active)}")
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link.counters.items() if n)
     console.print(f"counted from the first message on, measuring included: {counted or 'nothing'}")
     if details:

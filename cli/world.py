@@ -28,6 +28,7 @@ from haptic_loop.sim.world import (
     START_J,
     Claim,
     HandsInWorld,
+    SceneRecord,
     Touched,
     WorldFigures,
     WorldRecord,
@@ -35,16 +36,6 @@ from haptic_loop.sim.world import (
     scene_of,
     thrown,
 )
-
-
-@dataclass(frozen=True)
-class _Scene:
-    """A scene as reports describe it."""
-
-    file: str
-    settings: str  # that the program forces on it
-    parts: list[dict[str, object]]  # of which kinds, how many, and what is known of each at the port
-    active: list[str]  # actuators, plugins, callbacks
 
 
 @dataclass(frozen=True)
@@ -58,7 +49,7 @@ class _Report:
     assessment: Assessment
     guaranteed: bool
     guarantee: str
-    scene: _Scene
+    scene: SceneRecord
     world: WorldRecord | None = None
     least_at_port_J: dict[str, float] = field(default_factory=dict)
     peak_force_N: list[float] | None = None
@@ -74,9 +65,6 @@ def _reported(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, star
             scenario, args.case, chosen, energy_budget=start, limiter=False, seed=getattr(args, "seed", 0)
         )
     claim, scene = Claim.of(assessment, chosen.certified_for), scene_of(scenario, chosen.coupling)
-    parts: list[dict[str, object]] = [
-        {"part": p.what, "count": p.count, "at_the_port": p.at_the_port} for p in scene.parts()
-    ]
     return _Report(
         scenario=scenario.name,
         scenario_digest=scenario.digest,
@@ -85,7 +73,7 @@ def _reported(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, star
         assessment=assessment,
         guaranteed=claim.guaranteed,
         guarantee=claim.words,
-        scene=_Scene(scene.path.name, scene.settings(), parts, scene.outside_the_lemma()),
+        scene=SceneRecord.of(scene),
     )
 
 

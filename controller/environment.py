@@ -25,7 +25,7 @@ from haptic_loop.controller.lti import Array, Complex, Lti, Sampled, as_like
 from haptic_loop.controller.passivity import hermitian_floor
 
 GROUND = "ground"
-_NO_MODEL = "a MuJoCo world has no linear model E(z): any-environment needs none; linearise(world, pose) gives one"
+_NO_MODEL = "a MuJoCo world has no linear model E(z): take moving-average, or the network of linearise(world, pose)"
 
 
 #: largest amounts, far from where arithmetic ends and beyond what anybody renders

@@ -22,7 +22,7 @@ from haptic_loop.hw.recording import Recipe, Recorder
 from haptic_loop.hw.session import Session
 from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.trace import Growth, Trace, growths
-from haptic_loop.sim.world import WorldRecord
+from haptic_loop.sim.world import SceneRecord, WorldRecord
 
 _AT_CAP = 1 - 1e-6  # part of the cap: a limiter stops at it
 _PERCENTILES = (50, 90, 99, 100)
@@ -174,6 +174,7 @@ class SessionReport:
     growth: list[Growth] = off_table()
     energy_budget: list[BudgetFigures] | None = off_table()  # arming by arming
     world: list[WorldSession] | None = off_table()  # the same
+    scene: SceneRecord | None = off_table()
 
 
 def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:
@@ -205,6 +206,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
         grown,
         [arming.budget.figures() for arming in session.armings if arming.budget] or None,
         worlds,
+        SceneRecord.of(session.worlds[0].port.world) if session.worlds else None,
     )
 
 

@@ -33,7 +33,7 @@ from haptic_loop.sim.scenario import InputError, Scenario, is_world, require_lin
 from haptic_loop.sim.stability import stability_of
 from haptic_loop.sim.switching import Period, switching
 from haptic_loop.sim.trace import Trace
-from haptic_loop.sim.world import START_J, Claim, Touched, WorldFigures, WorldRecord
+from haptic_loop.sim.world import START_J, Claim, InWorld, SceneRecord, Touched, WorldRecord
 
 if TYPE_CHECKING:
     from haptic_loop.sim import crowds
@@ -184,9 +184,10 @@ def simulate(
         "remarks": done.remarks,
         "energy_budget": plain(trace.net.figures()) if trace.net else None,
     }
-    if trace.net and (figures := trace.net.figures()) and isinstance(figures, WorldFigures):
-        said = Claim.of(assessment, chosen.certified_for)
-        meta |= {"world": plain(WorldRecord.of(figures)), "guarantee": said.words, "guaranteed": said.guaranteed}
+    if isinstance(trace.net, InWorld):
+        said, scene = Claim.of(assessment, chosen.certified_for), SceneRecord.of(trace.net.ports[0].world)
+        meta |= {"world": plain(WorldRecord.of(trace.net.figures())), "scene": plain(scene)}
+        meta |= {"guarantee": said.words, "guaranteed": said.guaranteed}
     return replace(trace, meta=meta)
 
 

@@ -69,6 +69,23 @@ class WorldRecord:
 
 
 @dataclass(frozen=True)
+class SceneRecord:
+    """The entry `scene` of a report."""
+
+    file: str
+    settings: str  # that the program forces on it
+    parts: list[dict[str, object]]  # of which kinds, how many, and what is known of each at the port
+    active: list[str]  # actuators, plugins, callbacks
+
+    @classmethod
+    def of(cls, scene: World) -> SceneRecord:
+        parts: list[dict[str, object]] = [
+            {"part": p.what, "count": p.count, "at_the_port": p.at_the_port} for p in scene.parts()
+        ]
+        return cls(scene.path.name, scene.settings(), parts, scene.outside_the_lemma())
+
+
+@dataclass(frozen=True)
 class Claim:
     """What is proved of a run in a world, or why nothing is."""
 

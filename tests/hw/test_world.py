@@ -90,8 +90,10 @@ def test_ticks_whose_limits_do_not_settle_are_reported(tmp_path, capsys, monkeyp
 def test_an_active_scene_is_held_back_on_hardware(tmp_path, capsys, budget):
     """A motor with negative damping: forces are whole steps of 0.4 mN, and the account still holds."""
     words = ("--scenario", str(driven(tmp_path)), "--duration", "1.5", "--energy-budget", str(budget))
-    _, report, _ = session(tmp_path, capsys, *words)
+    _, report, shown = session(tmp_path, capsys, *words)
     (world,) = report["world"]
+    assert report["scene"]["active"] == ["actuator 0"]
+    assert "active parts: actuator 0" in shown
     trace, link = read(tmp_path / "out" / "trace.npz")
     coupling = read_coupling_of(trace)
     assert world["ticks_acted"] > 10

@@ -118,6 +118,8 @@ def test_a_packaged_world_runs_and_is_guaranteed(name):
     energies = {"given_J", "port_least_J", "released_J", "created_J"}
     assert set(world) == {"ticks", "ticks_acted", "unsettled_ticks"} | energies
     assert (world["ticks"], world["ticks_acted"], world["unsettled_ticks"]) == (500, 0, 0)
+    assert trace.meta["scene"]["active"] == []
+    assert trace.meta["scene"]["settings"].startswith("integrator discrete, timestep 0.001 s")
     np.testing.assert_array_equal(trace.f, again.f)
     dx, delta = np.diff(trace.x, axis=0), np.array(loop.delta)
     given = np.cumsum((-trace.f[:-1] * dx - delta / T * dx**2).sum(axis=1)).max()
@@ -362,6 +364,12 @@ def test_a_design_for_a_world_is_proved_exactly(tmp_path, capsys):
     assert stored.loop.environment.world.file == "door.xml"
     _, shown = command(capsys, "check", str(tmp_path / "door.json"))
     assert "no passive hand is given more than 0.002 J" in " ".join(shown.split())
+
+
+def test_a_design_that_needs_a_model_names_another(tmp_path):
+    words = ["--scenario", "world-door", "--coupling", "spring-damper", "--out", str(tmp_path / "no.json")]
+    with pytest.raises(InputError, match=r"no linear model E\(z\): take moving-average"):
+        import_module("haptic_loop.cli.design").main([*words, "--condition", "any-environment"])
 
 
 @pytest.mark.parametrize("words", ["zwidth", "compare", "accuracy"])
