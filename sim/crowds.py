@@ -286,7 +286,7 @@ def _group(
         exact = _traced(validation, simulation, held_by, loops, other, witnesses, ticked)
     switched = Switched(nowhere, nowhere)
     if scenario.switches or scenario.uneven:
-        also = partial(other, np.arange(len(crowd)), "RK4") if other and validation.ticks else None
+        also = other if validation.ticks else None
         switched = switched_crowd(simulation, held_by, index, validation.seed, validation.duration, also)
     return Findings(
         index=index,

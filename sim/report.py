@@ -19,7 +19,15 @@ from haptic_loop.design.result import finite, listed
 from haptic_loop.models.device import Device
 from haptic_loop.sim.run import Simulation
 from haptic_loop.sim.scenario import Scenario, load
-from haptic_loop.sim.stability import Stability, close, dominant_mode, eigenvalues, linear_growth
+from haptic_loop.sim.stability import (
+    UNDECIDED,
+    Stability,
+    close,
+    dominant_mode,
+    eigenvalues,
+    linear_growth,
+    verdict_within,
+)
 from haptic_loop.sim.switching import DelaysCovered, Period
 from haptic_loop.sim.trace import Trace
 
@@ -118,9 +126,6 @@ def _figure(case: str, stability: Stability) -> PaperRow:
 # Varying delays: ages, growth, and the cover of certificates.
 
 
-_JUDGED = 4.0  # [s] at most of the linear loop from which a growth is read: later numbers may overflow
-
-
 @dataclass(frozen=True)
 class DelaySpan:
     """The range of delays and the pattern within it."""
@@ -164,7 +169,7 @@ class _DelaysMet:
     lost_packets: list[int]
     held_ticks: list[int]
     growth_rate_per_s: float
-    verdict: str
+    verdict: str | None  # None where the rate is too small for the time
     judged_s: float
     period: _PeriodGrowth | None
 
@@ -174,7 +179,7 @@ class _DelaysMet:
         assert delays is not None
         met = ages(delays[:ticks])[..., 0]
         used = met[(met >= 0).all(axis=1)]
-        growth, window = linear_growth(switched, max(4, min(ticks, round(_JUDGED / switched.scenario.T))))
+        growth, window = linear_growth(switched, max(4, ticks))
         ends = (used.min(axis=0), used.max(axis=0), used.mean(axis=0)) if used.size else ()
         worst = period and (len(period.ages), period.growth, period.spectral_radius, _verdict(period.growth))
         return cls(
@@ -182,7 +187,7 @@ class _DelaysMet:
             (delays[:ticks] == LOST).sum(axis=(0, 2)).tolist(),
             (np.diff(used, axis=0) == 1).sum(axis=0).tolist(),
             growth,
-            _verdict(growth),
+            verdict_within(growth, window),
             window,
             _PeriodGrowth(*worst) if worst else None,
         )
@@ -258,12 +263,14 @@ def switched_stability(simulation: Simulation, trace: Trace, delays: VaryingDela
     assert met is not None
     constant = eigenvalues(dominant_mode(close(simulation.plant, simulation.F)))
     grows = trace.diverged or "unstable" in (met.worst.verdict, met.verdict)
+    decided = "unstable" if grows else met.worst.verdict
     theta = listed(simulation.scenario.theta)
     return Stability(
         **vars(constant),
-        verdict="unstable" if grows else "stable",
+        verdict=decided,
         clipped_ticks=int(trace.clipped(simulation.process.force_limit, simulation.process.balls).sum()),
         growth_rate_per_s=finite(met.worst.growth_rate_per_s),
         frequency_hz=trace.dominant_frequency_hz(),
-        reason=f"{met.how}; the eigenvalues are those of the constant delay theta = {theta}",
+        reason=f"{met.how}; the eigenvalues are those of the constant delay theta = {theta}"
+        + ("" if decided else f"; {UNDECIDED}"),
     )

@@ -28,10 +28,10 @@ from haptic_loop.sim.trace import Trace
 #: Growth rates up to this [1/s] count as stable. Rounding moves an eigenvalue at 1 (a drifting loop) by 1e-12.
 MARGINAL = 1e-9
 _CLEAR = 1e-3  # [1/s] engines may differ in sign below this growth rate, because of their own errors
-_JUDGED = 4.0  # [s] simulated of a loop whose ticks vary
-_DOUBTFUL, _LONGER = 1.0, 5  # growth below _DOUBTFUL [1/s] is measured again over _LONGER times the duration
+_JUDGED = 4.0, 20.0, 100.0  # [s] simulated in turn of a loop that varies, until the sign of its growth counts
 _NO_MODE = 1e-300  # modulus that stands for "no mode is fast enough"
 _SHORTEST_TRACE = 200  # ticks that a growth rate needs
+SETTLED = 10.0  # time constants: after fewer of them, fast modes that decay may still hide a slow one that grows
 _DECAY_TIMES = 4.0  # time constants that a trace must last for the sign of its rate to count
 
 
@@ -328,6 +328,7 @@ def _exact(mode: Mode) -> dict[str, Any]:
 def stability_of(simulation: Simulation, trace: Trace) -> Stability:
     """Return the verdict on a run."""
     contact = _contact(simulation, trace) if simulation.process.walls else None
+    decided: str | None = None
     if contact and contact.ticks:
         growth, reason = None, f"contact was made {contact.made} times; a growth rate needs a single linear loop"
     elif simulation.friction:
@@ -335,15 +336,20 @@ def stability_of(simulation: Simulation, trace: Trace) -> Stability:
     elif trace.net:
         growth, reason = None, "a passivity layer scales the forces; the eigenvalues are those of the loop without it"
     elif simulation.timing and not simulation.timing.steady:
-        growth, reason = _timed_growth(simulation)
+        growth, window = linear_growth(simulation)
+        decided = verdict_within(growth, window)
+        how = f"growth of the linear loop after an impulse, over {window:.3g} s of periods and latencies as in the run"
+        reason = f"{how}; the eigenvalues are those of even periods and the middle of the latency"
+        reason += "" if decided else f"; {UNDECIDED}"
     else:
         loop = close(simulation.plant, simulation.F)
         ahead = max(simulation.scenario.theta) if simulation.process.law.bounds else 0
         growth, reason = _measured_growth(loop, trace, simulation.process.force_limit, ahead, simulation.process.balls)
+        decided = None if growth is None else verdict(growth)
     if trace.diverged:
         reason = "the simulation left the range of finite numbers: reported as unstable"
     exact = eigenvalues(worst_mode(simulation))
-    found = "unstable" if trace.diverged else None if growth is None else verdict(growth)
+    found = "unstable" if trace.diverged else decided
     seconds = len(trace.f) * simulation.scenario.T
     slow = reason is None and growth is not None and abs(growth) * seconds < _DECAY_TIMES
     if slow and growth is not None and disagree(exact.exact_growth_rate_per_s, growth):
@@ -506,22 +512,31 @@ def impulse_growth(
     return np.where(speeds.late == 0, -np.inf, np.where(np.isnan(rate), np.inf, rate)), clipped
 
 
-def linear_growth(simulation: Simulation, ticks: int) -> tuple[float, float]:
-    """Return the growth rate [1/s] of the exact linear loop after an impulse, and the time [s] that it covers."""
+UNDECIDED = "not decidable: the rate is too small for its sign to count in this time"
+
+
+def verdict_within(growth: float, seconds: float) -> str | None:
+    """Return the verdict of a growth rate [1/s] that a trace of `seconds` shows; None where it is too slow for it."""
+    return verdict(growth) if abs(growth) * seconds >= _DECAY_TIMES else None
+
+
+def linear_growth(simulation: Simulation, most: int | None = None) -> tuple[float, float]:
+    """Return the growth rate [1/s] of the exact linear loop after an impulse, and the time [s] that it covers.
+
+    Modes that beat or decay one after the other hide a slow rate. So the time is extended until it has several time
+    constants, or `most` ticks.
+    """
     free = replace(simulation.smooth, process=simulation.process.unlimited)
     T, states = simulation.scenario.T, simulation.plant.A.shape[0]
-    rate, _ = impulse_growth(free.process, make_engine(free, "exact"), free.scene, states, ticks)
-    window = float(beginnings(T, simulation.timing, ticks, 1)[0])
-    return float(rate[0]) * ticks * T / window, window
-
-
-def _timed_growth(simulation: Simulation) -> tuple[float, str]:
-    """Return the growth [1/s] under a timing that varies, and how it was measured."""
-    growth, window = linear_growth(simulation, round(_JUDGED / simulation.scenario.T))
-    if 0 < growth < _DOUBTFUL:  # two decaying modes that beat look like growth in a short window
-        growth, window = linear_growth(simulation, round(_LONGER * _JUDGED / simulation.scenario.T))
-    how = f"growth of the linear loop after an impulse, over {window:.3g} s of periods and latencies as in the run"
-    return growth, f"{how}; the eigenvalues are those of even periods and the middle of the latency"
+    rate, window = 0.0, 0.0
+    for seconds in _JUDGED:
+        ticks = max(4, min(round(seconds / T), most or round(seconds / T)))
+        rates, _ = impulse_growth(free.process, make_engine(free, "exact"), free.scene, states, ticks)
+        window = float(beginnings(T, simulation.timing, ticks, 1)[0])
+        rate = float(rates[0]) * ticks * T / window
+        if ticks == most or abs(rate) * window >= SETTLED:
+            break
+    return rate, window
 
 
 class _Speeds:

@@ -33,7 +33,7 @@ from haptic_loop.models.scene import Scene, Variants
 from haptic_loop.sim.engines import Engine, ExactEngine, ExactTimedEngine
 from haptic_loop.sim.run import Simulation
 from haptic_loop.sim.scenario import Scenario
-from haptic_loop.sim.stability import impulse_forces, impulse_growth
+from haptic_loop.sim.stability import SETTLED, impulse_forces, impulse_growth, unstable
 
 _SEARCHED = 1600  # ticks of greedy switching that are searched for the worst period
 _LONGEST_PERIOD = 250  # [ticks]
@@ -178,8 +178,7 @@ def _running_products(matrices: list[Array]) -> tuple[Array, Array]:
 # ---- many humans under delays that vary: each meets delays of its own, drawn or found worst, in one batch
 
 _SHORTEST_CROWD = 2.0  # [s] of every trace; a growth of 1 1/s then exceeds the spreading of the impulse
-_DOUBTFUL = 1.0  # [1/s] a slower growth may be two modes that beat: it is judged again
-_LONGER = 5  # on traces this many times as long
+_LONGER = 5  # hands whose rate is not SETTLED are judged again on traces this many times as long
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,38 +195,42 @@ def switched_crowd(
     index: NDArray[np.intp],
     seed: int,
     duration: float,
-    other: Callable[[Timing | None], Engine] | None,
+    other: Callable[[NDArray[np.intp], str, Timing | None], Engine] | None,
 ) -> Switched:
     """Run the impulse test for every set of humans, each under the delays of its index.
 
     Delays depend on (seed, index) and the loop only; varying periods and latencies depend on the seed and are the same
-    for all sets. `other` makes the engine that is compared with the exact one.
+    for all sets. `other` makes the engine that is compared with the exact one, of the sets of these numbers. Sets whose
+    rate is too slow for the time run longer; where the sign changes, both engines' longer traces count.
     """
-    scenario, nsim, scene = simulation.scenario, len(held_by), held_by.scene
-    plants = hold(held_by.plants(), scenario.T, scenario.usual_latency)
-    states = plants.A.shape[1]
+    scenario, scene = simulation.scenario, held_by.scene
 
-    def judged(ticks: int) -> Switched:
-        process, timing = simulation.process, scenario.timing(seed, ticks)
+    def judged(ticks: int, sets: NDArray[np.intp], both: bool) -> Switched:
+        process, timing, some = simulation.process, scenario.timing(seed, ticks), held_by.taken(sets)
+        plants = hold(some.plants(), scenario.T, scenario.usual_latency)
+        states, nsim = plants.A.shape[1], len(sets)
         if scenario.switches:
-            process = replace(process, delays=_crowd_delays(scenario, process, scene, plants, index, seed, ticks))
+            process = replace(process, delays=_crowd_delays(scenario, process, scene, plants, index[sets], seed, ticks))
         if timing:
-            moved: Engine = ExactTimedEngine(held_by.plants(), timing)
+            moved: Engine = ExactTimedEngine(some.plants(), timing)
         else:
             moved = ExactEngine(plants)
         exact, _ = impulse_growth(process.unlimited, moved, scene, states, ticks, nsim)
-        if not other:
+        if not (other and both):
             return Switched(exact, np.full(nsim, np.nan))
-        own, clipped = impulse_growth(process, other(timing), scene, states, ticks, nsim)
+        own, clipped = impulse_growth(process, other(sets, "RK4", timing), scene, states, ticks, nsim)
         return Switched(exact, np.where(clipped, np.nan, own))
 
     ticks = round(max(duration, _SHORTEST_CROWD) / scenario.T)
-    found = judged(ticks)
-    doubtful = (found.exact > 0) & (found.exact < _DOUBTFUL)
-    if not doubtful.any():
-        return found
-    longer = judged(_LONGER * ticks)
-    return Switched(np.where(doubtful, longer.exact, found.exact), np.where(doubtful, longer.mujoco, found.mujoco))
+    found = judged(ticks, np.arange(len(held_by)), True)
+    slow = np.flatnonzero(np.abs(found.exact) * ticks * scenario.T < SETTLED)
+    if slow.size:
+        longer = judged(_LONGER * ticks, slow, False).exact
+        changed = slow[unstable(longer) != unstable(found.exact[slow])]
+        if changed.size:
+            again = judged(_LONGER * ticks, changed, True)
+            found.exact[changed], found.mujoco[changed] = again.exact, again.mujoco
+    return found
 
 
 def _crowd_delays(

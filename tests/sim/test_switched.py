@@ -256,7 +256,7 @@ def test_both_engines_see_the_population_grow_alike():
     links = np.stack([draw(scenario.population, 2, 0, i, 1) for i in range(4)])
     held_by = variants(scenario.device, Crowd(links))
     everyone = np.arange(4)
-    other = partial(_batch, held_by, loop.scenario.T, 1, everyone, "RK4")
+    other = partial(_batch, held_by, loop.scenario.T, 1)
     seen = switched_crowd(loop, held_by, everyone, 0, 2.0, other)
     kept = ~np.isnan(seen.mujoco)
     assert kept.any()

@@ -14,13 +14,14 @@ from haptic_loop.cli.run import main
 from haptic_loop.cli.validate import main as validate
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.delay import Periods, Timing, VaryingDelay
+from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.design.files import InputError
 from haptic_loop.models.hold import at_the_latch, hold
 from haptic_loop.models.scene import Plant, plant
 from haptic_loop.sim.crowds import Validation, _examine
 from haptic_loop.sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
 from haptic_loop.sim.run import assemble, make_engine, run
-from haptic_loop.sim.stability import close, dominant_mode
+from haptic_loop.sim.stability import close, dominant_mode, stability_of, verdict_within
 from tests.asked import needs
 from tests.checks import uneven
 
@@ -157,6 +158,26 @@ def test_hands_that_meet_uneven_ticks(tmp_path):
     report = json.loads(file.read_text())
     assert report["timing"]["unstable"]["exact"] > 0
     assert report["disagreements"] == 0
+
+
+def test_growth_of_uneven_ticks_agrees_with_the_eigenvalues():
+    """Fast decays hid slow growth: 19 of 43 hands, and the scenario's own, were called stable."""
+    springs = (Spring(("a", "m"), 397.7, 0.0), Spring(("b", "m"), 23.85, 0.2625), Spring(("c", "m"), 911.5, 0.2725))
+    nearly_even = {"period": Periods(0.99e-3, 1.01e-3), "theta": (1, 1, 4), "T_max": 1.1e-3}
+    scenario = load("three-rigid").replace(environment=Network(tuple("abc"), springs, {"m": 1.227}), **nearly_even)
+    found = _examine(Validation(scenario, NoCoupling(), 0, 60, 1, "exact", 2.0), range(60))
+    clear = np.abs(found.exact) > 0.05
+    assert {True, False} == set((found.exact[clear] > 0).tolist())
+    np.testing.assert_array_equal(found.switching[clear] > 0, found.exact[clear] > 0)
+
+    simulation = assemble(scenario.replace(duration=0.3), NoCoupling())
+    told = stability_of(simulation, run(simulation, "exact"))
+    assert told.verdict == told.exact_verdict == "unstable"
+    assert told.growth_rate_per_s == pytest.approx(told.exact_growth_rate_per_s, abs=0.05)
+
+
+def test_slow_rates_have_no_verdict():
+    assert [verdict_within(rate, 20.0) for rate in (-0.19, 0.19, -0.21, 0.21)] == [None, None, "stable", "unstable"]
 
 
 def test_periods_vary_beside_delays():
