@@ -58,18 +58,31 @@ SAMPLES = 64  # environments drawn evenly from inside the ranges, beside what th
 
 @dataclass(frozen=True, eq=False)
 class RangesResult:
-    """The this-environment condition over ranges: every vertex, a search between them, and random samples."""
+    """The this-environment condition over ranges: every vertex, a search between them, and random samples.
 
-    members: tuple[Member, ...]  # the nominal environment and the vertices
+    Attributes:
+        members: The nominal environment and the vertices.
+        at_members: The requirement of each member.
+        samples: Environments drawn from inside the ranges.
+        at_samples: The requirement of each sample.
+        vertices: The number of vertices of the ranges; of more than 128 vertices only so many are members.
+        searched: The search between the vertices.
+        at_found: The requirement at the worst environment that the search has found.
+        seed: The seed of the samples.
+        certificate: The Certificate for all members, with the guarantee "these ranges", or None.
+        reason: Why the ranges are not guaranteed, or None.
+    """
+
+    members: tuple[Member, ...]
     at_members: tuple[Requirement, ...]
-    samples: tuple[Member, ...]  # environments drawn from inside
+    samples: tuple[Member, ...]
     at_samples: tuple[Requirement, ...]
-    vertices: int  # of the ranges; of more than 128 vertices only so many are members
-    searched: Searched  # between the vertices
-    at_found: Requirement  # at the worst environment that the search has found
-    seed: int  # of the samples
-    certificate: Certificate | None  # for all members, with the guarantee "these ranges"
-    reason: str | None  # why the ranges are not guaranteed
+    vertices: int
+    searched: Searched
+    at_found: Requirement
+    seed: int
+    certificate: Certificate | None
+    reason: str | None
 
     @property
     def proved(self) -> bool:
@@ -195,16 +208,27 @@ _OWN_PROOF = "by a proof of its own, for this environment"
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """How forces are limited, and whether a condition holds while they are limited."""
+    """How forces are limited, and whether a condition holds while they are limited.
 
-    rho: tuple[float, ...] | None  # (m,) [N/m] of the limiter; None: no condition covers it, so the tick clips
-    reason: str  # why a condition covers limited forces, or why none does
-    requirement: Requirement | None = None  # of the condition `limiter`, where it was evaluated
-    c: tuple[tuple[float, ...], ...] = ()  # its multiplier
-    certificate: Certificate | None = None  # its proof
-    force_limit: tuple[float, ...] = ()  # (m,) [N]
-    less: bool = False  # it is proved in one environment, while the guarantee holds in more
-    energy_budget: float | None = None  # W0 [J] that forces may give in all
+    Attributes:
+        rho: (m,) stiffnesses of the limiter [N/m]; None where no condition covers it, so that the tick clips.
+        reason: Why a condition covers limited forces, or why none does.
+        requirement: The requirement of the condition `limiter`, where it was evaluated.
+        c: The multiplier of that condition, one row per channel, no unit.
+        certificate: The proof of that condition, or None.
+        force_limit: (m,) largest forces [N].
+        less: Whether it is proved in one environment, while the guarantee holds in more.
+        energy_budget: The energy W0 [J] that forces may give in all; None without a budget.
+    """
+
+    rho: tuple[float, ...] | None
+    reason: str
+    requirement: Requirement | None = None
+    c: tuple[tuple[float, ...], ...] = ()
+    certificate: Certificate | None = None
+    force_limit: tuple[float, ...] = ()
+    less: bool = False
+    energy_budget: float | None = None
 
     def within(self, force_limit: Sequence[float]) -> ForceLimits:
         """Return the record with other limits (m,) [N], which no proof depends on."""

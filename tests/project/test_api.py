@@ -35,6 +35,7 @@ from haptic_loop.cli.run import main as run_command
 from haptic_loop.cli.validate import main as validate_command
 from haptic_loop.controller.coupling import Coupling, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import Spring
+from haptic_loop.design.assessment import ForceLimits, RangesResult
 from haptic_loop.design.designs import KINDS
 from haptic_loop.models.device import RigidDevice
 from haptic_loop.sim.scenario import SCENARIOS
@@ -251,7 +252,7 @@ def test_help_describes_every_result_field():
     assert {kind.__name__ for kind in results} == {
         *("Assessment", "Design", "Findings", "Guarantee", "Rehearsed", "Requirement", "Trace", "Transparency")
     }
-    for kind in results:
+    for kind in [*results, ForceLimits, RangesResult]:
         described = dict(re.findall(r"^\s+(\w+): (.+)$", kind.__doc__.split("Attributes:")[1], re.MULTILINE))
         assert set(described) == {field.name for field in fields(kind)}, kind
         for field in fields(kind):
