@@ -833,12 +833,13 @@ def _shares_hold(
 
 
 def described(loop: Loop) -> str:
-    """The devices of a loop in words: 'devices with at least 60 g behind at most 14500 N/m and 0.5 to 0.5 N s/m'."""
+    """The devices of a loop in words: 'devices with at least 60 g behind at most 14500 N/m and 0.5 N s/m'."""
     said = []
     for device in dict.fromkeys(loop.known_devices or ()):
         mass, k = f"{1e3 * device.motor_mass_min:.4g} g", f"{device.transmission_stiffness_max:.6g} N/m"
         least, most = device.transmission_damping_min, device.transmission_damping_max
-        said.append(f"at least {mass} behind at most {k} and {least:.4g} to {most:.4g} N s/m")
+        losses = f"{least:.4g}" if least == most else f"{least:.4g} to {most:.4g}"
+        said.append(f"at least {mass} behind at most {k} and {losses} N s/m")
     return f"devices with {' or '.join(said)}"
 
 
