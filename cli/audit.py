@@ -219,7 +219,10 @@ def _coupling(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> Coupl
         return fitted(read_coupling(args.coupling), args.coupling, loop.channels, scenario.T)
     if len(gains) == 1:
         missing = "B" if gains == ["K"] else "K"
-        raise InputError(f"--{gains[0]} without --{missing}: a spring-damper has both (--B 0 is a spring alone)")
+        why = "a spring-damper has both (--B 0 is a spring alone)"
+        if args.rigid and missing == "K":
+            why = "give any K; the first line then names the stiffest wall with this B"
+        raise InputError(f"--{gains[0]} without --{missing}: {why}")
     if not gains:
         raise InputError(
             "nothing to audit: give --K and --B, --coupling FILE.json or FILE.py:NAME, --device NAME or --case none"

@@ -305,6 +305,7 @@ BAD = [
     ("", "nothing to audit"),
     ("--K 100", "--K without --B"),
     ("--B 1", "--B without --K"),
+    ("--rigid --B 1", "--B without --K: give any K; the first line then names the stiffest wall with this B"),
     ("--K nan --B 1", "--K is nan, allowed are 0.001 to 1e+09 N/m"),
     ("--K=-1,5 --B 1", "--K is -1, allowed"),
     ("--K 0 --B 1", "--K is 0, allowed"),
