@@ -24,7 +24,7 @@ DESIGNS = {
     "case II": ("--case", "II", "--coupling", "optimal"),
     "n2 with ranges": ("--scenario", str(LOOPS / "n2-lab31.toml"), "--coupling", "optimal", "--ranges", "10"),
     "n5": ("--scenario", str(LOOPS / "n5-three-psi1.toml"), "--coupling", "optimal"),
-    "o03, gains": ("--scenario", str(LOOPS / "o03-slow-sampling.toml"), "--condition", "this-environment"),
+    "o04, gains": ("--scenario", str(LOOPS / "o04-unlike-pair.toml"), "--condition", "this-environment"),
     "o12, limiter": ("--scenario", str(LOOPS / "o12-free-mass-late.toml"), "--coupling", "optimal", "--limiter"),
 }
 
