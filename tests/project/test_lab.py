@@ -11,9 +11,7 @@ from tests.asked import decisive
 
 LAB = str(Path(__file__).parents[2] / "examples/lab.toml")
 DESIGNS = [
-    ("spring-damper", []),
     ("anywhere", ["--condition", "any-environment"]),
-    ("average", ["--coupling", "moving-average"]),
     ("best", ["--coupling", "optimal"]),
 ]
 
@@ -39,19 +37,8 @@ def test_from_scenario_to_c(tmp_path, monkeypatch, capsys):
         go("design", *lab, *asked, "--out", f"{name}.json")
         go("check", f"{name}.json")
         go("audit", *lab, "--coupling", f"{name}.json", "--out", "audit")
-        go(
-            "validate",
-            *lab,
-            "--coupling",
-            f"{name}.json",
-            "--humans",
-            "10",
-            "--duration",
-            "0",
-            "--no-plot",
-            "--out",
-            "v",
-        )
+        few = ("--humans", "10", "--duration", "0", "--no-plot", "--out", "v")
+        go("validate", *lab, "--coupling", f"{name}.json", *few)
         go("export", f"{name}.json", "--process", "--out", f"{name}.c")
     said = capsys.readouterr().err
     assert "error" not in said
