@@ -199,6 +199,8 @@ def _print_session(report: SessionReport, console: render.Screen, details: bool)
         console.print(f"world, arming {i}: {claim} The shell acted on {part.ticks_acted} of {part.ticks} ticks.")
         if part.unsettled_ticks:
             console.print(f"  {part.unsettled_ticks} ticks whose limited channels did not settle")
+        if part.warnings:
+            console.print(f"  MuJoCo warns: {' '.join(part.warnings)}")
         if part.step_us:
             took = f"{part.step_us['p50']:.0f} us at the median, {part.step_us['p99']:.0f} at 99 %"
             console.print(f"  a step of the scene took {took} of the processor, of {1e6 * report.run.T_s:.0f} us")

@@ -165,6 +165,7 @@ def _run_rows(report: _Report, figures: WorldFigures, scenario: Scenario) -> Ite
     yield "peak force", f"{listed(report.peak_force_N or (), 3)} N"
     unsettled = figures.unsettled_ticks
     yield "limited forces", f"{unsettled} ticks whose limited channels did not settle" if unsettled else None
+    yield "MuJoCo warns", " ".join(figures.warnings) or None
     yield "active parts", ", ".join(report.scene.active) or None
     yield "scene", report.scene.settings
 

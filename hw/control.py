@@ -31,6 +31,7 @@ from haptic_loop.design.result import Chosen, Design, DesignFailed
 from haptic_loop.hw import monitor
 from haptic_loop.hw.limits import Gain, Heat, SafetyLimits, Units
 from haptic_loop.hw.protocol import MAX_THETA, Config, SafetyStop, State
+from haptic_loop.models.scene import quiet_warnings
 from haptic_loop.sim.couplings import assessed, choose, given
 from haptic_loop.sim.scenario import InputError, Scenario, is_world
 from haptic_loop.sim.world import START_J, scene_of
@@ -183,7 +184,8 @@ class WorldController:
             self.shell.book(self._sent)
         free = self.shell.free(np.array(x)[:, None])
         began = time.thread_time()
-        wanted = self.port.step(free[:, 0])
+        with quiet_warnings():
+            wanted = self.port.step(free[:, 0])
         self.seconds.append(time.thread_time() - began)
         self.shell.credit([self.port.released])
         self._open = True

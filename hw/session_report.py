@@ -152,6 +152,7 @@ class WorldSession(WorldRecord):
                     released_J=world.port.released,
                     created_J=world.port.created,
                     unsettled_ticks=world.port.unsettled,
+                    warnings=world.port.warnings,
                     step_us=_percentiles(1e6 * np.array(world.seconds)),
                 )
             )

@@ -25,6 +25,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from haptic_loop.models.scene import quiet_warnings
+
 Array = NDArray[np.floating[Any]]
 
 PROXY_MASS = 0.03  # [kg] of a contact for which the scene gives no mass
@@ -164,6 +166,11 @@ class World:
         self.path, self.contacts, self.T, self.every = Path(path), tuple(contacts), T, every
         if every < 1:
             raise ValueError(f"every is {every}, expected a whole number of ticks, 1 or more")
+        with quiet_warnings():
+            self._compile(stiffness, gravity)
+
+    def _compile(self, stiffness: Sequence[Array], gravity: bool) -> None:
+        """Build the model, and where the slides are in it."""
         spec = _spec(self.path)
         base = _compiled(spec, self.path)
         self._keys = {base.key(i).name: base.key(i).qpos.copy() for i in range(base.nkey)}
@@ -171,12 +178,12 @@ class World:
         for contact, G in zip(self.contacts, stiffness, strict=True):
             body = _touchable(spec, contact.body, [c.body for c in self.contacts])
             values, Q = _principal(np.atleast_2d(np.asarray(G, dtype=float)), contact)
-            _slide(body, contact, Q, values, base.body(contact.body).quat)
+            _slide(spec, body, contact, Q, values, base.body(contact.body).quat)
             rotations.append(Q)
             springs.append(values)
         for key in list(spec.keys):
             spec.delete(key)
-        _force_settings(spec, T * every, gravity)
+        _force_settings(spec, self.T * self.every, gravity)
         self.model = _compiled(spec, self.path)
         _off_rest(self.model)
         self.xml = spec.to_xml()
@@ -185,7 +192,8 @@ class World:
         self._qpos = np.array([joint.qposadr[0] for joint in joints])
         self._dof = np.array([joint.dofadr[0] for joint in joints])
         self._joint = np.array([joint.id for joint in joints])
-        self._afloat = self.model.body_gravcomp * self.model.body_mass  # (nbody,) [kg] without weight
+        weightless = self.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        self._afloat = self.model.body_mass * (0.0 if weightless else self.model.body_gravcomp)  # (nbody,) [kg]
 
     @property
     def channels(self) -> int:
@@ -287,9 +295,11 @@ class World:
 def _spec(path: Path) -> Any:
     files_of(path)  # raises ValueError with the name of a file that is missing
     try:
-        return mujoco.MjSpec.from_file(str(path))
+        spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, mujoco.FatalError) as error:
         raise ValueError(f"world {path}: {_one_line(error)}") from None
+    spec.compiler.fusestatic = False  # which would take the contacts away
+    return spec
 
 
 def _compiled(spec: Any, path: Path) -> mujoco.MjModel:
@@ -312,7 +322,8 @@ def _touchable(spec: Any, name: str, contacts: Sequence[str]) -> Any:
     body = spec.body(name)
     free = _without_joints(spec)
     if body is None or body.parent is None:  # the latter is the world body
-        raise ValueError(f"contact {name!r}: the world has no such body; bodies without a joint: {', '.join(free)}")
+        named = ", ".join(free) or "none"
+        raise ValueError(f"contact {name!r}: the world has no such body; bodies without a joint: {named}")
     if body.parent.name != "world":
         raise ValueError(f"contact {name!r} is a child of body {body.parent.name!r}, expected a child of the world")
     if body.joints:
@@ -351,13 +362,16 @@ def _name(contact: Contact, axis: int) -> str:
     return f"{contact.body}, slide {axis + 1}"
 
 
-def _slide(body: Any, contact: Contact, Q: Array, stiffness: Array, turn: Array) -> None:
+def _slide(spec: Any, body: Any, contact: Contact, Q: Array, stiffness: Array, turn: Array) -> None:
     """Give a body its slides, springs, mass and no weight; no default of the scene reaches them."""
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, np.asarray(turn, dtype=float))
     directions = Q.T @ np.array(contact.along) @ rotation.reshape(3, 3)  # in the frame of the body
     for axis, (direction, k) in enumerate(zip(directions, stiffness, strict=True)):
-        joint = body.add_joint(name=_name(contact, axis), type=mujoco.mjtJoint.mjJNT_SLIDE, axis=direction)
+        name = _name(contact, axis)
+        if spec.joint(name) is not None:
+            raise ValueError(f"joint {name!r} has the name of a slide that the program adds; rename it")
+        joint = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=direction)
         joint.stiffness = [k, 0.0, 0.0]
         joint.damping = [0.0, 0.0, 0.0]
         joint.armature = joint.frictionloss = joint.ref = joint.springref = joint.springyield = 0.0
@@ -365,6 +379,8 @@ def _slide(body: Any, contact: Contact, Q: Array, stiffness: Array, turn: Array)
     if not body.explicitinertial and all(np.isnan(geom.mass) for geom in body.geoms):
         body.explicitinertial, body.mass, body.inertia = True, PROXY_MASS, [1e-5] * 3
         body.ipos = [0.0, 0.0, 0.0]
+        for geom in body.geoms:  # compiler inertiafromgeom="true" takes masses from here
+            geom.mass = PROXY_MASS / len(body.geoms)
     for part in _fixed_to(body):
         part.gravcomp = 1.0
 
@@ -390,7 +406,6 @@ def _force_settings(spec: Any, h: float, gravity: bool) -> None:
         enable.mjENBL_SLEEP | enable.mjENBL_IPC | enable.mjENBL_FWDINV | enable.mjENBL_SPECULATIVE
     )
     option.disableflags |= disable.mjDSBL_AUTORESET
-    spec.compiler.inertiafromgeom = 2  # automatic, so that a mass that the program gives stays
     if not gravity:
         option.gravity = [0.0, 0.0, 0.0]
 
@@ -449,7 +464,8 @@ class Port:
     def step(self, u0: Array) -> Array:
         """The forces of the contacts on the devices, (m,) [N], where u0 (m,) [m] is their place without force.
 
-        Forces are within the limits. They are not finite where MuJoCo's numbers are not.
+        Forces are within the limits. They are not finite where MuJoCo's numbers are not. Raises ValueError in one line
+        where MuJoCo cannot step.
         """
         world = self.world
         goal = world._Q.T @ u0
@@ -484,16 +500,25 @@ class Port:
         """Displacements of the contacts along their directions, (m,) [m]."""
         return self.world._Q @ self.data.qpos[self.world._qpos]
 
+    @property
+    def warnings(self) -> list[str]:
+        """MuJoCo's warnings of this simulation in its own words: numbers that are not finite, contacts left out."""
+        kinds = enumerate(self.data.warning)
+        return [mujoco.mju_warningText(kind, each.lastinfo) for kind, each in kinds if each.number]
+
     def _stepped(self, goal: Array) -> Array:
         model, data, world = self.world.model, self.data, self.world
         model.qpos_spring[world._qpos] = goal
-        if self._saved is None:
-            mujoco.mj_step(model, data)
-            force = self._spring(goal)
-        else:
-            force = self._limited(goal, self._saved)
-        if data.nefc:
-            self.created += self._creates()
+        try:
+            if self._saved is None:
+                mujoco.mj_step(model, data)
+                force = self._spring(goal)
+            else:
+                force = self._limited(goal, self._saved)
+        except mujoco.FatalError as error:
+            raise ValueError(f"world {world.path}: {_one_line(error)}") from None
+        if data.nefc and np.isfinite(created := self._creates()):
+            self.created += created
         self.released = max(self.released, self._at_first - self._potential())
         return force
 
@@ -602,7 +627,7 @@ _SHELL = "the shell only"
 def _parts(m: mujoco.MjModel, slides: set[int]) -> Iterator[Part]:
     joints = [i for i in range(m.njnt) if i not in slides]
     turning = sum(m.jnt_type[i] != mujoco.mjtJoint.mjJNT_SLIDE for i in joints)
-    if joints:
+    if len(joints) > turning:
         yield Part("bodies that translate", len(joints) - turning, _NONE)
     if turning:
         yield Part("joints that turn", turning, _TURNING)

@@ -23,7 +23,8 @@ from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import StepBuffer
 from haptic_loop.design.files import off_table
 from haptic_loop.models.hold import HeldPlant
-from haptic_loop.sim.engines import EXPONENTIAL, default_integrator, pace, quiet_warnings
+from haptic_loop.models.scene import quiet_warnings
+from haptic_loop.sim.engines import EXPONENTIAL, default_integrator, pace
 from haptic_loop.sim.run import AnyEngine, EngineSettings, Progress, Simulation, engine_name, make_engine, run
 from haptic_loop.sim.scenario import InputError
 from haptic_loop.sim.stability import close, disagree, dominant_mode, exact_growth, unstable, worst_mode

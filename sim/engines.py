@@ -547,19 +547,6 @@ def profiler_off() -> Iterator[bool]:
         pointer.value = saved
 
 
-@contextmanager
-def quiet_warnings() -> Iterator[None]:
-    """Keep MuJoCo from printing and logging its warnings: the engine counts and reports them."""
-    import mujoco
-
-    previous = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(previous)
-
-
 @cache
 def _profiler_clock() -> ctypes.c_void_p | None:
     import mujoco

@@ -20,8 +20,8 @@ from haptic_loop.controller.tick import Process, StepBuffer
 from haptic_loop.models.device import Device
 from haptic_loop.models.hold import HeldPlant, hold
 from haptic_loop.models.human import Population
-from haptic_loop.models.scene import Crowd, Scene, crowds, variants
-from haptic_loop.sim.engines import MujocoBatchEngine, pace, profiler_off, quiet_warnings
+from haptic_loop.models.scene import Crowd, Scene, crowds, quiet_warnings, variants
+from haptic_loop.sim.engines import MujocoBatchEngine, pace, profiler_off
 from haptic_loop.sim.run import Progress, run_block
 from haptic_loop.sim.stability import close
 from haptic_loop.sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen

@@ -35,7 +35,7 @@ from haptic_loop.design.own import called
 from haptic_loop.models.device import Mechanics
 from haptic_loop.models.hold import HeldPlant, hold
 from haptic_loop.models.human import Hand, Person
-from haptic_loop.models.scene import Scene, build
+from haptic_loop.models.scene import Scene, build, quiet_warnings
 from haptic_loop.sim.engines import (
     EXPONENTIAL,
     LEAST,
@@ -46,7 +46,6 @@ from haptic_loop.sim.engines import (
     RunsBlocks,
     default_integrator,
     profiler_off,
-    quiet_warnings,
 )
 from haptic_loop.sim.scenario import InputError, Scenario
 from haptic_loop.sim.trace import Trace

@@ -726,7 +726,7 @@ def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
         world = {"file": str(path), "digest": digest_of(path), "along": along, "every": given.get("every", 1)}
         check_contacts(path, list(points) or contacts)
     except ValueError as error:
-        raise ValueError(f"environment.{error}") from None
+        raise ValueError(f"environment: {error}") from None
     rest = {key: value for key, value in given.items() if key not in ("along", "every")}
     return raw | {"environment": rest | {"world": world}}
 

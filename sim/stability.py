@@ -20,8 +20,8 @@ from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.controller.tick import Process, StepBuffer, at_limit
 from haptic_loop.design.files import off_table
 from haptic_loop.models.hold import HeldPlant, at_the_latch, hold
-from haptic_loop.models.scene import Scene, Variants
-from haptic_loop.sim.engines import Engine, MujocoBatchEngine, profiler_off, quiet_warnings
+from haptic_loop.models.scene import Scene, Variants, quiet_warnings
+from haptic_loop.sim.engines import Engine, MujocoBatchEngine, profiler_off
 from haptic_loop.sim.run import Simulation, beginnings, make_engine, run_blocks
 from haptic_loop.sim.trace import Trace
 

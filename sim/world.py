@@ -28,6 +28,7 @@ from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import InputError
 from haptic_loop.design.result import listed
 from haptic_loop.models.human import Human
+from haptic_loop.models.scene import quiet_warnings
 from haptic_loop.sim.passivity_layer import netted
 from haptic_loop.sim.run import Simulation, assemble, outside_forces, run
 from haptic_loop.sim.scenario import Scenario
@@ -48,6 +49,7 @@ class WorldFigures(ShellFigures):
     released_J: float  # the most that gravity and springs of the scene have given up
     created_J: float  # by contacts, as the lemma counts it
     unsettled_ticks: int  # in which the limited channels still changed after the last repetition of the step
+    warnings: list[str]  # of MuJoCo, in its words
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class WorldRecord:
     released_J: float
     created_J: float
     unsettled_ticks: int
+    warnings: list[str]
 
     @classmethod
     def of(cls, figures: WorldFigures) -> WorldRecord:
@@ -134,7 +137,7 @@ def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> Wo
     try:
         return World(world.file, contacts, _springs(V, contacts), scenario.T, world.every, gravity)
     except ValueError as error:
-        raise InputError(f"environment.world: {error}") from None
+        raise InputError(f"environment: {error}") from None
 
 
 def _no_spring(coupling: Coupling) -> str:
@@ -251,7 +254,10 @@ class InWorld:
             np.maximum(self._most, self._given, out=self._most)
         self._x = x.copy()
         free = self._shell.free(x)
-        wanted = np.stack([port.step(u0) for port, u0 in zip(self.ports, free.T, strict=True)], axis=1)
+        try:
+            wanted = np.stack([port.step(u0) for port, u0 in zip(self.ports, free.T, strict=True)], axis=1)
+        except ValueError as error:
+            raise InputError(f"environment: {error}") from None
         self._shell.credit([port.released for port in self.ports])
         force[...], u = self._shell.limit(wanted)
         self._at_port += (force * (u - self._u)).sum(axis=0)
@@ -269,6 +275,7 @@ class InWorld:
             released_J=max(port.released for port in self.ports),
             created_J=max(port.created for port in self.ports),
             unsettled_ticks=max(port.unsettled for port in self.ports),
+            warnings=list(dict.fromkeys(text for port in self.ports for text in port.warnings)),
         )
 
 
@@ -343,17 +350,18 @@ def _lossless(hand: Any) -> Any:
 def hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, runs: int = 10, seconds: float = 1.0) -> float:
     """The least sum of f'(u - u_-) [J] that motions of the springs' ends reached: they run, stop and turn at random."""
     scene, rng, least = scene_of(scenario, coupling), np.random.default_rng((seed, _STREAM)), 0.0
-    for _ in range(runs):
-        port, at_port = scene.port(), 0.0
-        goal, speed, left, before = np.zeros(scene.channels), np.zeros(scene.channels), 0, port.u
-        for _ in range(round(seconds / scenario.T)):
-            if left == 0:
-                left = int(rng.integers(2, 60))
-                speed = rng.normal(size=scene.channels) * rng.choice([0.0, 0.1, 0.5]) - goal / (100 * scenario.T)
-            left, goal = left - 1, goal + scenario.T * speed
-            force = port.step(goal)
-            at_port, before = at_port + float(force @ (port.u - before)), port.u
-            least = min(least, at_port)
+    with quiet_warnings():
+        for _ in range(runs):
+            port, at_port = scene.port(), 0.0
+            goal, speed, left, before = np.zeros(scene.channels), np.zeros(scene.channels), 0, port.u
+            for _ in range(round(seconds / scenario.T)):
+                if left == 0:
+                    left = int(rng.integers(2, 60))
+                    speed = rng.normal(size=scene.channels) * rng.choice([0.0, 0.1, 0.5]) - goal / (100 * scenario.T)
+                left, goal = left - 1, goal + scenario.T * speed
+                force = port.step(goal)
+                at_port, before = at_port + float(force @ (port.u - before)), port.u
+                least = min(least, at_port)
     return least
 
 

@@ -19,7 +19,7 @@ from haptic_loop.controller.environment import GROUND, Network, walled_environme
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.lti import Array, Lti
 from haptic_loop.models.device import AXES
-from haptic_loop.models.scene import APART, STEP, written
+from haptic_loop.models.scene import APART, STEP, quiet_warnings, written
 from haptic_loop.sim.run import Simulation
 
 if TYPE_CHECKING:  # MuJoCo, for which help does not wait
@@ -203,9 +203,10 @@ def _add_world(spec: mujoco.MjSpec, file: Path, dead: dict[str, Any]) -> None:
     """Add the geoms of a MuJoCo scene in its first pose, left of the devices; meshes and soft bodies are left out."""
     import mujoco
 
-    model, kind = mujoco.MjModel.from_xml_path(str(file)), mujoco.mjtGeom
+    with quiet_warnings():
+        model, kind = mujoco.MjModel.from_xml_path(str(file)), mujoco.mjtGeom
     data, extent = mujoco.MjData(model), float(model.stat.extent)
-    mujoco.mj_forward(model, data)
+    mujoco.mj_kinematics(model, data)
     away = np.array([-_FIRST - extent, 0.0, _HEIGHT]) - model.stat.center
     for i in range(model.ngeom):
         shape, material = int(model.geom_type[i]), int(model.geom_matid[i])

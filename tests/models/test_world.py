@@ -10,6 +10,7 @@ from worlds import environment_by_hand
 from haptic_loop.controller.coupling import MovingAverage, SpringDamper
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.lti import Lti
+from haptic_loop.models.scene import quiet_warnings
 from haptic_loop.models.world import Contact, Rows, World, digest_of, files_of
 
 T = 1e-3
@@ -297,6 +298,46 @@ def test_a_soft_body_only_loses_energy_and_is_listed(tmp_path):
 # ---- refusals
 
 
+@pytest.mark.parametrize("gravity", ['<option><flag gravity="disable"/></option>', '<option gravity="0 0 0"/>', ""])
+def test_a_lifted_contact_releases_nothing(tmp_path, gravity):
+    """A contact has no weight, whatever the scene's gravity: nothing falls here."""
+    port = world(tmp_path, with_body(f'<body name="left">{FREE}</body>', gravity), along=((0.0, 0.0, 1.0),)).port()
+    for k in range(100):
+        port.step(np.array([0.002, 0.001]) * k)
+    assert port.u.min() > 0.09
+    assert port.released < 1e-15
+
+
+@pytest.mark.parametrize("compiler", ['inertiafromgeom="true"', 'inertiafromgeom="auto"', 'fusestatic="true"'])
+def test_masses_are_those_of_the_scene(tmp_path, compiler):
+    """Also where MuJoCo takes them from geoms although a body names another mass; contacts weigh 30 g."""
+    load = '<inertial pos="0 0 0" mass="5" diaginertia="1 1 1"/><geom name="load" size="0.01" mass="0.2"/>'
+    text = with_body(f'<body name="left">{FREE}</body><body name="load"><joint type="slide"/>{load}</body>')
+    text = text.replace("<worldbody>", f"<compiler {compiler}/><worldbody>")
+    model = world(tmp_path, text).model
+    assert model.body("load").mass == mujoco.MjModel.from_xml_string(text).body("load").mass
+    assert model.body("left").mass == pytest.approx(0.03, abs=1e-15)
+
+
+def test_what_mujoco_cannot_step_is_one_line(tmp_path):
+    box = '<body name="load"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body><geom type="plane" size="1 1 1"/>'
+    text = with_body(f'<body name="left">{FREE}</body>{box}', '<size memory="1K"/>')
+    with pytest.raises(ValueError, match=r"increase <size memory") as caught:
+        world(tmp_path, text).port().step(np.zeros(2))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_scene_that_diverges_says_so(tmp_path):
+    driven = '<body name="load"><joint name="j" type="slide"/><geom size="0.1"/></body>'
+    drive = '<actuator><velocity joint="j" kv="-1e5"/></actuator>'
+    port = world(tmp_path, with_body(f'<body name="left" pos="0 0 1">{FREE}</body>{driven}', drive)).port()
+    with quiet_warnings():
+        for _ in range(400):
+            port.step(np.zeros(2))
+    assert any("Nan" in warning for warning in port.warnings)
+    assert np.isfinite(port.created)
+
+
 def with_body(body: str, more: str = "") -> str:
     return f'<mujoco><worldbody><body name="right">{FREE}</body>{body}</worldbody>{more}</mujoco>'
 
@@ -305,6 +346,11 @@ def with_body(body: str, more: str = "") -> str:
     ("text", "message"),
     [
         (with_body(""), "contact 'left': the world has no such body; bodies without a joint: right"),
+        ("<mujoco/>", "contact 'left': the world has no such body; bodies without a joint: none"),
+        (
+            with_body(f'<body name="left">{FREE}</body><body><joint name="left, slide 1"/><geom size="1"/></body>'),
+            "joint 'left, slide 1' has the name of a slide that the program adds; rename it",
+        ),
         (with_body(f'<body name="left"><joint name="j"/>{FREE}</body>'), "contact 'left' has a joint (j)"),
         (with_body(f'<body name="left" mocap="true">{FREE}</body>'), "contact 'left' is a mocap body"),
         (with_body(f'<body name="arm"><body name="left">{FREE}</body></body>'), "is a child of body 'arm'"),

@@ -116,7 +116,7 @@ def test_a_packaged_world_runs_and_is_guaranteed(name):
         in (trace.meta["guarantee"])
     )
     energies = {"given_J", "port_least_J", "released_J", "created_J"}
-    assert set(world) == {"ticks", "ticks_acted", "unsettled_ticks"} | energies
+    assert set(world) == {"ticks", "ticks_acted", "unsettled_ticks", "warnings"} | energies
     assert (world["ticks"], world["ticks_acted"], world["unsettled_ticks"]) == (500, 0, 0)
     assert trace.meta["scene"]["active"] == []
     assert trace.meta["scene"]["settings"].startswith("integrator discrete, timestep 0.001 s")
