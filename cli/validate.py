@@ -25,7 +25,7 @@ from haptic_loop.models.human import Human, Population
 from haptic_loop.models.scene import MIXED
 from haptic_loop.sim import verdicts
 from haptic_loop.sim.couplings import NAMES
-from haptic_loop.sim.crowds import ENGINES, Findings, Table, Validation, validate, validate_on_cluster
+from haptic_loop.sim.crowds import ENGINES, Findings, Validation, validate
 from haptic_loop.sim.report import DelaySpan, UnevenTicks, VaryingDelays, friction_left_out
 from haptic_loop.sim.run import assemble, engine_name
 from haptic_loop.sim.scenario import InputError, Scenario, is_world, require_linear, save_humans
@@ -52,7 +52,7 @@ def main(argv: list[str]) -> int:
     chosen = chosen_by(args, scenario)
     assessment = assessment_of(args, scenario, chosen)
     question = _question(args, scenario, chosen, assessment)
-    findings, wall = _findings(args, question, Table(question, out, args.resume))
+    findings, wall = _findings(args, question)
     searched = _Searched()
     if args.adversary and not (findings.interrupted or findings.lost):
         searched = _searched(args, question, chosen, assessment)
@@ -94,8 +94,6 @@ def _parser() -> options.Parser:
     made = "hands that MuJoCo simulates, too: sampled (default: nearest to the limit, lossless, 64 others) or all"
     add("--traces", choices=("sampled", "all"), default="sampled", help=made)
     add("--shards", type=whole(1, 256), default=1, metavar="K", help="local processes, for the same result (default 1)")
-    add("--dask", metavar="HOST:PORT", help="work on an existing Dask cluster; the result is the same")
-    add("--resume", action="store_true", help="go on with what a run of the same words left unfinished in the folder")
     add("--adversary", action="store_true", help="also search for the worst passive human")
     add("--generations", type=whole(1, 10_000), metavar="N", help="length of that search (default 150)")
     met = "nominal (default), or ranges: in turn all vertices of the scenario's ranges and as many others inside"
@@ -109,8 +107,6 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     """Return the scenario of the options. Raises InputError unless it is linear."""
     scenario = options.with_humans(args, options.with_varying_delays(args, options.scenario_from(args)))
     require_linear(scenario, "sim.validate", walls=True)
-    if args.dask is not None and args.shards > 1:
-        raise InputError(f"--shards {args.shards} with --dask: the cluster decides who does what, give one of them")
     if not (args.duration == 0 or 4 * scenario.T <= args.duration <= 1e5):
         allowed = f"allowed are 0 and {4 * scenario.T:g} to 100000 s"
         raise InputError(f"--duration is {args.duration:g}, {allowed}")
@@ -139,14 +135,11 @@ def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, asse
     return Validation(scenario, chosen.coupling, args.seed, *work, environments=met, lag=lag, all_traces=every)
 
 
-def _findings(args: argparse.Namespace, question: Validation, table: Table) -> tuple[Findings, float]:
+def _findings(args: argparse.Namespace, question: Validation) -> tuple[Findings, float]:
     """Return the findings on all humans, and the time that they took [s]."""
     begin = time.perf_counter()
     with render.progress("validating") as move:
-        if args.dask is not None:
-            findings = validate_on_cluster(question, args.dask, move, table)
-        else:
-            findings = validate(question, args.shards, move, table)
+        findings = validate(question, args.shards, move)
     return findings, time.perf_counter() - begin
 
 
@@ -329,7 +322,7 @@ def _reported(
     both, bad, grows = question.engine != "exact", unstable(findings.exact), unstable(findings.mujoco)
     disagreements, wrong = int(findings.disagreements.sum()), bad | (both & grows & (findings.mujoco > 1e-3))
     interrupted = findings.interrupted or searched.interrupted
-    kept = f"{findings.index.size} humans that were finished are kept, --resume does the others; searches are not kept"
+    kept = f"{findings.index.size} humans were finished before"
     return _Report(
         case=args.case,
         scenario=scenario.name,

@@ -1,33 +1,25 @@
-"""Validate a loop with many random passive humans, by both engines, in batches over processes or a cluster.
+"""Validate a loop with many random passive humans, by both engines, in batches over processes.
 
 Human i depends on the seed and on i alone. Batches do not depend on the number of processes, so the merged result is
-that of a single run, bit for bit (the workers of a cluster need this package and the same versions of NumPy, SciPy and
-MuJoCo). MuJoCo decides by the map of its Runge-Kutta integrator, which shares only the model with the exact engine. Its
-traces use the exponential integrator, at a fifth of the cost. The exact step simulates all humans, MuJoCo those whose
-traces say most (`_witnessed`).
-
-A batch whose worker died is repeated by another worker. A table, on disk if a folder is given for it, keeps every
-finished batch, so memory does not grow with the number of humans. Workers end with the process that started them.
+that of a single run, bit for bit. MuJoCo decides by the map of its Runge-Kutta integrator, which shares only the model
+with the exact engine. Its traces use the exponential integrator, at a fifth of the cost. The exact step simulates all
+humans, MuJoCo those whose traces say most (`_witnessed`). Workers end with the process that started them.
 """
 
 from __future__ import annotations
 
-import hashlib
-import logging
 import math
 import multiprocessing
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from multiprocessing.connection import wait as wait_for
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,13 +30,12 @@ from haptic_loop.controller.delay import Timing
 from haptic_loop.controller.law import Law
 from haptic_loop.controller.lti import Array
 from haptic_loop.controller.ranges import Member
-from haptic_loop.design.files import InputError
 from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Population
 from haptic_loop.models.scene import Crowd, HumanSets, Variants, crowds, draw_mechanics, variants
 from haptic_loop.sim.accuracy import simulated_growth
 from haptic_loop.sim.engines import EXPONENTIAL, LEAST, Engine, ExactEngine, MujocoBatchEngine, OneByOne
-from haptic_loop.sim.run import Progress, Simulation, assemble, engine_name, make_engine
+from haptic_loop.sim.run import Progress, Simulation, assemble, make_engine
 from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import (
     Balance,
@@ -58,10 +49,6 @@ from haptic_loop.sim.stability import (
     mujoco_loops,
 )
 from haptic_loop.sim.switching import Switched, switched_crowd
-
-if TYPE_CHECKING:
-    from distributed import Client
-
 
 ENGINES = ("exact", "mujoco", "both")
 _BATCH = 125  # humans that are decided together
@@ -117,22 +104,6 @@ class Validation:
     def environment(self, index: int) -> Member | None:
         """Return the environment that the humans of this index meet; None is the scenario's own."""
         return self.environments[index % len(self.environments)] if self.environments else None
-
-    @property
-    def digest(self) -> str:
-        """The digest of everything that the findings depend on."""
-        how = (
-            self.coupling.form(),
-            self.seed,
-            self.humans,
-            self.links,
-            self.engine if isinstance(self.engine, str) else engine_name(self.engine),
-            self.ticks,
-            self.environments,
-            self.lag,
-            *(["all traces"] if self.all_traces else []),
-        )
-        return hashlib.sha256(f"{self.scenario.digest} {how!r}".encode()).hexdigest()[:16]
 
     def crowds(self, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
         """Draw the humans of these indices, joined as the scenario's persons join its devices.
@@ -223,7 +194,11 @@ _COLUMNS = tuple(f.name for f in fields(Findings) if f.name not in ("simulated",
 
 
 def _merge(parts: Sequence[Findings]) -> Findings:
-    """Merge the findings of the groups of a batch."""
+    """Merge the findings of groups or batches; without any the columns are empty."""
+    if not parts:
+        kinds: dict[str, type] = {"index": int, "witnessed": bool, "clipped": int, "contacts": int}
+        empty: dict[str, Any] = {name: np.zeros(0, dtype=kinds.get(name, float)) for name in _COLUMNS}
+        return Findings(**empty, simulated=0.0)
     order = np.argsort(np.concatenate([p.index for p in parts]), kind="stable")
     joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts])[order] for name in _COLUMNS}
     return Findings(**joined, simulated=math.fsum(p.simulated for p in parts))
@@ -374,158 +349,66 @@ def _traced(
     return replace(exact, growth=growth, error=error, clipped=clipped, simulated=simulated)
 
 
-# ----------------------------------------------------------------------------------------------------
-# All batches: in this process, in several, or on a Dask cluster.
-
-_PATIENCE = 3.0  # [s] that a scheduler has to answer, and again its first worker
-_AGAIN = 3  # consecutive deaths of workers without a finished batch
-_LOOK, _DESERTED = 5.0, 60.0  # [s] between checks for workers, and without any worker until the cluster is given up
-_AHEAD = 4  # batches in flight for every worker, so that results do not pile up
+# ---- all batches, in this process or in several
 
 
-class Table:
-    """The findings by column, in memory or in a file that is mapped only while it is used."""
+def validate(question: Validation, shards: int = 1, progress: Progress = lambda done, total: None) -> Findings:
+    """Examine every batch and merge the findings, in `shards` processes.
 
-    def __init__(self, question: Validation, folder: Path | None = None, resume: bool = False) -> None:
-        """Open the table; `resume` continues an unfinished file. Raises InputError if none exists."""
-        self._batches = question.batches()
-        self._path = folder / f"unfinished-{question.digest}.npy" if folder else None
-        shape = (
-            len(_COLUMNS) + 2,
-            question.humans,
-        )  # the last two columns: simulated seconds, and whether the set is done
-        self._memory = None if self._path else np.zeros(shape)
-        if self._path and resume and not self._path.is_file():
-            raise InputError(f"--resume: {self._path.parent} holds nothing unfinished of these humans and this loop")
-        if self._path and not resume:
-            try:
-                np.lib.format.open_memmap(self._path, "w+", shape=shape)
-            except OSError as error:
-                raise InputError(f"cannot write {self._path}: {error.strerror}") from None
-
-    def _open(self, mode: Any) -> Array:
-        if self._memory is not None:
-            return self._memory
-        assert self._path is not None
-        return np.load(self._path, mmap_mode=mode)
-
-    def missing(self) -> list[int]:
-        """The numbers of the unfinished batches."""
-        done = self._open("r")[-1]
-        return [number for number, batch in enumerate(self._batches) if not done[batch[0]]]
-
-    def put(self, number: int, part: Findings) -> None:
-        """Store the findings of a batch; the mark "done" is written last."""
-        batch, table = self._batches[number], self._open("r+")
-        where = slice(batch.start, batch.stop, batch.step)
-        for row, name in zip(table, _COLUMNS, strict=False):
-            row[where] = getattr(part, name)
-        table[-2, where] = part.simulated / len(batch)
-        table[-1, where] = 1
-
-    def findings(self, interrupted: bool = False, lost: str = "") -> Findings:
-        """Return the findings of all finished batches, and remove the file once all are finished."""
-        table = self._open("r")
-        done, rows = table[-1] != 0, dict(zip(_COLUMNS, table, strict=False))
-        if not done.all():
-            rows = {name: row[done] for name, row in rows.items()}
-        elif self._path:
-            self._path.unlink()  # the mapped pages stay readable
-        for name in ("index", "clipped"):
-            rows[name] = rows[name].astype(int)
-        rows["witnessed"] = rows["witnessed"].astype(bool)
-        return Findings(**rows, simulated=float(table[-2].sum()), interrupted=interrupted, lost=lost)
-
-
-def validate(
-    question: Validation,
-    shards: int = 1,
-    progress: Progress = lambda done, total: None,
-    table: Table | None = None,
-) -> Findings:
-    """Examine every batch that is missing in the table, or all batches without a table.
-
-    An interruption and repeated deaths of workers end the validation with the batches that are finished.
+    An interruption, the death of a worker and a lack of memory end the validation with the batches that are finished.
     """
-    table = table or Table(question)
-    lost = ""
+    parts, interrupted, lost = dict[int, Findings](), False, ""
     try:
         if shards == 1:
-            _here(question, table, progress)
+            _here(question, parts, progress)
         else:
-            lost = _in_processes(question, table, shards, progress)
+            _in_processes(question, shards, parts, progress)
     except KeyboardInterrupt:
-        return table.findings(interrupted=True)
+        interrupted = True
+    except BrokenProcessPool:
+        lost = "a worker process died"
     except MemoryError:
         lost = "memory ran out"
-    return table.findings(lost=lost)
+    return replace(_merge(list(parts.values())), interrupted=interrupted, lost=lost)
 
 
-def _here(question: Validation, table: Table, progress: Progress) -> None:
-    batches, missing, ticks = question.batches(), table.missing(), max(1, question.ticks)
-    done = (len(batches) - len(missing)) * ticks
+def _here(question: Validation, parts: dict[int, Findings], progress: Progress) -> None:
+    batches, ticks, done = question.batches(), max(1, question.ticks), 0
 
     def ticked(count: int) -> None:
         nonlocal done
         done += count
         progress(done, ticks * len(batches))
 
-    for n, number in enumerate(missing, start=len(batches) - len(missing) + 1):
-        table.put(number, _examine(question, batches[number], ticked))
-        done = n * ticks
+    for number, batch in enumerate(batches):
+        parts[number] = _examine(question, batch, ticked)
+        done = (number + 1) * ticks
         progress(done, ticks * len(batches))
 
 
-def _in_processes(question: Validation, table: Table, shards: int, progress: Progress) -> str:
-    """Why batches are missing at the end, or nothing."""
-    tries = _AGAIN
-    while missing := table.missing():
-        done = _pool(question, table, missing, shards, progress)
-        if done < len(missing):
-            tries = tries - 1 if not done else _AGAIN
-            if not tries:
-                return f"worker processes died {_AGAIN} times in a row"
-    return ""
-
-
-def _pool(question: Validation, table: Table, missing: list[int], shards: int, progress: Progress) -> int:
-    """Return how many of the missing batches were finished before a worker died."""
-    batches, alone, done = question.batches(), replace(question, threads=1), 0
-    # a forked child would inherit locks of MuJoCo's threads and of the progress bar
+def _in_processes(question: Validation, shards: int, parts: dict[int, Findings], progress: Progress) -> None:
+    """Fill `parts` with the findings of each batch. Raises BrokenProcessPool if a worker dies."""
+    batches, alone = question.batches(), replace(question, threads=1)
+    # A forked child would inherit locks of MuJoCo's threads and of the progress bar.
     context = multiprocessing.get_context("spawn")
     strangers = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(shards, mp_context=context, initializer=_as_worker)
-    left, running = iter(missing), dict[Future[Findings], int]()
+    futures = dict[Future[Findings], int]()
     try:
-        while True:
-            for number in left:
-                running[pool.submit(_examine, alone, batches[number])] = number
-                if len(running) >= _AHEAD * shards:
-                    break
-            if not running:
-                return done
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                table.put(running[future], future.result())
-                del running[future]
-                done += 1
-                progress(len(batches) - len(missing) + done, len(batches))
-    except BrokenProcessPool:
-        return done + _finished(running, table)
+        for number, batch in enumerate(batches):
+            futures[pool.submit(_examine, alone, batch)] = number
+        for future in as_completed(futures):
+            parts[futures[future]] = future.result()
+            progress(len(parts), len(batches))
     except BaseException:
-        _finished(running, table)
+        for future, number in futures.items():
+            if future.done() and not future.cancelled() and not future.exception():
+                parts[number] = future.result()
         for worker in set(multiprocessing.active_children()) - strangers:
-            worker.terminate()  # a batch may take half a minute and stores nothing before its end
+            worker.terminate()  # A batch may take half a minute and stores nothing before its end.
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _finished(running: dict[Future[Findings], int], table: Table) -> int:
-    """Store the other batches that are finished, and return their number."""
-    ready = [future for future in running if future.done() and not future.cancelled() and not future.exception()]
-    for future in ready:
-        table.put(running[future], future.result())
-    return len(ready)
 
 
 def _as_worker() -> None:
@@ -539,111 +422,3 @@ def _as_worker() -> None:
         os._exit(1)
 
     threading.Thread(target=end, daemon=True).start()
-
-
-def validate_on_cluster(
-    question: Validation,
-    address: str,
-    progress: Progress = lambda done, total: None,
-    table: Table | None = None,
-    patience: float = _PATIENCE,
-) -> Findings:
-    """The same on the Dask cluster whose scheduler is at `address`.
-
-    A lost worker's batches are done again by another, until Dask gives them up; then, and where the scheduler is lost,
-    the rest is kept. Raises InputError where there is no cluster, no worker, or no package on the workers. Dask is an
-    optional extra, imported only here.
-    """
-    table = table or Table(question)
-    with _client(address, patience) as client:
-        try:
-            lost = _on_workers(question, table, client, address, progress)
-        except KeyboardInterrupt:
-            return table.findings(interrupted=True)
-    return table.findings(lost=lost)
-
-
-def _on_workers(question: Validation, table: Table, client: Client, address: str, progress: Progress) -> str:
-    """Why batches are missing at the end, or nothing."""
-    from distributed import CancelledError as Cancelled
-    from distributed import KilledWorker
-    from distributed import wait as wait_on_cluster
-
-    batches, missing, alone, lost = question.batches(), table.missing(), replace(question, threads=1), ""
-    left, done, running, deserted = iter(missing), len(batches) - len(missing), dict[Any, int](), 0.0
-    try:
-        while True:
-            ahead = _AHEAD * max(1, len(client.scheduler_info()["workers"]))
-            for number in left:
-                running[client.submit(_examine_alone, alone, batches[number], pure=False)] = number
-                if len(running) >= ahead:
-                    break
-            if not running:
-                return lost
-            try:
-                with client.as_current():
-                    found: Any = wait_on_cluster(list(running), timeout=_LOOK, return_when=FIRST_COMPLETED)
-            except TimeoutError:
-                deserted = 0.0 if client.nthreads() else deserted + _LOOK
-                if deserted >= _DESERTED:
-                    return f"--dask {address}: the cluster has had no workers for {deserted:g} s"
-                continue
-            for task in found.done:
-                number = running.pop(task)
-                try:
-                    part = task.result()
-                except ImportError as error:
-                    raise InputError(f"--dask {address}: the workers cannot import this package: {error}") from None
-                except KilledWorker as error:
-                    lost = f"--dask {address}: a batch killed every worker that tried it: {error}"
-                    continue
-                table.put(number, part)
-                done += 1
-                progress(done, len(batches))
-    except (CancelledError, Cancelled, OSError):
-        return f"--dask {address}: the cluster was lost before all batches were done"
-    except KeyboardInterrupt:
-        with suppress(Exception):
-            client.cancel(list(running))
-        raise
-
-
-_one_at_a_time = threading.Lock()  # MuJoCo's clock and warning handler are global to a process
-
-
-def _examine_alone(question: Validation, indices: Sequence[int]) -> Findings:
-    """`_examine`, one at a time in every worker process, however many threads that has."""
-    with _one_at_a_time:
-        return _examine(question, indices)
-
-
-@contextmanager
-def _client(address: str, patience: float) -> Iterator[Client]:
-    """Return a client of the cluster. Raises InputError where none answers."""
-    import asyncio  # slow to load
-
-    try:
-        from distributed import Client
-        from distributed.comm.core import connect
-        from distributed.core import coerce_to_address
-        from distributed.security import Security
-    except ImportError:
-        raise InputError("--dask needs Dask: pip install 'distributed>=2024.8'") from None
-    for name in ("distributed", "distributed.client"):  # errors are reported once, by us
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-
-    async def reach() -> None:
-        comm = await connect(coerce_to_address(address), timeout=patience, **Security().get_connection_args("client"))
-        await comm.close()
-
-    try:
-        asyncio.run(reach())  # a Client without a scheduler would complain again when it is collected
-        client = Client(address, timeout=patience, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"--dask {address}: no cluster there: {error}; expected HOST:PORT of a scheduler") from None
-    with client:
-        try:
-            client.wait_for_workers(1, timeout=patience)
-        except TimeoutError:
-            raise InputError(f"--dask {address}: that cluster has no workers") from None
-        yield client

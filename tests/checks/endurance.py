@@ -66,7 +66,7 @@ def _many_hands(mark: _Mark, count: int = 100_000) -> tuple[bool, str]:
 _Work = Callable[[_Mark], tuple[bool, str]]
 
 #: what is done, and by how much its peak of memory may rise after a tenth of it [MiB]: a session keeps nothing of a
-#: tick, a crowd 128 bytes of a hand, twice while its batches are joined
+#: tick, a crowd 150 bytes of a hand, twice while its batches are joined
 _LONG: tuple[tuple[str, _Work, float], ...] = (
     ("an hour of a session", _long_session, 8.0),
     ("100,000 hands", _many_hands, 32.0),

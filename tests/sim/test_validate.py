@@ -4,7 +4,6 @@ import json
 import multiprocessing
 import os
 import signal
-import sys
 import threading
 from dataclasses import fields, replace
 
@@ -379,7 +378,6 @@ def test_restless_short_traces_give_no_verdict(duration):
         (["--humans", "many"], "--humans is 'many', expected a whole number"),
         (["--engine", "drake"], "--engine is 'drake', allowed are exact, mujoco, both"),
         (["--links", "9"], "--links is '9', allowed are"),
-        (["--shards", "2", "--dask", "here:8786"], "--shards 2 with --dask: the cluster decides"),
         (["--shards", "0"], "--shards is 0, allowed are 1 to 256"),
         (["--generations", "0"], "--generations is 0, allowed are 1 to 10000"),
         (["--duration", "-1"], "--duration is -1, allowed are 0 and 0.0048 to 100000 s"),
@@ -430,12 +428,6 @@ def test_impossible_crowds_cannot_be_built():
         Crowd(np.ones((1, 2, 1, 3)), ((1, 2),))
     with pytest.raises(ValueError, match="massless"):
         Crowd(np.ones((1, 2, 1, 3)), ((1, 2),), np.zeros((1, 1, 5)))
-
-
-def test_without_dask_the_command_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match="--dask needs Dask: pip install 'distributed"):
-        main(["--dask", "127.0.0.1:9", "--humans", "5", "--out", str(tmp_path)])
 
 
 class OwnEngine(ExactEngine):

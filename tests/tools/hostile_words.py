@@ -213,9 +213,6 @@ SILENT = [
     (("bridge", "--rehearse", "--baud", "fast"), "--baud"),
     (("bridge", "--rehearse", "--condition", "magic"), "--condition"),
     (("identify", "--rehearse", "--band", "80,3"), "--band"),
-    (("validate", *QUICK["validate"], "--shards", "2", "--dask", "x:1"), "--dask"),
-    (("validate", *QUICK["validate"], "--dask", ""), "--dask"),
-    (("validate", *QUICK["validate"], "--dask", "nix"), "--dask"),
     (("validate", *QUICK["validate"], "--environments", "ranges"), "--environments"),
     (("validate", *QUICK["validate"], "--generations", "5"), "--generations"),
     (("view", "--video", "v.xyz"), "--video"),
@@ -255,8 +252,8 @@ REFUSED = {
         --band nan,5 | --theta 1,2,3 | --theta 1.5 | --psi -1,0 | --delta -1 | --T 1e-7 | --T 1 | --theta 1001,0
         --theta 1000,1000 | --case none --lam 0,0,0 | --condition any-environment --case III
         --no-limiter --energy-budget x | --human h.py:humans --vertex 3""",
-    "validate": """--resume | --environments ranges | --dask x
-        --dask h:1 --shards 2 | --generations 5 | --links 3 | --humans 0 | --humans 1e3 | --shards 0
+    "validate": """--environments ranges
+        --generations 5 | --links 3 | --humans 0 | --humans 1e3 | --shards 0
         --duration 1e-9 | --duration -1 | --latency 2e-3 | --T-max 1e-4 | --period 1e-3""",
     "design": """--ranges 0 | --ranges -5 | --ranges 101% | --ranges 1e9 | --ranges 10%% | --samples 5
         --ranges 10 --varying-delay 0,2 | --limiter --no-limiter | --coupling optimal --order 2
