@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from haptic_loop.controller.arithmetic import Number, SingularLoop, inverse, numbers
+from haptic_loop.controller.arithmetic import Number, SingularLoop, inverse, numbers, positive_definite
 from haptic_loop.controller.complementarity import magnitudes
 from haptic_loop.controller.coupling import Coupling
 from haptic_loop.controller.delay import delay, moving_sum
@@ -100,25 +100,25 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     He[[T v_hat(H), 0], [2 H, Delta_V^-1]] >= 0, without rows of the second kind where phi is 0. Damping enters by
     Theta-hat and Delta_D^-1, in proportion to 1/s. Raises ValueError for a phi that is not a multiplier.
     """
-    if phi is not None and loop.levels:
-        raise ValueError(f"levels: any-environment with psi >= 1 {FULL_LEVELS}")
     T, damping = V.T, even_damping(loop, V.T)
     shortage = numbers([0] * loop.channels if phi is None else phi, T)
-    if len(shortage) != len(damping) or not ((shortage >= 0) & (shortage < damping)).all():
+    level = even_level(loop, T) if loop.levels else damping
+    below = len(shortage) == len(damping) and ((shortage >= 0) & (shortage < damping)).all()
+    if not below or (loop.levels and not positive_definite(level - np.diag(shortage))):
         raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
     paid = np.flatnonzero(shortage)
 
-    def excess(H: Any, limit: Any) -> tuple[Array, Any]:
-        """H(1); the block of H with limit^-1 in its corner, linear in both."""
+    def excess(H: Any, corner: Any) -> tuple[Array, Any]:
+        """H(1); the block of H with this corner, linear in both."""
         H1, regular = v_hat(H)
         if not paid.size:
             return H1, regular
-        corner = np.vstack([np.zeros((loop.channels, paid.size), dtype=int), np.diag(1 / limit[paid])])
+        corner = np.vstack([np.zeros((loop.channels, paid.size), dtype=int), corner])
         return H1, hstack(vstack(T * regular, (2 * H).rows(paid)), constant_like(H, corner))
 
-    V1, gain = excess(V, shortage)
-    level = even_level(loop, T) if loop.levels else damping
-    _, taken = excess(as_like(V, theta_hat(loop.theta, level, T)), damping)
+    V1, gain = excess(V, np.diag(1 / shortage[paid]))
+    inverted = inverse(level)[np.ix_(paid, paid)] if loop.levels else np.diag(1 / damping[paid])
+    _, taken = excess(as_like(V, theta_hat(loop.theta, level, T)), inverted)
     return Demand(-taken, gain, {"V(1)": V1})
 
 

@@ -33,6 +33,7 @@ from haptic_loop.design.conditions import (
     covers,
     delayed_environment_demand,
     even_damping,
+    even_level,
     uncovered,
     unsound,
 )
@@ -246,19 +247,22 @@ def least_multiplier(loop: Loop) -> Array:
     """
     delta = even_damping(loop)
     unit = unit_environment(loop.E(), delta)
-    none = np.zeros(loop.channels)
+    none, level = np.zeros(loop.channels), even_level(loop) / np.sqrt(np.outer(delta, delta))  # of unit diagonal
     least, _ = uncovered(unit, loop.psi, none)  # bound for a full Phi and for each channel
+    each, root = least, np.linalg.inv(np.linalg.cholesky(level))
+    if loop.levels:
+        least, _ = uncovered(root @ unit @ root.T, loop.psi, none)
     if least >= 1:
         raise Infeasible(None, (), _needs(loop.psi, delta, least))
     regular = delayed_environment_demand(delay(loop.psi, 1.0) @ unit, none).free
     if regular.order > _MOST_STATES:
-        return max(least, 0.0) * delta
-    # Entries are at most halfway to Delta_D: the least trace alone may touch Delta_D.
-    return np.maximum(_of_least_trace(balanced(regular), (1 + least) / 2), 0.0) * delta
+        return max(each, 0.0) * delta
+    # Phi is at most halfway to Delta_D: the least trace alone may touch Delta_D.
+    return np.maximum(_of_least_trace(balanced(regular), (1 + least) / 2 * level), 0.0) * delta
 
 
-def _of_least_trace(regular: Lti, most: float) -> Array:
-    """Return the entries of the diagonal Phi <= most with least trace that makes `regular` passive."""
+def _of_least_trace(regular: Lti, most: Array) -> Array:
+    """Return the entries of the diagonal Phi <= most (m, m) with least trace that makes `regular` passive."""
     m, n = regular.inputs, regular.order
     ports, zero = Ports.same(regular), np.zeros((regular.inputs,) * 2)
 
@@ -266,7 +270,7 @@ def _of_least_trace(regular: Lti, most: float) -> Array:
         return lemma1(ports, symmetric_from(x[m:], n), zero, -np.diag(x[:m]))
 
     size = range(m + packed(n))
-    storage, room = Inequality.of(lambda x: symmetric_from(x[m:], n), size), lambda x: np.diag(most - x[:m])
+    storage, room = Inequality.of(lambda x: symmetric_from(x[m:], n), size), lambda x: most - np.diag(x[:m])
     problem = ConeProgram(
         np.repeat([1.0, 0.0], [m, packed(n)]), [Inequality.of(passive, size), storage, Inequality.of(room, size)]
     )
@@ -333,9 +337,6 @@ class _AnyEnvironment(Multiplied):
     def beyond(self, loop: Loop) -> str | None:
         if loop.environment.walls and any(loop.psi):
             return "with delay in the environment its multiplier is of a linear one: no walls"
-        if loop.levels and (any(loop.psi) or _in_frame(loop)):
-            what = "psi >= 1" if any(loop.psi) else "a latency" if loop.latency else "delays that switch"
-            return f"levels: {self.name} with {what} {conditions.FULL_LEVELS}"
         if _in_frame(loop) and any(loop.psi):
             what = "a latency" if loop.latency else "delays that switch"
             return f"with delay in the environment its multiplier is of whole, constant samples: no {what}"
@@ -395,7 +396,14 @@ class _AnyEnvironment(Multiplied):
 
     def _in_frame(self, V: Lti, loop: Loop, multiplier: Any) -> Requirement:
         if self.unknowns(loop):
-            return self.required_of(V, loop, multiplier)
+            found = self.required_of(V, loop, multiplier)
+            if multiplier or loop.latency or found.certified:
+                return found
+            spans = [(loop.delays.lo[own.start], loop.delays.hi[own.start]) for own in loop.devices]
+            mean = [float(np.mean(even_damping(loop)[own])) * (1 - RESERVE) / loop.T for own in loop.devices]
+            alpha = [float(f"{stiffest_alpha(*span, d):.10g}") for span, d in zip(spans, mean, strict=True)]
+            closed = self.required_of(V, loop, alpha)  # A search finds no room near the stiffest coupling.
+            return min(found, replace(closed, bound=found.bound), key=lambda requirement: requirement.ratio)
         asked = self.block(V, loop)
         if not V.is_stable():
             return refusal(self.name, loop.delta, "the coupling V has a pole on or outside the unit circle")
@@ -434,6 +442,15 @@ class _AnyEnvironment(Multiplied):
 
 
 ANY_ENVIRONMENT = _AnyEnvironment()
+
+
+def stiffest_alpha(lo: int, hi: int, damping: float) -> float:
+    """Return the alpha [N/m] for `damping` [N s/m^2] that admits the stiffest coupling before any environment.
+
+    It minimises the mean of |vt|^2/(4 (damping - alpha/2)) + h^2/(2 alpha), vt the mean window (docs/theory.md).
+    """
+    half = (hi - lo) / 2
+    return 2 * half * damping / (np.sqrt(lo + 1 + half / 2) + half)
 
 
 def _in_frame(loop: Loop) -> bool:

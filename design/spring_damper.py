@@ -46,6 +46,7 @@ from haptic_loop.design.lmi import (
     least_phi,
     lemma1,
     packed,
+    stiffest_alpha,
     symmetric_from,
     usable,
 )
@@ -541,17 +542,24 @@ def _stiffest_in_frame(loop: Loop) -> Design:
         )
         raise DesignFailed(None, (), line)
     started, channels = time.perf_counter(), []
-    chi = _late_chi if loop.latency else _switched_chi
-    for i in range(loop.channels):
-        terms = chi(loop, i)
+    chi, unit = _late_chi if loop.latency else _switched_chi, (1.0,) * loop.channels
+    for i, delta in enumerate(unit if loop.levels else loop.delta):
+        terms = chi(loop, i, delta)
         weights = 2 * -np.diff(np.append(terms, 0.0))
         weights[0] += 2 * RESERVE * terms[0]
         channels.append(taps([float(f"{v:.{_TAP_DIGITS}g}") for v in weights], loop.T))
     V = Lti.diag(*channels)
-    return _verified(loop, Compliance(V), None, "stiffness", float((1 / np.diag(V.dc())).sum()), 0, started)
+    if loop.levels:  # chi of a device is that of one N s/m times Delta_i^-1
+        V = _rounded_inverse(loop.Delta()) @ V
+    return _verified(loop, Compliance(V), None, "stiffness", float(np.trace(np.linalg.inv(V.dc()))), 0, started)
 
 
-def _late_chi(loop: Loop, i: int) -> Array:
+def _rounded_inverse(level: Array) -> Array:
+    inverse = np.linalg.inv(level)
+    return np.array([[float(f"{v:.{_TAP_DIGITS}g}") for v in row] for row in (inverse + inverse.T) / 2])
+
+
+def _late_chi(loop: Loop, i: int, delta: float) -> Array:
     """Return chi_k of l (Q delta)^-1 l*/4 with l = [1 + .. + z^-(theta+1), 1 + .. + z^-theta], with the best Q."""
     (first, last), theta = (loop.latency or ())[i], loop.theta[i]
     inverse = np.diag([last, (loop.T_max or loop.T) - first])
@@ -560,18 +568,18 @@ def _late_chi(loop: Loop, i: int) -> Array:
     windows = np.array([np.ones(theta + 2), [*np.ones(theta + 1), 0.0]])
     pairs = [(a, b) for a in (0, 1) for b in (0, 1)]
     terms = [inverse[a, b] * np.correlate(windows[a], windows[b], "full")[theta + 1 :] for a, b in pairs]
-    return np.sum(terms, axis=0) / (4 * (1 - RESERVE) * loop.delta[i])
+    return np.sum(terms, axis=0) / (4 * (1 - RESERVE) * delta)
 
 
-def _switched_chi(loop: Loop, i: int) -> Array:
-    """Return chi_k of |vt|^2/(4 (delta/T - alpha/2)) + h^2/(2 alpha), vt the mean window, with the best alpha."""
+def _switched_chi(loop: Loop, i: int, delta: float) -> Array:
+    """Return chi_k of |vt|^2/(4 (delta/T - alpha/2)) + h^2/(2 alpha), vt the mean window."""
     lo, hi = loop.delays.lo[i], loop.delays.hi[i]
-    damping, half = (1 - RESERVE) * loop.delta[i] / (loop.T_max or loop.T), (hi - lo) / 2
+    damping, half = (1 - RESERVE) * delta / (loop.T_max or loop.T), (hi - lo) / 2
     window = np.where(np.arange(hi + 1) > lo, 0.5, 1.0)
     square = np.correlate(window, window, "full")[hi:]
     if not half:
         return square / (4 * damping)
-    alpha = 2 * half * damping / (np.sqrt(square[0]) + half)
+    alpha = stiffest_alpha(lo, hi, damping)
     terms = square / (4 * (damping - alpha / 2))
     terms[0] += half**2 / (2 * alpha)
     return terms
@@ -606,8 +614,7 @@ def _moving_average_of_levels(loop: Loop, started: float) -> Design:
 
     It attains the lower bound V(1) = T/2 blockdiag(n_i Delta_i^-1) of a matrix inequality.
     """
-    inverses = np.linalg.inv(even_level(loop)) * loop.T / 2
-    weight = np.array([[float(f"{v:.{_TAP_DIGITS}g}") for v in row] for row in (inverses + inverses.T) / 2])
+    weight = _rounded_inverse(2 * even_level(loop) / loop.T)
     terms = np.array(loop.theta) + 1
     late = moving_sum(loop.theta, loop.T)
     constant = _spare(loop) * terms**2 * weight
