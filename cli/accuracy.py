@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from haptic_loop.cli import options, render
@@ -59,10 +59,21 @@ def main(argv: list[str]) -> int:
     files = render.pictures(args, report.rows, out, {"accuracy.png": "plot_accuracy"}, bool(report.rows))
     table = render.columns(f"speed against error · {scenario.title(args.case)}, {chosen.kind}", _CELLS, report.rows)
     lines = [*(f"not measured: {reason}" for reason in report.skipped), *_LEGEND]
-    render.publish(args, report, [table], lines, out, files)
     defaults = ((EXPONENTIAL, 1), ("RK4", default))
     right = all(row.verdict_correct for row in report.rows if (row.integrator, row.substeps) in defaults)
+    verdict = None if report.interrupted else _verdict(right, report.rows)
+    render.publish(args, report, [table], lines, out, files, verdict)
     return options.exit_code(right, report.interrupted)
+
+
+def _verdict(right: bool, rows: Sequence[Row]) -> str:
+    """Return whether the default settings judge stability right, and the errors of the exponential integrator."""
+    words = "The defaults judge stability as the exact engine does" if right else "A DEFAULT JUDGES STABILITY WRONGLY"
+    for row in rows:
+        if (row.integrator, row.substeps) == (EXPONENTIAL, 1):
+            position = render.optional(row.position_relative_rms, "{:.1e}", "unknown")
+            words += f"; errors of exponential x 1: position {position}, growth {row.growth_rate_error:+.1e} 1/s"
+    return f"{words}."
 
 
 def _parser() -> options.Parser:

@@ -8,6 +8,7 @@ damping, perceived stiffness and damping.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,8 +75,19 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
     if render.is_drawn(args, out / "couplings.png", any(each.trace is not None for each in made)):
         files.append(_side_by_side(made, out / "couplings.png", scenario.environment.contacts))
     report = _Alternatives(scenario.name, args.case, made)
-    render.publish(args, report, [_beside(made, args.condition)], (), out, files)
+    render.publish(args, report, [_beside(made, args.condition)], (), out, files, _nearest(made))
     return options.exit_code(True)
+
+
+def _nearest(made: Sequence[Alternative]) -> str:
+    """Return the verdict: which coupling with a guarantee has the least force error."""
+    guaranteed = [each for each in made if each.guarantee]
+    if not guaranteed:
+        return "No coupling of the table has a guarantee."
+    best = min(guaranteed, key=lambda each: math.inf if each.force_error_percent is None else each.force_error_percent)
+    error = render.optional(best.force_error_percent, "{:.3g} % force error", "no force error was measured")
+    felt = f"{_share(best.dc_ratio, '-')} of the stiffness, {error}"
+    return f"Nearest to the object with a guarantee ({best.guarantee}): {best.name}, {felt}."
 
 
 def _beside(made: Sequence[Alternative], own: Condition | None) -> render.Table:
@@ -127,7 +139,8 @@ def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
     report = Comparison.of(scenario, args.case, chosen, failed, args.seed)
     files = render.pictures(args, report, out, _PICTURES)
     prices = [line for c in report.couplings for line in _price(c.name, c.nearby)]
-    render.publish(args, report, [_guarantees(report), _feel(report)], [*report.notes, *prices], out, files)
+    lines, tables = [*report.notes, *prices], [_guarantees(report), _feel(report)]
+    render.publish(args, report, tables, lines, out, files, _guaranteed(report))
     return options.exit_code(not failed)
 
 
@@ -199,6 +212,13 @@ def _guarantees(report: Comparison) -> render.Table:
         "rms dB": lambda c: _mismatch(c, "rms_mismatch_db"),
     }
     return render.columns(title, cells, report.couplings)
+
+
+def _guaranteed(report: Comparison) -> str:
+    """Return the verdict: which couplings have a guarantee, and for what."""
+    guarantees = {coupling.name: coupling.assessment.guarantee for coupling in report.couplings}
+    words = [f"{name} ({guarantee.words if guarantee else 'none'})" for name, guarantee in guarantees.items()]
+    return f"Guarantee: {', '.join(words)}."
 
 
 def _mismatch(coupling: ComparedCoupling, of: str) -> str:

@@ -98,7 +98,9 @@ def main(argv: list[str]) -> int:
         claim,
     )
     title = f"{block.name} as C99"
-    render.publish(args, exported, [render.facts(title, render.rows_of(exported), left=True)])
+    proof = "the proof in its file was repeated" if verdict.proved else f"not proved: {verdict.reason}"
+    written = f"Wrote {path}: {block.name} as C99; {proof}."
+    render.publish(args, exported, [render.facts(title, render.rows_of(exported), left=True)], verdict=written)
     return options.exit_code(verdict.proved or not stored.certificate)
 
 

@@ -49,5 +49,10 @@ def main(argv: list[str]) -> int:
         first_difference_s=float(result.t[np.argmax(different)]) if different.any() else None,
         identical=compared.identical,
     )
-    render.publish(args, report, [render.facts(args.trace, render.rows_of(report))])
+    verdict = f"All {report.ticks} ticks give the recorded forces, bit by bit."
+    if not compared.identical:
+        verdict = (
+            f"Not identical: forces of {int(different.sum())} of {report.ticks} ticks differ from the recorded ones."
+        )
+    render.publish(args, report, [render.facts(args.trace, render.rows_of(report))], verdict=verdict)
     return options.exit_code(compared.identical)

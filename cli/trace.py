@@ -40,8 +40,19 @@ def main(argv: list[str]) -> int:
     traced = _Traced(args.trace, result.t.size, float(result.t[-1]), found)
     T = traced.duration_s / max(1, traced.ticks - 1)
     lines = [f"growth, {one.words(T)}" for one in found]
-    render.publish(args, traced, (), lines or ["no loop was closed at full gain: there is no growth to report"])
+    none = "No loop was closed at full gain: there is no growth to report."
+    render.publish(args, traced, (), lines, verdict=_verdict(found) if found else none)
     return options.DONE
+
+
+def _verdict(found: list[Growth]) -> str:
+    """Return whether an oscillation grows in any part of the trace."""
+    rates = [one for one in found if one.trend]
+    if not rates:
+        return "No growth rate can be given."
+    words = {"grows": "An oscillation grows", "neither": "An oscillation neither grows nor decays"}
+    worst = max(rates, key=lambda one: one.growth_rate_per_s or 0.0)
+    return f"{words.get(worst.trend or '', 'All oscillations decay')}: {worst.growth_rate_per_s:+.4g} 1/s."
 
 
 def _parser() -> options.Parser:

@@ -71,7 +71,8 @@ def main(argv: list[str]) -> int:
     title = f"{_span(grid.K)} N/m, B {_span(grid.B)} N s/m, {report.cells} couplings"
     unseen = friction_left_out(sweep.devices) if report.simulation.points else ()
     table = render.facts(f"K {title}", _rows(report), left=True)
-    render.publish(args, report, [table], [*_marked(report), *_remarks(report), *unseen], out, files)
+    lines = [*_marked(report), *_remarks(report), *unseen]
+    render.publish(args, report, [table], lines, out, files, _verdict(report))
     return options.exit_code(report.holds, drawn.interrupted)
 
 
@@ -156,6 +157,15 @@ def _plan(args: argparse.Namespace, sweep: zwidth.Sweep) -> Plan:
 
 # ----------------------------------------------------------------------------------------------------
 # The map in a few lines on the terminal.
+
+
+def _verdict(report: MapReport) -> str:
+    """Return what share of the map each condition certifies, and what share random hands leave stable."""
+    shares = ", ".join(f"{_share(report.ratios[name].certified_cells, report)} ({name})" for name in report.conditions)
+    crowd = report.population
+    return (
+        f"Certified: {shares}. Stable with all of {crowd.humans} random humans: {_share(crowd.stable_cells, report)}."
+    )
 
 
 def _rows(report: MapReport) -> render.Rows:
