@@ -70,7 +70,7 @@ figures: .venv/ready
 	cp out/figure-5/figure.png docs/pictures/figure-5.png
 	cp out/figure-6/figure.png docs/pictures/figure-6.png
 	$(PY) -m design.compare --coupling published,spring-damper:any-environment,spring-damper --out out/couplings
-	for name in required-damping perceived singular-values; do cp out/couplings/$$name.png docs/pictures/; done
+	for name in required-damping perceived; do cp out/couplings/$$name.png docs/pictures/; done
 	$(PY) -m sim.view --case I --video docs/pictures/view.gif --fps 5
 	cd docs/pictures && ../../$(PY) ../../examples/limits_of_any_coupling.py
 	$(PY) examples/wheel.py docs/pictures/wheel.png
