@@ -35,7 +35,7 @@ validate: .venv/ready
 	$(PY) -m pytest -m validate tests
 	$(PY) -m tests.checks.faults
 	$(PY) tests/tools/hostile.py --signals
-	$(PY) docs/regenerate.py --check
+	$(PY) tests/tools/regenerate.py --check
 	$(MAKE) installed
 
 firmware: .venv/ready
@@ -79,7 +79,7 @@ figures: .venv/ready
 	PYTHONPATH=. $(PY) tests/tools/pictures_of_worlds.py docs/pictures/worlds.png
 	$(PY) -m sim.zwidth --coupling optimal --out out/zwidth-optimal
 	cp out/zwidth-optimal/zwidth.png docs/pictures/zwidth-optimal.png
-	$(PY) docs/regenerate.py
+	$(PY) tests/tools/regenerate.py
 
 bench: .venv/ready
 	$(PY) -m pytest tests/benchmarks --benchmark-only -s

@@ -34,7 +34,7 @@ from haptic_loop.models.hold import hold
 from haptic_loop.models.human import Population
 from haptic_loop.models.scene import Crowd, HumanSets, Variants, crowds, draw_mechanics, variants
 from haptic_loop.sim.accuracy import simulated_growth
-from haptic_loop.sim.engines import EXPONENTIAL, LEAST, Engine, ExactEngine, MujocoBatchEngine, OneByOne
+from haptic_loop.sim.engines import EXPONENTIAL, Engine, ExactEngine, MujocoBatchEngine, OneByOne, least_substeps
 from haptic_loop.sim.run import Progress, Simulation, assemble, make_engine
 from haptic_loop.sim.scenario import Scenario
 from haptic_loop.sim.stability import (
@@ -292,9 +292,7 @@ _Other = Callable[[NDArray[np.intp], str, Timing | None], Engine]
 def _batch(
     held_by: Variants, T: float, threads: int, sets: NDArray[np.intp], integrator: str, timing: Timing | None
 ) -> Engine:
-    return MujocoBatchEngine(
-        held_by.taken(sets), T, integrator, 1 if integrator == EXPONENTIAL else LEAST, threads, timing
-    )
+    return MujocoBatchEngine(held_by.taken(sets), T, integrator, least_substeps(integrator), threads, timing)
 
 
 def _geometric_mean(values: Array) -> Array:

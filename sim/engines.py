@@ -182,10 +182,13 @@ INTEGRATORS = {
     "discrete": "mjINT_DISCRETE",
 }
 
-LEAST = 4  # steps per period of MuJoCo's own integrators
-
 _RESOLVED, _FOLLOWED = 0.2, 1.0  # what a step may advance the fastest mode [rad] and the strongest damping
 _WHOLE = 1e-9  # of a step: rounding, where a number of steps is counted
+
+
+def least_substeps(integrator: str) -> int:
+    """Return the default number of steps per period: 1 for the exponential integrator, 4 for MuJoCo's own."""
+    return 1 if integrator == EXPONENTIAL else 4
 
 
 def default_integrator(scene: Scene) -> str:
@@ -572,8 +575,10 @@ class _PlantSpeed:
         return self.mode * h <= _RESOLVED and self.rate * h < _FOLLOWED
 
     def substeps(self, T: float) -> int:
-        """The least number of steps in T seconds that follows it, LEAST at least."""
-        return max(LEAST, math.ceil(self.mode * T / _RESOLVED), math.floor(self.rate * T / _FOLLOWED) + 1)
+        """Return the least number of RK4 steps in T seconds that follows it."""
+        return max(
+            least_substeps("RK4"), math.ceil(self.mode * T / _RESOLVED), math.floor(self.rate * T / _FOLLOWED) + 1
+        )
 
     def hardest(self, h: float) -> str:
         """What a step of h seconds has most trouble with, in words."""

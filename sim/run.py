@@ -37,14 +37,13 @@ from haptic_loop.models.hold import HeldPlant, hold
 from haptic_loop.models.human import Hand, Person
 from haptic_loop.models.scene import Scene, build, quiet_warnings
 from haptic_loop.sim.engines import (
-    EXPONENTIAL,
-    LEAST,
     Engine,
     ExactEngine,
     ExactTimedEngine,
     MujocoEngine,
     RunsBlocks,
     default_integrator,
+    least_substeps,
     profiler_off,
 )
 from haptic_loop.sim.scenario import InputError, Scenario
@@ -350,8 +349,8 @@ def make_engine(
 ) -> Engine:
     """Return the engine of a name for one simulation; MuJoCo advances it by T seconds (default: the scenario's).
 
-    The default integrator is that of the scene; the default number of substeps is 1 for the exponential one and 4 for
-    others. An engine of the user's own is used as it is, or made from the simulation.
+    The default integrator is that of the scene, the default number of substeps that of `least_substeps`. An engine of
+    the user's own is used as it is, or made from the simulation.
     Raises ValueError for an unknown name or an object that is no engine, for the exact engine with Coulomb friction,
     and for an engine of the user's own with uneven ticks.
     """
@@ -366,7 +365,7 @@ def make_engine(
             return ExactTimedEngine(simulation.scene.plant, simulation.timing)
         return ExactEngine(simulation.plant)
     integrator = integrator or default_integrator(simulation.scene)
-    count = substeps if substeps is not None else 1 if integrator == EXPONENTIAL else LEAST
+    count = least_substeps(integrator) if substeps is None else substeps
     if T is not None:
         return MujocoEngine(simulation.scene, T, integrator, count)
     return MujocoEngine(simulation.scene, simulation.scenario.T, integrator, count, simulation.timing)

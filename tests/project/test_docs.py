@@ -11,7 +11,7 @@ import pytest
 from forked import run
 
 ROOT = Path(__file__).parents[2]
-_spec = importlib.util.spec_from_file_location("regenerate", ROOT / "docs/regenerate.py")
+_spec = importlib.util.spec_from_file_location("regenerate", ROOT / "tests/tools/regenerate.py")
 regenerate = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(regenerate)
 
@@ -68,7 +68,7 @@ def test_every_command_runs(command, place, printed):
 
 @pytest.mark.parametrize(("page", "command", "pattern", "shown"), QUICK, ids=[block[1] for block in QUICK])
 def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown, place, printed):
-    """`python docs/regenerate.py` writes it anew."""
+    """`python tests/tools/regenerate.py` writes it anew."""
     output = printed.get(command) or run(command, place).stdout
     fresh = regenerate.kept(output, pattern).splitlines()
     assert shown.splitlines()
@@ -84,7 +84,7 @@ def test_designs_named_in_sentences_exist(command, place):
 
 @pytest.mark.parametrize(("page", "command", "pattern", "shown"), MEASURED, ids=[block[1] for block in MEASURED])
 def test_measured_output_is_of_a_command_that_exists(page, command, pattern, shown):
-    """Minutes, and times: not run here, `python docs/regenerate.py --check` compares all but times."""
+    """Minutes, and times: not run here, `python tests/tools/regenerate.py --check` compares all but times."""
     module = command.split()[2]
     assert importlib.util.find_spec(module) is not None
     assert shown

@@ -1,4 +1,4 @@
-"""python docs/regenerate.py: run what README and docs command, and write the real output where a block asks for it.
+"""python tests/tools/regenerate.py: run the commands of README and docs, and write their output where a block asks.
 
 `--check` runs the slow commands alone (`make validate` does) and compares what they print with what the pages show, of
 what is measured all but times: exit code 1 where that is something else.
@@ -35,7 +35,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 _BLOCK = r"(<!-- {}(?:: (.+))? -->\n```{}\n\$ (python (?:-m|examples/).+)\n)((?:(?!.*```).*\n)*)(?=```)"
 SHOWN = re.compile(_BLOCK.format("output", "console"))
