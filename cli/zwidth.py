@@ -6,7 +6,7 @@ options -> CouplingSweep or EnvironmentSweep -> Grid -> Map -> files
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import msgspec
 import numpy as np
@@ -28,14 +28,14 @@ _EXAMPLES = (
     "python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0",
     "python -m sim.zwidth --coupling optimal --grid 10",
 )
-_FINEST = 1e-5  # [m] least default threshold: the resolution of a desk device's encoders
+_FINEST = 1e-5  # [m] least amplitude that counts as an oscillation: the resolution of a desk device's encoders
+_PRESS = 3.0  # [N] steady force of a hand; the soft environments of a map over environments give way to it
 
 
 def main(argv: list[str]) -> int:
     """Draw a map. 0: nothing contradicts it and every mark is certified, 1: else, 130: interrupted."""
     args = _parser().parse_args(argv)
     of_coupling = args.coupling is None
-    args.press = (3.0 if of_coupling else 0.0) if args.press is None else args.press
     scenario = options.scenario_from(args)
     require_no_world(scenario, "sim.zwidth")
     require_constant_delay(scenario, "sim.zwidth")
@@ -54,7 +54,7 @@ def main(argv: list[str]) -> int:
     marks = tuple(args.mark)
     args.grid = args.grid or (60 if of_coupling and not sweep.walls else 24)
     grid = zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, marks)
-    plan, out = _plan(args, sweep), options.out_folder(args, "zwidth")
+    plan, out = _plan(args, sweep, of_coupling), options.out_folder(args, "zwidth")
 
     crowd = HeldDevices.drawn(
         sweep.devices, sweep.population, sweep.loop.T, args.seed, args.humans, latency=sweep.loop.latency
@@ -95,32 +95,18 @@ def _parser() -> options.Parser:
     of_map.add_argument("--mark", type=_mark, action="append", default=[], metavar="K,B", help=mark)
     humans = "random humans per device (default 200)"
     of_map.add_argument("--humans", type=options.whole(1, 100_000), default=200, metavar="N", help=humans)
-    _add_points(parser)
+    points = parser.add_argument_group("the points simulated in MuJoCo")
+    rows = "rows and columns of them (default 10, 0 for none)"
+    points.add_argument("--points", type=options.whole(0, 400), metavar="N", default=10, help=rows)
+    points.add_argument("--duration", type=options.number(), metavar="SECONDS", default=3.0, help="of each (default 3)")
     parser.add_output(picture=True)
     parser.set_defaults(limiter=None)  # the simulated motors never clip
-    simulated = ("trials", "duration", "start", "press", "threshold")
-    parser.only("about simulated points: --points 0 has none", lambda args: args.points, *simulated)
+    parser.only("about simulated points: --points 0 has none", lambda args: args.points, "duration")
     designed = "with --coupling, or of your own: nothing else is designed"
     parser.only(designed, lambda args: args.coupling or name_and_own(args.condition)[1], "condition")
     gains = "for a map of spring-dampers: with --coupling the axes are the environment's"
     parser.only(gains, lambda args: args.coupling is None, "rigid")
     return parser
-
-
-def _add_points(parser: options.Parser) -> None:
-    points = parser.add_argument_group("the points simulated in MuJoCo")
-
-    def add(name: str, kind: Callable[[str], float], metavar: str, what: str, default: float | None = None) -> None:
-        points.add_argument(f"--{name}", type=kind, metavar=metavar, default=default, help=what)
-
-    add("points", options.whole(0, 400), "N", "rows and columns of them (default 10, 0 for none)", 10)
-    add("trials", options.whole(1, 100), "N", "humans at each, the most critical (default 1)", 1)
-    add("duration", options.number(), "SECONDS", "of each (default 3)", 3.0)
-    add("start", options.number(1e-9, 1, "m"), "METRES", "first swing of motor or handle (default 1e-3)", 1e-3)
-    pressing = "steady force of every hand (default 3; 0 with --coupling, whose soft environments give way to it)"
-    add("press", options.number(0, 1e3, "N"), "NEWTONS", pressing)
-    swing = "amplitude of an oscillation (default 2 steps or 1e-5)"
-    add("threshold", options.number(1e-9, 1, "m"), "METRES", swing)
 
 
 def _mark(text: str) -> tuple[float, float]:
@@ -146,13 +132,13 @@ def _sweep(args: argparse.Namespace, scenario: Scenario, chosen: Chosen | None) 
         return zwidth.CouplingSweep(devices, scenario.population, loop, own=name_and_own(args.condition)[1])
 
 
-def _plan(args: argparse.Namespace, sweep: zwidth.Sweep) -> Plan:
+def _plan(args: argparse.Namespace, sweep: zwidth.Sweep, of_coupling: bool) -> Plan:
     coarsest = max(float(np.max(device.encoder_step)) for device in sweep.devices)
-    threshold = max(2 * coarsest, _FINEST) if args.threshold is None else args.threshold
+    threshold = max(2 * coarsest, _FINEST)
     shortest = max(1.5, 1024 * sweep.loop.T)
     if not shortest <= args.duration <= 1e4:
         raise InputError(f"--duration is {args.duration:g}, allowed are {shortest:g} to 10000 s")
-    return Plan(args.points, args.trials, args.start, args.press, args.duration, threshold)
+    return Plan(args.points, _PRESS if of_coupling else 0.0, args.duration, threshold)
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -1,8 +1,8 @@
-"""Which loops go on oscillating in human hands: exactly with every human, in MuJoCo with the worst of them.
+"""Which loops go on oscillating in human hands, by eigenvalues for every human and in MuJoCo for the worst.
 
-A cell is a force map F, and a process that computes it. `HeldDevices` closes F around the devices in the hands of every
-human and gives the growth of the dominant mode. `simulate_cells` runs many cells, each with a process of its own, as
-one MuJoCo batch, with the effects that no theory covers switched on.
+A cell is a force map F and a process that computes it. `HeldDevices` closes F around the devices in the hands of every
+human and gives the growth of the dominant mode. `simulate_cells` runs many cells as one MuJoCo batch, with encoder
+steps, friction and walls.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _LEADING = 0.1  # share of the humans that meet every cell; the rest meet those 
 
 @dataclass(frozen=True, eq=False)
 class HeldDevices:
-    """The devices in the hands of every human, sampled; in groups of humans with the same number of links."""
+    """Sampled devices in the hands of every human, in groups of humans with the same number of links."""
 
     devices: tuple[Device, ...]  # (m,)
     T: float  # [s]
@@ -58,9 +58,11 @@ class HeldDevices:
         links: int | None = None,
         latency: Sequence[tuple[float, float]] | None = None,
     ) -> HeldDevices:
-        """Random humans with the devices; of so many links each, by default as their population says.
+        """Draw random humans for the devices.
 
-        With a latency (m,) [s] forces latch at its later end.
+        Args:
+            links: Links of each human; None: as the population says.
+            latency: (m,) earliest and latest latching of forces [s]; they latch at the latest.
         """
         late = None if latency is None else tuple(most for _, most in latency)
         groups = []
@@ -75,16 +77,16 @@ class HeldDevices:
         return sum(index.size for index, *_ in self.groups)
 
     def links(self, human: int) -> Array:
-        """(m, links, 3) of one human, as in Crowd."""
+        """Return the links (m, links, 3) of one human, as in `Crowd`."""
         (_, crowd, *_), i = self._place(human)
         return crowd.links[i]
 
     def growth(
         self, F: Lti, humans: NDArray[np.bool_] | None = None, min_frequency_hz: float = _MIN_FREQUENCY_HZ
     ) -> tuple[Array, Array]:
-        """Growth [1/s] of the dominant mode, and of the dominant one above `min_frequency_hz`, with every human (n,).
+        """Return two growth rates (n,) [1/s] for every human: of the dominant mode, and of that above a frequency.
 
-        Where `humans` (n,) is false nothing is computed, and the answer is -inf.
+        Humans for which `humans` (n,) is false are skipped; their growth is -inf.
         """
         n = len(self)
         everything, turning = np.full((2, n), -np.inf)
@@ -98,8 +100,10 @@ class HeldDevices:
         return everything, turning
 
     def mode(self, F: Lti, human: int, min_frequency_hz: float) -> Array:
-        """The dominant mode above that frequency with one human, as a state [s; z]: the motor or handle that moves most
-        moves by 1 m."""
+        """Return the dominant mode above a frequency with one human, as a state [s; z].
+
+        It is scaled so that the motor or handle that moves most moves by 1 m.
+        """
         (_, _, plants, seen), i = self._place(human)
         values, vectors = np.linalg.eig(close(HeldPlant(plants.A[i], plants.B[i], plants.C, plants.T), F).A)
         fast = np.abs(np.angle(values)) >= 2 * np.pi * min_frequency_hz * plants.T
@@ -108,7 +112,7 @@ class HeldDevices:
         return (vector / positions[np.argmax(np.abs(positions))]).real
 
     def leading(self, some: Sequence[Lti]) -> NDArray[np.bool_]:
-        """The tenth (8 at least) of the humans that are unstable with most of these maps, then nearest to it."""
+        """Return the tenth of the humans (at least 8) that are unstable or nearest to it with most of these maps."""
         growths = np.array([self.growth(F)[1] for F in some])
         score = (growths > 0).sum(axis=0) + np.clip(growths, -100, 100).mean(axis=0) / 1000
         first = np.zeros(len(self), dtype=bool)
@@ -116,7 +120,7 @@ class HeldDevices:
         return first
 
     def _place(self, human: int) -> tuple[tuple[Cells, Crowd, HeldPlant, tuple[int, ...]], int]:
-        """The group of a human, and the position in it."""
+        """Return the group of a human and its position in the group."""
         for group in self.groups:
             at = np.flatnonzero(group[0] == human)
             if at.size:
@@ -125,26 +129,27 @@ class HeldDevices:
 
 
 def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
-    """Their positions in a plant state; of a rigid device they are one."""
+    """Return the indices of motors and handles in a plant state; a rigid device has one."""
     return tuple(dict.fromkeys((*range(scene.channels), *scene.handles)))
 
 
 # ----------------------------------------------------------------------------------------------------
 # Cells in MuJoCo, with the encoder steps, the friction and the walls of the scenario. The human that is nearest to
 # oscillating, by the exact linear loop, holds the devices. The loop starts on that mode, so far out that Coulomb
-# friction does not hold it; the hand presses with a constant force, eased in; the end of the trace decides.
+# friction does not hold it. The hand presses with a constant force, which grows smoothly. The end of the trace decides.
 
 
 _UNLIMITED = 1e6  # [N] the largest force limit that a device may have
 _BATCH = 20  # simulations in one MuJoCo batch
 _EASE = 0.5  # [s] in which the press grows
+_START = 1e-3  # [m] displacement of the motor or handle that moves most, at the start
 _BLOCK = 64  # ticks between two looks at the keyboard
 DECIDED = 0.2  # [1/s] linear growth nearer to zero than this does not show within a trace
 UNDECIDED = "too slow to say"  # verdict where the trace goes on oscillating as the linear loop would, decaying or not
 
 
 def unlimited(devices: Sequence[Device]) -> tuple[Device, ...]:
-    """The devices with motors that never clip: a map shows the loop below its force limits."""
+    """Return the devices with motors that never clip: a map shows the loop below its force limits."""
     return tuple(msgspec.structs.replace(device, force_limit=_UNLIMITED) for device in devices)
 
 
@@ -153,16 +158,14 @@ class Plan:
     """How cells are simulated."""
 
     points: int  # rows and columns of the grid that are simulated; 0 for none
-    trials: int  # humans at each cell
-    start: float  # [m] displacement of the motor or handle that moves most, at the start
-    press: float  # [N]
+    press: float  # [N] steady force of every hand
     duration: float  # [s]
     threshold: float  # [m] amplitude above which a handle oscillates
 
     @property
     def runaway_growth(self) -> float:
-        """[1/s] A mode that grows faster has diverged by the end of the trace, whether it swings or not."""
-        return 1.2 * np.log(RUNAWAY / self.start) / self.duration
+        """Return the growth [1/s] above which a mode has diverged by the end of the trace, whether it swings or not."""
+        return 1.2 * np.log(RUNAWAY / _START) / self.duration
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,31 +173,31 @@ class Points:
     """The simulated cells, (k,) each."""
 
     cell: Cells  # flat index in the grid
-    oscillates: NDArray[np.bool_]  # to the end of the trace, with any of the humans that were tried
-    amplitude: Array  # [m] the largest among them that decided; inf: diverged
-    frequency_hz: Array  # [Hz] of it; nan: diverged
-    growth: Array  # [1/s] of the exact loop's dominant mode, swinging or running away, with the worst of these humans
+    oscillates: NDArray[np.bool_]  # to the end of the trace
+    amplitude: Array  # [m] of the oscillation; inf: diverged
+    frequency_hz: Array  # [Hz] of the oscillation; nan: diverged
+    growth: Array  # [1/s] of the exact loop's dominant mode, swinging or running away
 
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:
-        """The cells of all parts in one; no cells where there are no parts."""
+        """Join parts; without parts there are no cells."""
         if not parts:
             return cls(np.zeros(0, dtype=int), np.zeros(0, dtype=bool), *np.zeros((3, 0)))
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
 
     @property
     def near(self) -> NDArray[np.bool_]:
-        """Whether the linear loop neither grows nor decays enough to be told from a limit cycle."""
+        """Return where the linear loop grows or decays too slowly to be told from a limit cycle."""
         return np.abs(self.growth) <= DECIDED
 
     @property
     def differ(self) -> NDArray[np.bool_]:
-        """Whether MuJoCo does what the linear loop clearly does not."""
+        """Return where MuJoCo contradicts a linear loop that clearly grows or decays."""
         return ~self.near & ((self.growth > 0) != self.oscillates)
 
     @property
     def verdicts(self) -> list[str]:
-        """Each one "rests", "oscillates" or UNDECIDED."""
+        """Return "rests", "oscillates" or UNDECIDED for each cell."""
         words = np.where(self.oscillates, np.where(self.near, UNDECIDED, "oscillates"), "rests")
         return [str(word) for word in words]
 
@@ -206,18 +209,21 @@ _Loops = Callable[[Cells], tuple[Lti, Sequence[Process]]]
 def simulate_cells(
     cells: Cells, loops: _Loops, held: HeldDevices, plan: Plan, press: Array, progress: Progress
 ) -> tuple[Points, bool]:
-    """These cells, in batches of whole ones, and whether the keyboard ended it; `press` (m,) [N] is the hands' push."""
+    """Simulate cells in batches, and return the points and whether the keyboard interrupted.
+
+    `press` (m,) [N] are the steady forces of the hands.
+    """
     parts: list[Points] = []
-    size, ticks = max(1, _BATCH // plan.trials), round(plan.duration / held.T)
+    ticks = round(plan.duration / held.T)
     try:
-        for first in range(0, cells.size, size):
-            some, seen = cells[first : first + size], 0
+        for first in range(0, cells.size, _BATCH):
+            some, seen = cells[first : first + _BATCH], 0
             trials, growth = _trials(*loops(some), held, plan)
 
             def ticked(count: int, first: int = first) -> None:
                 nonlocal seen
                 seen += count
-                progress(first * ticks + min(seen, ticks) * min(size, cells.size - first), cells.size * ticks)
+                progress(first * ticks + min(seen, ticks) * min(_BATCH, cells.size - first), cells.size * ticks)
 
             parts.append(_points(some, growth, trials, held, plan, press, ticked))
     except KeyboardInterrupt:
@@ -235,17 +241,16 @@ class _Trial:
 
 
 def _trials(F: Lti, processes: Sequence[Process], held: HeldDevices, plan: Plan) -> tuple[list[_Trial], Array]:
-    """The trials of these cells, plan.trials of each in succession, and the growth of the worst of each."""
+    """Return one trial for each cell, with the human nearest to oscillating, and the growth with that human."""
     slowest, trials, growth = slowest_seen(plan.duration), [], []
     for i, process in enumerate(processes):
         whole, swinging = held.growth(F[i], min_frequency_hz=slowest)
         runs_away = whole > plan.runaway_growth  # without an oscillation: what pushes outwards at rest
         shown = np.where(runs_away, whole, swinging)
-        worst = np.argsort(-shown, kind="stable")[: plan.trials]
-        for human in worst.tolist():
-            mode = held.mode(F[i], human, 0.0 if runs_away[human] else slowest)
-            trials.append(_Trial(process, held.links(human), plan.start * mode))
-        growth.append(shown[worst[0]])
+        human = int(np.argmax(shown))
+        mode = held.mode(F[i], human, 0.0 if runs_away[human] else slowest)
+        trials.append(_Trial(process, held.links(human), _START * mode))
+        growth.append(shown[human])
     return trials, np.array(growth)
 
 
@@ -258,23 +263,20 @@ def _points(
     press: Array,
     ticked: Callable[[int], None],
 ) -> Points:
-    """Simulate the trials of these cells, plan.trials of each in succession."""
+    """Simulate the trials of these cells."""
     lasting, amplitude, frequency = np.zeros(len(trials), dtype=bool), np.zeros(len(trials)), np.zeros(len(trials))
     links = np.array([trial.links.shape[1] for trial in trials])
     for count in np.unique(links):
         which = np.flatnonzero(links == count)
         found = _simulate([trials[i] for i in which], held, press, plan, ticked)
         lasting[which], amplitude[which], frequency[which] = found.sustained, found.amplitude, found.frequency_hz
-    shape = (cells.size, -1)
-    shown = np.where(lasting, amplitude + 1e9, amplitude).reshape(shape).argmax(axis=1)[:, None]
-    pick = lambda values: np.take_along_axis(values.reshape(shape), shown, axis=1)[:, 0]  # noqa: E731
-    return Points(cells, np.any(lasting.reshape(shape), axis=1), pick(amplitude), pick(frequency), growth)
+    return Points(cells, lasting, amplitude, frequency, growth)
 
 
 def _simulate(
     trials: Sequence[_Trial], held: HeldDevices, press: Array, plan: Plan, ticked: Callable[[int], None]
 ) -> Oscillation:
-    """All trials at once; their humans must have the same number of links. `press` (m,) [N]."""
+    """Simulate all trials together; their humans must have the same number of links. `press` is (m,) [N]."""
     T = trials[0].process.F.T
     held_by = variants(unlimited(held.devices), Crowd(np.stack([trial.links for trial in trials])))
     scene, ticks = held_by.scene, round(plan.duration / T)
@@ -285,7 +287,7 @@ def _simulate(
     together = law.together([process.law for process in processes])
     buffer = StepBuffer(processes[0], min(_BLOCK, ticks), n, scene.outside, len(trials), together)
     buffer.s[0] = starts[:n]
-    if not (law.walls or law.bounds):  # the states of a process with walls or a limiter are others: it begins at rest
+    if not (law.walls or law.bounds):  # A process with walls or a limiter has other states and begins at rest.
         buffer.z[0] = starts[n:]
     seen, kept, done = list(_motors_and_handles(scene)), [], 0
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
@@ -303,7 +305,7 @@ def _simulate(
 
 
 def _press_forces(scene: Scene, T: float, press: Array, first: int, ticks: int) -> Array:
-    """Outside forces [N], (ticks, outside): `press` (m,) on the ends of the humans."""
+    """Return the outside forces (ticks, outside) [N]: `press` (m,) on the ends of the humans."""
     t = (first + np.arange(ticks)) * T
     eased = np.where(t < _EASE, (1 - np.cos(np.pi * t / _EASE)) / 2, 1.0)
     w = np.zeros((ticks, scene.outside))

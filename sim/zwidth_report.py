@@ -129,9 +129,7 @@ class _Simulated:
 
     effects: Shown
     nonlinear: bool
-    trials: int
     duration_s: float
-    start_m: float
     press_n: float
     threshold_m: float
     from_hz: float
@@ -150,9 +148,7 @@ class _Simulated:
         return cls(
             Shown(steps, friction, sweep.walls),
             sweep.walls or any(steps) or any(friction),
-            plan.trials,
             plan.duration,
-            plan.start,
             plan.press,
             plan.threshold,
             slowest_seen(plan.duration),

@@ -328,7 +328,7 @@ def test_coulomb_friction_stops_a_device_where_coulomb_says():
 
 def points(sweep, K, B, **changes):
     """The simulated points of a 2 x 2 map whose corners they are."""
-    settings = {"points": 2, "trials": 1, "start": 1e-3, "press": 3.0, "duration": 2.0, "threshold": 2e-5} | changes
+    settings = {"points": 2, "press": 3.0, "duration": 2.0, "threshold": 2e-5} | changes
     grid = Grid(np.array(K), np.array(B), "linear")
     crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 0, 40, 1)
     return draw_map(sweep, grid, crowd, Plan(**settings), lambda *stage: None).points

@@ -15,7 +15,7 @@ NO_NUMBERS = ("x", "", "nan", "1,,2", "\x1b[31m1", "9" * 5000, "-1e999")
 NUMERIC = {
     "run": "theta psi lam delta T T-max latency loss varying-delay energy-budget substeps duration vertex seed",
     "validate": "humans shards generations duration seed theta",
-    "zwidth": "grid K-range B-range mark humans points trials duration start press threshold",
+    "zwidth": "grid K-range B-range mark humans points duration",
     "view": "fps duration",
     "accuracy": "duration",
     "design": "ranges samples band high-gain seconds order varying-delay delta",
