@@ -619,7 +619,7 @@ _NONE = "no energy (lemma)"
 _BOUNDED = "lemma, up to what contacts create (printed by a run)"
 _ROW = "lemma with the row term: may create energy, the shell acts"
 _SMALL = "measured: small; the shell"
-_VARYING = "measured: small, up to 17 mJ if made at speed; the shell"
+_VARYING = "measured: small unless made at speed; the shell"
 _TURNING = "measured: small for slow motion; the shell"
 _SHELL = "the shell only"
 

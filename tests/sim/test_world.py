@@ -230,41 +230,35 @@ def test_an_active_scene_is_held_back(tmp_path):
     assert acted > 0
 
 
-THROWN_AT = """<mujoco><option gravity="0 0 0"/><default><geom solimp="0.99 0.99 0.001" solref="0.02 1"/></default>
-<worldbody><geom type="box" size="0.01 0.1 0.1" pos="0.2 0 0"/><geom type="box" size="0.01 0.1 0.1" pos="-0.2 0 0"/>
-<body name="left" pos="-0.05 0 0"><geom type="sphere" size="0.01"/></body>
-<body name="right" pos="0.05 0 0"><geom type="sphere" size="0.01"/></body>
-<body name="load"><joint type="slide" axis="1 0 0"/><geom type="box" size="0.03 0.03 0.03" mass="0.2"/></body>
-</worldbody></mujoco>"""
-
-
-def thrown_masses(loop: Scenario, seed: int, start: float) -> tuple[float, int]:
-    """Least energy at the port [J], and ticks of the shell, for two masses thrown at free bodies and walls."""
-    coupling = SpringDamper([1500.0, 1500.0], [0.5, 0.5])
+def thrown_at_walls(loop: Scenario, start: float) -> tuple[float, int]:
+    """Least energy at the port [J], and ticks of the shell: hands of 1 kg, each on a spring, thrown at 1.5 m/s."""
+    coupling = SpringDamper([1000.0, 1000.0], [0.5, 0.5])
     port, shell = scene_of(loop, coupling).port(), Shell(coupling.compliance(T), start=start)
-    rng = np.random.default_rng(seed)
-    x, v = np.zeros(2), 0.5 * rng.normal(size=2)
-    stiffness, mass = rng.choice([0.0, 50.0, 500.0]), 0.55 * np.exp(rng.normal())
-    at_port, least, before = 0.0, 0.0, port.u
+    x, v, at_port, least, before = np.zeros(2), np.array([-1.5, 1.5]), 0.0, 0.0, port.u
     for _ in range(250):
         wanted = port.step(shell.free(x[:, None])[:, 0])
         shell.credit([port.released])
         force, u = shell.limit(wanted[:, None])
         at_port, before = at_port + float(force[:, 0] @ (u[:, 0] - before)), u[:, 0]
         least = min(least, at_port)
-        v = v - T * (force[:, 0] + stiffness * x) / mass
+        v = v - T * (force[:, 0] + 50.0 * x)
         x = x + T * v
     return least, int(shell.limited[0])
 
 
-def test_contacts_that_multiply_a_mass_are_held_back(tmp_path):
-    """d = 0.99 makes a body's mass apparently a hundredfold: the scene gives, and the shell lets W0 through."""
-    loop = scenario(tmp_path, THROWN_AT)
-    free, held = ([thrown_masses(loop, seed, start) for seed in range(8)] for start in (1e3, START_J))
-    assert min(least for least, _ in free) < -5e-3
-    assert not sum(acted for _, acted in free)
-    assert min(least for least, _ in held) >= -START_J - 1e-12
-    assert sum(acted for _, acted in held) > 0
+@pytest.mark.parametrize(("impedance", "gives_J"), [("0.9 0.95", 0.04), ("0.99 0.99", 0.15), ("0.9 0.9", 0.0)])
+def test_contacts_that_multiply_a_mass_are_held_back(tmp_path, impedance, gives_J):
+    """Contacts of 0.1 kg are made at speed: d = 0.99 and MuJoCo's default give, and the shell lets W0 through."""
+    tips = '<body name="{}" pos="{} 0 0"><geom size="0.01" mass="0.1"/></body>'
+    walls = "".join(f'<geom type="box" size="0.01 0.1 0.1" pos="{x} 0 0"/>' for x in (-0.2, 0.2))
+    text = f"""<mujoco><option gravity="0 0 0"/><default><geom solimp="{impedance} 0.001"/></default><worldbody>{walls}
+    {tips.format("left", -0.05)}{tips.format("right", 0.05)}</worldbody></mujoco>"""
+    loop = scenario(tmp_path, text)
+    (least, idle), (held, acted) = (thrown_at_walls(loop, start) for start in (1e3, START_J))
+    assert least <= -gives_J
+    assert held >= -START_J - 1e-12
+    assert not idle
+    assert (acted > 0) == (gives_J > 0)
 
 
 # ---- what is claimed
