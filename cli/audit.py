@@ -180,15 +180,18 @@ def _list_devices(args: argparse.Namespace) -> int:
 def _audited_world(args: argparse.Namespace, scenario: Scenario) -> int:
     """Audit a coupling, by default the stiffest certified one, in a MuJoCo world."""
     from haptic_loop.cli import world
+    from haptic_loop.design.lmi import ANY_ENVIRONMENT
+    from haptic_loop.design.result import Chosen
     from haptic_loop.sim.couplings import choose
 
-    named_here = args.K or args.B or args.coupling or args.case == "none"
-    if named_here:
-        coupling, kind = _coupling(args, scenario.loop(args.case), scenario), args.coupling or "spring-damper"
+    if args.coupling and Path(args.coupling).exists():
+        chosen = choose(scenario, args.case, args.coupling)
+    elif args.K or args.B or args.coupling or args.case == "none":
+        made = _coupling(args, scenario.loop(args.case), scenario)
+        chosen = Chosen(made, ANY_ENVIRONMENT.name, kind=args.coupling or "spring-damper")
     else:
         chosen = choose(scenario, args.case)
-        coupling, kind = chosen.coupling, chosen.kind
-    return world.audit(args, scenario, coupling, kind, options.out_folder(args, "audit"))
+    return world.audit(args, scenario, chosen, options.out_folder(args, "audit"))
 
 
 def _is_own(args: argparse.Namespace) -> bool:

@@ -19,7 +19,6 @@ from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.designs import name_and_own
 from haptic_loop.design.export import (
     ExportedBlock,
-    NothingToExport,
     c_source,
     coupling_block,
     in_single_precision,
@@ -131,9 +130,7 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: st
     limit = options.per_channel("--force-limit", args.force_limit, stored.loop.channels) if args.force_limit else None
     try:
         block = process_block(stored, not args.without_theta, limit) if args.process else coupling_block(stored)
-    except NothingToExport as error:
-        raise InputError(f"{args.coupling}: {error} (--process)") from None
-    except ValueError as error:  # coefficients beyond floating point
+    except ValueError as error:  # also coefficients beyond floating point
         raise InputError(f"{args.coupling}: {error}") from None
     block = with_origin(block, Path(args.coupling).name, stored, verdict, claim)
     return in_single_precision(block) if args.float else block

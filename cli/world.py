@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from haptic_loop.cli import options, render
-from haptic_loop.controller.coupling import Coupling
 from haptic_loop.design.api import proved, store
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.designs import design_by_kind
@@ -228,12 +227,12 @@ def design(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
     return options.exit_code(report.guaranteed)
 
 
-def audit(args: argparse.Namespace, scenario: Scenario, coupling: Coupling, kind: str, out: Path) -> int:
+def audit(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, out: Path) -> int:
     """Say what is in a scene and what adversaries reached. 0: the coupling is certified for any environment, 1: not."""
     began = time.perf_counter()
-    report = _reported(args, scenario, Chosen(coupling, ANY_ENVIRONMENT.name, kind=kind), START_J)
+    report = _reported(args, scenario, chosen, START_J)
     with render.progress("attacking"):
-        least = least_at_port(scenario, coupling, args.seed)
+        least = least_at_port(scenario, chosen.coupling, args.seed)
     report = replace(report, least_at_port_J=least, wall_s=time.perf_counter() - began)
     rows = [*_common_rows(report), *((f"least energy, {name}", _energy(value)) for name, value in least.items())]
     rows.append(("active parts", ", ".join(report.scene.active) or None))

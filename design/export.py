@@ -92,7 +92,8 @@ def coupling_block(stored: Stored) -> ExportedBlock:
     """V(z), force to displacement. Raises NothingToExport where the coupling is no V in feedback."""
     V = stored.built().compliance(stored.loop.T)
     if V is None:
-        raise NothingToExport("this coupling is no V in feedback around the environment; the whole process can be had")
+        reason = "this coupling is no V in feedback around the environment; the whole process can be had (--process)"
+        raise NothingToExport(reason)
     about = ("d = V f: what the coupling gives way by. In its loop the environment sees u = x - d, and f = Psi E u.",)
     return ExportedBlock("coupling", _with_a_state(V), _FORCE, _GIVEN_WAY, about)
 
@@ -106,6 +107,8 @@ def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence
     loop, delays = stored.loop, _delays(stored.loop, with_theta)
     if not with_theta:
         loop = loop.delayed((0,) * loop.channels)
+    if getattr(loop.environment, "world", None):
+        raise NothingToExport("a MuJoCo world is no linear block: export the coupling alone, without --process")
     if loop.environment.walls:
         raise NothingToExport("environment.walls: contact that makes and breaks is not a linear block")
     if force_limit is not None:

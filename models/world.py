@@ -279,7 +279,7 @@ class World:
         """Actuators, plugins and callbacks of the scene, which only the energy account covers; one text for each."""
         m = self.model
         listed = [f"actuator {m.actuator(i).name or i}" for i in range(m.nu)]
-        listed += [f"plugin {i}" for i in range(m.nplugin)]
+        listed += [f"plugin {m.plugin(i).name or i}" for i in range(m.nplugin)]
         callbacks = ("passive", "control", "act_dyn", "act_gain", "act_bias", "contactfilter")
         for name in callbacks:
             get = getattr(mujoco, f"get_mjcb_{name}", None)
@@ -617,7 +617,7 @@ class Rows:
 
 _NONE = "no energy (lemma)"
 _BOUNDED = "lemma, up to what contacts create (printed by a run)"
-_ROW = "lemma with the row term: may create energy, the shell acts"
+_ROW = "lemma with the row term: may create energy; the shell"
 _SMALL = "measured: small; the shell"
 _VARYING = "measured: small unless made at speed; the shell"
 _TURNING = "measured: small for slow motion; the shell"
@@ -626,11 +626,15 @@ _SHELL = "the shell only"
 
 def _parts(m: mujoco.MjModel, slides: set[int]) -> Iterator[Part]:
     joints = [i for i in range(m.njnt) if i not in slides]
-    turning = sum(m.jnt_type[i] != mujoco.mjtJoint.mjJNT_SLIDE for i in joints)
-    if len(joints) > turning:
-        yield Part("bodies that translate", len(joints) - turning, _NONE)
+    movable, turns = set(m.jnt_bodyid[joints].tolist()), np.zeros(m.nbody, dtype=bool)
+    turns[m.jnt_bodyid[m.jnt_type != mujoco.mjtJoint.mjJNT_SLIDE]] = True
+    for body in range(1, m.nbody):  # parents come before their children
+        turns[body] |= turns[m.body_parentid[body]]
+    turning = sum(bool(turns[body]) for body in movable)
+    if len(movable) > turning:
+        yield Part("bodies that translate", len(movable) - turning, _NONE)
     if turning:
-        yield Part("joints that turn", turning, _TURNING)
+        yield Part("bodies that turn", turning, _TURNING)
     springs = int((m.jnt_stiffness[joints] != 0).sum())
     if springs:
         yield Part("joint springs", springs, _NONE)

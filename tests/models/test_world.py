@@ -227,6 +227,24 @@ def test_a_contact_creates_no_more_than_the_lemma(tmp_path, scene):
     assert count_of_the_lemma(tmp_path, scene, 600) > 1000
 
 
+def test_friction_loss_takes_more_than_it_creates(tmp_path):
+    """Two contacts push a body with 2 N of friction loss to and fro: the port never gives."""
+    loss = '<joint type="slide" axis="1 0 0" frictionloss="2"/>'
+    tips = "".join(
+        f'<body name="{n}" pos="{x} 0 0"><geom size="0.01"/></body>' for n, x in (("left", -4e-2), ("right", 4e-2))
+    )
+    box = f'<body>{loss}<geom type="box" size="0.03 0.03 0.03" mass="0.2" solimp="0.9 0.9"/></body>'
+    port = world(tmp_path, f"<mujoco><worldbody>{tips}{box}</worldbody></mujoco>", G=(1500.0, 1500.0)).port()
+    rng, u0, v, at_port, before = np.random.default_rng(0), np.zeros(2), np.zeros(2), 0.0, port.u
+    for _ in range(1500):
+        v = 0.98 * v + 0.1 * rng.normal(size=2) - 0.1 * u0
+        u0 = u0 + T * v
+        force = port.step(u0 + np.array([0.015, -0.015]))
+        at_port, before = at_port + force @ (port.u - before), port.u
+        assert at_port >= -1e-12
+    assert 0.1 < port.created < at_port / 3
+
+
 @pytest.mark.parametrize("scene", SCENES[:5])
 def test_rows_follow_the_law_of_the_lemma(tmp_path, scene):
     """f = -D ((w+ - w)/h + b w+ + K (r + h w+)) wherever a one-sided row presses and no cone cuts it."""
@@ -459,6 +477,21 @@ def test_an_active_scene_is_listed(tmp_path):
     scene = world(tmp_path, text)
     assert scene.outside_the_lemma() == ["actuator drive"]
     assert {part.what: part.at_the_port for part in scene.parts()}["actuators"] == "the shell only"
+    mujoco.set_mjcb_passive(lambda model, data: None)
+    try:
+        assert scene.outside_the_lemma() == ["actuator drive", "callback mjcb_passive"]
+    finally:
+        mujoco.set_mjcb_passive(None)
+
+
+def test_bodies_are_counted_by_how_they_move(tmp_path):
+    """What slides on a body that turns, turns; slides of one body count once, and contacts not at all."""
+    slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 0 1"))
+    box, mass = '<geom size="0.01"/>', '<geom size="0.01" mass="1"/>'
+    arm = f'<body><joint axis="0 1 0"/>{mass}<body>{slides}{mass}</body></body>'
+    scene = world(tmp_path, with_body(f'<body name="left">{box}</body><body>{slides}{mass}</body>{arm}'))
+    counts = {part.what: part.count for part in scene.parts()}
+    assert (counts["bodies that translate"], counts["bodies that turn"]) == (1, 2)
 
 
 if __name__ == "__main__":

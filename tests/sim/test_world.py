@@ -418,7 +418,7 @@ def test_the_digest_is_of_contents_not_of_places(tmp_path):
 # ---- a linear model
 
 
-def test_a_world_becomes_a_network_for_a_design(tmp_path):
+def test_a_world_becomes_a_network_for_a_design(tmp_path, capsys, monkeypatch):
     """A body on a spring and a damper beside each contact: E(z) of the pair, masses of contacts included."""
     text = f"""<mujoco><option gravity="0 0 0"/><worldbody>
     <body name="left"><site name="l"/>{TIP}</body><body name="right" pos="1 0 0"><site name="r"/>{TIP}</body>
@@ -440,6 +440,10 @@ def test_a_world_becomes_a_network_for_a_design(tmp_path):
         said = simulate(loop.replace(duration=0.05), coupling).meta["guarantee"]
         assert said.startswith("No guarantee: the coupling is not certified for any environment: needs ")
         assert said.endswith(where)
+    monkeypatch.setattr("haptic_loop.cli.world.least_at_port", lambda *given: {})
+    words = ("--scenario", str(tmp_path / "loop.toml"), "--coupling", str(tmp_path / "design.json"))
+    _, shown = command(capsys, "audit", *words, "--out", str(tmp_path / "out"))
+    assert where in " ".join(shown.split())
     assert "linear network" not in simulate(loop.replace(duration=0.05), certified(linear)).meta["guarantee"]
     assert linearise(loop, [0.0, 0.01]).linear_model_of == "scene.xml near the pose [0, 0.01]"
     with pytest.raises(InputError, match="filters the forces of its linear model and has no V"):
