@@ -198,7 +198,7 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
     flat, shape = H.reshape(-1, *H.shape[-2:]), H.shape[:-2]
     missing = np.broadcast_to((eigenvalues <= floor).sum(axis=-1), shape).ravel()
     needed = np.empty(missing.size)
-    for r in np.unique(missing):  # eigenvalues ascend: the first r directions are those that the gain does not reach
+    for r in set(missing.tolist()):  # eigenvalues ascend: the first r directions are those that the gain does not reach
         here = flat[missing == r]
         needed[missing == r] = _beyond_the_null_space(here, r) if r else largest_eigenvalue(-here)
     needed[np.broadcast_to((eigenvalues < -floor).any(axis=-1), shape).ravel()] = np.inf

@@ -33,7 +33,7 @@ from haptic_loop.design.conditions import (
     unsound,
     unsound_static,
 )
-from haptic_loop.design.cone import ConeProgram, Inequality
+from haptic_loop.design.cone import LIGHT, ConeProgram, Inequality
 from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.exact import require_size
 from haptic_loop.design.facts import Fact, HandsSide, Limiter, Switching, Unknowns, Walls, compose, hands_side
@@ -201,7 +201,9 @@ class _Search:
                 break
             blocks.append(self._inequality(w))
             try:
-                found = ConeProgram(np.eye(count + 1)[-1], blocks).solve(f"the multiplier {self._names}")
+                found = ConeProgram(np.eye(count + 1)[-1], blocks).solve(
+                    f"the multiplier {self._names}", settings=LIGHT
+                )
             except DesignFailed:  # No multiplier within the bounds makes the block positive.
                 break
             stalled = 0 if found[-1] > bound + _SETTLED * max(bound, 1.0) else stalled + 1
