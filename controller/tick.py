@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,13 +163,13 @@ class StepBuffer:
             raise ValueError(f"plant_states is {plant_states}, but the first {m} entries must be the positions")
         self.ticks = ticks
         self.process = process
-        self._width = width = nz + plant_states + outside + m
-        self._memory = np.zeros(((ticks + 1) * width, nsim))
+        width = nz + plant_states + outside + m
+        memory = np.zeros(((ticks + 1) * width, nsim))
         #: (ticks + 1, entries, nsim); the last row holds only the states after the last tick
-        self.rows = rows = self._memory.reshape(ticks + 1, width, nsim)
+        self.rows = rows = memory.reshape(ticks + 1, width, nsim)
         self.z, self.s, self.w, self.f = np.split(rows, np.cumsum([nz, plant_states, outside]), axis=1)
         self.x = self.s[:, :m]
-        shifted = self._memory[width - m :][: ticks * width].reshape(ticks, width, nsim)
+        shifted = memory[width - m :][: ticks * width].reshape(ticks, width, nsim)
         #: (ticks, m + order, nsim): [f; z+] of each tick
         self.after = shifted[:, : m + nz]
         self._given = transition
@@ -224,11 +224,6 @@ class StepBuffer:
         """[f; z+] of each tick."""
         return list(self.after)
 
-    @property
-    def limited(self) -> bool:
-        """Whether the limiter or the actuators may limit a force, so that a linear block may have to be repeated."""
-        return bool(self._bounds)
-
     def linear_until(self, ticks: int, most: float = 1.0) -> int:
         """Return the first of these ticks in which a force is nan or above `most` of its limit, else `ticks`."""
         for forces, limit in self._asked:
@@ -250,45 +245,6 @@ class StepBuffer:
             self.net.apply(self.first + k, self.force[k])
         if self.clips:
             self.process.applied(self.force[k], self.force[k])
-
-    def ticking(self) -> Callable[[int], object]:
-        """Return the fastest function that does `tick` for this process."""
-        return self._shortest or self.tick
-
-    @cached_property
-    def _shortest(self) -> Callable[[int], object] | None:
-        """Return `tick` as one product and one test of the limited forces, or None if it needs more."""
-        if self._quantised or self._line is not None or self.net is not None:
-            return None
-        transition, seen, after, process = self._transition, self.law_input, self.law_output, self.process
-        if not self._bounds:
-            if self.clips:
-                return None
-            return lambda k: transition(seen[k], after[k])
-        # Calls dominate the time of a single simulation: its forces are tested without numpy.
-        linear, force, clips, limited = process.linear.dot, self.force, self.clips, process.law.bounds
-        first = self._width - process.channels
-        asked: list[tuple[Any, float, float]] = [
-            (self._memory[first + i :: self._width, 0].data, -limit, limit) for i, limit in self._bounds
-        ]
-        (one, low, high), (other, lowest, highest), *others = asked if len(asked) > 1 else 2 * asked
-
-        def tick(k: int) -> None:
-            linear(seen[k], after[k])
-            within = low <= one[k] <= high and lowest <= other[k] <= highest
-            if within and (not others or all(least <= asked[k] <= most for asked, least, most in others)):
-                return
-            if limited or process.balls:
-                if limited:
-                    transition(seen[k], after[k])
-                if clips:
-                    process.applied(force[k], force[k])
-                return
-            for numbers, least, most in asked:  # three times as fast as numpy's clip
-                if not least <= numbers[k] <= most:
-                    numbers[k] = least if numbers[k] < least else most if numbers[k] > most else numbers[k]
-
-        return tick
 
     def seen(self, k: int) -> Array:
         """Return [z; x] (order + m, nsim) of row k with measured x; the plant's own positions do not change."""

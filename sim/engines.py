@@ -101,9 +101,8 @@ class ExactEngine(_Exact):
         def advance(k: int) -> None:
             product(rows[k], states[k + 1])
 
-        # what clips does so in long runs, and then bit for bit as tick by tick
-        straight = buffer.calm and not buffer.clips and self._plant.ndim == 2
-        self.advance, self.run_block = advance, self._fused(buffer) if straight else None
+        self.advance = advance
+        self.run_block = self._fused(buffer) if buffer.calm and self._plant.ndim == 2 else None
 
     def _fused(self, buffer: StepBuffer) -> RunBlock:
         fused = FusedTicks(buffer, *np.split(self._plant, [len(self._plant)], axis=1))
@@ -343,6 +342,8 @@ class MujocoEngine:
         self._warnings = self.data.warning.number
         self.run_block: RunBlock | None = None
         stacked, moves = _stacked(scene.plant), partial(_step_of, scene.plant, scene.model.nv)
+        # MuJoCo solves friction from the solution before, which `back` cannot restore.
+        self._smooth = default_integrator(scene) == EXPONENTIAL
         self._whole = moves if integrator == EXPONENTIAL and substeps == 1 else None
         self._timing, both, q, v = timing, (self.model, self.data), self.data.qpos, self.data.qvel
         self._access = _Access(
@@ -359,15 +360,13 @@ class MujocoEngine:
             move=(lambda h: moves(h).dot) if integrator == EXPONENTIAL else None,
             kick=_kicks(stacked),
         )
-        # what rubs is solved from the solution before, which nothing takes back
-        self._rubs = default_integrator(scene) != EXPONENTIAL
 
     def start(self, buffer: StepBuffer) -> None:
         self._buffer, self.run_block, access = buffer, None, self._access
         access.put(buffer, 0)
         self._warnings[:] = 0
         self._advance: Callable[[int], None] | None = None
-        if buffer.calm and not self._timing and not (self._rubs and buffer.limited):
+        if buffer.calm and self._smooth and not self._timing:
             if self._whole:
                 self.run_block = self._fused(buffer, self._whole(access.T))
             elif not (access.move or access.kick):

@@ -298,7 +298,7 @@ def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
             return
         engine.back(done)
         buffer.calm = False
-    tick, advance = buffer.ticking(), engine.advance
+    tick, advance = buffer.tick, engine.advance
     for k in range(done, ticks):
         tick(k)  # sample x, compute f and z+, limit f
         advance(k)  # hold -f on the actuators for T, move the plant
