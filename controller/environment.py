@@ -51,7 +51,7 @@ def _unit(field: str, direction: tuple[float, ...]) -> tuple[float, ...]:
     return direction if abs(length - 1) <= _SAME_LENGTH else tuple(c / length for c in direction)
 
 
-class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A spring and a damper in parallel between two nodes or two points with several coordinates.
 
     Between points it acts on every coordinate, or along one direction.
@@ -77,7 +77,7 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return number(self.inertance or 0.0), number(self.damping), number(self.stiffness)
 
 
-class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A one-sided spring-damper that pushes the first node back once it is `gap` beyond the second (controller.law).
 
     Between points with several coordinates the distance counts along `normal`, the direction into the wall.
@@ -306,7 +306,7 @@ class _NoModel(SingularLoop):
         super().__init__(_NO_MODEL)
 
 
-class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A MuJoCo scene instead of a network. It has no known E(z), so only any-environment can be certified."""
 
     file: str  # MJCF
@@ -319,7 +319,9 @@ class World(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"every is {self.every}, allowed are 1 to {_MOST_TICKS} ticks")
 
 
-class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class Network(
+    msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=True, omit_defaults=True, repr_omit_defaults=True
+):
     """A passive mechanical network seen at its contacts, in the order of the channels."""
 
     contacts: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]

@@ -57,7 +57,7 @@ def _listed(value: Any) -> Any:
     return [_listed(part) for part in value] if isinstance(value, list | tuple) else value
 
 
-class Guaranteed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Guaranteed(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """What is guaranteed of a device's motor and transmission, `[device.guaranteed]` of a scenario.
 
     The bounds hold for the real device; what is simulated must lie within them. The known-device conditions rest on
@@ -81,7 +81,7 @@ class Guaranteed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         require("guaranteed.transmission_damping_max", self.transmission_damping_max, least, 1e5, "N s/m")
 
 
-class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """What both kinds of a device, which declare the fields, have."""
 
     @property

@@ -345,7 +345,7 @@ def _freeze(record: object, name: str, values: Any) -> None:
 # The project's own humans.
 
 
-class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A mass and the spring-damper behind it, which ends at the next mass or at the moving equilibrium.
 
     In space damping and stiffness are numbers, the same in every direction, one number per axis, or symmetric matrices.
@@ -375,7 +375,7 @@ class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return max(len(value) if isinstance(value, tuple) else 1 for value in (self.damping, self.stiffness))
 
 
-class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A motion of the equilibrium, amplitude sin(2 pi frequency t + phase), faded in by a raised cosine."""
 
     amplitude: float  # [m]
@@ -407,7 +407,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 _MOST_LINKS = 500  # of one hand: the eigenvalues of a loop around so many take five seconds, of 1000 half a minute
 
 
-class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A chain of masses and spring-dampers, from the handle to the equilibrium.
 
     It is passive because no parameter can be negative. One link is the usual mass-damper-spring hand, two links are a
@@ -459,7 +459,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return np.stack([self.voluntary.force(t, k, b) for k, b in zip(K, B, strict=True)], axis=1)
 
 
-class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A hand as a transfer function, `mass` s + C (s I - A)^-1 B + D from velocity to force; see `state_space`.
 
     It has no bodies. The MuJoCo engines integrate its state beside those of the scene (sim.engines).
@@ -495,7 +495,7 @@ class Cross(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         require("stiffness", self.stiffness, 0.0, 1e9, "N/m")
 
 
-class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_defaults=True):
     """A person who holds several devices: a passive mechanical multi-port.
 
     The arms at these devices end on the person's body instead of on ground. The body is a mass with a spring-damper
