@@ -59,7 +59,7 @@ _IDEAL: dict[str, Any] = {"color": "0.45", "linestyle": "-", "linewidth": 3.0, "
 
 
 def _panels(title: str, rows: int, columns: int, size: tuple[float, float], **shared: Any) -> tuple[Figure, Any]:
-    """A figure of `size` [inch] with a title, and its axes (rows, columns), each with a grid."""
+    """Make a figure of `size` [inch] with a title, and its axes (rows, columns), each with a grid."""
     figure = Figure(size, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, **shared)
     for axis in axes.flat:
@@ -69,12 +69,12 @@ def _panels(title: str, rows: int, columns: int, size: tuple[float, float], **sh
 
 
 def _legend(figure: Figure, entries: dict[str, Any], columns: int, **style: Any) -> None:
-    """A legend below all panels; `entries` has the drawn object of each label."""
+    """Draw a legend below all panels; `entries` has the drawn object of each label."""
     figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=columns, **style)
 
 
 def _entries(axis: Axes) -> dict[str, Any]:
-    """The drawn object of each label, in the order of drawing."""
+    """Return the drawn object of each label, in the order of drawing."""
     handles, labels = axis.get_legend_handles_labels()
     return dict(zip(labels, handles, strict=True))
 
@@ -122,7 +122,7 @@ def _fit_paper(figure: Figure) -> None:
 
 
 def _literal(figure: Figure) -> None:
-    """Names that users gave as they are: no mathematics between dollars, and a mark for what the font cannot show."""
+    """Escape names of users: dollars start no mathematics, and characters that the font lacks become a mark."""
     glyphs = get_font(findfont(FontProperties())).get_charmap()
     axes = [axis for panel in figure.axes for axis in (panel.xaxis, panel.yaxis)]
     ticks = {label for axis in axes for label in (*axis.get_ticklabels(which="both"), axis.get_offset_text())}
@@ -133,7 +133,7 @@ def _literal(figure: Figure) -> None:
 
 
 def _plain_numbers(axes: Any) -> None:
-    """0.1, 1, 10 are read faster than powers of ten, and drawn faster."""
+    """Label an axis 0.1, 1, 10, which is read and drawn faster than powers of ten."""
     for axis in (part for panel in axes.flat for part in (panel.xaxis, panel.yaxis)):
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
@@ -224,7 +224,7 @@ def draw_run(
 
 
 def _ordered(entries: dict[str, Any], around: Contacts) -> dict[str, Any]:
-    """Channel by channel, of each what the hand holds first, and then the rest."""
+    """Order curves channel by channel, for each channel first what the hand holds."""
     names = around.names or [f"device {i}" for i in range(1, 100)]
 
     def place(label: str) -> tuple[int, bool, str]:
@@ -235,7 +235,7 @@ def _ordered(entries: dict[str, Any], around: Contacts) -> dict[str, Any]:
 
 
 def _two_points(result: Run) -> bool:
-    """Whether handles and encoders move apart by what can be seen in a picture."""
+    """Return whether handles and encoders move apart visibly in a picture."""
     return bool(np.abs(result.x_handle - result.x).max(initial=0.0) > 0.02 * np.abs(result.x).max(initial=0.0))
 
 
@@ -247,7 +247,7 @@ _ALIKE = 0.005  # of the largest value: curves that differ by less cannot be tol
 
 
 def _coinciding(values: Array, around: Contacts) -> list[str]:
-    """Per curve of (N, m) which earlier one it lies on, as the end of its label."""
+    """Return for each curve of (N, m) which earlier one it lies on, as the end of its label."""
     scale = np.abs(values).max(initial=0.0)
     ends = [""] * values.shape[1]
     for i in range(1, values.shape[1]):
@@ -260,7 +260,7 @@ _SHARPER = 4.0  # times the run's mean: what is to be seen in a zoom
 
 
 def _stands_out(result: Run, near: slice, ticks: int) -> bool:
-    """Whether the forces turn more sharply in this part than in the whole of the first `ticks`."""
+    """Return whether the forces turn more sharply in this part than in the whole of the first `ticks`."""
     if 10 * (near.stop - near.start) > result.t.size:
         return False  # nearly the whole is no zoom
     bend = np.square(np.diff(result.f[:ticks], n=2, axis=0)).sum(axis=1)
@@ -268,14 +268,14 @@ def _stands_out(result: Run, near: slice, ticks: int) -> bool:
 
 
 def _one_point(result: Run) -> str:
-    """The axis of displacements where one curve stands for the handle, which the user holds, and for the encoder."""
+    """Return the label of the axis of displacements if one curve stands for the handle and for the encoder."""
     apart = 1e3 * float(np.abs(result.x_handle - result.x).max(initial=0.0))
     beside = f"within {apart:.1g} mm of the encoder" if apart > 1e-9 else "where the encoder is"
     return f"displacement of the handle [mm],\n{beside}"
 
 
 def _draw_walls(axes: Array, result: Run, around: Contacts) -> None:
-    """Where walls stand, in the panel of displacements, and when they were touched, in both."""
+    """Draw where walls stand, in the panel of displacements, and when they were touched, in both panels."""
     for i, place, name in around.walls:
         colour = STYLES[i % len(STYLES)]["color"]
         axes[0].axhline(1e3 * place, color=colour, linestyle=(0, (2, 2)), linewidth=1.0, label=name)
@@ -290,7 +290,7 @@ def _draw_walls(axes: Array, result: Run, around: Contacts) -> None:
 
 
 def _draw_displacements(axes: Array, result: Run, parts: tuple[slice, ...], around: Contacts) -> None:
-    """Handles over encoders, in millimetres; the handle alone where a picture shows them as one point."""
+    """Draw handles over encoders, in millimetres; only handles where both are one point in the picture."""
     two, alike = _two_points(result), _coinciding(result.x, around)
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
         for i in _calmest_last(result.x):
@@ -317,7 +317,7 @@ def _grey_out(axes: Array | list[Axes], result: Run, until: float) -> None:
 
 
 def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Contacts) -> None:
-    """The amplitude of the oscillation at the encoders over time, up to the first clipped tick, and its prediction."""
+    """Draw the amplitude of the oscillation at the encoders up to the first clipped tick, and its prediction."""
     assert onset.growth is not None
     t, sizes = _amplitudes(result, hertz, onset.steady)
     axis.set_title(f"{hertz:.0f} Hz oscillation until a force clips", fontsize=10)
@@ -340,7 +340,7 @@ def _draw_onset(axis: Axes, result: Run, hertz: float, onset: Onset, around: Con
 
 
 def _amplitudes(result: Run, hertz: float, ticks: int) -> tuple[Array, Array]:
-    """(t (k,), amplitude (k, m) [m]) of the encoders' oscillation at `hertz` in Hann windows of twelve periods."""
+    """Return t (k,) and amplitudes (k, m) [m] of the encoders' oscillation at `hertz`, windowed over 12 periods."""
     T = float(result.t[1] - result.t[0]) if result.t.size > 1 else 1.0
     width = max(8, round(12 / (max(hertz, 1.0) * T)))
     if ticks < 2 * width:
@@ -355,7 +355,7 @@ def _amplitudes(result: Run, hertz: float, ticks: int) -> tuple[Array, Array]:
 
 
 def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
-    """The ideal forces, broad and pale in each device's colour; cut where they are more than three times as large."""
+    """Draw the ideal forces, broad and pale in each device's colour, cut at three times the others."""
     forces, percent = ideal
     label = "pale: what the object itself gives for this motion"
     if percent is not None:  # of the force before the motors' limit, as in the report
@@ -370,7 +370,7 @@ def _draw_ideal(axes: Array, result: Run, ideal: tuple[Array, float | None], par
 
 
 def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> slice:
-    """Six periods where the forces of the first `ticks` turn most sharply; more where they turn less than six times."""
+    """Return six periods in which the forces of the first `ticks` turn most sharply, more if they turn less often."""
     n = result.t.size if ticks is None else ticks
     T = result.t[1] - result.t[0] if n > 1 else 1.0
     width = min(n, max(60, round(6 / (max(frequency_hz, 1.0) * T))))
@@ -385,7 +385,7 @@ def _sharpest(result: Run, frequency_hz: float, ticks: int | None = None) -> sli
 
 
 def _turns(f: Array) -> int:
-    """How often the force that turns round most often does so, (k, m)."""
+    """Return how often the force that turns most often does so, (k, m)."""
     signs = (np.sign(column[column != 0]) for column in np.diff(f, axis=0).T)
     return max((int(np.count_nonzero(np.diff(sign))) for sign in signs), default=0)
 
@@ -401,7 +401,7 @@ class Panel:
 
 
 def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] = ()) -> Path:
-    """The forces of several couplings on the same axes, each over what the object gives for the panel's motion (pale).
+    """Plot the forces of several couplings on equal axes, each over the object's forces for that motion (pale).
 
     The axes are those of the forces that should be felt, as far as they are credible; what oscillates leaves them.
     """
@@ -439,7 +439,7 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
 
 
 def plot_accuracy(rows: Sequence[Row], path: Path) -> Path:
-    """Cost against both errors, one line per integrator; wrong verdicts are crossed."""
+    """Plot cost against both errors, one line per integrator; wrong verdicts are crossed."""
     errors = {"position_relative_rms": "position error, relative rms", "growth_rate_error": "|growth-rate error| [1/s]"}
     figure, axes = _panels("speed against error (crossed: wrong verdict)", 1, 2, (11, 4.5), sharex=True)
     names = list(dict.fromkeys(row.integrator for row in rows if row.integrator))
@@ -458,7 +458,7 @@ def plot_accuracy(rows: Sequence[Row], path: Path) -> Path:
 
 
 def plot_population(mass: Array, damping: Array, growth: Array, path: Path, title: str) -> Path:
-    """Growth rate [1/s] of every loop over its humans' mass [kg] and least damping [N s/m]; all shapes (n,).
+    """Plot growth rates [1/s] over the mass [kg] and the least damping [N s/m] of hands; all shapes are (n,).
 
     Where a loop has several humans, mass and damping are geometric means over them.
     """
@@ -492,7 +492,7 @@ _FLOOR = 1e-4  # of the largest value: what a logarithmic axis still shows
 
 
 def plot_singular_values(report: Comparison, path: Path) -> Path:
-    """E, F and the mismatch M, one panel per coupling; all singular values, the smaller ones thinner."""
+    """Plot all singular values of E, F and the mismatch M, one panel per coupling; smaller ones are thinner."""
     couplings = report.couplings
     figure, axes = _over_frequency("singular values", 1, len(couplings), (4.2, 4.2))
     hz = report.frequency_hz
@@ -514,7 +514,7 @@ def plot_singular_values(report: Comparison, path: Path) -> Path:
 
 
 def plot_required_damping(report: Comparison, path: Path) -> Path:
-    """What each condition asks of the devices at each frequency, what they have, and where it binds."""
+    """Plot the damping that each condition requires at each frequency, the available one, and where it binds."""
     title = "required damping over frequency; o: where it binds, ^: above the picture"
     names = report.conditions
     figure, axes = _over_frequency(title, 1, len(names), (5.5, 4.2))
@@ -545,7 +545,7 @@ def plot_required_damping(report: Comparison, path: Path) -> Path:
 
 
 def plot_perceived(report: Comparison, path: Path) -> Path:
-    """The effective impedance of each channel as a stiffness and a damping, against the ideal."""
+    """Plot the effective impedance of each channel as a stiffness and a damping, beside the ideal one."""
     title = "felt by each user, the other devices held still; linear near zero"
     figure, axes = _over_frequency(title, 2, len(report.available_damping), (4.8, 3.2))
     hz = report.frequency_hz
@@ -571,5 +571,5 @@ def plot_perceived(report: Comparison, path: Path) -> Path:
 
 
 def _over_frequency(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, Any]:
-    """Panels of `size` each, wide enough together for the title."""
+    """Make panels of `size` [inch] each, together wide enough for the title."""
     return _panels(title, rows, columns, (max(columns * size[0], 5.5), rows * size[1] + 0.6), sharex=True)

@@ -63,7 +63,7 @@ class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _usual_hand(i: int) -> Human:
-    """The default hand of device i: .3 kg that swings 15 mm at .6 Hz, a quarter turn apart."""
+    """Return the default hand of device i: 0.3 kg that swings 15 mm at 0.6 Hz, a quarter turn after the one before."""
     return Human((Link(0.3, 3.0, 200.0),), Voluntary(0.015, 0.6, phase=0.5 * np.pi * i))
 
 
@@ -311,7 +311,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return hashlib.sha256(content).hexdigest()
 
     def reference_delays(self, case: str) -> tuple[int, ...]:
-        """Lambda of a case: what `lam` says, else 0 in case II and theta + psi otherwise. Raises InputError."""
+        """Return Lambda of a case: `lam` if given, else 0 in case II and theta + psi otherwise. Raises InputError."""
         if case not in CASES:
             raise InputError(f"case is {case!r}, allowed are {', '.join(CASES)}")
         if self.lam is not None:
@@ -321,13 +321,13 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return tuple(t + p for t, p in zip(self.theta, self.psi, strict=True))
 
     def title(self, case: str) -> str:
-        """The title of reports and pictures; the paper's cases have names for the paper's loop only."""
+        """Return the title of reports and pictures; the paper's cases have names for the paper's loop only."""
         if (case == "none" or self.varying_delay is None) and self.loop(case) == load().loop(case):
             return f"{self.name}, case {case}"
         return self.name + {"none": ", no coupling", "II": ", reference without delay"}.get(case, "")
 
     def loop(self, case: str) -> Loop:
-        """All that a design may know: no device but its damping, no human. `case` is "none", "I" or "II".
+        """Return all that a design may know: no device but its damping, no human. `case` is "none", "I" or "II".
 
         Raises InputError for another case.
         """
@@ -339,7 +339,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency, **more)
 
     def _known(self, channels: int | None = None) -> dict[str, Any]:
-        """The fields of a loop on known devices, those of its first channels; none where a device is not known.
+        """Return the fields of a loop on known devices for its first channels; none if a device is not known.
 
         The shortest period belongs to them, so that other loops keep their digest.
         """
@@ -347,7 +347,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return {"known_devices": known[:channels], "T_min": self.shortest_period} if known else {}
 
     def before_a_rigid_wall(self, psi: tuple[int, ...] = (0,)) -> Loop:
-        """The loop of the first device alone, a rigid wall in the place of the environment. Raises ValueError.
+        """Return the loop of the first device alone before a rigid wall. Raises ValueError.
 
         Of a device with several axes the wall may face any direction, so that the least damping of all counts.
         """
@@ -359,7 +359,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return Loop(self.T, theta, psi, theta, delta, RIGID_WALL, latency=late, **rest)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
-        """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping [N s/m].
+        """Return the scenario with some fields changed; `delta` is another guaranteed damping [N s/m].
 
         As strict as a file, and what comes out is what a file would have given: lists become tuples. Humans may also
         be of a user's own class (models.human.Hand), and so may a population with `draw(rng, n)`, n humans, and an
@@ -387,7 +387,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def with_environment(scenario: Scenario, text: str) -> Scenario:
-    """The scenario with the environment of FILE.py:NAME: a Network, or what has contacts and E(T) or parts().
+    """Return the scenario with the environment of FILE.py:NAME: a Network, or an object with contacts and E or parts().
 
     A class or a function is called without arguments. Raises InputError.
     """
@@ -397,7 +397,7 @@ def with_environment(scenario: Scenario, text: str) -> Scenario:
 
 
 def load(source: str | Path = DEFAULT) -> Scenario:
-    """A scenario from a TOML file, or one of the built-in ones by name. Raises InputError."""
+    """Load a scenario from a TOML file, or a built-in one by its name. Raises InputError."""
     if not isinstance(source, str | Path):
         kind = type(source).__name__
         raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
@@ -407,7 +407,7 @@ def load(source: str | Path = DEFAULT) -> Scenario:
 
 
 def parse(text: str, source: str = "scenario", folder: Path = Path()) -> Scenario:
-    """A scenario from TOML text. Raises InputError, with the path of the field and the value that came.
+    """Parse TOML text as a scenario. Raises InputError with the path of the field and its value.
 
     The file of a world is looked for in `folder`.
     """
@@ -422,17 +422,17 @@ def parse(text: str, source: str = "scenario", folder: Path = Path()) -> Scenari
 
 
 def built_in() -> list[str]:
-    """Names of the scenarios that come with the program."""
+    """Return the names of the scenarios that come with the program."""
     return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
 
 
 def is_world(scenario: Scenario) -> bool:
-    """Whether the scenario's environment is a MuJoCo scene."""
+    """Return whether the scenario's environment is a MuJoCo scene."""
     return scenario.environment.world is not None
 
 
 def require_no_world(scenario: Scenario, what: str) -> None:
-    """Raises InputError for commands that cannot use a world."""
+    """Raise InputError if the environment is a MuJoCo scene, for commands that cannot use one."""
     if is_world(scenario):
         able = "sim.run, sim.view, sim.validate, design, design.audit and hw.bridge take worlds"
         raise InputError(
@@ -441,7 +441,7 @@ def require_no_world(scenario: Scenario, what: str) -> None:
 
 
 def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
-    """Raises InputError where a loop has Coulomb friction or, unless `walls` are decided too, walls."""
+    """Raise InputError if a loop has Coulomb friction or walls; with `walls` the command decides walls, too."""
     for i, device in enumerate(scenario.device, start=1):
         if np.any(device.friction):
             friction = list(device.friction) if isinstance(device.friction, tuple) else f"{device.friction:g}"
@@ -452,14 +452,14 @@ def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
 
 
 def require_constant_delay(scenario: Scenario, what: str) -> None:
-    """Raises InputError where delays vary, for commands that cannot simulate this."""
+    """Raise InputError if delays vary, for commands that cannot simulate this."""
     if scenario.varying_delay is not None:
         instead = "sim.run simulates it"
         raise InputError(f"varying_delay: {what} takes the delays that its link has; take the table out, {instead}")
 
 
 def require_even_ticks(scenario: Scenario, what: str) -> None:
-    """Raises InputError where ticks are uneven or late, for commands that cannot simulate this."""
+    """Raise InputError if ticks are uneven or forces latch late, for commands that cannot simulate this."""
     for name in ("period", "latency"):
         if getattr(scenario, name) is not None:
             raise InputError(f"{name}: {what} takes the ticks that it has; take the key out, sim.run simulates it")
@@ -478,7 +478,7 @@ class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def held_by(scenario: Scenario, text: str) -> Scenario:
-    """The scenario with the hands, or the population, of a TOML file or of FILE.py:NAME. Raises InputError."""
+    """Return the scenario with the hands or the population of a TOML file or of FILE.py:NAME. Raises InputError."""
     people = _load_humans(text, len(scenario.device))
     who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
     if people.population is not None:
@@ -495,7 +495,7 @@ def held_by(scenario: Scenario, text: str) -> Scenario:
 
 
 def _load_humans(text: str, devices: int) -> _HumanFile:
-    """The humans of a TOML file or of FILE.py:NAME, one per device, and who holds several devices.
+    """Load humans, one per device, and the persons who hold several devices, from a TOML file or FILE.py:NAME.
 
     Raises InputError with one line that names the file and the field.
     """
@@ -518,7 +518,7 @@ def _load_humans(text: str, devices: int) -> _HumanFile:
 
 
 def _humans_of(text: str, source: str) -> _HumanFile:
-    """A file of humans; a [[human]] with A, B, C and D is a measured transfer function, any other a chain."""
+    """Return the humans of a file: measured transfer functions (A, B, C, D) and chains."""
     people: _HumanFile = _converted(text, _HumanFile, source)
     made = []
     for i, human in enumerate(people.human, start=1):
@@ -535,7 +535,7 @@ def _humans_of(text: str, source: str) -> _HumanFile:
 
 
 def _own_humans(text: str) -> _HumanFile:
-    """The people that FILE.py:NAME names: hands and persons, a population with draw(rng, n), or a function of them."""
+    """Return the people of FILE.py:NAME: hands and persons, a population with draw(rng, n), or a function of them."""
     people: Any = named("--human", text)
     if isinstance(people, type) or isfunction(people):
         made: Any = called(f"--human {text}", people)
@@ -552,7 +552,7 @@ def _own_humans(text: str) -> _HumanFile:
 
 
 def _toml(value: Any) -> str:
-    """A number, or a list or a matrix of numbers, as TOML has it."""
+    """Write a number, a list or a matrix of numbers in TOML."""
     return f"[{', '.join(map(_toml, value))}]" if isinstance(value, tuple) else repr(value)
 
 
@@ -590,7 +590,7 @@ _NEEDED = ("name", "T", "theta", "device", "environment")
 
 
 def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
-    """TOML text as `kind`. Raises InputError with the path of the field and the value that came."""
+    """Convert TOML text to `kind`. Raises InputError with the path of the field and its value."""
     raw = toml(text, source)
     try:
         raw = _whole(raw) if kind is Scenario else raw
@@ -604,7 +604,7 @@ def _converted(text: str, kind: Any, source: str, folder: Path = Path()) -> Any:
 
 
 def _whole(raw: dict[str, Any]) -> dict[str, Any]:
-    """The file, if it has every key that a scenario needs. An unknown key is reported first. Raises ValueError."""
+    """Return the file if it has every key that a scenario needs. Raises ValueError; unknown keys are reported first."""
     missing = [name for name in _NEEDED if name not in raw]
     if missing and set(raw) <= set(Scenario.__struct_fields__):
         raise ValueError(f"missing {', '.join(missing)}; every scenario has {', '.join(_NEEDED)}")
@@ -612,7 +612,7 @@ def _whole(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
-    """The file with devices of the catalogue, by their names or as `device` of a [[device]], written out."""
+    """Replace names of the catalogue, and `device` of a [[device]], by the fields of the device."""
     devices = raw.get("device")
     if isinstance(devices, str):
         contacts = raw.get("environment", {}).get("contacts", [])
@@ -632,7 +632,7 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
-    """The file with the points of its environment in space, where its devices have several axes. Raises ValueError."""
+    """Place the points of the environment in space if devices have several axes. Raises ValueError."""
     devices, given = raw.get("device"), raw.get("environment")
     tables = [one for one in devices if isinstance(one, dict)] if isinstance(devices, list) else []
     counts = [one.get("axes", 1) for one in tables]
@@ -704,7 +704,7 @@ _ALONG = [1.0, 0.0, 0.0]  # x, unless a scenario says otherwise
 
 
 def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """The file with the MJCF file of a world, its path and its digest, and with a direction for each contact."""
+    """Add the path and the digest of a world's MJCF file, and a direction for each coordinate of a contact."""
     given = raw.get("environment")
     if not isinstance(given, dict) or "world" not in given:
         return _without_along(raw, given)
@@ -732,12 +732,12 @@ def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _free_axes(nodes: Sequence[str]) -> list[list[float]]:
-    """The directions x, y, z in which a contact with these coordinates slides."""
+    """Return the directions x, y, z in which a contact with these coordinates slides."""
     return [row for row, node in zip(np.eye(len(AXES)).tolist(), nodes, strict=False) if node != GROUND]
 
 
 def world_environment(table: dict[str, Any], folder: Path = Path()) -> Network:
-    """The environment of a table with `world`, as a file has it. Raises InputError."""
+    """Return the environment of a table with `world` as it stands in a file. Raises InputError."""
     try:
         return msgspec.convert(_with_world({"environment": table}, folder)["environment"], Network)
     except ValueError as error:
@@ -745,7 +745,7 @@ def world_environment(table: dict[str, Any], folder: Path = Path()) -> Network:
 
 
 def _without_along(raw: dict[str, Any], given: Any) -> dict[str, Any]:
-    """The file, if it does not speak of a world's steps and directions. Raises ValueError."""
+    """Return the file unless it gives steps or directions of a world. Raises ValueError."""
     beside = [key for key in ("along", "every") if isinstance(given, dict) and key in given]
     if beside:
         raise ValueError(f"environment.{beside[0]} is only with environment.world")
@@ -753,7 +753,7 @@ def _without_along(raw: dict[str, Any], given: Any) -> dict[str, Any]:
 
 
 def _direction(number: int, row: Any) -> list[float]:
-    """A direction x, y, z of unit length. Raises ValueError."""
+    """Return a direction x, y, z of unit length. Raises ValueError."""
     length = 0.0
     if isinstance(row, list) and len(row) == 3 and all(type(c) in (int, float) for c in row):
         length = float(np.linalg.norm(row))
@@ -763,7 +763,7 @@ def _direction(number: int, row: Any) -> list[float]:
 
 
 def _nowhere(environment: Network) -> Network:
-    """The environment, with the name of a world's file in place of its path."""
+    """Return the environment with the name of a world's file in place of its path."""
     if not environment.world:
         return environment
     world = msgspec.structs.replace(environment.world, file=Path(environment.world.file).name)
@@ -771,7 +771,7 @@ def _nowhere(environment: Network) -> Network:
 
 
 def _network(own: Any, T: Any) -> Network:
-    """A user's own environment, which has `contacts` and `E(T)` or `parts()`, at this period. Raises InputError."""
+    """Return a user's own environment, which has `contacts` and `E(T)` or `parts()`, at a period. Raises InputError."""
     what = f"environment {type(own).__name__}"
     contacts, block = getattr(own, "contacts", None), None
     known = getattr(type(own), "E", Environment.E) is not Environment.E
@@ -797,7 +797,7 @@ class _Damping(msgspec.Struct, frozen=True):
 
 
 def _strictly(fields: dict[str, Any], kind: Any) -> Any:
-    """The fields as `kind`, by the rules of a file. Raises InputError."""
+    """Convert fields to `kind` by the rules of a file. Raises InputError."""
     raw = {name: _plain(name, value) for name, value in fields.items()}
     try:
         return msgspec.convert(_in_space(_with_catalogue(raw)), kind)
@@ -806,7 +806,7 @@ def _strictly(fields: dict[str, Any], kind: Any) -> Any:
 
 
 def _plain(name: str, value: Any) -> Any:
-    """Structs, tuples, and numpy's numbers and arrays as what a file holds. Raises InputError."""
+    """Convert structs, tuples, and NumPy's numbers and arrays to what a file holds. Raises InputError."""
 
     def of_numpy(part: Any) -> Any:
         if isinstance(part, np.ndarray | np.generic):
@@ -825,7 +825,7 @@ _TIMES = np.array([0.0, 0.1])  # [s] at which a hand's own force is tried
 
 
 def _is_own(name: str, value: Any) -> bool:
-    """Whether some of these humans, or this population, are of a user's own class, which no file could have given."""
+    """Return whether a human, or the population, is of a user's own class, which no file can hold."""
     if name == "population":
         return callable(getattr(value, "draw", None)) and not isinstance(value, Population)
     parts = value if isinstance(value, list | tuple) else ()
@@ -833,7 +833,7 @@ def _is_own(name: str, value: Any) -> bool:
 
 
 def _kept(value: Any) -> Any:
-    """A user's own population as it is, or humans, each of which must be able to hold a device. Raises ValueError."""
+    """Return a user's own population, or humans each of which can hold a device. Raises ValueError."""
     if not isinstance(value, list | tuple):
         return value
     for i, human in enumerate(value, start=1):
@@ -858,12 +858,12 @@ def _given_fields(device: Device) -> dict[str, Any]:
 
 
 def _contents(part: Any) -> Any:
-    """The contents of a user's own human or population."""
+    """Return the contents of a user's own human or population."""
     return part.tolist() if isinstance(part, np.ndarray | np.generic) else [type(part).__qualname__, vars(part)]
 
 
 def _located(message: str, raw: dict[str, Any]) -> str:
-    """'Expected `int`, got `float` - at `$.theta[0]`' as 'theta #1 = 1.5: expected `int`, got `float`'."""
+    """Rewrite 'Expected `int`, got `float` - at `$.theta[0]`' as 'theta #1 = 1.5: expected `int`, got `float`'."""
     match = re.fullmatch(r"(.*?)(?: - at `(?:key in )?\$\.?(.*)`)?", message, flags=re.DOTALL)
     assert match
     what, path = match[1], match[2] or ""
@@ -882,7 +882,7 @@ def _located(message: str, raw: dict[str, Any]) -> str:
 
 
 def _hint(what: str) -> str:
-    """What is allowed, where the message does not say it."""
+    """Return the allowed values where the message does not give them."""
     unknown = re.search(r"unknown field `(.*)`", what)
     if unknown:
         known = {name for struct in _STRUCTS for name in struct.__struct_fields__}

@@ -97,7 +97,7 @@ class Claim:
 
     @classmethod
     def of(cls, assessment: Assessment, certified_for: str = "") -> Claim:
-        """The claim of a run in a world, from the assessment of exactly this run.
+        """Return the claim of a run in a world, from the assessment of exactly this run.
 
         Without a guarantee it names the linear network that the coupling is `certified_for`, if it is for one.
         """
@@ -122,7 +122,7 @@ def _energy(joules: float) -> str:
 
 
 def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> World:
-    """The compiled scene with a spring G = D_V^-1 at each contact.
+    """Return the compiled scene with a spring G = D_V^-1 at each contact.
 
     Raises InputError for a coupling whose direct part D_V is not positive definite, or couples devices.
     """
@@ -150,7 +150,7 @@ def _no_spring(coupling: Coupling) -> str:
 
 
 def contacts_of(environment: Network) -> list[Contact]:
-    """The bodies that the devices touch, with the directions in which they slide."""
+    """Return the bodies that the devices touch, with the directions in which they slide."""
     from haptic_loop.models.world import Contact
 
     world = environment.world
@@ -159,7 +159,7 @@ def contacts_of(environment: Network) -> list[Contact]:
 
 
 def _springs(V: Lti, contacts: Sequence[Contact]) -> list[Array]:
-    """G = D_V^-1 of each device. Raises ValueError."""
+    """Return G = D_V^-1 of each device. Raises ValueError."""
     ends = np.cumsum([0, *(len(contact.along) for contact in contacts)])
     if V.D.shape != (ends[-1], ends[-1]):
         raise ValueError(f"the coupling has {len(V.D)} channels, the world has {ends[-1]}")
@@ -189,7 +189,7 @@ class Touched:
     gravity: bool = True  # False switches the scene's gravity off
 
     def net(self, simulation: Simulation, process: Process, nsim: int) -> InWorld:
-        """A fresh one. Raises InputError."""
+        """Make a new net. Raises InputError."""
         V = simulation.coupling.compliance(simulation.loop.T)
         if V is None or not V.D.any():
             raise InputError(f"environment.world needs a coupling: {_no_spring(simulation.coupling)}")
@@ -205,7 +205,7 @@ class Touched:
 
 
 def live(simulation: Simulation, start: float = START_J) -> Simulation:
-    """The same loop with its world in it, for any number of ticks: the scene's net delays the forces itself."""
+    """Return the same loop with its world in it, for any number of ticks: the scene's net delays the forces itself."""
     touched, process = Touched(start), simulation.process
 
     def late(nsim: int) -> Net:
@@ -340,7 +340,7 @@ def thrown(
 
 
 def _lossless(hand: Any) -> Any:
-    """The hand without its dampers, if it is a chain; another one as it is."""
+    """Return the hand without its dampers if it is a chain; another one unchanged."""
     if not isinstance(hand, Human):
         return hand
     links = tuple(msgspec.structs.replace(link, damping=0.0) for link in hand.links)
@@ -348,7 +348,7 @@ def _lossless(hand: Any) -> Any:
 
 
 def hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, runs: int = 10, seconds: float = 1.0) -> float:
-    """The least sum of f'(u - u_-) [J] that motions of the springs' ends reached: they run, stop and turn at random."""
+    """Return the least sum of f'(u - u_-) [J] that the springs' ends reached when they run, stop and turn at random."""
     scene, rng, least = scene_of(scenario, coupling), np.random.default_rng((seed, _STREAM)), 0.0
     with quiet_warnings():
         for _ in range(runs):
@@ -366,7 +366,7 @@ def hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, runs: int =
 
 
 def least_at_port(scenario: Scenario, coupling: Coupling, seed: int, humans: int = 20) -> dict[str, float]:
-    """The least energy at the port [J] by each adversary, while no shell acts: 0 where the scene gave nothing."""
+    """Return the least energy at the port [J] by each adversary while no shell acts: 0 if the scene gave nothing."""
     found = {"hit and brake": hit_and_brake(scenario, coupling, seed)}
     hands = thrown(scenario, coupling, humans, seed, 1.0, _NEVER)
     for kind in (RANDOM, LOSSLESS):
@@ -418,7 +418,7 @@ def _pose_words(pose: Any) -> str:
 
 
 def _joined(G: Lti) -> Lti:
-    """The system without the states of bodies that do not touch a contact, directly or through others."""
+    """Return the system without the states of bodies that touch no contact, directly or through others."""
     size = np.abs(G.A).max(initial=1.0)
     linked = np.abs(G.A) > _ROUNDING * size
     driven, seen = (np.abs(G.B) > 0).any(axis=1), (np.abs(G.C) > 0).any(axis=0)

@@ -259,7 +259,7 @@ class EnvironmentSweep(_Sweep):
         return self.coupling.with_model(self.loop.sent(NoCoupling()))
 
     def _at(self, K: Array, B: Array) -> Loop:
-        """The loop around all these environments, (n,), as a stack."""
+        """Return the loop around all these environments (n,), as a stack."""
         network = self.loop.network
         M, D, S = network.matrices()
         varied = contact_springs(network)
@@ -276,12 +276,12 @@ Sweep = CouplingSweep | EnvironmentSweep
 
 
 def contact_springs(network: environment.Network) -> tuple[environment.Spring, ...]:
-    """The springs that end at a contact."""
+    """Return the springs that end at a contact."""
     return tuple(s for s in network.springs if set(s.between) & set(network.contacts))
 
 
 def _press_directions(loop: Loop) -> Array:
-    """(m,) +1 or -1: into the walls where contacts have some, else alternately."""
+    """Return the directions (m,) of the press, +1 or -1: into walls at contacts with walls, else alternately."""
     directions = (-1.0) ** np.arange(loop.channels)
     for i, name in enumerate(loop.environment.contacts):
         for wall in loop.environment.walls:
@@ -318,13 +318,13 @@ class Grid:
         return K.ravel(), B.ravel()
 
     def subset(self, count: int) -> limit_cycles.Cells:
-        """(k,) flat indices of `count` rows and columns at most, evenly spread, with the corners."""
+        """Return flat indices (k,) of at most `count` rows and columns, evenly spread, with the corners."""
         rows, columns = (np.unique(np.round(np.linspace(0, n - 1, min(count, n))).astype(int)) for n in self.shape)
         return (rows[:, None] * self.shape[1] + columns).ravel()
 
 
 def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: tuple[_Range, ...] = ()) -> Grid:
-    """n x n cells. Ranges that are not given come from the loop, and make room for the marks.
+    """Make n x n cells. Ranges that are not given follow from the loop and leave room for the marks.
 
     K is about the loop's stiffness_scale, B about delta, the most that a linear law may damp. A linear map goes up to
     2.5 times these, a logarithmic one from far below to far above. Raises InputError.
@@ -350,7 +350,7 @@ def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: t
 
 
 def _with_room(usual: _Range, marked: Sequence[float]) -> _Range:
-    """The range, widened so that marks lie well inside; a mark at 0 stays on the edge of a logarithmic map."""
+    """Widen a range so that marks lie well inside; a mark at 0 stays on the edge of a logarithmic map."""
     low, high = usual
     return min([low, *(mark / 1.1 for mark in marked if mark > 0)]), max([high, *(1.1 * mark for mark in marked)])
 
@@ -393,7 +393,7 @@ def draw_map(
     plan: limit_cycles.Plan,
     progress: Callable[[str, int, int], None],
 ) -> Map:
-    """All stages, each with its name in `progress` (stage, done, total); Ctrl-C keeps what is done."""
+    """Draw all stages of the map, reported as (stage, done, total) to `progress`; Ctrl-C keeps what is done."""
     K, B = grid.flat
     seconds, n = {}, K.size
     ratio: dict[str, Array] = {name: np.full(n, np.nan) for name in sweep.conditions}
@@ -437,7 +437,7 @@ def draw_map(
 
 
 def _population(held: limit_cycles.HeldDevices, states: Sequence[Lti], leading: NDArray[np.bool_]) -> tuple[float, int]:
-    """Worst growth and number of unstable humans among the leading ones, or, if none of these, among all.
+    """Return the worst growth and the number of unstable humans among the leading ones, or else among all.
 
     `states` are the force maps of one cell; a human is unstable if it is with any of them.
     """
@@ -454,7 +454,7 @@ _Part = TypeVar("_Part")
 def _in_slices(
     task: Callable[[slice], _Part], count: int, size: int, progress: Progress
 ) -> tuple[list[tuple[slice, _Part]], bool]:
-    """task(slice) for slices of `size` that cover range(count), and whether the keyboard ended it before the last.
+    """Return task(slice) for slices of `size` that cover range(count), and whether the keyboard interrupted.
 
     On all cores, since NumPy's kernels leave Python to other threads; what was finished is returned.
     """
@@ -509,7 +509,7 @@ class MapError:
 
 
 def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: float, grid_K: Array) -> Mark:
-    """What each condition and the population say at (K, B), and up to which K they are content at this B."""
+    """Judge (K, B) by each condition and the population, and find the stiffest K of each at this B."""
 
     def calm(k: float) -> bool:
         return bool((_growth(sweep, held, k, B) <= MARGINAL).all())
@@ -527,7 +527,7 @@ def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: fl
 
 
 def map_error(sweep: Sweep, drawn: Map, condition: str) -> MapError | None:
-    """Columns of the map that cross the edge, evenly chosen; None where there is none."""
+    """Compare evenly chosen columns that cross the edge with single sweeps; None if there are none."""
     grid, ratio = drawn.grid, drawn.ratio[condition].reshape(drawn.grid.shape)
     inside = suffices(ratio)
     crossing = inside[:-1] & ~inside[1:] & np.isfinite(ratio[1:])
@@ -558,7 +558,7 @@ def _edge(sweep: Sweep, condition: str, low: float, high: float, B: float) -> fl
 
 
 def _growth(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: float) -> Array:
-    """Growth with every human, in the worst contact state [1/s]."""
+    """Return the growth with every human in the worst contact state [1/s]."""
     states = sweep.force_maps(np.array([K]), np.array([B]))
     return np.max([held.growth(F[0])[0] for F in states], axis=0)
 
@@ -571,7 +571,7 @@ def _bisected(calm: Callable[[float], bool], low: float, high: float) -> float:
 
 
 def _last(tried: Array, safe: NDArray[np.bool_], between: Callable[[float, float], float]) -> float | None:
-    """The largest value that is safe; inf where all are, None where none is."""
+    """Return the largest safe value: inf if all are safe, None if none is."""
     if not safe.any():
         return None
     last = int(np.flatnonzero(safe)[-1])

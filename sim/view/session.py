@@ -97,7 +97,7 @@ KEYS: dict[int, tuple[str, _Event]] = {
 
 
 def keys_help(given: bool) -> list[tuple[str, str]]:
-    """The keys and what they ask for; `given` where there is a coupling from a file. The mouse comes last."""
+    """Return the keys and their actions; `given` adds the coupling from a file. The mouse comes last."""
     keys = [(name, words(event)) for name, event in KEYS.values() if given or event != Couple(GIVEN)]
     return [*keys, ("double click", "take a body"), ("Ctrl+right", "draw it")]
 
@@ -106,7 +106,7 @@ Script = tuple[tuple[float, _Event], ...]  # (time [s], event), in order of time
 
 
 def parse_script(text: str, channels: int) -> Script:
-    """'0:none 5:designed 7:theta+1 8:push1=3' as events in order of time. Raises InputError."""
+    """Parse '0:none 5:designed 7:theta+1 8:push1=3' as events in order of time. Raises InputError."""
     script = []
     for entry in text.split():
         when, colon, what = entry.partition(":")
@@ -120,7 +120,7 @@ def parse_script(text: str, channels: int) -> Script:
 
 
 def words(event: _Event) -> str:
-    """The event as a script spells it."""
+    """Write the event as a script spells it."""
     match event:
         case Couple(name):
             return name
@@ -149,7 +149,7 @@ def _event(entry: str, what: str, channels: int) -> _Event:
 
 
 def _number(text: str) -> float:
-    """What the text says, infinite where it is no number: that is never allowed."""
+    """Parse a number; text that is none gives infinity, which is never allowed."""
     try:
         return float(text)
     except ValueError:
@@ -191,12 +191,12 @@ class PreparedLoop:
 
 
 def first_loop(menu: Menu, scenario: Scenario, label: str) -> PreparedLoop:
-    """The loop to begin with. Raises InputError, DesignFailed or SingularLoop."""
+    """Return the loop that the session begins with. Raises InputError, DesignFailed or SingularLoop."""
     return _prepare(menu, scenario, label, _choose(menu, scenario, label))
 
 
 def _changed(prepared: PreparedLoop, event: Couple | _Delay) -> PreparedLoop:
-    """The loop after an event. Raises InputError, DesignFailed or SingularLoop; the old loop can go on."""
+    """Return the loop after an event. Raises InputError, DesignFailed or SingularLoop; the old loop can go on."""
     if isinstance(event, Couple):
         chosen = _choose(prepared.menu, prepared.scenario, event.name)
         return _prepare(prepared.menu, prepared.scenario, event.name, chosen)
@@ -249,7 +249,7 @@ class _Pace:
     lost: float = 0.0  # [s] clock time that no tick was made for
 
     def due(self, now: float) -> int:
-        """Ticks to be made now, so that the next one lies in the future; they count as done."""
+        """Count the ticks to be made now, so that the next one lies in the future, and mark them as done."""
         # a clock that is a rounding error short of a tick has reached it
         ticks = max(0, int((now - self.lost) / self.T + 1e-6) - self.done)
         most = self.patience / self.T
@@ -262,7 +262,7 @@ class _Pace:
         return ticks
 
     def factor(self, now: float) -> float:
-        """Simulated over clock time: 1 where nothing was lost."""
+        """Return simulated over clock time: 1 if nothing was lost."""
         return self.done * self.T / now if now > self.T else 1.0
 
 
@@ -283,13 +283,13 @@ class Grip:
         return _STIFFNESS * np.array(self.target)
 
     def force(self, scene: Scene, s: Array) -> Array:
-        """Force [N] of the hand on the handle in the plant state s, positions and velocities, on each axis."""
+        """Return the force [N] of the hand on the handle, on each axis, in the plant state s."""
         joints, n = np.array(scene.handles)[list(self.channels)], scene.model.nq
         return self.pull - _STIFFNESS * s[joints] - _DAMPING * s[n + joints]
 
 
 def _gripped(scene: Scene, channels: range, T: float) -> HeldPlant:
-    """The plant with the hand's spring and damper on a handle, its end at rest."""
+    """Return the plant with the hand's spring and damper, whose far end rests, on a handle."""
     free, n = scene.plant, scene.model.nq
     A = free.A.copy()
     for channel in channels:
@@ -408,7 +408,7 @@ class LiveLoop:
                 self._happen(event)
 
     def _make(self, event: Couple | _Delay) -> PreparedLoop | str:
-        """The loop after an event, or why there is none. The executor makes them in turn."""
+        """Return the loop after an event, or why there is none. The executor makes them in turn."""
         try:
             self._latest = _changed(self._latest, event)
         except (InputError, DesignFailed, SingularLoop) as error:  # the old loop goes on
@@ -500,7 +500,7 @@ class LiveLoop:
             self._start_engine()
 
     def _start_engine(self) -> None:
-        """The engine of the plant, with the mouse's hand where there is one, on the present buffer."""
+        """Start the engine of the plant, with the mouse's hand if there is one, on the present buffer."""
         simulation, held = self.prepared.simulation, self._grip
         plant = _gripped(simulation.scene, held.channels, simulation.scenario.T) if held else simulation.plant
         self._engine = ExactEngine(plant)
@@ -508,7 +508,7 @@ class LiveLoop:
 
 
 def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, _Event, PreparedLoop | None]]:
-    """The script with the tick of each event and the loop that it leads to."""
+    """Return the script with the tick of each event and the loop that it leads to."""
     made = []
     for time, event in script:
         into = None

@@ -70,7 +70,7 @@ _MASSLESS = {"mass": 0, "contype": 0, "conaffinity": 0}
 
 
 def _colour(channel: int) -> _Colour:
-    """The colour of a device, counted from 0."""
+    """Return the colour of a device, counted from 0."""
     return _PALETTE[channel % len(_PALETTE)]
 
 
@@ -79,12 +79,12 @@ def _devices(scene: Scene) -> int:
 
 
 def _own(scene: Scene, device: int) -> list[int]:
-    """The channels of a device."""
+    """Return the channels of a device."""
     return [channel for channel, of in enumerate(scene.devices) if of == device]
 
 
 def _owners(scene: Scene) -> tuple[int, ...]:
-    """The device (from 0) that each joint belongs to; of a person's body, the first that the person holds."""
+    """Return the device (from 0) of each joint; for a person's body, the first device that the person holds."""
     owner = dict(enumerate(scene.devices))
     for i, points in enumerate(scene.points[: _devices(scene)]):
         owner |= dict.fromkeys(points, i)
@@ -94,7 +94,7 @@ def _owners(scene: Scene) -> tuple[int, ...]:
 
 
 def _places(scene: Scene) -> tuple[int, ...]:
-    """How many steps behind its handle each joint's body stands: 0 the handle, -1 a motor, 1.. a human's arm."""
+    """Return how many steps each joint's body stands behind its handle: 0 the handle, -1 a motor, 1.. an arm."""
     place = dict.fromkeys(range(scene.channels), -1)
     for i, points in enumerate(scene.points[: _devices(scene)]):
         place |= {joint: k // len(_own(scene, i)) for k, joint in enumerate(points)}
@@ -103,12 +103,12 @@ def _places(scene: Scene) -> tuple[int, ...]:
 
 
 def _scale(history: Array) -> float:
-    """A power of two [N] above every force."""
+    """Return a power of two [N] above every force."""
     return float(2.0 ** np.ceil(np.log2(max(1.0, 1.05 * np.abs(history).max(initial=0.0)))))
 
 
 def _envelope(history: Array, columns: int, ticks: int) -> tuple[Array, Array]:
-    """Least and largest force in `columns` equal spans of the last `ticks` ticks, (columns, m) each.
+    """Return least and largest forces (columns, m) in `columns` equal spans of the last `ticks` ticks.
 
     Where the history is shorter than that, the spans before it are not-a-number.
     """
@@ -120,7 +120,7 @@ def _envelope(history: Array, columns: int, ticks: int) -> tuple[Array, Array]:
 
 
 def _overlay(frame: Frame, live: bool) -> _Lines:
-    """Labels and values; `live` adds the clock, which a video has none of."""
+    """Return labels and values of the overlay; `live` adds the clock, which a film does not have."""
     prepared, scenario = frame.prepared, frame.prepared.scenario
     delays = f"theta {_list(scenario.theta)}, psi {_list(scenario.psi)} samples of {1e3 * scenario.T:g} ms"
     mode, needs = prepared.mode, prepared.assessment.requirements
@@ -145,7 +145,7 @@ def _overlay(frame: Frame, live: bool) -> _Lines:
 
 
 def _limited(prepared: PreparedLoop) -> str:
-    """Whether a guarantee holds at the force limits."""
+    """Return in words whether a guarantee holds at the force limits."""
     assessment = prepared.assessment
     if assessment.guarantee is None:
         return "no guarantee"
@@ -153,14 +153,14 @@ def _limited(prepared: PreparedLoop) -> str:
 
 
 def _account(figures: WorldFigures, prepared: PreparedLoop) -> tuple[str, str]:
-    """What the energy shell of a world has done."""
+    """Return in words what the energy shell of a world has done."""
     W0, given, released = (1e3 * joules for joules in (figures.start_J, figures.given_J, figures.released_J))
     most = f"gave {given:.2f} mJ of {W0:g} + {released:.1f}" if prepared.assessment.guarantee else "no guarantee"
     return "energy shell", f"acted on {figures.limited_ticks} of {figures.ticks} ticks, {most}"
 
 
 def _needs(requirement: Requirement) -> str:
-    """Required against available damping of the worst channel, and the verdict."""
+    """Return required and available damping of the worst channel and the verdict, in words."""
     if not np.isfinite(requirement.ratio):
         return "no certificate"
     worst = int(np.argmax(np.divide(requirement.required, requirement.available)))
@@ -169,13 +169,13 @@ def _needs(requirement: Requirement) -> str:
 
 
 def _apart(lines: _Lines) -> tuple[_Lines, _Lines]:
-    """The lines, and the last refusal, which may take several lines."""
+    """Separate the last refusal, which may take several lines, from the other lines."""
     at = next((i for i, (label, _) in enumerate(lines) if label == "last"), len(lines))
     return (lines[:at], lines[at:]) if len(lines) - at > 1 else (lines, [])
 
 
 def _columns(lines: _Lines) -> tuple[str, str]:
-    """Labels and values as MuJoCo's overlays take them."""
+    """Join labels and values as MuJoCo's overlays expect them."""
     return "\n".join(label for label, _ in lines), "\n".join(value for _, value in lines)
 
 
@@ -202,7 +202,7 @@ class ShownScene:
         mujoco.mj_forward(self.model, self.data)
 
     def grip(self, perturb: mujoco.MjvPerturb) -> Grip | None:
-        """What the mouse holds. A hand holds the handle, whichever body of its device was taken."""
+        """Return what the mouse holds: a hand holds the handle, whichever body of its device was taken."""
         joint = int(self.model.body_jntadr[perturb.select]) if perturb.select > 0 else -1
         if joint < 0 or not (perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE):
             return None
@@ -237,7 +237,7 @@ class ShownScene:
             _arrow(drawn, at + np.array([0, 0, 0.03]), pushed, (0.1, 0.1, 0.1, 1.0))
 
     def figures(self, frame: Frame, picture: mujoco.MjrRect) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
-        """The forces of the last seconds, side by side at the bottom of a picture."""
+        """Draw the forces of the last seconds, side by side at the bottom of a picture."""
         m = len(self._channels)
         width, height = picture.width // m, round(_PLOT * picture.height)
         low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
@@ -290,7 +290,7 @@ class ShownWorld(ShownScene):
         return np.split(values[: sum(map(len, self._along))], np.cumsum([len(a) for a in self._along])[:-1])
 
     def grip(self, perturb: mujoco.MjvPerturb) -> Grip | None:
-        """What the mouse holds: a contact, in the directions in which it slides."""
+        """Return what the mouse holds: a contact, in the directions in which it slides."""
         held = int(perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
         if perturb.select not in self._bodies or not held:
             return None
@@ -299,7 +299,7 @@ class ShownWorld(ShownScene):
         return Grip(self._channels[i][0], tuple((self._along[i] @ drawn).tolist()))
 
     def draw(self, drawn: mujoco.MjvScene, frame: Frame) -> None:
-        """A stylus for each device, and arrows at its handle for the force on it and what pushes it."""
+        """Draw a stylus for each device, and arrows at its handle for its force and for what pushes it."""
         size = 0.045 * self.model.stat.extent
         forces, pushes = self._by_device(frame.mean), self._by_device(frame.push)
         for i, (along, x) in enumerate(zip(self._along, self._x, strict=True)):
@@ -320,7 +320,7 @@ class ShownWorld(ShownScene):
 
 
 def stage_for(session: LiveLoop) -> ShownScene:
-    """What shows this loop."""
+    """Return the stage that shows a loop."""
     simulation = session.prepared.simulation
     if session.world:
         return ShownWorld(session.world.ports[0].world, simulation.process.force_limit)
@@ -328,7 +328,7 @@ def stage_for(session: LiveLoop) -> ShownScene:
 
 
 def _dressed(scene: Scene, size: tuple[int, int] = _SIZE) -> mujoco.MjModel:
-    """The scene's model with shapes, places, a camera's distance and colours, but the same dynamics."""
+    """Return the scene's model with shapes, places, colours and a camera's distance, but the same dynamics."""
     spec = mujoco.MjSpec.from_string(scene.xml)
     _undress(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = size
@@ -369,7 +369,7 @@ def _undress(spec: mujoco.MjSpec) -> None:
 
 
 def _figure(device: int, low: Array, high: Array, top: float) -> mujoco.MjvFigure:
-    """One device's forces [N], (spans, axes), each drawn from least to largest in every span."""
+    """Return a figure of one device's forces (spans, axes) [N], drawn from least to largest in every span."""
     figure = mujoco.MjvFigure()
     mujoco.mjv_defaultFigure(figure)
     figure.title, figure.xlabel = f"force on device {device + 1} [N]", "time [s]"
@@ -390,7 +390,7 @@ def _figure(device: int, low: Array, high: Array, top: float) -> mujoco.MjvFigur
 
 
 def _shade(device: int, axis: int) -> _Colour:
-    """The colour of an axis of a device: darker from one to the next."""
+    """Return the colour of an axis of a device: darker from one to the next."""
     red, green, blue = _colour(device)
     return red * 0.6**axis, green * 0.6**axis, blue * 0.6**axis
 
@@ -445,7 +445,7 @@ class NoWindow(Exception):
 
 
 def _display() -> bool:
-    """Whether a window can be opened here."""
+    """Return whether a window can be opened here."""
     try:
         done = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, timeout=_PATIENCE, check=False)
     except subprocess.TimeoutExpired:
@@ -487,7 +487,7 @@ def _loop(
     sleep: Callable[[float], None],
     until: float | None = None,
 ) -> None:
-    """Frame after frame: the mouse to the session, the session to the window."""
+    """Show frame after frame: pass the mouse to the session and the session to the window."""
     start = clock()
     grip = None
     while window.is_running():
@@ -517,7 +517,7 @@ def _shown(stage: ShownScene, window: viewer.Handle, frame: Frame) -> Grip | Non
 
 
 def _typed(session: LiveLoop) -> Callable[[int], None]:
-    """The viewer's callback for a key, in the viewer's own thread."""
+    """Return the viewer's callback for a key, which runs in the viewer's own thread."""
 
     def key(code: int) -> None:
         if code in KEYS:
@@ -550,7 +550,7 @@ class FlatPictures:
         self._shapes = [(body, places[joint], owners[joint]) for body, joint in first.items()]
 
     def picture(self, frame: Frame) -> Picture:
-        """(height, width, 3): what is said of the loop, the bodies, the forces, from top to bottom."""
+        """Return the picture (height, width, 3) of a frame: words, bodies and forces from top to bottom."""
         image = Image.new("RGB", _SIZE, "white")
         pen = ImageDraw.Draw(image)
         height = _SIZE[1]
@@ -596,7 +596,7 @@ class FlatPictures:
     def _object(
         self, pen: ImageDraw.ImageDraw, frame: Frame, origin: float, per_metre: float, top: float, row: float
     ) -> None:
-        """The virtual object from above; what moves along z is not told."""
+        """Draw the virtual object from above; motion along z is not shown."""
 
         def place(at: Array) -> tuple[float, float]:
             return origin + at[0] * per_metre, top + (0.5 - at[1] / APART) * row
@@ -614,7 +614,7 @@ class FlatPictures:
                 (pen.rectangle if shape.kind == "mass" else pen.ellipse)(corners, colour)
 
     def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, device: int, x: float, y: float, per_metre: float) -> None:
-        """The range of the force since the last frame, and its mean; the device feels -f. In space only the mean."""
+        """Draw the range of the force since the last frame and its mean, in space the mean only; the device feels -f."""
         channels = _own(self.scene, device)
         if len(channels) > 1:
             joints = np.array(self.scene.handles)[channels]
@@ -632,7 +632,7 @@ class FlatPictures:
             pen.line((x, y + 9, x + frame.push[i] * reach, y + 9), _BLACK, 4)
 
     def _forces(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
-        """One plot per device, side by side."""
+        """Draw one plot for each device, side by side."""
         m, most, middle = _devices(self.scene), _scale(frame.history), (top + bottom) / 2
         low, high = _envelope(frame.history, _COLUMNS, round(HISTORY / frame.prepared.scenario.T))
         width = (_SIZE[0] - 20) / m
@@ -654,7 +654,7 @@ class WorldPictures(FlatPictures):
     """Frames of a MuJoCo scene with the devices in it, rendered without a display, and the forces."""
 
     def __init__(self, stage: ShownWorld, scene: Scene, force_limit: Array, size: tuple[int, int] = _SIZE) -> None:
-        """Raises InputError where there is no OpenGL."""
+        """Open the renderer. Raises InputError if there is no OpenGL."""
         super().__init__(scene, force_limit)
         self.stage, self._gl = stage, _offscreen(*size)
         self._gl.make_current()
@@ -665,7 +665,7 @@ class WorldPictures(FlatPictures):
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
 
     def rendered(self, frame: Frame, width: int, height: int) -> Picture:
-        """(height, width, 3): scene and devices alone."""
+        """Return the pixels (height, width, 3) of scene and devices alone."""
         stage, size = self.stage, mujoco.MjrRect(0, 0, width, height)
         stage.show(frame)
         whole = int(mujoco.mjtCatBit.mjCAT_ALL)
@@ -689,7 +689,7 @@ class WorldPictures(FlatPictures):
 
 
 def pictures_for(session: LiveLoop) -> FlatPictures:
-    """What draws the pictures of this loop's film. Raises InputError where a world needs OpenGL and there is none."""
+    """Return what draws the pictures of a film. Raises InputError if a world needs OpenGL and there is none."""
     simulation, stage = session.prepared.simulation, stage_for(session)
     if isinstance(stage, ShownWorld):
         return WorldPictures(stage, simulation.scene, simulation.process.force_limit)
@@ -697,7 +697,7 @@ def pictures_for(session: LiveLoop) -> FlatPictures:
 
 
 def _offscreen(width: int, height: int) -> Any:
-    """An OpenGL context without a window, by EGL or OSMesa. Raises InputError."""
+    """Return an OpenGL context without a window, by EGL or OSMesa. Raises InputError."""
     for kind in ("egl", "osmesa", "cgl"):
         try:
             return import_module(f"mujoco.{kind}").GLContext(width, height)
@@ -712,7 +712,7 @@ def _rgb(parts: _Colour) -> tuple[int, int, int]:
 
 
 def check_film(path: Path) -> None:
-    """Whether such a film can be written, before any work is done. Raises InputError."""
+    """Check, before any work is done, that a film can be written. Raises InputError."""
     if path.suffix not in _FORMATS:
         raise InputError(f"--video {path}: the name must end in {' or '.join(_FORMATS)}")
     check_file("--video", path)
@@ -741,7 +741,7 @@ def _gif(path: Path, pictures: Iterable[Picture], fps: float) -> int:
 
 
 def _palette(first: Picture) -> Image.Image:
-    """The colours of the first picture, and of what may appear later: forces, in light and in shade."""
+    """Return the colours of the first picture and of forces that may appear later, in light and in shade."""
     shades = [np.multiply(shade, light) for shade in (*_PALETTE, _ALARM) for light in (1.0, 0.75, 0.5)]
     strip = np.repeat(np.array(shades) * 255, -(-first.shape[1] // len(shades)), axis=0)[: first.shape[1]]
     later = np.repeat(strip[None].astype(np.uint8), first.shape[0] // 4, axis=0)
@@ -749,7 +749,7 @@ def _palette(first: Picture) -> Image.Image:
 
 
 def _mp4(path: Path, pictures: Iterable[Picture], fps: float) -> int:
-    """ffmpeg writes elsewhere; the film is put in its place when it is complete."""
+    """Write an MP4 film with ffmpeg elsewhere, and put it in its place when it is complete."""
     with tempfile.TemporaryDirectory() as folder:
         raw, whole, count = Path(folder) / "film.rgb", Path(folder) / "film.mp4", 0
         with raw.open("wb") as file:
