@@ -106,12 +106,12 @@ def _spend_on_differences(count: int, factor: Fraction) -> None:
 
 
 def rational(value: Any) -> Fraction:
-    """The exact value of a number; a float stands for its shortest decimal."""
+    """Return the exact value of a number; a float stands for its shortest decimal."""
     return Fraction(repr(float(value))) if isinstance(value, float) else Fraction(value)
 
 
 def numbers(values: ArrayLike, T: Number) -> Any:
-    """The values as an array in the arithmetic of T: float64, or Fractions. A scalar stays a scalar."""
+    """Return values as an array in the arithmetic of T: float64, or Fractions. A scalar stays a scalar."""
     if isinstance(T, Fraction):
         exact = np.frompyfunc(rational, 1, 1)(np.asarray(values, dtype=object))
         return exact if isinstance(exact, np.ndarray) else Fraction(exact)
@@ -122,7 +122,7 @@ _ZERO = Fraction(0)
 
 
 def fractions(value: Any) -> Any:
-    """A copy as Fractions."""
+    """Copy an array as Fractions."""
     array = np.asarray(value, dtype=object)
     known = isinstance(value, np.ndarray) and value.dtype == object and not value.flags.writeable
     if known and all(type(v) is Fraction for v in value.ravel()):
@@ -138,7 +138,7 @@ def eye(n: int, T: Number) -> Array:
 
 
 def inverse(M: Array) -> Array:
-    """M^-1 in its own arithmetic. Raises SingularLoop."""
+    """Return M^-1 in its own arithmetic. Raises SingularLoop."""
     if M.dtype == object:
         return solve(M, fractions(np.eye(M.shape[-1])))
     if M.size and np.max(np.linalg.cond(M)) > 1e12:
@@ -147,7 +147,7 @@ def inverse(M: Array) -> Array:
 
 
 def positive_definite(M: Any) -> bool:
-    """Whether a symmetric matrix of Fractions is positive definite: all pivots of its elimination are."""
+    """Return whether a symmetric matrix of Fractions is positive definite: all pivots of its elimination are."""
     left = M.copy()
     for i in range(len(left)):
         if left[i, i] <= 0:
@@ -157,7 +157,7 @@ def positive_definite(M: Any) -> bool:
 
 
 def times(left: Array, right: Array) -> Array:
-    """left @ right; of Fractions only the entries that are not zero are multiplied, since next to all are.
+    """Return left @ right; Fractions are multiplied only where they are not zero, since most are.
 
     Rows of the left one and columns of the right one become integers over a common denominator each, so that a sum
     needs no common divisors but one at its end.
@@ -184,7 +184,7 @@ def times(left: Array, right: Array) -> Array:
 
 
 def _cleared(M: Array) -> tuple[list[list[int]], list[int]]:
-    """Every row as integers, and the common denominator of each."""
+    """Return every row as integers, and the common denominator of each row."""
     common = [math.lcm(*(v.denominator for v in row if v)) for row in M.tolist()]
     whole = [
         [v.numerator * (den // v.denominator) if v else 0 for v in row]
@@ -194,7 +194,7 @@ def _cleared(M: Array) -> tuple[list[list[int]], list[int]]:
 
 
 def solve(M: Array, right: Array) -> Array:
-    """M^-1 right in their own arithmetic. Raises SingularLoop."""
+    """Return M^-1 right in their own arithmetic. Raises SingularLoop."""
     if M.dtype != object:
         try:
             return np.linalg.solve(M, right)
@@ -204,7 +204,7 @@ def solve(M: Array, right: Array) -> Array:
 
 
 def _solve_exactly(M: Any, right: Any) -> Any:
-    """X with M X = right over the Fractions, by sparse elimination. Raises SingularLoop.
+    """Solve M X = right over the Fractions by sparse elimination. Raises SingularLoop.
 
     The models here are series of small blocks, triangular when read in the right order: the next pivot is in the row
     with the fewest entries, and there in the column with the fewest (Markowitz), so next to nothing fills in.

@@ -292,7 +292,7 @@ class _BallBlock:
         self._inverse = np.linalg.inv(self.M)
 
     def _missing(self, v: Array, f: Array, q: Array) -> Any:
-        """Where f + M v - q is beyond its tolerance, (nsim,)."""
+        """Return where (nsim,) f + M v - q exceeds its tolerance."""
         terms = np.abs(f) + np.abs(self.M) @ np.abs(v) + np.abs(q)
         finite = np.where(np.isfinite(self.limit), self.limit, np.abs(q))
         allowed = np.maximum(_RESIDUAL * finite, _ROUNDED * terms.max(axis=0))
@@ -318,7 +318,7 @@ class _BallBlock:
         return v, f, lost.size
 
     def _newton(self, u: Array, q: Array) -> Array:
-        """Improve u, of which P(u) + M (u - P(u))/tau = q is asked, column by column."""
+        """Improve the solution u of P(u) + M (u - P(u))/tau = q by Newton steps, column by column."""
         one, starts = np.eye(len(q)), np.cumsum((0, *self.balls))
         for turn in range(_NEWTON):
             v, f = self._of(u)
@@ -345,7 +345,7 @@ class _BallBlock:
         return u
 
     def _bisected(self, q: Array) -> tuple[Array, Array]:
-        """One vector: f = (I + lam M)^-1 q has the length of the limit, and gets shorter with lam."""
+        """Solve for one vector: f = (I + lam M)^-1 q with the length of the limit; its length falls with lam."""
         one, limit = np.eye(len(q)), self.limit[0]
         excess = np.linalg.norm(q, axis=0) / limit - 1
         low, high = excess / np.linalg.norm(self.M, 2), excess / np.linalg.eigvalsh((self.M + self.M.T) / 2)[0]
@@ -361,7 +361,7 @@ class _BallBlock:
         return high * f, f
 
     def _split(self, q: Array) -> tuple[Array, Array]:
-        """Douglas and Rachford's iteration, which converges for every monotone M; Newton finishes it."""
+        """Iterate by Douglas and Rachford, which converges for every monotone M; Newton steps finish the solution."""
         v, f = self._of(q)
         u, resolvent = q.copy(), np.linalg.inv(self._by_tau + np.eye(len(q)))
         for turn in range(_SPLIT):

@@ -31,7 +31,7 @@ LOST = -1  # as a delay: the packet never arrives
 
 
 def delay(steps: Sequence[int], T: Number) -> Lti:
-    """blockdiag(z^-n_1, ..., z^-n_m) in the arithmetic of T: a chain of n_i unit delays per channel."""
+    """Return blockdiag(z^-n_1, ..., z^-n_m) in the arithmetic of T: a chain of n_i unit delays per channel."""
     for n in steps:
         if n != int(n) or n < 0:
             raise ValueError(f"a delay is a whole number of samples, zero or more, got {n}")
@@ -39,18 +39,18 @@ def delay(steps: Sequence[int], T: Number) -> Lti:
 
 
 def moving_sum(steps: Sequence[int], T: Number) -> Lti:
-    """diag(1 + 1/z + ... + z^-n_i)."""
+    """Return diag(1 + 1/z + ... + z^-n_i)."""
     return _chains(tuple((1,) * (n + 1) for n in steps), T)
 
 
 @lru_cache(maxsize=256, typed=True)  # typed: the period's type decides the arithmetic
 def _chains(weights: tuple[tuple[int, ...], ...], T: Number) -> Lti:
-    """The taps of each channel, built once: loops are evaluated again and again with the same delays."""
+    """Return the taps of each channel, cached: loops are evaluated often with the same delays."""
     return Lti.diag(*(taps(each, T) for each in weights))
 
 
 def packet_delays(values: ArrayLike) -> Ticks:
-    """A read-only (ticks, m, nsim) array of delays [samples], LOST among them. Raises ValueError for other numbers."""
+    """Return a read-only array of delays (ticks, m, nsim) [samples], LOST among them. Raises ValueError."""
     delays = np.array(values, dtype=np.int64)
     if delays.ndim != 3:
         raise ValueError(f"delays have the shape {delays.shape}, expected (ticks, channels, simulations)")
@@ -61,7 +61,7 @@ def packet_delays(values: ArrayLike) -> Ticks:
 
 
 def _newest(delays: Ticks) -> Ticks:
-    """The packet in use at every tick, (ticks, m, nsim); -1 before the first arrival."""
+    """Return the packet in use at every tick (ticks, m, nsim); -1 before the first arrival."""
     ticks = delays.shape[0]
     sent = np.arange(ticks)[:, None, None]
     there = np.full(delays.shape, -1)
@@ -72,13 +72,13 @@ def _newest(delays: Ticks) -> Ticks:
 
 
 def ages(delays: Ticks) -> Ticks:
-    """k - j of the force in use at every tick, (ticks, m, nsim); -1 before the first arrival."""
+    """Return the age k - j of the force in use at every tick (ticks, m, nsim); -1 before the first arrival."""
     packet = _newest(delays)
     return np.where(packet >= 0, np.arange(delays.shape[0])[:, None, None] - packet, -1)
 
 
 def realising(wanted: Ticks) -> Ticks:
-    """Packet delays (ticks, ..) under which the device uses forces of the `wanted` ages (ticks, ..).
+    """Return packet delays (ticks, ..) under which the device uses forces of the `wanted` ages (ticks, ..).
 
     Ages may grow by one per tick at most. A packet that is never used arrives together with the next newer one, so no
     delay exceeds the largest wanted age.
@@ -100,7 +100,7 @@ class HeldLine:
     """Forces on their way to the devices, for any number of simulations; see the head of this file."""
 
     def __init__(self, delays: Ticks, nsim: int) -> None:
-        """`delays` of one simulation serve all. Raises ValueError where their number is another."""
+        """Take `delays` of all simulations, or of one that serves all. Raises ValueError for another number of them."""
         if delays.shape[2] not in (1, nsim):
             raise ValueError(f"delays are those of {delays.shape[2]} simulations, expected 1 or {nsim}")
         ticks, m, _ = delays.shape
@@ -180,7 +180,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return any(LOST in row for row in self.recorded)
 
     def draw(self, rng: np.random.Generator, ticks: int, given: ArrayLike | None = None) -> Ticks:
-        """Delays of the packets of one run, (ticks, m), LOST among them.
+        """Draw the delays (ticks, m) of the packets of one run, LOST among them.
 
         `given` are the rows (period, m), repeated, of the patterns that depend on the loop: theta for constant, what
         a search has found worst for adversarial. Raises ValueError where they are missing.
@@ -205,7 +205,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 return np.resize(np.asarray(given, dtype=np.int64), (ticks, lo.size))
 
     def _bursts(self, rng: np.random.Generator, ticks: int) -> NDArray[np.bool_]:
-        """(ticks, m) whether a packet is in a burst: two states per channel with geometric stretches, calm first."""
+        """Return where (ticks, m) a packet is in a burst: two states per channel, geometric stretches, calm first."""
         count = 1 + int(2 * ticks / (self.calm + self.burst)) + 8 * int(np.sqrt(ticks) + 1)
         columns = []
         for _ in self.lo:
@@ -253,7 +253,7 @@ class Periods(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return sum(self.recorded) / len(self.recorded) if self.recorded else (self.shortest + self.longest) / 2
 
     def draw(self, rng: np.random.Generator, ticks: int) -> Array:
-        """(ticks,) [s]"""
+        """Draw the periods (ticks,) [s]."""
         if self.recorded:
             return np.resize(np.array(self.recorded), ticks)
         return rng.choice(np.linspace(self.shortest, self.longest, _PERIODS), ticks)
@@ -297,7 +297,7 @@ class Timing:
         return len(self._table[0]) == 1
 
     def times(self, first: int, ticks: int) -> Array:
-        """[s] when ticks first .. first + ticks - 1 begin, (ticks,)."""
+        """Return the times (ticks,) [s] at which ticks first .. first + ticks - 1 begin."""
         ends = np.cumsum(self.period)
         k = np.arange(first, first + ticks)
         begins = np.concatenate([[0.0], ends[:-1]])
@@ -311,7 +311,7 @@ def drawn(
     ticks: int,
     rng: np.random.Generator,
 ) -> Timing | None:
-    """A timing of `ticks` ticks; None where all are even and forces latch at their beginning.
+    """Return a timing of `ticks` ticks; None if all are even and forces latch at their beginning.
 
     A latency is drawn for each tick and channel from the ends and the middle of its range.
     """

@@ -305,12 +305,12 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         )
 
     def delayed(self, theta: _Steps) -> Loop:
-        """The loop whose forces have these delays, constant ones."""
+        """Return the loop with these constant delays of its forces."""
         lam = tuple(min(n, t + p) for n, t, p in zip(self.lam, theta, self.psi, strict=True))
         return msgspec.structs.replace(self, theta=theta, lam=lam, varying_delay=None)
 
     def switching(self, span: DelayRange | None) -> Loop:
-        """The loop whose delays may switch within this range, or are the constant theta."""
+        """Return the loop with delays that may switch within a range, or with the constant theta."""
         return msgspec.structs.replace(self, varying_delay=span)
 
     @property

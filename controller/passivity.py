@@ -57,7 +57,7 @@ def hermitian_floor(G: Lti, enough: float, unwanted: float) -> tuple[float, floa
 
 
 def _balanced(G: Lti) -> Lti:
-    """The same block with states scaled by powers of two, which is exact."""
+    """Return the same block with states scaled by powers of two, which is exact."""
     if not G.order:
         return G
     import scipy.linalg  # no help has to wait for it
@@ -73,7 +73,7 @@ _Lost = tuple[float, float, float]
 
 
 def _without_idle_directions(G: Lti) -> tuple[Lti, _Lost | None]:
-    """Q'GQ, where an orthonormal Q leaves out the directions in which nothing goes in or comes out at any frequency.
+    """Return Q'GQ, where an orthonormal Q leaves out directions that are zero at every frequency.
 
     He G is zero in such a direction, as that of two contacts that move alike, which no finite number of intervals
     would decide. The second value holds the norms of what Q leaves out of B, C and D, or None where that is nothing.
@@ -91,7 +91,7 @@ def _without_idle_directions(G: Lti) -> tuple[Lti, _Lost | None]:
 
 
 def _norms(G: Lti) -> list[tuple[Array, Array]]:
-    """(L, L^-1), (n, n) each, of states L^-1 x in which the resolvent's norm tells how far the poles are.
+    """Return L and L^-1 (n, n): for states L^-1 x the norm of the resolvent tells how far the poles are.
 
     Any L gives a valid bound, and the better one counts: the states as they are, and states that are even under noise.
     """
@@ -111,7 +111,7 @@ def _norms(G: Lti) -> list[tuple[Array, Array]]:
 def _bounded(
     G: Lti, norms: list[tuple[Array, Array]], lost: _Lost | None, w: Array, half: Array
 ) -> tuple[Array, Array]:
-    """(lower bounds over |w' - w| <= half, least eigenvalues at w), (k,) each."""
+    """Return lower bounds (k,) over |w' - w| <= half, and least eigenvalues (k,) at w."""
     A, B, C, D = G.A, G.B, G.C, G.D
     n, m = B.shape
     if not n:
@@ -176,7 +176,7 @@ def sizes_around(G: Lti, w: Array, radius: Array) -> tuple[Array, Array]:
 
 
 def _size(M: NDArray[np.inexact[Any]]) -> Array:
-    """The Frobenius norm of each matrix."""
+    """Return the Frobenius norm of each matrix."""
     return np.linalg.norm(M, axis=(1, 2))
 
 

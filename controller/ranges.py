@@ -65,7 +65,7 @@ class Region:
 
 
 def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
-    """The environment itself, then the vertices of the ranges that differ from it; of more than 128 so many.
+    """Return the environment, then the vertices of the ranges that differ from it, or 128 of more vertices.
 
     Raises ValueError naming the field where the ranges do not fit the network, or are of too many parameters.
     """
@@ -77,12 +77,12 @@ def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
 
 
 def number_of_vertices(network: Network, ranges: Ranges) -> int:
-    """Every combination of ends, and of contacts that are there or absent."""
+    """Count every combination of ends, and of contacts that are there or absent."""
     return prod(len(part.corners) for part in _parts(network, ranges))
 
 
 def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
-    """Which corner every part has: all combinations, or 128 in which any three ends meet in every combination.
+    """Return the corner of every part: all combinations, or 128 in which any three ends meet in every combination.
 
     These are the words of a linear code. A bit of a corner's number is the parity of the word's number and a mask of
     its own; all masks have the highest bit, so that no two of them add up to a third: any three are independent.
@@ -106,13 +106,13 @@ def _vertices(parts: Sequence[_Part]) -> Iterable[tuple[int, ...]]:
 
 
 def regions(network: Network, ranges: Ranges) -> tuple[Region, ...]:
-    """The ranges as one region for every way in which its contacts can be there or absent."""
+    """Return the ranges as one region for every way in which its contacts can be there or absent."""
     parts = _parts(network, ranges)
     return tuple(_region(network, parts, states) for states in product(*(part.states for part in parts)))
 
 
 def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Member, ...]:
-    """`count` environments drawn from the ranges: every parameter evenly, a contact that may be absent as often as not.
+    """Draw `count` environments from the ranges, uniformly; a contact that may be absent is absent half of the time.
 
     The first are the same whatever the count.
     """
@@ -202,7 +202,7 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
 
 
 def _spring_state(own: Spring, stiffness: _Range, damping: _Range) -> _State:
-    """A spring that is present; a range of no width is not a coordinate."""
+    """Return a spring that is present; a range of no width is not a coordinate."""
     free = [low < high for low, high in (stiffness, damping)]
 
     def value(point: Sequence[float]) -> Spring:

@@ -38,7 +38,7 @@ class MatrixInequality:
 
     @classmethod
     def of(cls, constant: Complex, slope: Complex) -> MatrixInequality:
-        """Of Hermitian matrices: constant (k, r, r), slope (k, n, r, r)."""
+        """Make the block of Hermitian matrices: constant (k, r, r), slope (k, n, r, r)."""
         return cls(packed(constant), np.ascontiguousarray(np.swapaxes(packed(slope), 1, 2)))
 
     @property
@@ -52,26 +52,26 @@ class MatrixInequality:
         return k * square * n * (square + n)
 
     def at(self, x: Array) -> Complex:
-        """S(x), shape (k, r, r)."""
+        """Return S(x), shape (k, r, r)."""
         return _unpacked(self.constant + self.slope @ x)
 
     def moved(self, step: Array) -> Complex:
-        """What a step adds to S, (k, r, r)."""
+        """Return what a step adds to S, (k, r, r)."""
         return _unpacked(self.slope @ step)
 
     def directions(self, x: Array) -> Array:
-        """The vectors of S^-1/2 slope_a S^-1/2 as columns, (k r^2, n)."""
+        """Return the vectors of S^-1/2 slope_a S^-1/2 as columns (k r^2, n)."""
         rows = _turned(_inverse_root(self.at(x))) @ self.slope
         return rows.reshape(-1, rows.shape[2])
 
     def newton(self, x: Array) -> tuple[Array, Array]:
-        """Gradient of -log det S, and its Hessian."""
+        """Return the gradient of -log det S and its Hessian."""
         rows = self.directions(x)
         one = packed(np.eye(math.isqrt(self.constant.shape[1]), dtype=complex))
         return -np.tile(one, len(self.constant)) @ rows, rows.T @ rows
 
     def changed(self, U: Array) -> MatrixInequality:
-        """The same of y where x = U^-1 y."""
+        """Return the block in terms of y, where x = U^-1 y."""
         import scipy
 
         slope = scipy.linalg.solve_triangular(U, self.slope.reshape(-1, len(U)).T, trans=1).T
@@ -103,11 +103,11 @@ class EntryInequality:
         return k * (n**2 * square**2 + square * own * (square + n * square + own))
 
     def at(self, x: Array) -> Complex:
-        """S(x), shape (k, r, r)."""
+        """Return S(x), shape (k, r, r)."""
         return _unpacked(self.constant) + self.moved(x)
 
     def moved(self, step: Array) -> Complex:
-        """What a step adds to S, (k, r, r)."""
+        """Return what a step adds to S, (k, r, r)."""
         r = self.left.shape[-1]
         X, own = np.split(step, [r * r * self.functions.shape[1]])
         filtered = (self.functions @ X.reshape(r * r, -1).T).reshape(-1, r, r)
@@ -122,7 +122,7 @@ class EntryInequality:
         return first, second, np.hstack([along.real, along.imag, against.real]), np.ascontiguousarray(against.imag)
 
     def newton(self, x: Array) -> tuple[Array, Array]:
-        """Gradient of -log det S, and the upper triangle of its Hessian."""
+        """Return the gradient of -log det S and the upper triangle of its Hessian."""
         (k, n), r = self.functions.shape, self.left.shape[-1]
         L, V, adjoint = self.left, self.right, lambda X: np.conj(np.swapaxes(X, 1, 2))
         P = hermitian(np.linalg.inv(self.at(x)).astype(np.complex128, copy=False))
@@ -153,7 +153,7 @@ class EntryInequality:
 
 
 def joined(blocks: Sequence[MatrixInequality]) -> tuple[MatrixInequality, ...]:
-    """The same inequalities as one block for each size of matrices."""
+    """Join the inequalities into one block for each size of matrices."""
     sizes = dict.fromkeys(block.constant.shape[1] for block in blocks)
     alike = [[block for block in blocks if block.constant.shape[1] == size] for size in sizes]
     return tuple(
@@ -186,16 +186,16 @@ class Program:
         return _STEP + _PRODUCT * products
 
     def value(self, x: Array) -> float:
-        """|A x - b|^2 + c'x."""
+        """Return |A x - b|^2 + c'x."""
         residual = self.A @ x - self.b
         return float(residual @ residual + self.c @ x)
 
     def feasible(self, x: Array) -> bool:
-        """Whether every inequality holds strictly."""
+        """Return whether every inequality holds strictly."""
         return all(_definite(block.at(x)) for block in self.blocks)
 
     def conditioned(self, x: Array) -> tuple[Program, Array]:
-        """(the program in y, the upper triangle U with x = U^-1 y), for which objective and barrier at x are balanced.
+        """Return the program in y and the upper triangle U, x = U^-1 y, that balance objective and barrier at x.
 
         U is the triangle of the stacked rows of both, so that no inner product is ever formed in the ill-conditioned
         coordinates of a basis of filters.
@@ -215,7 +215,7 @@ class Program:
 
 
 def centre(program: Program, x: Array, t: float) -> Array:
-    """The minimiser of t (|A x - b|^2 + c'x) - sum log det S, from a strictly feasible x."""
+    """Minimise t (|A x - b|^2 + c'x) - sum log det S from a strictly feasible x."""
     cost = program.step_cost
     for _ in range(budgets.CENTRING_STEPS):
         spend(cost)
@@ -234,7 +234,7 @@ def centre(program: Program, x: Array, t: float) -> Array:
 
 
 def towards(start: Array, x: Array, program: Program, reserve: float = 0.9) -> Array:
-    """The point between `start`, strictly feasible, and x that is strictly feasible: x itself where it is one."""
+    """Return the feasible point nearest to x on the way from the feasible `start`: x itself if it is feasible."""
     if program.feasible(x):
         return x
     low, high = 0.0, 1.0
@@ -260,7 +260,7 @@ def _solved(hessian: Array, right: Array) -> Array:
 
 
 def _length(program: Program, step: Array, x: Array, t: float) -> float:
-    """The minimiser of the barrier function along the step, where no inequality loses more than it may at once.
+    """Return the step length that minimises the barrier function, where no inequality falls by more than allowed.
 
     A point that an exact search has taken close to the boundary leaves it in tiny steps only, along a curve.
     """
@@ -281,13 +281,13 @@ def _length(program: Program, step: Array, x: Array, t: float) -> float:
 
 
 def _eigenvalues(block: MatrixInequality | EntryInequality, x: Array, step: Array) -> Array:
-    """Those of S^-1/2 dS S^-1/2 for the step, at every frequency."""
+    """Return the eigenvalues of S^-1/2 dS S^-1/2 for the step, at every frequency."""
     inverse = _inverse_root(block.at(x))
     return np.linalg.eigvalsh(inverse @ block.moved(step) @ np.conj(np.swapaxes(inverse, 1, 2))).ravel()
 
 
 def _turned(W: Complex) -> Array:
-    """H -> W H W* of `packed` matrices, (k, r^2, r^2): its entry a, b is the sum of W_ac conj(W_bd) H_cd."""
+    """Return H -> W H W* of `packed` matrices (k, r^2, r^2); entry a, b is the sum of W_ac conj(W_bd) H_cd."""
     r = W.shape[-1]
     c, d = np.triu_indices(r, 1)
     a, b = np.append(np.arange(r), c), np.append(np.arange(r), d)
@@ -299,14 +299,14 @@ def _turned(W: Complex) -> Array:
 
 
 def packed(H: Complex) -> Array:
-    """Hermitian matrices (.., r, r) as real vectors (.., r^2) of the same inner product."""
+    """Return Hermitian matrices (.., r, r) as real vectors (.., r^2) with the same inner product."""
     upper = np.triu_indices(H.shape[-1], 1)
     off = np.sqrt(2) * H[..., upper[0], upper[1]]
     return np.concatenate([np.real(np.diagonal(H, axis1=-2, axis2=-1)), np.real(off), np.imag(off)], axis=-1)
 
 
 def _unpacked(v: Array) -> Complex:
-    """The Hermitian matrices of `packed`."""
+    """Return the Hermitian matrices of `packed` vectors."""
     r = math.isqrt(v.shape[-1])
     upper, count = np.triu_indices(r, 1), r * (r - 1) // 2
     H = np.zeros((*v.shape[:-1], r, r), dtype=complex)
@@ -317,7 +317,7 @@ def _unpacked(v: Array) -> Complex:
 
 
 def _inverse_root(S: Complex) -> Complex:
-    """W with W S W* = I."""
+    """Return W with W S W* = I."""
     return np.linalg.inv(np.linalg.cholesky(S)).astype(np.complex128, copy=False)
 
 

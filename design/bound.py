@@ -81,7 +81,7 @@ class _Bound:
 
 
 def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> _Bound:
-    """The least rms mismatch over the band of any coupling certified this-environment; for up to MOST channels.
+    """Bound the least rms mismatch of any coupling certified this-environment from below; for up to MOST channels.
 
     Periods up to T_max count as less damping, as in the condition.
     """
@@ -145,11 +145,11 @@ class _Dual:
         return np.concatenate([np.zeros(m * m * len(self.target)), unit, np.zeros(len(self.forbidden))])
 
     def objective(self) -> tuple[Array, Array, Array]:
-        """A, b, c: -2 <H, Lambda E> - <H, H/w> is |b|^2 - |A x - b|^2, and c'x is tr C_0."""
+        """Return A, b, c with -2 <H, Lambda E> - <H, H/w> = |b|^2 - |A x - b|^2; c'x is tr C_0."""
         return np.eye(self.target.size, self.start.size), self.target.T.ravel(), self.start
 
     def imposed(self) -> Array:
-        """The frequencies at which D > 0 is imposed first, closer at the band's ends, by modes and where delays end."""
+        """Return the frequencies at which D > 0 is imposed first: dense at the band's ends, modes and delays."""
         low, high = self.grid[0], self.grid[-1]
         steps = np.arange(4 * self.knots.size - 3) / 4
         within = np.exp(np.interp(steps, np.arange(self.knots.size), np.log(self.knots)))
@@ -163,14 +163,14 @@ class _Dual:
         return w[w <= np.pi]
 
     def swept(self) -> Array:
-        """Those at which it is looked whether D > 0."""
+        """Return the frequencies at which D > 0 is checked."""
         low, high = self.grid[0], self.grid[-1]
         beside = np.concatenate([low * np.geomspace(1e-3, 1, 60), np.geomspace(high, np.pi, 200)])
         swept = np.unique(np.concatenate([[0.0], self.grid, beside, np.linspace(high, np.pi, 400)]))
         return np.union1d(swept, (swept[1:] + swept[:-1]) / 2)
 
     def further(self, w: Array) -> Complex:
-        """What each unknown of C_0 and the C_k adds to D, (k, unknowns, m, m), before its Hermitian part is taken."""
+        """Return what unknowns of C_0 and the C_k add to D (k, unknowns, m, m), before its Hermitian part is taken."""
         m, z = self.loop.channels, on_circle(w)
         triangle = _triangle(m)
         slope = np.zeros((w.size, len(triangle) + len(self.forbidden), m, m), dtype=np.complex128)
@@ -182,14 +182,14 @@ class _Dual:
         return slope
 
     def block(self, w: Array) -> EntryInequality:
-        """D > 0 at these frequencies, scaled by root(delta) from both sides."""
+        """Return the block D > 0 at these frequencies, scaled by root(delta) from both sides."""
         further = np.swapaxes(packed(hermitian(self.further(w))), 1, 2)
         functions = 4 / self.loop.T * _causal(self.grid, self.heights, w)
         root = np.tile(np.diag(np.sqrt(self.loop.delta)).astype(complex), (w.size, 1, 1))
         return EntryInequality(np.zeros(further.shape[:2]), functions, root, root, np.ascontiguousarray(further))
 
     def matrix(self, x: Array) -> DualMatrix:
-        """D of a point, as what can be bounded between frequencies."""
+        """Return D of a point in a form that can be bounded between frequencies."""
         m, root = self.loop.channels, np.sqrt(np.asarray(self.loop.delta))
         own, triangle = x[m * m * len(self.target) :], _triangle(m)
         sums = np.zeros((1 + max((len(weights) for _, weights in self.forbidden), default=0), m, m))
@@ -200,7 +200,7 @@ class _Dual:
         return DualMatrix.of(self.grid, self.h(x), 4 / self.loop.T * np.outer(root, root), sums)
 
     def h(self, x: Array) -> Complex:
-        """H of a point at the grid, (k, m, m)."""
+        """Return H of a point at the grid (k, m, m)."""
         m, inner = self.loop.channels, self.heights.shape[1]
         parts = x[: 2 * m * m * inner].reshape(m * m, 2 * inner)
         return (self.heights @ (parts[:, :inner] + 1j * parts[:, inner:]).T).reshape(-1, m, m)
@@ -231,7 +231,7 @@ class _Dual:
         return middle, half, response, bounds
 
     def objective_again(self, x: Array) -> tuple[float, float]:
-        """The bound of a point by Gauss's rule, from H itself; and how far it is off at most.
+        """Return the bound of a point by Gauss's rule, from H itself, and its largest error.
 
         In an interval the integrand g = (2/pi) Re tr H* Lambda E + (span/pi^2) w |H|^2 |E|^2 is analytic, since H is
         linear there. Gauss's rule of N points is exact for polynomials up to the degree 2N - 1, and its weights are
@@ -257,7 +257,7 @@ class _Dual:
         return -value - float(self.start @ x), float(missed.sum() + (of_sum + of_values).sum())
 
     def charged(self, x: Array, value: float, swept: Array) -> tuple[float, Array, Array]:
-        """The bound of a point after what D lacks anywhere is charged; where D was evaluated, and its eigenvalues.
+        """Return the bound of a point after what D lacks is charged; where D was evaluated, and its eigenvalues.
 
         A sum that is zero only but for rounding leaves no bound.
         """
@@ -268,7 +268,7 @@ class _Dual:
         return again - error + m * min(lower, 0.0), where, least
 
     def best(self) -> tuple[float, float]:
-        """Two bounds on the mean square: with D at samples, and what remains after D is charged on the whole circle.
+        """Return two bounds on the mean square: with D at samples, and with D charged on the whole circle.
 
         The points are along the barrier's path, with further frequencies where D fails between.
         """
@@ -304,14 +304,14 @@ class _Dual:
 
 
 def _gauss(grid: Array) -> tuple[Array, Array, Array]:
-    """Gauss's rule of three points in each interval: points, weights, and shares of an interval before them (3,)."""
+    """Return Gauss's rule of three points in each interval: points, weights, and shares of the interval before (3,)."""
     part, weight = np.polynomial.legendre.leggauss(3)
     part, width = (1 + part) / 2, np.diff(grid)
     return (grid[:-1] + part[:, None] * width).ravel(), (weight[:, None] / 2 * width).ravel(), part
 
 
 def _late(loop: Loop, E: Lti, w: Array) -> tuple[Array, Complex]:
-    """|E| (k,), and Lambda E/|E| (k, m, m)."""
+    """Return |E| (k,) and Lambda E/|E| (k, m, m)."""
     z = on_circle(w)
     response = E.at(z)
     size = np.linalg.norm(response, axis=(1, 2))
@@ -319,7 +319,7 @@ def _late(loop: Loop, E: Lti, w: Array) -> tuple[Array, Complex]:
 
 
 def _between(inner: Array, room: Array, x: Array, lacking: Array) -> Array | None:
-    """The point nearest to x, on the way from `inner`, at which no least eigenvalue is negative: they are concave."""
+    """Return the point nearest to x on the way from `inner` at which no least eigenvalue is negative (concavity)."""
     if room.min() <= 0:
         return None if lacking.min() < 0 else x
     fails = lacking < 0
@@ -328,7 +328,7 @@ def _between(inner: Array, room: Array, x: Array, lacking: Array) -> Array | Non
 
 
 def _knots(E: Lti, low: float, high: float, count: int) -> Array:
-    """Those of h: even in the logarithm, closer at the ends of the band and around the modes of E, by their width."""
+    """Return the knots of h: even in log frequency, dense at the band's ends and, by their width, at modes of E."""
     even = np.geomspace(low, high, count)
     step = np.log(even[1] / even[0])
     ends = np.exp(step * np.array(_NEAR_END))
@@ -340,7 +340,7 @@ def _knots(E: Lti, low: float, high: float, count: int) -> Array:
 
 
 def _modes(E: Lti) -> tuple[Array, Array]:
-    """Those of E [rad/sample], and their relative widths."""
+    """Return the modes of E [rad/sample] and their relative widths."""
     poles = E.poles()
     poles = poles[(np.abs(poles) > 0.01) & (poles.imag > 0)]
     return np.angle(poles), -np.log(np.abs(poles)) / np.angle(poles)
@@ -351,7 +351,7 @@ def _triangle(m: int) -> list[tuple[int, int]]:
 
 
 def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]:
-    """What the delays forbid: (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E.
+    """Return what delays forbid: (row i, weights v (k, m)) with sum_k v_k' s_k[i] = 0 for every F = Theta R Psi E.
 
     And whether these sums are exact: those of a null space are not but for rounding where the channels' psi differ.
 
@@ -389,12 +389,12 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
 
 
 def _first(sums: list[tuple[int, Array]]) -> tuple[tuple[int, Array], ...]:
-    """Those that begin first, as many as are taken."""
+    """Return the columns that begin first, as many as are used."""
     return tuple(sorted(sums, key=lambda one: int(np.flatnonzero(one[1].any(axis=1))[0]))[: budgets.BOUND_SUMS])
 
 
 def _causal(grid: Array, heights: Array, w: Array) -> Complex:
-    """(1/z - 1) H_+ + H_0 at z = e^jw of H = a and H = j a, each H(conj z) = conj H(z), (k, 2 functions).
+    """Return (1/z - 1) H_+ + H_0 at z = e^jw of H = a and H = j a, H(conj z) = conj H(z), (k, 2 functions).
 
     Each a is piecewise linear with these heights on the grid, the first and last of them zero, and zero elsewhere. With
     sigma_i the change of its slope at x_i, H_k = -sum sigma_i cos(k x_i)/(pi k^2), so that H_+ consists of dilogarithms
@@ -410,7 +410,7 @@ def _causal(grid: Array, heights: Array, w: Array) -> Complex:
 
 
 def _worst(lacking: Array, w: Array) -> Array:
-    """The frequencies of the highest local maxima above zero."""
+    """Return the frequencies of the highest local maxima above zero."""
     padded = np.concatenate([[-np.inf], lacking, [-np.inf]])
     local = np.flatnonzero((lacking >= padded[:-2]) & (lacking >= padded[2:]) & (lacking > 0))
     return w[local[np.argsort(lacking[local])[-_MOST_ADDED:]]]

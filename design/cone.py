@@ -74,12 +74,12 @@ class Inequality:
 
     @classmethod
     def least(cls, unknowns: Sequence[int], value: float) -> Inequality:
-        """x >= value, for each of the unknowns."""
+        """Add x >= value for each of the unknowns."""
         return cls(np.full((len(unknowns), 1, 1), -value), np.eye(len(unknowns))[:, :, None, None], unknowns)
 
     @classmethod
     def most(cls, unknowns: Sequence[int], value: float) -> Inequality:
-        """x <= value, for each of the unknowns."""
+        """Add x <= value for each of the unknowns."""
         return cls(np.full((len(unknowns), 1, 1), value), -np.eye(len(unknowns))[:, :, None, None], unknowns)
 
     def at(self, x: Array) -> Array | Complex:
@@ -92,7 +92,7 @@ class Inequality:
         return rows * (rows + 1) // 2 > max(_LARGE, _MANY * len(self.unknowns))
 
     def rows(self) -> tuple[Array, Array]:
-        """(k, r) and (q, k, r) real: the lower triangles row by row, such that inner products stay the same."""
+        """Return the lower triangles row by row, (k, r) and (q, k, r) real, scaled to keep inner products."""
         constant, slopes = (_real(part) for part in (self.constant, self.slopes))
         i, j = np.tril_indices(constant.shape[-1])
         weight = np.where(i == j, 1.0, np.sqrt(2))
@@ -100,7 +100,7 @@ class Inequality:
 
 
 def _real(H: Array | Complex) -> Array:
-    """[[X, -Y], [Y, X]] of H = X + jY, (..., n, n) -> (..., 2n, 2n): Hermitian >= 0 iff symmetric >= 0."""
+    """Return [[X, -Y], [Y, X]] of H = X + jY, (..., n, n) -> (..., 2n, 2n): Hermitian >= 0 iff symmetric >= 0."""
     if not np.iscomplexobj(H):
         return np.asarray(H, dtype=float)
     top, low = np.concatenate([H.real, -H.imag], axis=-1), np.concatenate([H.imag, H.real], axis=-1)

@@ -37,7 +37,7 @@ class Matrix:
 
     @classmethod
     def of(cls, rows: Any, shape: Any = None) -> Matrix:
-        """From rows of floats (read as decimals), integers, fractions or strings "p/q"."""
+        """Convert rows of floats (read as decimals), integers, fractions or strings "p/q"."""
         entries = [[rational(v) for v in row] for row in rows]
         shape = shape or getattr(rows, "shape", None) or (len(entries), len(entries[0]) if entries else 0)
         den = math.lcm(*(v.denominator for row in entries for v in row))
@@ -60,18 +60,18 @@ class Matrix:
         return Matrix(self.num.T, self.den)
 
     def reduced(self) -> Matrix:
-        """The same matrix in lowest terms."""
+        """Return the same matrix in lowest terms."""
         common = math.gcd(self.den, *self.num.ravel())
         return self if common == 1 else Matrix(self.num // common, self.den // common)
 
     def fractions(self) -> NDArray[np.object_]:
-        """(p, m) array of Fraction."""
+        """Return a (p, m) array of Fraction."""
         return np.array([[Fraction(int(v), self.den) for v in row] for row in self.num], dtype=object).reshape(
             self.shape
         )
 
     def floats(self) -> NDArray[np.float64]:
-        """(p, m), every entry correctly rounded."""
+        """Return (p, m) floats, every entry correctly rounded."""
         return np.array([[int(v) / self.den for v in row] for row in self.num], dtype=np.float64).reshape(self.shape)
 
     def equals(self, other: Matrix) -> bool:
@@ -119,7 +119,7 @@ _MANY_ROWS = 8
 
 
 def definiteness(S: Matrix) -> _Definiteness:
-    """Whether the symmetric matrix S is positive (semi)definite, by fraction-free LDL' (Bareiss).
+    """Decide whether the symmetric matrix S is positive (semi)definite, by fraction-free LDL' (Bareiss).
 
     The pivots of the elimination are the leading minors themselves. A zero pivot leaves a semidefinite
     matrix only if its whole row of the Schur complement is zero; that row is then passed over. A large matrix is tried
@@ -160,7 +160,7 @@ GROWTH = 2.0**-40  # part of the identity that is added where rounding has made 
 
 
 def strictly_positive(S: Matrix) -> bool:
-    """Whether S > 0 is proved, for an exactly symmetric S (n, n).
+    """Return whether S > 0 is proved, for an exactly symmetric S (n, n).
 
     S is scaled by powers of two to a diagonal near one and every entry rounded to a multiple of 2^-BITS. The error is
     at most 2^-BITS / 2 per entry, hence n 2^-BITS in norm, which is taken off the diagonal. The numbers in the products
@@ -174,12 +174,12 @@ def strictly_positive(S: Matrix) -> bool:
 
 
 def _halves(S: Matrix) -> list[int]:
-    """The powers of two by which rows and columns of S are divided for a diagonal near one; it is positive."""
+    """Return the powers of two that divide rows and columns of a positive S for a diagonal near one."""
     return [(int(v).bit_length() - S.den.bit_length()) // 2 for v in np.diag(S.num)]
 
 
 def _rounded(S: Matrix, half: Sequence[int], bits: int) -> _Integers:
-    """A symmetric S with scaled rows and columns, in units of 2^-bits."""
+    """Return a symmetric S with scaled rows and columns, in units of 2^-bits."""
     n = S.shape[0]
     rounded = np.empty((n, n), dtype=object)
     for i, row in enumerate(S.num.tolist()):
@@ -189,20 +189,20 @@ def _rounded(S: Matrix, half: Sequence[int], bits: int) -> _Integers:
 
 
 def _nearest(num: int, den: int, shift: int) -> int:
-    """num/den times 2^shift, to the nearest integer."""
+    """Return num/den times 2^shift, rounded to the nearest integer."""
     num, den = (num << shift, den) if shift >= 0 else (num, den << -shift)
     return (2 * num + den) // (2 * den)
 
 
 def _less(W: _Integers, units: int) -> _Integers:
-    """W - units I."""
+    """Return W - units I."""
     W = W.copy()
     W[np.diag_indices(len(W))] -= units
     return W
 
 
 def _definite(W: _Integers, bits: int) -> bool:
-    """Whether the symmetric integer matrix W (n, n) > 0 is proved.
+    """Return whether the symmetric integer matrix W (n, n) > 0 is proved.
 
     Between passes the entries are shortened to about 32 bits more than `bits`: each entry then changes by less than one
     unit, and the matrix by less than n units in norm, which are subtracted from the diagonal.
@@ -220,12 +220,12 @@ def _definite(W: _Integers, bits: int) -> bool:
 
 
 def _longest(W: _Integers) -> int:
-    """Bits of the largest entry."""
+    """Return the number of bits of the largest entry."""
     return max((v.bit_length() for v in W.ravel().tolist()), default=0)
 
 
 def _dominates(W: Floats) -> bool:
-    """Whether every diagonal entry exceeds the sum of the absolute values of the others in its row.
+    """Return whether every diagonal entry exceeds the sum of absolute values of the others in its row.
 
     Decided for the integers of which `_floats` made W. Those are within 2^-53 of each entry and 2^-900 of the largest
     one, and a sum of n < 2^11 terms is within n 2^-53 of its value: both are far below the factor 1 + 2^-40.
@@ -236,7 +236,7 @@ def _dominates(W: Floats) -> bool:
 
 
 def _floats(W: _Integers) -> Floats:
-    """W in double precision, times a power of two that brings its largest entry near one.
+    """Return W in double precision, times a power of two that brings its largest entry near one.
 
     Each entry is off by at most 2^-53 of itself and 2^-900 of the largest.
     """
@@ -246,7 +246,7 @@ def _floats(W: _Integers) -> Floats:
 
 
 def _whitening(W: Floats) -> _Integers | None:
-    """R such that R'WR is nearly a multiple of the identity, or None where W is far from definite."""
+    """Return R for which R'WR is nearly a multiple of the identity, or None if W is far from definite."""
     diagonal = np.diag(W)
     if not (diagonal > 0).all():
         return None
@@ -289,7 +289,7 @@ _SAMPLES = 400  # frequencies at which states are looked at, about
 
 
 def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, float]:
-    """The matrix of (KYP) in units of u = 2^-finer, and the largest norm of its error in these units.
+    """Return the matrix of (KYP) in units of u = 2^-finer, and the largest norm of its error in these units.
 
     States and channels are scaled by powers of two, so that P and D + D' have diagonals near one. P is rounded to
     multiples of 2^-bits: the rounded P is as good a proof as any other, and is exactly known. The other matrices are
@@ -326,20 +326,20 @@ def _kyp_matrix(G: Lti, P: Matrix, bits: int, finer: int) -> tuple[_Integers, fl
 
 
 def too_large(states: int) -> str | None:
-    """Why no proof is tried for a model of so many states, or None."""
+    """Return the reason why no proof is tried for a model of so many states, or None."""
     if states <= budgets.PROOF_STATES:
         return None
     return f"a proof over {states} states takes long: up to {budgets.PROOF_STATES} are tried"
 
 
 def require_size(states: int, requirement: Requirement | None = None) -> None:
-    """Raises NotProved where exact arithmetic over so many states would take minutes."""
+    """Raise NotProved if exact arithmetic over so many states would take minutes."""
     if reason := too_large(states):
         raise NotProved(reason, requirement)
 
 
 def prove_positive_real(G: Lti, P: Matrix) -> str | None:
-    """None if P proves that G is strictly positive real, otherwise why it does not.
+    """Return None if P proves that G is strictly positive real, otherwise the reason.
 
     Floating point with an a-priori error bound may refuse early; only exact arithmetic accepts.
     """
@@ -361,7 +361,7 @@ def prove_positive_real(G: Lti, P: Matrix) -> str | None:
 
 
 def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
-    """Whether some direction makes the KYP matrix negative by more than every rounding error.
+    """Return whether a direction makes the KYP matrix negative by more than every rounding error.
 
     The matrix is S - J'PJ with S = [[P, C'], [C, D + D']] and J = [A B], sums of products of three correctly
     rounded numbers: entry by entry the computed one is within gamma (|S| + |J|'|P||J|),
@@ -387,7 +387,7 @@ def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
 
 
 def reached(G: Lti) -> Lti:
-    """The same map over the states that an input reaches, by the pattern of A and B; from rest the others stay zero.
+    """Return the same map over states that an input reaches, by the pattern of A and B; others stay zero from rest.
 
     Behind a contact that is lost a filter's states are such. No equation of Riccati is in need of them.
     """
@@ -408,7 +408,7 @@ _CLEARLY = 1e-6  # below 0, of a block with inputs of size one
 
 
 def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
-    """(P, None) with a P that proves G strictly positive real, or (None, why there is none).
+    """Return (P, None) with a P that proves G strictly positive real, or (None, reason).
 
     P is over the states that an input reaches (`reached`).
     P solves the discrete algebraic Riccati equation of G pushed half-way into its margin: D is reduced by
@@ -445,7 +445,7 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
 
 
 def _solved(parts: _Parts, margin: float, share: float, white: bool) -> tuple[Array, Array]:
-    """(the change to independent coordinates, P there), or of the states as they are. Raises LinAlgError."""
+    """Return the change to independent coordinates and P there, or of the states unchanged. Raises LinAlgError."""
     (A, B, C, D), G = parts, _double(parts)
     with np.errstate(all="ignore"):
         out, into = _independent(_doubled(G.A, G.B @ G.B.T)) if white else (np.eye(G.order),) * 2
@@ -462,7 +462,7 @@ def _double(parts: _Parts) -> Lti:
 
 
 def _extended(M: Any) -> Array:
-    """Fractions, or floats, in extended precision: 64 binary digits where the machine has it."""
+    """Return Fractions or floats in extended precision: 64 binary digits where the machine has it."""
     found = np.asarray(M, dtype=np.float64).astype(np.longdouble)
     if M.dtype == object:
         for place in zip(*np.nonzero(M), strict=True):
@@ -471,7 +471,7 @@ def _extended(M: Any) -> Array:
 
 
 def _scaled(G: Lti) -> tuple[_Parts, NDArray[np.int64]]:
-    """G with states and channels of about size one, and the powers of two that the states had.
+    """Return G with states and channels of about size one, and the powers of two that scaled the states.
 
     The size of a state is the largest gain from the scaled inputs to it, over frequency.
     """
@@ -485,14 +485,14 @@ def _scaled(G: Lti) -> tuple[_Parts, NDArray[np.int64]]:
 
 
 def _states(G: Lti) -> NDArray[np.complex128]:
-    """(zI - A)^-1 B on a grid of the circle that knows the poles, shape (k, n, m): for the size of things."""
+    """Return (zI - A)^-1 B (k, n, m) on a grid of the circle that knows the poles, to estimate sizes."""
     n, m = G.B.shape
     w = frequencies(G, points=100)
     return Lti(G.A, G.B, np.eye(n), np.zeros((n, m)), G.T).at(on_circle(w[:: 1 + w.size // _SAMPLES]))
 
 
 def _least_eigenvalue(G: Lti) -> tuple[float, float]:
-    """(min over the circle of the least eigenvalue of He G, where [rad/sample])."""
+    """Return the least eigenvalue of He G over the circle, and its frequency [rad/sample]."""
     value, w = supremum(  # of 1 - lambda: `supremum` refines what is within a fifth of the largest, little near zero
         lambda w: 1 - np.linalg.eigvalsh(hermitian(G.at(on_circle(w))))[:, 0], np.concatenate([[0.0], frequencies(G)])
     )
@@ -500,7 +500,7 @@ def _least_eigenvalue(G: Lti) -> tuple[float, float]:
 
 
 def _independent(covariance: Array) -> tuple[Array, Array]:
-    """The change to coordinates of covariance I, and back."""
+    """Return the change to coordinates of covariance I, and back."""
     variance = np.diag(covariance)
     deviation = np.sqrt(np.maximum(variance, variance.max() * _UNIT))  # of equal and opposite pushes rounding is left
     size, V = np.linalg.eigh(covariance / np.outer(deviation, deviation))
@@ -509,7 +509,7 @@ def _independent(covariance: Array) -> tuple[Array, Array]:
 
 
 def _riccati(parts: _Parts, margin: float, share: float) -> Array:
-    """P (n, n) of the equation by doubling: what the first 2^k samples can give back, its limit from below.
+    """Return P (n, n) of the Riccati equation by doubling: its limit from below.
 
     What rounding leaves of the equation, Newton's steps take off while there is more of it than a part of the drive:
     in extended precision, since a lightly damped mode has room for little. Raises LinAlgError where there is no
@@ -536,7 +536,7 @@ def _riccati(parts: _Parts, margin: float, share: float) -> Array:
 
 
 def _doubled(A: Array, H: Array, S: Array | None = None) -> Array:
-    """The limit of X = H + A'X (I + S X)^-1 A from X = 0, or without S of X = H + A X A': twice the steps in each.
+    """Return the limit of X = H + A'X (I + S X)^-1 A from X = 0, or without S of X = H + A X A', by doubling.
 
     Raises LinAlgError where it grows without limit.
     """
@@ -558,7 +558,7 @@ def _doubled(A: Array, H: Array, S: Array | None = None) -> Array:
 
 
 def _congruent(out: Array, P: Array, half: NDArray[np.int64]) -> Matrix:
-    """out' P out, with rows and columns divided by powers of two, exact for `out` and P as they are rounded here."""
+    """Return out' P out with rows and columns divided by powers of two, exact for the rounded `out` and P."""
 
     def integers(a: Array) -> tuple[_Integers, int]:
         power = _EXTENDED_BITS - int(np.frexp(np.abs(a).max())[1])
@@ -569,7 +569,7 @@ def _congruent(out: Array, P: Array, half: NDArray[np.int64]) -> Matrix:
 
 
 def _divided(numbers: _Integers, half: Sequence[int] | NDArray[np.int64], power: int) -> Matrix:
-    """Integers over 2^power, rows and columns divided by 2^half each."""
+    """Return integers over 2^power, with rows and columns divided by 2^half each."""
     most = int(max(half))
     for i, row in enumerate(numbers):
         for j in range(len(row)):
@@ -579,7 +579,7 @@ def _divided(numbers: _Integers, half: Sequence[int] | NDArray[np.int64], power:
 
 
 def _shortened(P: Matrix) -> Matrix:
-    """P to STORED_BITS binary digits, relative to its diagonal; as it is where that is not positive."""
+    """Return P to STORED_BITS binary digits relative to its diagonal; unchanged if the diagonal is not positive."""
     if any(v <= 0 for v in np.diag(P.num)):
         return P
     half = _halves(P)
@@ -590,12 +590,12 @@ _Rows = tuple[tuple[str, ...], ...]
 
 
 def rows_of(M: Matrix) -> _Rows:
-    """Every entry in lowest terms."""
+    """Return every entry in lowest terms."""
     return tuple(tuple(str(value) for value in row) for row in M.fractions())
 
 
 def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | None:
-    """Why the matrix of this name does not prove that the block is strictly positive real, or None if it does."""
+    """Return why the matrix of a name does not prove that the block is strictly positive real, or None if it does."""
     if len(rows) != block.order:  # files made before kept the states that no input reaches
         block = reached(block)
     n = block.order

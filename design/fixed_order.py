@@ -45,7 +45,7 @@ class _Units:
         self.phi = None if phi is None else phi / self.usable
 
     def si(self, V: Lti) -> Lti:
-        """V in SI units [m/N]."""
+        """Return V in SI units [m/N]."""
         root = 1 / np.sqrt(self.usable)
         return Lti(V.A, V.B * root, self.T * root[:, None] * V.C, self.T * root[:, None] * V.D * root, self.T)
 
@@ -85,7 +85,7 @@ class FixedOrder:
         return sum(rows.size for rows, _ in self._free)
 
     def unit_coupling(self, p: Array) -> Lti:
-        """V in units T = 1 and usable damping = I."""
+        """Return V in units T = 1 and usable damping = I."""
         found = [np.zeros(shape) for shape in self._shapes]
         ends = np.cumsum([rows.size for rows, _ in self._free])[:-1]
         for matrix, free, values in zip(found, self._free, np.split(p, ends), strict=True):
@@ -94,7 +94,7 @@ class FixedOrder:
         return Lti.with_rest(A, B, self.F, V1 + np.triu(V1, 1).T, 1.0)
 
     def coupling(self, p: Array) -> Lti:
-        """V in SI units [m/N]."""
+        """Return V in SI units [m/N]."""
         return self.units.si(self.unit_coupling(p))
 
     def start(self, gains: SpringDamper) -> Array:
@@ -236,7 +236,7 @@ def descend(family: FixedOrder, p: Array, norm: float) -> Iterator[Array]:
 
 
 def _descended(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: int) -> tuple[Array, int]:
-    """(the best coupling, SDPs spent)."""
+    """Return the best coupling and the number of semidefinite programs solved."""
     steps, sdps = descend(family, p, norm), 0
     while sdps < budget:
         try:
@@ -354,7 +354,7 @@ class FixedPoles:
         self.sdps = 0
 
     def best(self, poles: Sequence[Sequence[float]]) -> tuple[Lti, float]:
-        """(V in SI units, ||W1 L W2||_inf) for `poles`, one real sequence per channel, each in (-1, 1)."""
+        """Return V in SI units and ||W1 L W2||_inf for `poles`, one real sequence per channel, each pole in (-1, 1)."""
         cuts = 0
         while True:
             V, bound = self._solve(poles)

@@ -22,7 +22,7 @@ _NODES, _WEIGHTS = np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 8.0
 
 
 def integral(response: Callable[[Array], Array], grid: Array, error: float = _ERROR) -> float:
-    """The integral of `response`, (k,) -> (k,) and not negative, from grid[0] to grid[-1].
+    """Integrate a nonnegative `response`, (k,) -> (k,), from grid[0] to grid[-1].
 
     Three points of Gauss in each interval of the grid, against the same in its halves: an interval whose two figures
     differ by more than its share of `error`, relative to the whole, gives way to its halves. What differs by rounding
@@ -49,7 +49,7 @@ def integral(response: Callable[[Array], Array], grid: Array, error: float = _ER
 
 
 def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Array:
-    """(k,): Gauss's rule in each interval."""
+    """Apply Gauss's rule in each interval, (k,)."""
     half = (right - left) / 2
     points = (left + right) / 2 + half * _NODES[:, None]
     return half * (_WEIGHTS @ response(points.ravel()).reshape(points.shape))
@@ -66,7 +66,7 @@ _Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real
 
 
 def suprema(responses: _Responses, common: Array, own: Array) -> Array:
-    """The largest value of each row, (n,), over frequencies `common` to all, (k,), and its `own`, (n, p).
+    """Return the largest value of each row (n,) over the frequencies `common` (k,) and its `own` (n, p).
 
     A row with a value that is not finite gives infinity.
     """
@@ -94,7 +94,7 @@ def suprema(responses: _Responses, common: Array, own: Array) -> Array:
 
 
 def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
-    """The frequencies (n, peaks) of the grid below and above `at`; a grid may have some twice."""
+    """Return the frequencies (n, peaks) of the grid below and above `at`; a grid may have some twice."""
     room = 1e-12 * grid[:, -1:]
     below = np.where(grid[:, None] < (at - room)[..., None], grid[:, None], grid[:, None, :1]).max(axis=2)
     above = np.where(grid[:, None] > (at + room)[..., None], grid[:, None], grid[:, None, -1:]).min(axis=2)
@@ -110,7 +110,7 @@ _NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomsp
 
 
 def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Array, Array]:
-    """As `frequencies`, for many systems: those common to all, (k,), and around the poles (n, p) of each, (n, j).
+    """Return frequencies for many systems: those common to all (k,), and those around the poles (n, p) of each (n, j).
 
     `delay` [samples] is the longest of the loop, which makes so many lobes.
     """
@@ -127,7 +127,7 @@ _POINT = 1.5e-6  # [s] measured: the eigenvalues at a point of a sweep, beside i
 
 
 def _sweep_cost(G: Lti) -> float:
-    """The work of a sweep of G [s], to a factor of three; delays at its outputs cost nothing."""
+    """Return the work of a sweep of G [s], to a factor of three; delays at its outputs cost nothing."""
     n, m = G.inner_order, G.inputs
     return _POINTS_SWEPT * m * (n**2 + m**2) * _RESPONSE + n**3 * _SCHUR
 
@@ -153,7 +153,7 @@ Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
 
 
 def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: int = 600) -> Array:
-    """Sorted frequencies [rad/sample] in [low, high]: even in w and in log w, dense around each pole.
+    """Return sorted frequencies [rad/sample] in [low, high]: even in w and in log w, dense around each pole.
 
     A pole r exp(j phi) bends the response over a width of about 1 - r around phi, however sharp it is. One that
     repeats counts once: of points that rounding alone holds apart the wrong one may be the higher, and hide the peak
@@ -171,7 +171,7 @@ def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: i
 
 
 def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> float:
-    """How much rounding may change an entry of the response of y = C x + D u, x+ = A x + B u, at any of the z (k,).
+    """Bound how much rounding changes an entry of the response of y = C x + D u, x+ = A x + B u, at each z (k,).
 
     A tick in double precision is one of a system whose coefficients are off by (2n + 8) u relatively, entry by entry
     (n states, u the unit), and by what they miss of a system `meant` with the same states. With R = (zI - A)^-1 errors
@@ -191,7 +191,7 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
 
 
 def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """One of each group of poles that lie within a hundredth of their distance to the circle."""
+    """Return one of each group of poles that lie within a hundredth of their distance to the circle."""
     kept = np.zeros(0, dtype=np.complex128)
     for pole in poles[poles.imag >= 0]:
         if not (np.abs(kept - pole) < 0.01 * max(1 - abs(pole), 1e-9)).any():
@@ -200,7 +200,7 @@ def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
 
 
 def supremum(response: Response, grid: Array) -> tuple[float, float]:
-    """(value, w): the largest `response` over [grid[0], grid[-1]], refined between grid points.
+    """Return the largest `response` over [grid[0], grid[-1]], refined between grid points, and its frequency.
 
     The highest local maxima of the grid (32 at most, within 20 % of the largest) are bracketed by their
     neighbours, and the brackets narrowed by a factor of 8, ten times or until two rounds gain nothing: a smooth peak is
@@ -227,7 +227,7 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
 
 
 def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -> Array:
-    """Where the 32 highest local maxima of `response` over [grid[0], grid[-1]] exceed `above`; (peaks,).
+    """Return where (peaks,) the 32 highest local maxima of `response` over [grid[0], grid[-1]] exceed `above`.
 
     Of those only that come as `near` to the highest, relatively.
     """
@@ -241,7 +241,7 @@ def peaks(response: Response, grid: Array, above: float, near: float = np.inf) -
 
 
 def _brackets(values: Array, grid: Array, above: float) -> tuple[Array, Array]:
-    """The neighbours of the 32 highest local maxima of at least `above`."""
+    """Return the neighbours of the 32 highest local maxima of at least `above`."""
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
     local = (values >= padded[:-2]) & (values >= padded[2:])
     at = np.flatnonzero(local & (values >= above))
@@ -250,7 +250,7 @@ def _brackets(values: Array, grid: Array, above: float) -> tuple[Array, Array]:
 
 
 def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Array, tuple[Array, Array], Array]:
-    """The best of 17 points in each bracket, where it is, the bracket of its neighbours, and how far that may reach.
+    """Return the best of 17 points in each bracket: value, place, bracket of its neighbours, and its possible gain.
 
     Between three points of a parabola it rises by at most a quarter of the drop to the lower neighbour; four times
     that are allowed.
@@ -267,17 +267,17 @@ def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Arr
 
 
 def on_circle(w: Array) -> NDArray[np.complex128]:
-    """z = exp(j w)."""
+    """Return z = exp(j w)."""
     return np.exp(1j * w)
 
 
 def hermitian(G: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """He G = (G + G*)/2 over the last two axes."""
+    """Return He G = (G + G*)/2 over the last two axes."""
     return (G + np.conj(np.swapaxes(G, -1, -2))) / 2
 
 
 def largest_eigenvalue(H: NDArray[np.complex128]) -> Array:
-    """Of Hermitian matrices over the last two axes; in closed form up to two rows: LAPACK takes ten times as long."""
+    """Return the largest eigenvalue of Hermitian matrices (last two axes), in closed form up to two rows."""
     m = H.shape[-1]
     if m == 1:
         return H[..., 0, 0].real

@@ -90,7 +90,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
         return self.damping if self.delta is None else self.delta
 
     def with_damping(self: Any, damping: float) -> Device:
-        """The same device with another motor damping, all of it guaranteed and equal on its axes."""
+        """Return the device with another motor damping, all of it guaranteed and equal on its axes."""
         return msgspec.structs.replace(self, damping=damping, delta=None)
 
     @property
@@ -104,7 +104,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
         return tuple(f".{AXES[i]}" for i in self.free) if self.axes > 1 else ("",)
 
     def matrix(self: Any, field: str) -> _Matrix:
-        """`damping`, or the guaranteed one as `delta`, over the free axes [N s/m].
+        """Return `damping`, or the guaranteed damping as `delta`, as a matrix over the free axes [N s/m].
 
         The clamped axes do not move, so that the form v' Delta v of the free ones is that of their own block.
         """
@@ -117,7 +117,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
         return isinstance(self.force_limit, Real) and len(self.free) > 1
 
     def channels(self: Any) -> tuple[Device, ...]:
-        """The free axes as devices with one axis each; their dampings are the diagonals of the matrices."""
+        """Return the free axes as devices with one axis each; their dampings are the diagonals of the matrices."""
         if self.axes == 1:
             return (self,)
         damping, level = np.diag(self.matrix("damping")), np.diag(self.matrix("delta"))
@@ -274,7 +274,7 @@ def _check_common(device: Device, masses: tuple[str, ...]) -> None:
 
 
 def _each(self: Any, name: str) -> tuple[float, ...]:
-    """One number per axis, or the one number. Raises ValueError for a list of the wrong length."""
+    """Return one number per axis, or the one number. Raises ValueError for a list of the wrong length."""
     value = getattr(self, name)
     if not isinstance(value, tuple):
         return (value,)
@@ -423,7 +423,7 @@ _NEEDED = ("damping", "force_limit")  # of a simulated device; for mass and enco
 
 
 def listed_device(name: str) -> tuple[str, Listed]:
-    """The catalogue's device of this name, and its spelling there. Raises ValueError that lists the names."""
+    """Return the catalogue's device of a name, and its spelling there. Raises ValueError that lists the names."""
     key = _OTHER_NAMES.get(name.lower(), name.lower())
     if key not in CATALOGUE:
         close = difflib.get_close_matches(key, CATALOGUE, n=1)
@@ -433,7 +433,7 @@ def listed_device(name: str) -> tuple[str, Listed]:
 
 
 def fields_of(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """A catalogue device as the fields of a scenario's [[device]]; numbers that are given replace the catalogue's.
+    """Return a catalogue device as fields of a scenario's [[device]]; given numbers replace those of the catalogue.
 
     Raises ValueError for an unknown name, and where a number is neither published nor given.
     """

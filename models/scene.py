@@ -656,12 +656,12 @@ class Crowd:
         return tuple((holds, Port.body(len(holds), self.bodies[:, p])) for p, holds in enumerate(self.holds))
 
     def humans(self, i: int) -> tuple[Human, ...]:
-        """The humans of set i, one per device."""
+        """Return the humans of set i, one per device."""
         axes = self.axes or (1,) * self.links.shape[1]
         return tuple(Human(tuple(_link(row, k) for row in human)) for human, k in zip(self.links[i], axes, strict=True))
 
     def persons(self, i: int) -> tuple[Person, ...]:
-        """The persons of set i who hold several devices."""
+        """Return the persons of set i who hold several devices."""
         pairs = zip(self.holds, self.bodies[i].tolist(), strict=True)
         return tuple(Person(holds, m, b, k, Cross(*cross)) for holds, (m, b, k, *cross) in pairs)
 
@@ -768,11 +768,11 @@ class HumanSets:
         return tuple((person.holds, Port.stack([person.port()] * len(self))) for person in self.people)
 
     def humans(self, i: int) -> tuple[Hand, ...]:
-        """The humans of set i, one per device."""
+        """Return the humans of set i, one per device."""
         return self.sets[i]
 
     def persons(self, i: int) -> tuple[Person, ...]:
-        """The persons of set i who hold several devices."""
+        """Return the persons of set i who hold several devices."""
         return self.people
 
 

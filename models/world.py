@@ -68,7 +68,7 @@ class Part:
 
 
 def files_of(path: Path) -> list[Path]:
-    """The MJCF file, all files that it includes or attaches, and the meshes, height fields and textures that they name.
+    """Return the MJCF file, all files that it includes or attaches, and their meshes, height fields and textures.
 
     A mesh that several folders hold is listed from each. Raises ValueError where a file cannot be read or is no XML.
     """
@@ -113,7 +113,7 @@ def _xml(file: Path, world: Path) -> ElementTree.Element:
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 over the contents of all files of a scene, whatever their folder. Raises ValueError."""
+    """Return the SHA-256 digest of the contents of all files of a scene, whatever their folder. Raises ValueError."""
     total = hashlib.sha256()
     for file in files_of(path):
         content = file.read_bytes()
@@ -122,12 +122,12 @@ def digest_of(path: Path) -> str:
 
 
 def check_contacts(path: Path, bodies: Sequence[str]) -> None:
-    """Raises ValueError, in one line, for a file that MuJoCo refuses, or a body that cannot be a contact."""
+    """Raise a one-line ValueError for a file that MuJoCo refuses, or a body that cannot be a contact."""
     World(path, [Contact(body) for body in bodies], [np.eye(1)] * len(bodies), 1e-3)
 
 
 def touchable_bodies(path: Path) -> list[str]:
-    """Names of the bodies of a scene that may be contacts, in the order of the file. Raises ValueError."""
+    """Return the names of bodies that may be contacts, in the order of the file. Raises ValueError."""
     return _without_joints(_spec(path))
 
 
@@ -205,7 +205,7 @@ class World:
         return self.model.opt.timestep
 
     def port(self, force_limit: Sequence[float] | Array | None = None, balls: Sequence[slice] = ()) -> Port:
-        """A simulation of the scene from its initial pose, whose contacts feel at most these forces (m,) [N].
+        """Simulate the scene from its initial pose; its contacts feel at most the given forces (m,) [N].
 
         The limit of a contact whose channels are one of the `balls` bounds the length of its force, elsewhere it bounds
         each component.
@@ -214,7 +214,7 @@ class World:
         return Port(self, limits, balls)
 
     def linear(self, pose: Array | str | None = None, step: float = 1e-6) -> tuple[Array, Array, Array, Array]:
-        """The scene near a pose, without the springs G: A, B, C, D from forces on the contacts [N] to u [m].
+        """Linearise the scene near a pose, without the springs G: A, B, C, D from forces on the contacts [N] to u [m].
 
         Centred differences of one step of the scene. A is over (q, h v). What it
         neglects: everything that is not linear, above all contacts that open or close and joints that turn far.
@@ -276,7 +276,7 @@ class World:
         return f"integrator discrete, timestep {self.h:g} s{slow}, elliptic cones, {solver}"
 
     def outside_the_lemma(self) -> list[str]:
-        """Actuators, plugins and callbacks of the scene, which only the energy account covers; one text for each."""
+        """Return one text for each actuator, plugin and callback of the scene: only the energy account covers them."""
         m = self.model
         listed = [f"actuator {m.actuator(i).name or i}" for i in range(m.nu)]
         listed += [f"plugin {m.plugin(i).name or i}" for i in range(m.nplugin)]
@@ -288,7 +288,7 @@ class World:
         return listed
 
     def parts(self) -> list[Part]:
-        """What is in the scene, and what is known of each kind of part at the contacts (docs/worlds.md)."""
+        """Return the kinds of parts in the scene, and what is known of each at the contacts (docs/worlds.md)."""
         return list(_parts(self.model, set(self._joint.tolist())))
 
 
@@ -318,7 +318,7 @@ def _without_joints(spec: Any) -> list[str]:
 
 
 def _touchable(spec: Any, name: str, contacts: Sequence[str]) -> Any:
-    """The body of a contact. Raises ValueError for a body that cannot be one."""
+    """Return the body of a contact. Raises ValueError for a body that cannot be one."""
     body = spec.body(name)
     free = _without_joints(spec)
     if body is None or body.parent is None:  # the latter is the world body
@@ -343,7 +343,7 @@ def _touchable(spec: Any, name: str, contacts: Sequence[str]) -> Any:
 
 
 def _principal(G: Array, contact: Contact) -> tuple[Array, Array]:
-    """Spring stiffnesses (axes,) and principal directions Q (axes, axes) of G = Q diag Q'. Raises ValueError."""
+    """Return stiffnesses (axes,) and principal directions Q (axes, axes) of G = Q diag Q'. Raises ValueError."""
     axes = len(contact.along)
     if G.shape != (axes, axes):
         raise ValueError(f"contact {contact.body!r} has {axes} directions, its spring is {G.shape[0]} x {G.shape[1]}")
@@ -386,7 +386,7 @@ def _slide(spec: Any, body: Any, contact: Contact, Q: Array, stiffness: Array, t
 
 
 def _fixed_to(body: Any) -> Iterator[Any]:
-    """The body and its children without joints, which move with it."""
+    """Return the body and its children without joints, which move with it."""
     yield body
     for child in body.bodies:
         if not child.joints:
@@ -462,7 +462,7 @@ class Port:
         self.released = 0.0  # [J] the most that gravity and the scene's springs have given up so far
 
     def step(self, u0: Array) -> Array:
-        """The forces of the contacts on the devices, (m,) [N], where u0 (m,) [m] is their place without force.
+        """Step the scene; return the forces (m,) [N] of contacts whose places without force are u0 (m,) [m].
 
         Forces are within the limits. They are not finite where MuJoCo's numbers are not. Raises ValueError in one line
         where MuJoCo cannot step.
@@ -475,12 +475,12 @@ class Port:
         return force
 
     def _spring(self, goal: Array) -> Array:
-        """G (u0 - u) (m,) [N] where the scene is now."""
+        """Return G (u0 - u) (m,) [N] at the scene's present position."""
         world = self.world
         return world._Q @ (world._g * (goal - self.data.qpos[world._qpos]))
 
     def _used(self, force: Array) -> Array:
-        """(contacts,) the share of its limit that each contact's force is."""
+        """Return the share of its limit (contacts,) that each contact's force takes."""
         share = np.abs(force) / self._limits
         most = np.maximum.reduceat(share, self._first)
         return (
@@ -490,7 +490,7 @@ class Port:
         )
 
     def _within(self, force: Array) -> Array:
-        """The force that the motors give in place of `force` (m,) [N]."""
+        """Return the force that the motors give in place of `force` (m,) [N]."""
         if self._radial.any():
             force = force / np.repeat(np.where(self._radial, np.maximum(self._used(force), 1.0), 1.0), self._axes)
         return np.clip(force, -self._limits, self._limits)
@@ -548,7 +548,7 @@ class Port:
         return self._within(np.where(held, push, free))
 
     def _potential(self) -> float:
-        """U [J] of gravity and the scene's own springs at the present positions, without the springs G."""
+        """Return U [J] of gravity and the scene's own springs at the present positions, without the springs G."""
         model, data, world = self.world.model, self.data, self.world
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -562,7 +562,7 @@ class Port:
         return float(data.energy[0] + (world._afloat @ data.xipos) @ model.opt.gravity)
 
     def _creates(self) -> float:
-        """[J] by which the contacts of the step that was just made exceed what they stored: the lemma's left side."""
+        """Return the energy [J] that contacts of the last step gave beyond what they stored: the lemma's left side."""
         rows = Rows.of(self.world.model, self.data)
         return float(np.maximum(rows.excess(self.world.h), 0.0).sum())
 
@@ -602,12 +602,12 @@ class Rows:
         return self.D * self.K * inside**2 / 2
 
     def excess(self, h: float) -> Array:
-        """h f'w+ + phi(r + h w+) - phi(r) [J] of each contact or other constraint: the energy that it creates."""
+        """Return h f'w+ + phi(r + h w+) - phi(r) [J], the energy that each contact or other constraint creates."""
         rows = h * self.force * self.after + self._stored(self.depth + h * self.after) - self._stored(self.depth)
         return np.add.reduceat(rows, self.first)
 
     def bound(self, h: float) -> Array:
-        """The lemma's bound on it, the sum of D w^2/(4 (1 + b h)) over its rows [J]."""
+        """Return the lemma's bound [J] on the excess: the sum of D w^2/(4 (1 + b h)) over the rows of a constraint."""
         return np.add.reduceat(self.D * self.before**2 / (4 * (1 + self.b * h)), self.first)
 
 

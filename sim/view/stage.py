@@ -614,7 +614,7 @@ class FlatPictures:
                 (pen.rectangle if shape.kind == "mass" else pen.ellipse)(corners, colour)
 
     def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, device: int, x: float, y: float, per_metre: float) -> None:
-        """Draw the range of the force since the last frame and its mean, in space the mean only; the device feels -f."""
+        """Draw range and mean of the force since the last frame, in space the mean only; the device feels -f."""
         channels = _own(self.scene, device)
         if len(channels) > 1:
             joints = np.array(self.scene.handles)[channels]
