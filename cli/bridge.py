@@ -63,8 +63,7 @@ def main(argv: list[str]) -> int:
             raise InputError(f"--port is {args.port}: {what} counts forces by one clock, several boards have several")
     settings = replace(settings, behind=behind, rereference=not args.no_rereference, energy_budget=args.energy_budget)
     limits = session_cli.limits_from(args, scenario)
-    held = args.held or not args.port  # emulated people never let go
-    settings = replace(settings, deadman=args.deadman == "device", held=held)
+    settings = replace(settings, deadman=args.deadman == "device", held=args.rehearse)  # emulated people never let go
     session = session_for(scenario, settings, **limits)
     session.record = recorder = Recorder(scenario.channels)
     out = options.out_folder(args, "bridge")

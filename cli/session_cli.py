@@ -88,10 +88,8 @@ def add_safety_options(parser: options.Parser) -> None:
     who = "forces act only while the user presses a key or touches FILE once a second, or holds the device's own switch"
     add("--deadman", metavar="key|device|FILE", help=f"{who} (default with --port: key)")
     add("--no-dead-man", action="store_true", help="let forces act though nobody says that he is there")
-    hands = "hands hold the handles while they are tested at arming: then no motion is too small"
-    add("--held", action="store_true", help=hands)
     add("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
-    parser.only("with --port", lambda args: args.port, "no_preflight", "no_dead_man", "held")
+    parser.only("with --port", lambda args: args.port, "no_preflight", "no_dead_man")
     parser.only("with --continuous-force", lambda args: args.continuous_force, "thermal_time")
 
 

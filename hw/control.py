@@ -243,20 +243,22 @@ class Drive:
         settings: monitor.LinkSettings,
         counters: monitor.Counters,
         record: Callable[[TraceRow], None],
+        expected: monitor.Expected,
         still: Sequence[int] | None = None,
-        expected: Sequence[monitor.Expected] | None = None,
     ) -> None:
-        """Take `still` (m,) [counts], the encoders' noise, and `expected` (m,), the motions that the test compares."""
+        """Take `still` (m,) [counts], the encoders' noise, and `expected`, the motions that the test compares."""
         self.controller, config = arming.program.controller(limits.cap), arming.config
         self.units, self.config, self.limits = units, config, limits
         self.T = T = self.controller.T
         self.gain = Gain(limits, T)
+        self.ended = False  # whether the gain has fallen to 0, and the motors have passed their last test
         self.force = (0.0,) * config.axes  # [N] last force sent
         self.x: tuple[float, ...] | None = None  # [m] displacements of the last STATE
         self.reference: tuple[int, ...] | None = None  # [counts] origin of the displacements
         self._rereference = settings.rereference
-        test = monitor.EncoderTest(limits.cap, T, units, still, expected, settings.held)
-        self._test = test if settings.test_encoders else None
+        about = limits.cap, T, units, expected, still, config.theta == 0
+        self._test = monitor.EncoderTest(*about) if settings.test_encoders else None
+        self._last_test = monitor.EncoderTest(*about, alive=True) if settings.test_encoders else None
         self._encoders = monitor.EncoderMonitor(units.encoder_step, units.force_step, T, still)
         self._heat = Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] window of a speed estimate
@@ -272,10 +274,11 @@ class Drive:
         """A message about an axis that stands still although a force has acted on it for long; None without one."""
         return self._encoders.dead
 
-    def step(self, state: State, ticks: int, direction: int, now: int) -> tuple[int, ...]:
+    def step(self, state: State, ticks: int, direction: int, now: int, closing: bool = False) -> tuple[int, ...]:
         """Return the force [steps] for `state`, which came at `now` [us], `ticks` ticks after the previous STATE.
 
         The gain rises (direction 1), falls (-1) or stays (0); it rises only after every encoder has passed its test.
+        With `closing`, the motors are tested once more after the gain has fallen to 0.
         Raises SafetyStop where the device, an encoder or the controller is out of bounds.
         """
         if self.x is None:
@@ -294,12 +297,17 @@ class Drive:
         if ticks > 1 and self.x is not None:
             self._miss(state, _fill(self.x, x, ticks)[:-1])
         asked = self.controller.step(x)
-        test = self._test.force(state, ticks) if self._test and direction > 0 else None
-        if direction > 0 and test is None:
-            self._test = None
-            self.gain.rise(ticks)
+        test = None
+        if direction > 0:
+            test = self._test.force(state, ticks) if self._test else None
+            if test is None:
+                self._test = None
+                self.gain.rise(ticks)
         elif direction < 0:
             self.gain.fall(ticks)
+            if closing and self._last_test and self.gain.value == 0:
+                test = self._last_test.force(state, ticks)
+            self.ended = self.gain.value == 0 and test is None
         shaped = self.limits.shape(asked, self.force, self.gain.value, self.T, test)
         force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap)
         if self._budget:

@@ -40,7 +40,7 @@ _SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
 _FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
 _ENCODER_STEP = 1e-6  # [m] where the scenario has ideal encoders
 _REACH = 0.1  # [m] assumed: the workspace is +-10 cm
-_SETTLED = 50  # ticks at full cap after which the person starts to move
+_SETTLED = 203  # ticks at full cap after which the person starts to move: the gain is at 1 by then
 _FARTHEST = 2**31 - 1  # [counts]
 
 

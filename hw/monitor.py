@@ -17,9 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from haptic_loop.controller.lti import Array
 from haptic_loop.hw.limits import Units
 from haptic_loop.hw.protocol import NO_MARGIN, Config, Phase, SafetyStop, State, distance
-from haptic_loop.models.device import Device
+from haptic_loop.models.hold import hold
+from haptic_loop.models.human import Human, Link
+from haptic_loop.models.scene import build
+from haptic_loop.sim.scenario import Scenario
 
 _STATES_PER_ANSWER = 8  # at most: a USB frame of 1 ms may bring several FORCEs, of which one margin is told
 _MEASURED_TOLERANCE = 0.01  # of the device's clock against T, over the measurement
@@ -33,10 +37,13 @@ _PATIENCE = 5  # ticks in a row
 _CHANGE = 1.0  # [N] of force that moves any handle which is not against a stop
 _IMPULSE = 0.1  # [N s] of such a change without a motion: 100 ms of 1 N, 20 ms of 5 N
 _HEAVIEST = 2.5  # [kg] of hand and handle
-_TEST_FORCE, _TEST_SECONDS, _TEST_HALF = 1.0, 0.24, 0.03  # [N] reached after so many seconds, and half a period
-_TEST_BEFORE = 0.012  # [s] without a force, in which the drift of a hand is seen
-_TEST_RATIO = 2.0  # between a motion and the one that is expected of a free handle
-_SWAPPED = 0.1  # part of a free handle's motion that another encoder must show: a heavy, stiff hand leaves as much
+_TEST_FORCE, _TEST_HALF, _BLOCKS = 1.0, 0.03, 4  # [N] in the last of the blocks, and half a period [s]
+_TEST_BEFORE = 0.012  # [s] without a force
+_TEST_RATIO = 2.0  # between a motion and the expected one
+_DEGREE = 5  # of the polynomials that contain a hand's own motion: 1 % is left of 2 Hz
+_FIT = 0.8  # of the power: a free handle moved by a hand has 0.93 or more, a held one at most 0.5
+_ALIVE = 0.06  # of the expected swing: a firm hand (0.5 kg, 20 N s/m, 1500 N/m) leaves 0.09, a dead motor shows 0.03
+_STRONG = 2  # the block with which the test at the end begins
 _REST = 0.1  # [s] in which a handle rests
 _PRESSING, _PRESSED = 0.3, 0.5  # [N], [s]
 _FORGETTING = 8  # right ticks that make up for a wrong one: seldom wrong is stopped too, just later
@@ -52,7 +59,7 @@ class LinkSettings:
     late: float = 0.1  # part of late answers above which the coupling is too fast for the link
     missed: float = 0.2  # part of missing answers above which nothing is certified: mean-square stability ends there
     test_encoders: bool = True  # by a small force at every arming
-    held: bool = True  # hands may hold the handles meanwhile, so that a motion that is too small says nothing
+    held: bool = True  # the scenario's hands hold the handles meanwhile, as in a rehearsal; else they are free
     energy_budget: tuple[float, float] | None = None  # W0 and cap [J]
     rereference: bool = True  # positions count from where the handles are at arming
     deadman: bool = False  # forces act only while the deadman at the device is held
@@ -439,46 +446,38 @@ class EncoderNoise:
 
 
 class Expected:
-    """What the encoder of a free handle shows under a force: a mass, or a motor and a handle with a spring between."""
+    """How the encoders move under a force while the handles are free, or held by the scenario's hands."""
 
-    def __init__(self, device: Device, T: float) -> None:
-        """`device` is a model with one axis, T [s] the time for which a force is held."""
-        import scipy
-
-        masses, link = list(device.bodies.values()), device.transmission or (0.0, 0.0)
-        n = len(masses)
-        a = np.zeros((2 * n + 1, 2 * n + 1))
-        a[:n, n : 2 * n] = np.eye(n)
-        a[n, n], a[n, 2 * n] = -device.matrix("damping")[0, 0] / masses[0], 1 / masses[0]
-        if n == 2:
-            for column, value in ((0, link[1]), (2, link[0])):
-                spring = value * np.array([-1.0, 1.0])
-                a[2, column : column + 2] += spring / masses[0]
-                a[3, column : column + 2] -= spring / masses[1]
-        self.mass, self._friction, self._n = sum(masses), float(np.max(device.friction)), n
-        self._held = np.asarray(scipy.linalg.expm(a * T))
-        self._state = np.zeros(2 * n + 1)
+    def __init__(self, scenario: Scenario, held: bool) -> None:
+        """Build the plant; the handles are free unless they are `held`."""
+        empty = (Human((Link(0.0, 0.0, 0.0),)),) * scenario.channels
+        scene = build(scenario.device, scenario.human, scenario.person) if held else build(scenario.device, empty)
+        plant = hold(scene.plant, scenario.T)
+        self._A, self._B = plant.A, -plant.B[:, scene.outside :]  # the wire carries -f
+        self.mass = [sum(device.bodies.values()) for device in scenario.axis_devices]  # (m,) [kg]
+        self.rest()
 
     def rest(self) -> None:
         """Begin at rest."""
-        self._state[:] = 0.0
+        self._state = np.zeros(len(self._A))
 
-    def advance(self, force: float) -> float:
-        """Hold a force [N] for T and return the place [m] at its end."""
-        speed = self._state[self._n]
-        rubs = math.copysign(min(self._friction, abs(force)), speed or force) if self._friction else 0.0
-        self._state[-1] = force - rubs
-        self._state = self._held @ self._state
-        return float(self._state[0])
+    def advance(self, axis: int, force: float) -> float:
+        """Hold a motor's force [N] for a tick and return the position [m] of its axis at the end."""
+        self._state = self._A @ self._state + self._B[:, axis] * force
+        return float(self._state[axis])
 
 
 class EncoderTest:
-    """A small force on one axis after the other, up and down by turns and growing, until its encoder has answered.
+    """Whether encoders answer a small force that acts on one axis after the other.
 
-    From rest, the work of a force on anything passive is positive. An encoder of which the work is negative has the
-    wrong sign, and one that stands still while another moves is swapped with that. The motion of a free handle is
-    known from its mass: one that is more than a factor of 2 larger has a wrong scale, and so has one that is
-    smaller, unless hands hold the handles. A drift from before the force is taken off.
+    The force changes its sign every 30 ms, in blocks of 120 ms; each block is twice as strong as the one before. After
+    a block, polynomials of degree 5 are removed from all positions: they contain what a hand does on purpose in this
+    time, 50 mm at 2 Hz included, and little of the answer. What is left must have the shape of the expected motion
+    (`_FIT` of its sum of squares), the sign of it, and its size within a factor of 2. A reversed motor or encoder has
+    the wrong sign, a wrong scale the wrong size; a dead encoder, a moved or a held handle has another shape.
+
+    At the end of a session hands may hold the handles and move them. It then suffices (`alive`) that the axis swings
+    in the rhythm of the force at any phase, which that of a dead motor does not.
     """
 
     def __init__(
@@ -486,119 +485,96 @@ class EncoderTest:
         cap: Sequence[float],
         T: float,
         units: Units,
+        expected: Expected,
         still: Sequence[int] | None = None,
-        expected: Sequence[Expected] | None = None,
-        held: bool = True,
+        at_once: bool = False,
+        alive: bool = False,
     ) -> None:
-        """`still` (m,) [counts] are within noise. Without `expected` (m,) no scale is tested."""
-        self._cap, self._T, self._units, self._expected, self._held = cap, T, units, expected, held
-        self._still = tuple(still or (1,) * len(cap))
-        self._axis = -1
-        self._last: State | None = None
-        self._begin(None)
+        """Test within `cap` (m,) [N]; a motion within `still` (m,) [counts] is noise.
 
-    def _begin(self, state: State | None) -> None:
-        """The next axis."""
-        self._axis, self._ticks, self._first = self._axis + 1, 0, state
-        self._drift = [0.0] * len(self._cap)  # [counts per tick] before the force
-        self._passed = 0  # ticks under the force
-        self._squares, self._before = 0.0, 0.0  # [N2] of the force's changes so far, and [N] the last force
-        m = len(self._cap)
-        self._moved = [0.0] * m  # [counts] beyond the drift
-        self._work = [0.0] * m  # [N counts] of the force on this axis at every encoder
-        self._least, self._most = ([0.0] * m for _ in range(2))  # [counts] of that
-        if self._expected and self._axis < m:
-            self._expected[self._axis].rest()
-        self._along = [0.0] * m  # [m2] sums of x x_free at every encoder
-        self._square = 0.0  # [m2] sum of x_free^2
+        A STATE tells the force that acts after it, or with `at_once` (theta = 0) the one that acted before it.
+        """
+        self._at_once = at_once
+        self._cap, self._T, self._units, self._expected, self._alive = cap, T, units, expected, alive
+        self._still = tuple(still or (1,) * len(cap))
+        self._axis, self._last = -1, None
+        self._next_axis()
+
+    def _next_axis(self) -> None:
+        self._axis, self._ticks, self._block = self._axis + 1, 0, _STRONG if self._alive else 0
+        self._expected.rest()
+        self._rows: list[tuple[float, ...]] = []  # tick, expected position [m] and counts (m,) in this block
 
     def force(self, state: State, ticks: int) -> tuple[float, ...] | None:
-        """Forces fed back (m,) [N], `ticks` after the call before; None once every encoder has answered.
+        """Return the forces fed back (m,) [N], `ticks` after the call before; None once every encoder has answered.
 
         Raises SafetyStop, naming the axis, where an encoder answers in a wrong way, or not even to 1 N.
         """
-        m, before = len(self._cap), max(1, round(_TEST_BEFORE / self._T))
-        if self._last is None or self._first is None:
-            self._first = state
-        elif self._ticks > before:
-            self._note(self._last, state, ticks)
-        self._last = state
-        if self._answered(self._axis) and self._wrong() is None:
-            self._begin(state)
-            if self._axis == m:
-                return None
-        self._ticks += ticks
-        if self._ticks <= before:
-            return (0.0,) * m
-        if self._passed == 0:
-            past = self._ticks - ticks
-            own = self._axis  # the others only have to tell a swap, and swing on for as long as they are tested
-            self._drift[own] = (state.counts[own] - self._first.counts[own]) / max(1, past)
-            self._first = state
-        t = (self._ticks - before - 1) * self._T
-        if t > _TEST_SECONDS:
-            raise SafetyStop(self._wrong() if self._answered(self._axis) else self._unanswered())
-        size = _TEST_FORCE * t / _TEST_SECONDS * (-1 if int(t / _TEST_HALF) % 2 else 1)
-        cap = self._cap[self._axis]
-        return tuple(max(-cap, min(cap, size)) if i == self._axis else 0.0 for i in range(m))
+        acted: State | None = state if self._at_once else self._last
+        pushed = acted.applied[self._axis] * self._units.force_step[self._axis] if acted else 0.0
+        position = [self._expected.advance(self._axis, pushed) for _ in range(ticks)][-1]
+        self._last, self._ticks = state, self._ticks + ticks
+        self._rows.append((self._ticks, position, *state.counts))
+        before, half = max(1, round(_TEST_BEFORE / self._T)), max(2, round(_TEST_HALF / self._T))
+        if self._ticks > before + 4 * half:
+            if self._answered():
+                self._next_axis()
+                if self._axis == len(self._cap):
+                    return None
+            elif self._block == _BLOCKS - 1:
+                raise SafetyStop(self._unanswered())
+            else:
+                self._ticks, self._block, self._rows = before, self._block + 1, [(before, position, *state.counts)]
+        since = self._ticks - before
+        if since <= 0:
+            return (0.0,) * len(self._cap)
+        size = min(self._cap[self._axis], _TEST_FORCE * 2.0 ** (self._block + 1 - _BLOCKS))
+        sign = -1 if (since + half // 2) // half % 2 else 1
+        return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._cap)))
 
-    def _note(self, last: State, state: State, ticks: int) -> None:
-        """Process the motion from `last` to `state`, in which the force of `last` acted."""
-        axis, units = self._axis, self._units
-        assert self._first
-        pushed = last.applied[axis] * units.force_step[axis]
-        self._passed += ticks
-        self._squares += (pushed - self._before) ** 2
-        self._before = pushed
-        moved = [
-            n - n0 - self._passed * v for n, n0, v in zip(state.counts, self._first.counts, self._drift, strict=True)
-        ]
-        for i, (now, before) in enumerate(zip(moved, self._moved, strict=True)):
-            self._work[i] += pushed * (now - before)
-            self._least[i], self._most[i] = min(self._least[i], now), max(self._most[i], now)
-        self._moved = moved
-        if self._expected:
-            place = [self._expected[axis].advance(pushed) for _ in range(ticks)][-1]
-            self._square += place**2
-            for i, step in enumerate(units.encoder_step):
-                self._along[i] += moved[i] * step * place
+    def _compare(self) -> tuple[Array, Array, float]:
+        """Return size and fit (m,) of the motions against the expected one, and the own size at any phase."""
+        t, expected, *counts = np.array(self._rows).T
+        smooth = np.linalg.qr(np.vander((t - t.mean()) / len(t), _DEGREE + 1))[0]
+        wanted, shifted = (a - smooth @ (smooth.T @ a) for a in (expected, np.cumsum(expected)))
+        moved = np.array(counts).T * self._units.encoder_step
+        moved -= smooth @ (smooth.T @ moved)
+        power = wanted @ wanted or 1.0
+        size = wanted @ moved / power
+        rounding = len(t) * np.square(self._units.encoder_step) / 12  # no motion
+        own = np.maximum((moved**2).sum(axis=0) - rounding, rounding)
+        fit = size**2 * power / own
+        both = np.linalg.qr(np.stack([wanted, shifted], axis=1))[0]
+        return size, fit, float(np.linalg.norm(both.T @ moved[:, self._axis]) / math.sqrt(power))
 
-    def _answered(self, i: int) -> bool:
-        """Whether the work at encoder i is beyond what its rounding and noise can make of no motion at all."""
-        if self._passed * self._T < _TEST_HALF:  # by then a free handle is far enough for its scale to be told
-            return False
-        # sum F de errs by sum e dF; rounding has a deviation of 0.29 counts, noise a quarter of its range
-        doubt = 4 * max(0.29, self._still[i] / 4) * math.sqrt(self._squares + self._before**2)
-        return self._most[i] - self._least[i] > 2 * self._still[i] and abs(self._work[i]) > doubt
+    def _counted(self, i: int) -> float:
+        """Return the range of encoder i in this block [counts]."""
+        return float(np.ptp([row[2 + i] for row in self._rows]))
 
-    def _wrong(self) -> str | None:
-        """What is wrong with the answer of this axis; None where nothing is."""
-        name = f"axis {self._axis + 1}"
-        if self._work[self._axis] < 0:
-            return (
-                f"{name} has the wrong sign: a positive force moves it to negative counts. Reverse its motor or "
-                "encoder (or hold still, if a hand moved it)"
-            )
-        if not self._expected or not self._square:
-            return None
-        ratio, mass = self._along[self._axis] / self._square, self._expected[self._axis].mass
-        moved = f"{name} moves {ratio:.2g} times as far as a free handle of {mass:.3g} kg"
-        if ratio > _TEST_RATIO:
-            return f"{moved}: its encoder step, force step or mass is wrong"
-        if ratio < 1 / _TEST_RATIO and not self._held:
-            return f"{moved}: let go of it while arming (or say --held), or correct its steps or mass"
-        return None
+    def _answered(self) -> bool:
+        """Return whether the axis has answered well in this block. Raises SafetyStop where it answered wrongly."""
+        axis, name, (size, fit, swing) = self._axis, f"axis {self._axis + 1}", self._compare()
+        moves = [self._counted(i) > self._still[i] for i in range(len(self._cap))]
+        follows = [bool(one and good > _FIT) for one, good in zip(moves, fit, strict=True)]
+        others = [i + 1 for i, one in enumerate(follows) if one and i != axis]
+        if others and not moves[axis]:
+            raise SafetyStop(f"a force on {name} moves encoder {others[0]}: axes are swapped")
+        if follows[axis] and size[axis] < 0:
+            wrong = "a positive force moves it to negative counts"
+            raise SafetyStop(f"{name} has the wrong sign: {wrong}. Reverse its motor or encoder")
+        if follows[axis] and not (0 if self._alive else 1 / _TEST_RATIO) <= size[axis] <= _TEST_RATIO:
+            than = f"{size[axis]:.2g} times as far as expected of {self._expected.mass[axis]:.3g} kg"
+            raise SafetyStop(f"{name} moves {than}: its encoder step, force step or mass is wrong")
+        return follows[axis] or (self._alive and moves[axis] and swing > _ALIVE)
 
     def _unanswered(self) -> str:
-        """What to say of an axis whose encoder has not answered."""
-        axis = self._axis
-        follows = [self._answered(i) and abs(self._along[i]) > _SWAPPED * self._square for i in range(len(self._cap))]
-        other = [i + 1 for i, one in enumerate(follows) if one and i != axis]
-        if other and self._most[axis] - self._least[axis] <= self._still[axis]:
-            return f"a force on axis {axis + 1} moves encoder {other[0]}: axes are swapped"
-        strongest, moved = min(_TEST_FORCE, self._cap[axis]), self._most[axis] - self._least[axis]
-        what = f"it moved by {moved:.0f} counts at a test force of up to {strongest:g} N"
-        return f"encoder of axis {axis + 1} does not follow: {what}. Is its motor on?"
+        """Return a message about an axis whose encoder has not answered."""
+        axis, at = self._axis + 1, f"a test force of up to {min(_TEST_FORCE, self._cap[self._axis]):g} N"
+        if self._alive:
+            return f"motor or encoder of axis {axis} did not answer {at} at the end of the session"
+        if (moved := self._counted(self._axis)) > self._still[self._axis]:
+            return f"axis {axis} does not follow {at} as a free handle does: let go of it while arming"
+        return f"encoder of axis {axis} does not follow: it moved by {moved:.0f} counts at {at}. Is its motor on?"
 
 
 class EncoderMonitor:

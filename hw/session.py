@@ -27,7 +27,7 @@ from haptic_loop.hw.monitor import Counters, EncoderNoise, Expected, LinkMonitor
 from haptic_loop.sim.scenario import InputError, Scenario
 
 _PATIENCE_US = 2_000_000  # a question without an answer is given up after this time
-_ARMING_US = 500_000  # per axis: the device must follow ARM and pass the test of its encoders within this time
+_ARMING_US = 600_000  # per axis: the device must follow ARM and pass the test of its encoders within this time
 _QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
 _STOPPING_US = 50_000  # STOP is repeated for so long to a device that says nothing
 _OBEYING_US = 30_000  # a device must rest so soon after STOP: 1.5 times the longest hold and ramp
@@ -68,6 +68,7 @@ class Session:
         self.worlds: list[WorldController] = []  # arming by arming
         self.record: Callable[[TraceRow], None] = lambda row: None
         self.listen: Callable[[_Event], None] = lambda event: None
+        self._expected = Expected(scenario, self.settings.held)
         self.missed_while_driving = 0  # ticks
         self.now = self.entered = self.heard = 0  # [us]
         self._units: Units | None = None
@@ -140,7 +141,7 @@ class Session:
             self.armings.append(arming)
             assert self._noise
             told = self.units, self.limits, self.settings, self.counters, self.record
-            self.drive = Drive(arming, *told, self._noise.still, _expected(self.scenario))
+            self.drive = Drive(arming, *told, self._expected, self._noise.still)
             if self.drive.world:
                 self.worlds.append(self.drive.world)
             self._enter(Stage.ARMING, "asked to")
@@ -153,18 +154,24 @@ class Session:
         longest = max(scenario.T_max or 0.0, 1e-6 * self.measurement.result.longest_tick(1e6 * scenario.T))
         return SentBudget(BudgetPlan.of(*self.settings.energy_budget, scenario.delta, self.units, config, longest))
 
-    def stop(self, cause: str, now: int) -> Said:
-        """End the session as planned: by a ramp where forces act, at once where none do."""
-        self.now = now
+    def stop(self, cause: str, now: int, let_go: bool = False) -> Said:
+        """End the session as planned: by a ramp where forces act, at once where none do.
+
+        After the ramp the motors are tested once more. Where the user `let_go` of the deadman no force may act any
+        more, so the session ends as stopped.
+        """
+        self.now, after = now, Stage.STOPPED if let_go else Stage.FINISHED
         if self.stage in ENDED:
             return ()
         if self.stage == Stage.DISARMING:
-            self._after = self._after or Stage.FINISHED
+            if let_go and self._after == Stage.FINISHED:
+                self._ramp_out(after, cause)
+            self._after = self._after or after
             return ()
         if self.stage == Stage.ARMED or (self.stage == Stage.ARMING and self.gain > 0):
-            self._ramp_out(Stage.FINISHED, cause)
+            self._ramp_out(after, cause)
             return ()
-        return self._end(Stage.FINISHED, cause, wire.Reason.DONE)
+        return self._end(after, cause, wire.Reason.DONE)
 
     def fail(self, cause: str, now: int) -> Said:
         """End the session at zero force, at once, for a fault that was found outside of it."""
@@ -274,7 +281,7 @@ class Session:
         assert self.config is not None
         _check_state(state, self.config, self.stage, self.gain)
         if self.stage in DRIVING:
-            ended = () if self.held else self.stop("the deadman at the device was let go", self.now)
+            ended = () if self.held else self.stop("the deadman at the device was let go", self.now, let_go=True)
             return ended or self._on_driving(state, ticks)
         assert self._noise
         self._noise.note(state.counts)
@@ -297,7 +304,7 @@ class Session:
         direction = (-1 if self.stage == Stage.DISARMING else 1) if ready else 0
         self.missed_while_driving += self.link.missed
         first = self.drive.reference is None
-        steps = self.drive.step(state, ticks, direction, self.now)
+        steps = self.drive.step(state, ticks, direction, self.now, self._after == Stage.FINISHED)
         if first and any(self.drive.reference or ()):
             places = ", ".join(f"{1e3 * x:+.4g}" for x in self.units.positions(self.drive.reference or ()))
             self._log(f"positions count from where the handles are: {places} mm")
@@ -307,7 +314,7 @@ class Session:
             self._ramp_out(Stage.STOPPED, dead)
         if self.stage == Stage.ARMING and self.gain == 1.0:
             self._enter(Stage.ARMED, "full gain")
-        if self.stage == Stage.DISARMING and self.gain == 0.0:
+        if self.stage == Stage.DISARMING and self.drive.ended:
             return self._ramped_out()
         return self._answer(state, wire.Command.RUN if ready else wire.Command.ARM, steps)
 
@@ -376,11 +383,6 @@ def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: flo
         raise wire.SafetyStop("the device has disarmed itself")
     if not armed and any(state.applied):
         raise wire.SafetyStop(f"the device is disarmed and applies {state.applied} steps")
-
-
-def _expected(scenario: Scenario) -> list[Expected]:
-    """Return how the free handles of a scenario's devices are expected to move."""
-    return [Expected(device, scenario.T) for device in scenario.axis_devices]
 
 
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:

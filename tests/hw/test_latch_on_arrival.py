@@ -38,7 +38,7 @@ def test_the_last_force_holds_until_the_answer():
 
     emulator = Emulator(LAB)
     rehearsal = Rehearsal(session, emulator, plan)
-    rehearsal.run_until_armed(1.2)
+    rehearsal.run_until_armed(1.4)
     assert session.stage == Stage.ARMED
     assert session.config.theta == 0
     assert session.program.scenario.theta == (0, 0)

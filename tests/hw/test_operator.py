@@ -41,10 +41,10 @@ def test_late_answers_never_reach_full_gain(scenario, rungs):
 def test_sessions_end_after_their_time_at_full_gain(scenario, rungs):
     operator = Operator(True, 0.3)
     rehearsal = rehearsal_of(scenario, rungs, operator)
-    session = rehearsal.run_until_armed(0.4)
+    session = rehearsal.run_until_armed(0.6)
     assert session.stage == Stage.ARMED
     assert operator.press("a", session, session.now) == ()
-    rehearsal.run_until_armed(1.0)
+    rehearsal.run_until_armed(1.5)
     assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
     at = {event.stage: event.t_us for event in session.log}
     assert at[Stage.DISARMING] - at[Stage.ARMED] == pytest.approx(300_000, abs=2400)  # looked at once a tick
@@ -53,11 +53,11 @@ def test_sessions_end_after_their_time_at_full_gain(scenario, rungs):
 def test_a_key_arms_a_disarmed_session_only(scenario, rungs):
     """In a ramp-out it must not arm what comes after it."""
     operator = Operator(False, 5.0)
-    rehearsal = rehearsal_of(scenario, rungs, operator, "down:jitter=0.0008@0.3")
+    rehearsal = rehearsal_of(scenario, rungs, operator, "down:jitter=0.0008@0.5")
     session = rehearsal.run(0.5)
     assert session.stage == Stage.DISARMED
     assert operator.press("a", session, session.now) == ()
-    rehearsal.run_until_armed(0.4)
+    rehearsal.run_until_armed(0.6)
     assert session.stage == Stage.ARMED
     begun = session.now
     while session.stage != Stage.DISARMING:

@@ -55,11 +55,11 @@ def test_releasing_the_deadman_ramps_out(scenario, rungs, until):
 
     rehearsal = rehearsal_of(scenario, rungs, Operator(True, 10.0, there))
     session = rehearsal.run_until_armed(3.0)
-    assert (session.stage, session.cause) == (Stage.FINISHED, "the deadman was let go for 1 s")
+    assert (session.stage, session.cause) == (Stage.STOPPED, "the deadman was let go for 1 s")
     at = {event.stage: event.t_us for event in session.log}
     last = shown[-1] if shown else at[Stage.ARMING]
     assert 1e-6 * (at[Stage.DISARMING] - last) == pytest.approx(1.0, abs=0.01)
-    assert 1e-6 * (at[Stage.FINISHED] - at[Stage.DISARMING]) == pytest.approx(0.1, abs=0.005)
+    assert 1e-6 * (at[Stage.STOPPED] - at[Stage.DISARMING]) == pytest.approx(0.1, abs=0.005)
 
 
 def test_holding_the_deadman_continues_the_session(scenario, rungs):
@@ -69,7 +69,7 @@ def test_holding_the_deadman_continues_the_session(scenario, rungs):
 
 def test_the_deadman_at_the_device(scenario, rungs):
     """It arms while the switch is held only, and ramps out at the first STATE that says it is not."""
-    faults = (FaultInjection.parse("letgo@0.5"),)
+    faults = (FaultInjection.parse("letgo@0.7"),)
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
     rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, operator=Operator(True, 9.0))
     rehearsal.emulator.device.deadman = False
@@ -80,9 +80,9 @@ def test_the_deadman_at_the_device(scenario, rungs):
     assert not any(np.any(m.applied) for m in rehearsal.moments)
     rehearsal.emulator.device.deadman = True
     rehearsal.run_until_armed(2.0)
-    assert (session.stage, session.cause) == (Stage.FINISHED, "the deadman at the device was let go")
-    assert rehearsal.zero_after(0.5) < 0.110
-    assert [event.stage for event in session.log[-3:]] == [Stage.ARMED, Stage.DISARMING, Stage.FINISHED]
+    assert (session.stage, session.cause) == (Stage.STOPPED, "the deadman at the device was let go")
+    assert rehearsal.zero_after(0.7) < 0.110
+    assert [event.stage for event in session.log[-3:]] == [Stage.ARMED, Stage.DISARMING, Stage.STOPPED]
 
 
 def test_releasing_the_deadman_early_ends_at_once(scenario, rungs):
@@ -90,7 +90,7 @@ def test_releasing_the_deadman_early_ends_at_once(scenario, rungs):
     faults = (FaultInjection.parse("letgo@0"),)
     rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults)
     rehearsal.run_until_armed(0.5)
-    assert (session.stage, session.cause) == (Stage.FINISHED, "the deadman at the device was let go")
+    assert (session.stage, session.cause) == (Stage.STOPPED, "the deadman at the device was let go")
     assert Stage.ARMED not in [event.stage for event in session.log]
 
 
@@ -162,7 +162,7 @@ def test_sessions_with_clipped_forces_have_not_finished(scenario, rungs):
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs)
     rehearsal.run_until_armed(2.5)
     session.stop("enough", session.now)
-    rehearsal.run(1e-6 * session.now + 0.3)
+    rehearsal.run(1e-6 * session.now + 0.5)
     report = outcome("I", session, recorder, 0)
     assert session.stage == Stage.FINISHED
     assert report.session.stage == "stopped"

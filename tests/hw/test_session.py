@@ -40,7 +40,7 @@ from tests.checks.faults import CASES, Fault, _rehearse_case, at, person
 def test_deaf_devices_do_not_finish_sessions(scenario, rungs):
     """Nothing at this end of the line can take the force away; it can be said, and the exit code not be 0."""
     planned = _rehearse_case(
-        Fault("planned", Stage.FINISHED, faults=at("stuck"), action=person("stop")), scenario, rungs
+        Fault("planned", Stage.FINISHED, faults=at("stuck"), action=person("stop"), lasts=1.3), scenario, rungs
     )[0]
     session = planned.session
     assert session.stage == Stage.STOPPED
@@ -75,7 +75,7 @@ def test_harmless_faults_leave_forces_alone(scenario, rungs):
 def test_repeating_devices_count_as_lost(scenario, rungs):
     """Time-outs are looked at between bytes: the same STATE for ever is no life."""
     rehearsal = rehearsal_of(scenario, rungs)
-    session = rehearsal.run_until_armed(0.5)
+    session = rehearsal.run_until_armed(0.7)
     assert session.stage == Stage.ARMED
     assert session.link.last
     again, now = session.link.last, session.now
@@ -166,7 +166,7 @@ def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
     """
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)
-    rehearsal.run_until_armed(2.5)
+    rehearsal.run_until_armed(2.7)
     emulator = rehearsal.emulator
     link, begun = recorder.link(), emulator.begun_at
     first = int(np.argmax(link["tick"] == begun))
@@ -240,7 +240,7 @@ def test_long_delays_wait_in_the_host(scenario):
     controller = made.controller((12.0, 12.0))
     answers = np.array([controller.step((1e-3 * (k == 0), 1e-3 * (k == 0))) for k in range(4)])
     assert (answers != 0).tolist() == [[False, False], [True, False], [True, True], [True, True]]
-    session = rehearsal_of(scenario, [made]).run_until_armed(0.5)
+    session = rehearsal_of(scenario, [made]).run_until_armed(0.7)
     assert session.stage == Stage.ARMED
     assert session.config
     assert session.config.theta == made.link == 15
