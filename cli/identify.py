@@ -302,8 +302,8 @@ def _figures(report: _Report) -> render.Table:
         mode = "-" if axis.transmission is None else f"{axis.transmission.mode_hz:.2f}"
         names = ("mass", "viscous", "coulomb", "stiffness")
         figures = [f"{getattr(found, name):.5g} ± {2 * found.errors[name]:.2g}" for name in names]
-        bound = f"{axis.delta:.4f}" if report.bounded else "-"
-        cells.append((str(i), *figures, mode, bound, f"{axis.viscosity.speed:.2f}"))
+        bound = f"{np.floor(1e4 * axis.delta) / 1e4:.4f}" if report.bounded else "-"  # never above the bound
+        cells.append((str(i), *figures, mode, bound, f"{np.floor(1e2 * axis.viscosity.speed) / 1e2:.2f}"))
     heads = (
         *("axis", "mass [kg]", "viscous [N s/m]", "dry [N]", "to ground [N/m]", "mode [Hz]", "delta at least"),
         "up to [m/s]",

@@ -142,7 +142,8 @@ def inverse(M: Array) -> Array:
     if M.dtype == object:
         return solve(M, fractions(np.eye(M.shape[-1])))
     if M.size and np.max(np.linalg.cond(M)) > 1e12:
-        raise SingularLoop(f"the algebraic loop I + D_G D_H is singular: {M.tolist()}")
+        solved = "the algebraic loop I + D_G D_H is singular, or too stiff for floating point (condition above 1e12)"
+        raise SingularLoop(f"{solved}: soften the environment or the coupling, or give psi a sample")
     return np.linalg.inv(M)
 
 

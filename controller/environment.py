@@ -30,13 +30,14 @@ _NO_MODEL = "a MuJoCo world has no linear model E(z): take moving-average, or th
 
 #: largest amounts, far from where arithmetic ends and beyond what anybody renders
 MOST_AMOUNT = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
+_LEAST_AMOUNT = 1e-12  # far below anything that is felt, and its square still far above the smallest float
 _MOST_WALLS = 6
 _MOST_TICKS = 100  # largest number of ticks between two steps of a world
 _MOST_NODES, _MOST_PARTS = 200, 2000  # a mass is two states, and a proof has at most a few hundred
 
 
 def _check_amount(what: str, value: float, unit: str) -> None:
-    if not 0 <= value <= MOST_AMOUNT[unit]:
+    if value != 0 and not _LEAST_AMOUNT <= value <= MOST_AMOUNT[unit]:
         raise ValueError(f"{what} is {value}, allowed are 0 to {MOST_AMOUNT[unit]:g} {unit} (a passive network)")
 
 

@@ -30,6 +30,7 @@ from haptic_loop.controller.ranges import Member, Ranges, members
 MOST_SAMPLES = 1000  # longest delay of a channel; every sample is a state
 _Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=MOST_SAMPLES)], ...]
 _Positive = Annotated[float, msgspec.Meta(gt=0)]
+_LEAST_DAMPING = 1e-12  # [N s/m] far below any device's, and squares of its inverse are still floats
 Rows = tuple[tuple[float, ...], ...]  # rows of a matrix
 
 
@@ -95,6 +96,8 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
             steps = getattr(self, name)
             if any(n != int(n) or n < 0 for n in steps):
                 raise ValueError(f"{name} is {list(steps)}, expected whole numbers of samples, zero or more")
+        if any(0 < d < _LEAST_DAMPING for d in self.delta):
+            raise ValueError(f"delta is {list(self.delta)}, expected 0 or at least {_LEAST_DAMPING:g} N s/m")
         if any(n > t + p for n, t, p in zip(self.lam, self.theta, self.psi, strict=True)):
             raise ValueError(f"lam is {list(self.lam)}, expected at most theta + psi on every channel")
         for member in self.members():

@@ -43,7 +43,7 @@ from haptic_loop.design.guarantees import ANY, AT_VERTICES, RANGES
 from haptic_loop.design.known_device import KNOWN_DEVICE, LimitedKnownDevice, described
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Design, NotProved, Requirement, suffices
-from haptic_loop.design.transparency import BAND_HZ, Transparency, transparency
+from haptic_loop.design.transparency import BAND_HZ, Transparency, silent, transparency
 from haptic_loop.design.worst_member import SEARCH, Progress, Searched, search_ranges
 
 PluggedEnvironment = Callable[[Array], Array]  # where the port would be without force, (m,) [m] -> its force (m,) [N]
@@ -576,7 +576,7 @@ def _transparency(loop: Loop, coupling: Coupling, band_hz: tuple[float, float]) 
         F, E = loop.F(coupling), loop.E()
     except ValueError:  # a rigid wall has no E(z), and a singular loop no F
         return None
-    if too_long(F) or (not E.D.any() and not E.C.any()):
+    if too_long(F) or silent(E):
         return None
     try:
         return transparency(F, E, loop.lam, band_hz)

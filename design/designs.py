@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 import numpy as np
 
-from haptic_loop.controller.arithmetic import Number, numbers
+from haptic_loop.controller.arithmetic import Number, SingularLoop, numbers
 from haptic_loop.controller.coupling import Coupling, ForceFilter, NoCoupling
 from haptic_loop.controller.environment import Environment
 from haptic_loop.controller.loop import Loop
@@ -26,6 +26,7 @@ from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.own import called, named
 from haptic_loop.design.result import Design, DesignFailed
 from haptic_loop.design.robustness import Nearby, robustness_nearby
+from haptic_loop.design.transparency import NO_FORCE, silent
 
 if TYPE_CHECKING:
     from haptic_loop.design.program import Options
@@ -159,6 +160,8 @@ def design_by_kind(
 
     if loop.latency and (reason := made_for.beyond(loop)):
         raise ValueError(f"latency: {reason}")
+    if kind != "moving-average" and _without_force(loop):
+        raise ValueError(f"{NO_FORCE}, or take moving-average")
     if own:
         return replace(_with_less_damping(loop, made, own), condition=own.name, own=own, phi=None)
     anywhere = made_for.guarantee(loop) == ANY
@@ -167,6 +170,13 @@ def design_by_kind(
     if chosen.model or anywhere or not (loop.latency or loop.environment.walls):
         return made(loop)
     return _with_less_damping(loop, made, made_for)
+
+
+def _without_force(loop: Loop) -> bool:
+    """Return whether the environment has a model and never exerts a force."""
+    with suppress(SingularLoop):  # a rigid wall or a world has no E(z)
+        return silent(loop.E())
+    return False
 
 
 class _Turned(Environment):

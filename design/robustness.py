@@ -117,8 +117,15 @@ def robustness(
 
 
 def robustness_nearby(loop: Loop, coupling: Coupling, condition: Condition = THIS_ENVIRONMENT) -> Robustness | None:
-    """Return the worst requirement within ten percent; None for walls and for environments given by a block."""
+    """Return the worst requirement within ten percent, or None.
+
+    None is for walls, for environments given by a block, and for amounts within ten percent of the largest allowed.
+    """
     if loop.environment.walls or not isinstance(loop.environment, Network) or loop.environment.block:
+        return None
+    try:
+        vertices(loop.network)
+    except InputError:
         return None
     return robustness(loop, coupling, condition=condition)
 

@@ -74,8 +74,18 @@ class Transparency:
         return part | ({"reason": self.reason} if self.reason else {})
 
 
+NO_FORCE = "environment: it has no force at any frequency, so that no mismatch can be computed: add a spring or a mass"
+
+
+def silent(E: Lti) -> bool:
+    """Return whether an environment never exerts a force."""
+    return not E.D.any() and not E.C.any()
+
+
 def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
-    """Compute the figures of the force map F against Lambda E."""
+    """Compute the figures of the force map F against Lambda E. Raises ValueError where E is zero."""
+    if silent(environment):
+        raise ValueError(NO_FORCE)
     target = delay(lam, F.T) @ environment
     per_hz = 2 * np.pi * F.T
     low, high = band_hz[0] * per_hz, min(band_hz[1] * per_hz, np.pi)

@@ -42,6 +42,7 @@ _MODES_HZ = np.geomspace(25.0, 300.0, 40)  # where a transmission's mode is look
 _PARTS = (0.15, 0.3, 0.5)  # of the mass, that the motor may have
 _STEPS = 30  # of a fit
 _VAGUE = 3.0  # standard deviation of a logarithm before the record is seen
+_B, _C = 4, 7  # places of b and c among the parameters
 _MUCH = 0.15  # part of the damping that a memory may have where the fit is linear in it
 _QUANTILE = 2.0  # of the normal distribution, 97.7 % to one side
 _SURE = 100.0  # log likelihood ratio from which on a memory is not chance, nor friction that is modelled badly
@@ -184,46 +185,75 @@ class Spectra:
 def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[float, float, bool]:
     """The least lower end of b [N s/m] over all tau, that tau [s], and whether the record shows a memory.
 
-    `force` is that of the motor less dry friction. The model without memory is fitted to all frequencies. Beside the
-    mass a Maxwell element changes little, so its part is linear in c, and each tau takes one linear fit.
+    `force` is that of the motor less dry friction. The model without memory is fitted to all frequencies. A small
+    Maxwell element changes little beside the mass, so its part is linear in c, and each tau takes one linear fit. That
+    model may also have explained a large element by a lag and a transmission. So all parameters are fitted with most of
+    the damping in the element first, and what explains the record about as well counts.
     """
     import scipy
 
     few, every = Spectra(x, force, T), Spectra(x, force, T, points=len(x))
-    low = np.array([-20.0] * 4 + [0.0, 0.0, -T, -np.inf])  # an encoder may be read later than forces latch
-    high = np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T, np.inf])
+    low = np.array([-20.0] * 4 + [0.0, 0.0, -T, 0.0, -np.inf])  # an encoder may be read later than forces latch
+    high = np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T, np.inf, np.inf])
 
-    def error_of(spectra: Spectra, p: Array, c: float = 0.0, tau: float = 1.0) -> Array:
-        """Errors by p = [log m1, log m2, log k, log d, b, lag, delay, end]."""
-        return spectra.error(np.append(p[:7], c), tau, p[7])
+    def error_of(spectra: Spectra, tau: float, p: Array) -> Array:
+        """Errors by p = [log m1, log m2, log k, log d, b, lag, delay, c, end]."""
+        return spectra.error(p[:8], tau, p[8])
 
-    def fitted(spectra: Spectra, start: Array) -> Any:
-        begin = np.clip(start, low + 1e-13, high - 1e-13)
-        how: dict[str, Any] = {"bounds": (low, high), "x_scale": "jac", "max_nfev": _STEPS}
-        return scipy.optimize.least_squares(partial(error_of, spectra), begin, **how)
+    def fitted(spectra: Spectra, start: Array, tau: float | None = None) -> Any:
+        """The fit from a start; without tau c stays next to 0."""
+        top = np.where(np.arange(9) == _C, 1e-12, high) if tau is None else high
+        begin = np.clip(start, low + 1e-13, top - 1e-13)
+        how: dict[str, Any] = {"bounds": (low, top), "x_scale": "jac", "max_nfev": _STEPS}
+        return scipy.optimize.least_squares(partial(error_of, spectra, tau or 1.0), begin, **how)
 
-    rough = min((fitted(few, start[:8]) for start in few.starts(friction)), key=lambda fit: fit.cost)
+    starts = [np.insert(start, _C, 0.0) for start in few.starts(friction)]
+    rough = min((fitted(few, start) for start in starts), key=lambda fit: fit.cost)
     plain = fitted(every, rough.x)
     left, points = plain.fun, len(every.force)
     noise = np.sqrt(float(left @ left) / len(left))
     # a rigid device tells nothing of a transmission, and a delay acts like a lag
     vague = noise * np.diag([1 / _VAGUE] * 4 + [0.0] + [1 / T] * 2 + [0.0] * 2)
-    least, memory, best, part = np.inf, 0.0, float(left @ left), 0.0
-    for tau in _TAUS:
-        step = 1e-3 * max(friction.viscous, 1e-3)
-        column = (error_of(every, plain.x, step, tau) - left) / step
-        columns = np.vstack([np.column_stack([plain.jac, column]), vague])
+
+    def linear(jacobian: Array, errors: Array) -> tuple[Array, Array, float]:
+        """(best change of p, its standard errors, squares that are left), (9,) each."""
+        columns = np.vstack([jacobian, vague])
         size = np.linalg.norm(columns, axis=0) + 1e-300
         q, r = np.linalg.qr(columns / size)
-        known = np.append(left, np.zeros(len(vague)))
-        change = -scipy.linalg.solve_triangular(r, q.T @ known) / size
+        known = np.append(errors, np.zeros(len(vague)))
         rest = known - q @ (q.T @ known)
-        spread = scipy.linalg.solve_triangular(r, np.eye(len(r)))[4] / size[4]
-        error = float(np.linalg.norm(spread) * np.linalg.norm(rest)) / np.sqrt(len(left) - len(r))
-        b = float(plain.x[4] + min(change[4], 0.0))
-        if b - _QUANTILE * error < least:
-            least, memory = b - _QUANTILE * error, tau
-        if float(rest @ rest) < best:
-            best, part = float(rest @ rest), float(change[-1] / max(b + change[-1], 1e-9))
+        inverse = scipy.linalg.solve_triangular(r, np.eye(len(r)))
+        spread = np.linalg.norm(inverse, axis=1) * np.linalg.norm(rest) / np.sqrt(len(errors) - len(r))
+        return -(inverse @ (q.T @ known)) / size, spread / size, float(rest @ rest)
+
+    least, memory, best, part = np.inf, 0.0, float(left @ left), 0.0
+    for tau in _TAUS:
+        bent, step = plain.x.copy(), 1e-3 * max(friction.viscous, 1e-3)
+        bent[_C] += step
+        jacobian = plain.jac.copy()
+        jacobian[:, _C] = (error_of(every, tau, bent) - left) / step
+        change, spread, squares = linear(jacobian, left)
+        b, c = float(plain.x[_B] + min(change[_B], 0.0)), float(change[_C])
+        tried = [_split(start, friction.viscous) for start in (plain.x, starts[0])]
+        if unsure := abs(c) + _QUANTILE * spread[_C] > _MUCH * plain.x[_B]:
+            tried.append(plain.x + change)
+        near = min((fitted(few, start, tau) for start in tried), key=lambda fit: fit.cost)
+        if unsure or near.x[_C] > _MUCH * (near.x[_B] + near.x[_C]):
+            fit = fitted(every, near.x, tau)
+            if points * np.log(2 * fit.cost / float(left @ left)) < _SURE:
+                _, spread, _ = linear(fit.jac, fit.fun)
+                squares = 2 * float(fit.cost)
+                b, c = min(b, float(fit.x[_B])), float(fit.x[_C])
+        if b - _QUANTILE * spread[_B] < least:
+            least, memory = float(b - _QUANTILE * spread[_B]), tau
+        if squares < best:
+            best, part = squares, c / max(b + c, 1e-9)
     remembers = part > _MUCH and points * np.log(float(left @ left) / best) > _SURE
     return max(0.0, (1 - SCALE) * least), memory, bool(remembers)
+
+
+def _split(p: Array, viscous: float) -> Array:
+    """The parameters with most of the damping [N s/m] in the memory."""
+    p = p.copy()
+    p[[_B, _C]] = 0.3 * viscous, 0.7 * viscous
+    return p

@@ -103,6 +103,8 @@ def files_of(path: Path) -> list[Path]:
 
 def _xml(file: Path, world: Path) -> ElementTree.Element:
     try:
+        if file.exists() and not (file.is_file() and file.stat().st_size):  # a pipe or a file of the kernel's may wait
+            raise ValueError(f"world {file}: is empty or not a regular file, expected an MJCF file")
         if file.stat().st_size > _TOO_LARGE:
             raise ValueError(f"world {world}: {file.name} is larger than {_TOO_LARGE // 1_000_000} MB")
         return ElementTree.fromstring(file.read_bytes())

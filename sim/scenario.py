@@ -128,6 +128,10 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError("ranges and environment.walls: ranges are of linear environments; give one of them")
         self._check_timing()
         self.loop("I")  # raises ValueError where the ranges do not fit the environment
+        there = self.environment
+        parts = (amount for spring in there.springs for amount in spring.amounts(float))
+        if not (there.world or there.block or there.walls or any(there.masses.values()) or any(parts)):
+            raise ValueError("environment has no force: all springs, dampers and masses are 0, and there are no walls")
         if self.tap and not 1 <= self.tap.channel <= self.channels:
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
 

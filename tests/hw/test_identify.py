@@ -154,6 +154,14 @@ NOT_VISCOUS = {
     "trace of 30 ms, 0.1 N s/m": ({"memory": 0.1, "relax": 3e-2}, 1.0),
     "trace of 3 ms, 0.1 N s/m": ({"memory": 0.1, "relax": 3e-3}, 1.0),
     "trace of 10 ms, 0.02 N s/m": ({"memory": 0.02, "relax": 1e-2}, 1.0),
+    "memory of 4 ms, 1.5 N s/m, behind a lag": (
+        {"memory": 1.5, "relax": 4e-3, "lag": 0.45, "mass": 0.308, "step": 2e-6},
+        1.0,
+    ),
+    "dashpot of 8 N s/m behind a spring, 3 ms, on a light handle": (
+        {"memory": 8.0, "relax": 3e-3, "mass": 0.2, "motor": 0.97},
+        1.0,
+    ),
     "viscous": ({}, 1.0),
     "viscous, half the mass": ({"mass": 0.125}, 1.0),
     **{f"dry friction that bends at {v:g} m/s": ({"coulomb": 0.05, "slip": v}, 1.0) for v in (0.06, 0.1)},

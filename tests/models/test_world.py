@@ -11,7 +11,7 @@ from haptic_loop.controller.coupling import MovingAverage, SpringDamper
 from haptic_loop.controller.environment import Network, Spring
 from haptic_loop.controller.lti import Lti
 from haptic_loop.models.scene import quiet_warnings
-from haptic_loop.models.world import Contact, Rows, World, digest_of, files_of
+from haptic_loop.models.world import Contact, Rows, World, digest_of, files_of, touchable_bodies
 
 T = 1e-3
 FREE = '<geom type="sphere" size="0.005" contype="0" conaffinity="0"/>'
@@ -410,6 +410,13 @@ def test_scene_defaults_do_not_reach_slides(tmp_path):
         for part in (model.dof_damping, model.dof_armature, model.dof_frictionloss, model.jnt_limited):
             assert not part.any()
         assert model.body("left").mass == model.body("right").mass == 0.03
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "/proc/kmsg", "empty.xml"])
+def test_files_without_an_end_are_refused(tmp_path, name):
+    (tmp_path / "empty.xml").touch()
+    with pytest.raises(ValueError, match="is empty or not a regular file, expected an MJCF file"):
+        touchable_bodies(tmp_path / name)
 
 
 def test_the_digest_covers_what_a_scene_includes(tmp_path):

@@ -1,12 +1,15 @@
 """Scenarios are strict: every impossible one gives one line that names the field."""
 
+import msgspec
 import numpy as np
 import pytest
 from worlds import FIGURE_4
 
-from haptic_loop.controller.coupling import NoCoupling
+from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import Spring
-from haptic_loop.design.robustness import vertices
+from haptic_loop.design.designs import design_by_kind
+from haptic_loop.design.robustness import robustness_nearby, vertices
+from haptic_loop.design.transparency import transparency
 from haptic_loop.models.human import Human, Link
 from haptic_loop.sim.report import friction_left_out
 from haptic_loop.sim.run import assemble, run
@@ -38,6 +41,7 @@ BAD = [
     ("mass = 0.3", "mass = 3e5", "human #1.links #1: mass is 300000, allowed are 0 to 1000 kg"),
     ("frequency = 0.6", "frequency = inf", "frequency is inf"),
     ("stiffness = 800.0", "stiffness = -800.0", "stiffness between contact 1 and mass is -800.0"),
+    ("stiffness = 800.0", "stiffness = 1e-300", "stiffness between contact 1 and mass is 1e-300, allowed are 0 to"),
     ("mass = 1.0 }", "mas = 1.0 }", "masses names 'mas', which no spring reaches"),
     ("channel = 1", "channel = 3", "tap.channel is 3, allowed are 1 to 2"),
     ("[tap]", "[tapp]", "unknown field `tapp` (did you mean `tap`?)"),
@@ -254,6 +258,19 @@ def test_the_stiffest_spring_has_no_stiffer_vertex():
     network = FIGURE_4.__class__(contacts=("a",), springs=(Spring(("a", "ground"), 1e12),))
     with pytest.raises(InputError, match=r"10 % can be computed: stiffness between a and ground is .*allowed are"):
         vertices(network)
+    stiffest = load("one-wall").replace(environment=network)
+    assert robustness_nearby(stiffest.loop("I"), SpringDamper([2000.0], [2.0])) is None
+
+
+def test_an_environment_without_force_is_refused():
+    network = FIGURE_4.__class__(contacts=("a",), springs=(Spring(("a", "ground"), 0.0),))
+    with pytest.raises(InputError, match=r"environment has no force: all springs, dampers and masses are 0"):
+        load("one-wall").replace(environment=network)
+    loop = msgspec.structs.replace(load("one-wall").loop("I"), environment=network)
+    with pytest.raises(ValueError, match=r"environment: it has no force at any frequency"):
+        design_by_kind(loop, "spring-damper")
+    with pytest.raises(ValueError, match=r"environment: it has no force at any frequency"):
+        transparency(loop.F(SpringDamper([2000.0], [2.0])), loop.E(), loop.lam)
 
 
 @pytest.mark.parametrize("kind", ["rigid", "compliant"])
