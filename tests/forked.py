@@ -13,6 +13,7 @@ import inspect
 import json
 import os
 import pickle
+import pkgutil
 import runpy
 import shlex
 import subprocess
@@ -23,6 +24,19 @@ from importlib import import_module
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+
+
+def load() -> None:
+    """Import all modules, so that no fork has to."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    for name in ("matplotlib.pyplot", "clarabel", "numpy.random"):
+        import_module(name)
+    for folder in ("cli", "controller", "design", "hw", "models", "sim"):
+        package = import_module(f"haptic_loop.{folder}")
+        for module in pkgutil.iter_modules(package.__path__):
+            import_module(f"haptic_loop.{folder}.{module.name}")
 
 
 def share_designs(folder: Path, patch=setattr) -> None:
@@ -45,6 +59,24 @@ def share_designs(folder: Path, patch=setattr) -> None:
     ):
         for module in modules:
             patch(module, made.__name__, _remembering(folder, made))
+
+
+def draw_once(folder: Path) -> None:
+    """The first picture of each command is drawn, and those after it are empty: they take most of a second each."""
+    from matplotlib.figure import Figure
+
+    from haptic_loop.sim import plots
+
+    save = plots.save
+
+    def drawn(figure: Figure, path: Path, dpi: int = 130) -> Path:
+        try:
+            (folder / f"{Path(sys.argv[0]).name}-{Path(path).name}").touch(exist_ok=False)
+        except FileExistsError:
+            figure = Figure()
+        return save(figure, path, dpi)
+
+    plots.save = drawn
 
 
 def _remembering(folder: Path, make):
@@ -103,13 +135,23 @@ def _warm() -> subprocess.Popen[str]:
 def run(command: str | list[str], folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """`python -m MODULE ...` of a command, or `python FILE ...`, in a terminal of 100 columns."""
     words = shlex.split(command, comments=True) if isinstance(command, str) else [str(word) for word in command]
-    warm = _warm()
     with tempfile.TemporaryDirectory() as place:
         files = [Path(place, name) for name in ("out", "err")]
-        request = {"words": words[1:], "folder": str(folder), "files": [str(file) for file in files]}
-        print(json.dumps(request | {"environment": {"COLUMNS": "100"} | environment}), file=warm.stdin, flush=True)
-        code = int(warm.stdout.readline())
+        code = _asked_for(words[1:], folder, files, {"COLUMNS": "100"} | environment)
         return subprocess.CompletedProcess(words, code, *(file.read_text(encoding="utf-8") for file in files))
+
+
+def begin(module: str, *options: str, out: Path, err: Path) -> int:
+    """Begin `python -m MODULE ...`, a session of its own that writes to these files, and return its process id."""
+    return _asked_for(["-m", module, f"--parent={_warm().pid}", *options], ROOT, [out, err], {}, beside=True)
+
+
+def _asked_for(words: list[str], folder: Path, files: list[Path], environment: dict[str, str], beside=False) -> int:
+    """The code that the command leaves with, or where it goes on beside, its process id."""
+    request = {"words": words, "folder": str(folder), "files": [str(file) for file in files]}
+    request |= {"environment": environment, "beside": beside}
+    print(json.dumps(request), file=_warm().stdin, flush=True)
+    return int(_warm().stdout.readline())
 
 
 def _command(words: list[str]) -> None:
@@ -121,13 +163,17 @@ def _command(words: list[str]) -> None:
         runpy.run_path(str(ROOT / words[0]), run_name="__main__")
         return
     sys.argv = words[1:]
-    door({module: command for command, (module, _) in COMMANDS.items()}[words[1]])
+    if command := {module: command for command, (module, _) in COMMANDS.items()}.get(words[1]):
+        door(command)
+    runpy.run_module(words[1], run_name="__main__")
 
 
 def _child(request: dict) -> None:
     """Never returns."""
     code = 99
     try:
+        if request["beside"]:
+            os.setsid()  # Ctrl-C is not for it
         os.chdir(request["folder"])
         os.environ.update(request["environment"])
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
@@ -154,19 +200,15 @@ def _child(request: dict) -> None:
 
 
 def _serve() -> None:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from haptic_loop.cli.main import COMMANDS
-
-    for name in ["matplotlib.pyplot", "clarabel", *(f"cli.{command}" for command in COMMANDS)]:
-        import_module(name)
+    load()
     if sys.argv[1]:
         share_designs(Path(sys.argv[1]))
+        draw_once(Path(sys.argv[1]))
     for line in sys.stdin:
+        request = json.loads(line)
         if (child := os.fork()) == 0:
-            _child(json.loads(line))
-        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+            _child(request)
+        print(child if request["beside"] else os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 
 
 if __name__ == "__main__":

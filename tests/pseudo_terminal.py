@@ -9,8 +9,8 @@ import json
 import os
 import select
 import signal
-import subprocess
 import sys
+import tempfile
 import termios
 import time
 import tty
@@ -19,11 +19,12 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
+from forked import begin
+
 from haptic_loop.hw.emulator import Emulator, FaultInjection, Line, nobody
 from haptic_loop.sim.scenario import load
 
-_ROOT = Path(__file__).parents[1]
-_PATIENCE = 60.0  # [s] for the emulator to load MuJoCo and print its path
+_PATIENCE = 60.0  # [s] for the emulator to begin, and to end
 _LINGER_US = 50_000  # after the cable was pulled: the device comes to rest by itself
 
 
@@ -131,27 +132,46 @@ class RealTimeEmulator:
         heapq.heappush(self._queue, (when, next(self._number), deliver, data))
 
 
+class EmulatorProcess:
+    """An emulator in a process of its own, which is started with `options`; `path` is its terminal."""
+
+    def __init__(self, *options: str) -> None:
+        self._folder = tempfile.TemporaryDirectory()
+        self._said = Path(self._folder.name, "err")
+        path = Path(self._folder.name, "out")
+        self._number = begin("tests.pseudo_terminal", *options, out=path, err=self._said)
+        assert _within(_PATIENCE, lambda: path.exists() and path.read_text().endswith("\n")), "it did not start"
+        self.path = path.read_text().strip()
+
+    def end(self, patience: float = 0.0) -> dict[str, str]:
+        """What it says of its device at the end, which comes by itself where the cable was pulled."""
+
+        def ended() -> bool:
+            return self._said.read_text().endswith("}\n")
+
+        if not _within(patience, ended):
+            os.kill(self._number, signal.SIGTERM)
+            assert _within(_PATIENCE, ended), self._said.read_text()
+        said = json.loads(self._said.read_text().splitlines()[-1])
+        self._folder.cleanup()
+        return said
+
+
+def _within(seconds: float, true: Callable[[], bool]) -> bool:
+    end = time.monotonic() + seconds
+    while not (done := true()) and time.monotonic() < end:
+        time.sleep(0.005)
+    return done
+
+
 @contextmanager
 def emulated(*options: str) -> Iterator[str]:
-    """Yield the path of an emulator in a process of its own, which is started with `options` and ended afterwards."""
-    child = subprocess.Popen(
-        [sys.executable, "-m", "tests.pseudo_terminal", f"--parent={os.getpid()}", *options],
-        cwd=_ROOT,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,  # Ctrl-C is for the bridge, which ramps out first
-        text=True,
-    )
-    assert child.stdout is not None
+    """Yield the path of an emulator in a process of its own, which is ended afterwards."""
+    emulator = EmulatorProcess(*options)
     try:
-        ready = select.select([child.stdout], [], [], _PATIENCE)[0]
-        path = child.stdout.readline().strip() if ready else ""
-        assert path, "the emulator did not start"
-        yield path
+        yield emulator.path
     finally:
-        child.terminate()
-        child.communicate()
+        emulator.end()
 
 
 def main() -> None:

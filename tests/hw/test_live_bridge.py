@@ -14,7 +14,7 @@ import subprocess
 import sys
 import termios
 import time
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -36,36 +36,13 @@ from haptic_loop.hw.session_report import IncidentLog
 from haptic_loop.hw.transport import Live, SerialPort
 from haptic_loop.sim.scenario import InputError
 from tests.asked import decisive
-from tests.pseudo_terminal import emulated
+from tests.pseudo_terminal import EmulatorProcess, emulated
 
 pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
 ROOT = Path(__file__).parent.parent.parent
 PACE = 0.2  # seconds of a session per second: the patience of a session (1 s of silence) is 5 s of the machine
 PACES = (0.3, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05)  # of attempts
 AT_REST = ("silent", "disarmed", "stopped", "estop", "ramp")
-
-
-class EmulatorProcess:
-    """An emulated device behind a pseudo-terminal."""
-
-    def __init__(self, *options):
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.pseudo_terminal", "--duration=300", *options],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        assert select.select([self.process.stdout], [], [], 120)[0]
-        self.path = self.process.stdout.readline().strip()
-
-    def end(self, patience=0.0):
-        """What it says of its device at the end, which comes by itself where the cable was pulled."""
-        with suppress(subprocess.TimeoutExpired):
-            self.process.wait(patience)
-        self.process.terminate()
-        said = self.process.communicate()[1]
-        return json.loads(said.splitlines()[-1])
 
 
 @pytest.fixture(scope="module")

@@ -225,12 +225,12 @@ def chosen(word: str, folder: Path, model: Path) -> Iterator[tuple[str, list[str
 
 def main() -> int:
     word = sys.argv[1] if len(sys.argv) > 1 else ""
-    for command in COMMANDS:
-        import_module(f"haptic_loop.cli.{command}")
+    sys.path.append(str(Path(__file__).parents[1]))
+    forked = import_module("forked")
+    forked.load()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     if shared := os.environ.get("SHARED_DESIGNS"):
-        sys.path.append(str(Path(__file__).parents[1]))
-        import_module("forked").share_designs(Path(shared))
+        forked.share_designs(Path(shared))
     begin = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder) / "model"
