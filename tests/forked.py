@@ -55,6 +55,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
         (optimal.spread, (optimal,)),
         (assessment.required_damping, (assessment,)),
         (assessment.requirements_of, (assessment,)),
+        (assessment.search_ranges, (assessment,)),
         (api.instead, (api,)),
     ):
         for module in modules:

@@ -81,7 +81,7 @@ def test_no_hand_is_given_more_than_the_budget(controller, lossless, start):
     W0, given, theta = 0.05, hands.energy(), (1, 2)
     force, budget = controller(hands, rng), EnergyBudget(DELTA, T, Packets(theta), start=W0, nsim=40)
     line, x, most = np.zeros((3, 2, 40)), hands.x, 0.0
-    for _ in range(2500):
+    for _ in range(1500):
         line = np.concatenate([budget.limit(force(), hands.x - x)[None], line[:-1]])
         x = hands.x
         assert (budget.energy - budget.reserved > -1e-9).all()
@@ -138,7 +138,7 @@ def test_varying_delays_and_losses_keep_the_guarantee(told, hold, loss):
         budget = EnergyBudget(DELTA, T, Packets(lo, hi, hold), start=W0, nsim=30)
         line, force, x, acted = Line(rng, lo, hi, hold, loss, 30), controller(hands, rng), hands.x, [np.zeros((2, 30))]
         worked = np.zeros(30)
-        for k in range(1200):
+        for k in range(600):
             sent = budget.limit(force(), hands.x - x, acted[-1] if told == "at once" else None)
             x = hands.x
             if told == "late" and k > late:

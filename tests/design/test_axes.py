@@ -327,7 +327,8 @@ def turned(loop: Loop, Q: np.ndarray) -> Loop:
     return msgspec.structs.replace(loop, environment=loop.environment.turned(Q), delta=delta, levels=levels)
 
 
-def test_turning_the_axes_changes_nothing() -> None:
+@pytest.mark.parametrize("turns", [40, pytest.param(200, marks=pytest.mark.validate)])
+def test_turning_the_axes_changes_nothing(turns: int) -> None:
     """Delta -> Q' Delta Q, E -> Q'EQ, V -> Q'VQ with an orthogonal Q_i for each device."""
     rng = np.random.default_rng(3)
     asked = [
@@ -340,7 +341,7 @@ def test_turning_the_axes_changes_nothing() -> None:
         (LOOP, LimitedForces(held=(7.0, 11.0)), (0.26, 0.742)),
     ]
     before = [required_damping(loop, BUILT, condition, values).ratio for loop, condition, values in asked]
-    for number in range(200):
+    for number in range(turns):
         parts = [np.linalg.qr(rng.normal(size=(2, 2)))[0] for _ in range(2)]
         Q = np.zeros((4, 4))
         Q[:2, :2], Q[2:, 2:] = parts

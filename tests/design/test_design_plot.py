@@ -158,10 +158,10 @@ def test_other_devices_other_delays_and_no_pictures(tmp_path):
 
 def test_a_missing_design_leaves_the_others(tmp_path, capsys):
     base = ["--psi", "1,1", "--no-plot", "--out", str(tmp_path)]
-    assert main(["--coupling", "none,spring-damper", *base]) == 1
+    assert main(["--coupling", "none,spring-damper:any-environment", *base]) == 1
     assert "spring-damper: not possible" in capsys.readouterr().out
     with pytest.raises(DesignFailed):
-        main(["--coupling", "spring-damper", *base])
+        main(["--coupling", "spring-damper:any-environment", *base])
 
 
 @pytest.mark.parametrize(

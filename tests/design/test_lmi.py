@@ -174,10 +174,10 @@ def test_2_as_printed_is_infeasible_for_v_hat():
 
 
 def test_analysis_agrees_with_the_frequency_condition():
-    """80 couplings near the boundary, of both signs, from one to three channels, diagonal and coupled."""
+    """48 couplings near the boundary, of both signs, from one to three channels, diagonal and coupled."""
     rng = np.random.default_rng(7)
     verdicts = []
-    for trial in range(80):
+    for trial in range(48):
         m = int(rng.integers(1, 4))
         walls = Network(
             contacts=tuple(f"c{i}" for i in range(m)),
@@ -195,7 +195,7 @@ def test_analysis_agrees_with_the_frequency_condition():
             continue
         verdicts.append(ratio < 1)
         assert analysis(V, E, theta, [0] * m, delta).feasible == verdicts[-1], (trial, ratio)
-    assert 16 < sum(verdicts) < len(verdicts) - 16
+    assert 10 < sum(verdicts) < len(verdicts) - 10
 
 
 def scalar_any_environment(V, E, theta, psi, delta):
@@ -213,7 +213,7 @@ def scalar_any_environment(V, E, theta, psi, delta):
 def test_environment_delay_agrees_with_lemma_4():
     rng = np.random.default_rng(3)
     verdicts = []
-    for _ in range(50):
+    for _ in range(30):
         network = Network(contacts=("c",), springs=(Spring(("c", "ground"), rng.uniform(5, 300), rng.uniform(0, 0.2)),))
         E = environment(network, T)
         theta, psi, delta = int(rng.integers(0, 3)), int(rng.integers(1, 3)), rng.uniform(0.5, 3)
@@ -223,7 +223,7 @@ def test_environment_delay_agrees_with_lemma_4():
             continue
         verdicts.append(room > 0)
         assert analysis(V, E, [theta], [psi], [delta]).feasible == (room > 0), (theta, psi, delta, room)
-    assert 8 < sum(verdicts) < len(verdicts) - 8
+    assert 5 < sum(verdicts) < len(verdicts) - 5
 
 
 def test_separate_channels_have_the_smallest_margin():

@@ -34,7 +34,7 @@ import numpy as np
 from hostile_cases import BUT, Case, furnish, npz, put
 
 from haptic_loop.cli import options
-from haptic_loop.cli.main import COMMANDS, execute
+from haptic_loop.cli.main import execute
 
 SECONDS = 20  # of processor time that a case may take
 
