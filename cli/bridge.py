@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 
 from haptic_loop.cli import options, render, session_cli
+from haptic_loop.cli.verdict import verdict
 from haptic_loop.cli.world import world_start
 from haptic_loop.design.certificate import named
 from haptic_loop.design.files import plain, write_json
@@ -118,7 +119,8 @@ def _parser() -> argparse.ArgumentParser:
 def _print_certificate(
     ages: Ages, link: int, programs: Sequence[CertifiedCoupling], caps: Sequence[float], console: render.Screen
 ) -> None:
-    """What was measured, and what is certified for it: printed before anything is armed."""
+    """What is certified and what was measured for it: printed before anything is armed."""
+    console.print(verdict(programs[0].assessment), soft_wrap=True)
     at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
     console.print(
         f"answers are {at[50]} us old, {at[99]} us at the 99th percentile, {ages.missing} of "

@@ -462,8 +462,9 @@ def in_world(scenario: Scenario, file: str) -> Scenario:
     with refused("--world: "):
         bodies = touchable_bodies(Path(file))
     if len(bodies) != scenario.channels:
-        found = f"{len(bodies)} named bodies without a joint ({', '.join(bodies)})"
-        raise InputError(f"--world {file} has {found} for {scenario.channels} devices: write a scenario with contacts")
+        found = f"{len(bodies)} named bodies without a joint ({', '.join(bodies) or 'none'})"
+        need = f"{scenario.name} has {scenario.channels} contact{'s' if scenario.channels > 1 else ''}"
+        raise InputError(f"--world {file} has {found}, {need}: name contacts in a scenario, as in world-cube")
     return scenario.replace(environment=world_environment({"world": str(Path(file).resolve()), "contacts": bodies}))
 
 

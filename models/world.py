@@ -176,9 +176,9 @@ class World:
         spec = _spec(self.path)
         base = _compiled(spec, self.path)
         self._keys = {base.key(i).name: base.key(i).qpos.copy() for i in range(base.nkey)}
-        rotations, springs = [], []
-        for contact, G in zip(self.contacts, stiffness, strict=True):
-            body = _touchable(spec, contact.body, [c.body for c in self.contacts])
+        rotations, springs, names = [], [], [contact.body for contact in self.contacts]
+        bodies = [_touchable(spec, name, names) for name in names]  # all of them before one gets a joint
+        for contact, body, G in zip(self.contacts, bodies, stiffness, strict=True):
             values, Q = _principal(np.atleast_2d(np.asarray(G, dtype=float)), contact)
             _slide(spec, body, contact, Q, values, base.body(contact.body).quat)
             rotations.append(Q)

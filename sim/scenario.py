@@ -406,7 +406,9 @@ def load(source: str | Path = DEFAULT) -> Scenario:
         kind = type(source).__name__
         raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
     path = SCENARIOS / f"{source}.toml" if str(source) in built_in() else Path(source)
-    text = read_text(path, f"scenario {source}", f"; give a TOML file or one of: {', '.join(built_in())}")
+    close = difflib.get_close_matches(str(source), built_in(), n=1)
+    hint = f" (did you mean {close[0]}?)" if close else ""
+    text = read_text(path, f"scenario {source}", f"{hint}; give a TOML file or one of: {', '.join(built_in())}")
     return parse(text, str(source), path.parent)
 
 

@@ -364,6 +364,10 @@ def with_body(body: str, more: str = "") -> str:
     ("text", "message"),
     [
         (with_body(""), "contact 'left': the world has no such body; bodies without a joint: right"),
+        (
+            f'<mujoco><worldbody><body name="left">{FREE}</body></worldbody></mujoco>',
+            "contact 'right': the world has no such body; bodies without a joint: left",
+        ),
         ("<mujoco/>", "contact 'left': the world has no such body; bodies without a joint: none"),
         (
             with_body(f'<body name="left">{FREE}</body><body><joint name="left, slide 1"/><geom size="1"/></body>'),
