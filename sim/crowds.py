@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import cached_property, partial
 from multiprocessing.connection import wait as wait_for
 from typing import Any
 
@@ -51,8 +51,8 @@ from haptic_loop.sim.stability import (
 from haptic_loop.sim.switching import Switched, switched_crowd
 
 ENGINES = ("exact", "mujoco", "both")
-_BATCH = 125  # humans that are decided together
-_NEAREST = 4  # of each group of alike humans in a batch, which are nearest to the limit
+_BATCH = 500  # humans that are decided together
+_NEAREST = 8  # of each group of alike humans in a batch, which are nearest to the limit
 _AT_RANDOM = 64  # of all humans
 
 
@@ -94,6 +94,11 @@ class Validation:
     @property
     def ticks(self) -> int:
         return round(self.duration / self.scenario.T)
+
+    @cached_property
+    def simulation(self) -> Simulation:
+        """The loop with the scenario's own humans and environment."""
+        return assemble(self.scenario, self.coupling, self.lag)
 
     def batches(self) -> list[range]:
         """Yield all indices in batches of _BATCH; each batch meets one environment."""
@@ -215,10 +220,10 @@ def _examine(
 
     `ticked` is called with the number of ticks that were simulated for all of them.
     """
-    scenario, member = validation.scenario, validation.environment(indices[0])
-    if member:
-        scenario = scenario.replace(environment=member.network, ranges=None)
-    simulation = assemble(scenario, validation.coupling, validation.lag)
+    simulation = validation.simulation
+    if member := validation.environment(indices[0]):
+        scenario = validation.scenario.replace(environment=member.network, ranges=None)
+        simulation = assemble(scenario, validation.coupling, validation.lag)
     return _merge([_group(validation, simulation, *group, ticked) for group in validation.crowds(indices)])
 
 

@@ -17,12 +17,18 @@ from haptic_loop.cli.validate import main
 from haptic_loop.controller.coupling import PUBLISHED
 from haptic_loop.models.scene import MIXED
 from haptic_loop.sim import crowds
-from haptic_loop.sim.crowds import _BATCH, Validation, validate
+from haptic_loop.sim.crowds import Validation, validate
 from haptic_loop.sim.scenario import load
 
 ROOT = Path(__file__).parents[2]
+_BATCH = 125
 QUESTION = Validation(load(), PUBLISHED["I"], 0, 3 * _BATCH + 10, MIXED, "exact", 0.0)
 OPTIONS = ["--humans", str(3 * _BATCH), "--engine", "exact", "--duration", "0", "--no-plot"]
+
+
+@pytest.fixture(autouse=True)
+def small_batches(monkeypatch):
+    monkeypatch.setattr(crowds, "_BATCH", _BATCH)
 
 
 def kill_when_there(times: int, strangers) -> threading.Thread:

@@ -23,7 +23,7 @@ from haptic_loop.models.human import Human, Person
 from haptic_loop.models.scene import MIXED, Crowd, build, crowds, draw, plant, variants
 from haptic_loop.sim import crowds as examine_module
 from haptic_loop.sim.couplings import choose
-from haptic_loop.sim.crowds import _BATCH, Findings, Validation, validate
+from haptic_loop.sim.crowds import Findings, Validation, validate
 from haptic_loop.sim.engines import ExactEngine
 from haptic_loop.sim.run import assemble, run
 from haptic_loop.sim.scenario import InputError, held_by, load
@@ -210,9 +210,10 @@ def test_a_human_depends_on_seed_and_index_only():
     assert {c.links.shape[2]: len(i) for i, c in crowds(SCENARIO.population, 2, 5, range(20), MIXED)}.keys() == {1, 2}
 
 
-def test_shards_repeat_the_single_run_bit_for_bit():
+def test_shards_repeat_the_single_run_bit_for_bit(monkeypatch):
     """Verdicts and MuJoCo's traces, long enough for a growth rate on each."""
-    question = Validation(SCENARIO, PUBLISHED["I"], 0, 2 * _BATCH + 10, MIXED, "both", 0.3)
+    monkeypatch.setattr(examine_module, "_BATCH", 60)
+    question = Validation(SCENARIO, PUBLISHED["I"], 0, 130, MIXED, "both", 0.3)
     assert len(question.batches()) > 2
     alone, shared = validate(question), validate(question, shards=2)
     for field in fields(Findings):
@@ -340,11 +341,12 @@ def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
         return real(question, batch, ticked)
 
     monkeypatch.setattr(examine_module, "_examine", interrupted)
+    monkeypatch.setattr(examine_module, "_BATCH", 125)
     options = ["--humans", "300", "--engine", "exact", "--duration", "0", "--no-plot"]
     assert main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 130
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["interrupted"]
-    assert report["humans"] == examine_module._BATCH
+    assert report["humans"] == 125
 
 
 def test_ctrl_c_ends_other_processes_batches():
