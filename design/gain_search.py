@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +80,9 @@ class SampledLoop:
         self.size2 = (np.abs(E.G[0]) ** 2).sum(axis=(1, 2))
         self.target = delay(loop.lam, loop.T).at(E.z[0]) @ E.G[0]
         self._known: dict[str, _Around] = {}
-        self._delayed = {"band": self._responses(self.band)}
+        self._delayed: dict[str, Sampled] = {}
+        self._rate: dict[str, Complex] = {}  # derivative of 1/V by B/delta
+        self._sample("band", self.band)
         self._impose(frequencies(self.E, low=1e-3, points=80))
 
     def coupling(self, x: Array) -> SpringDamper:
@@ -120,7 +123,7 @@ class SampledLoop:
     def _impose(self, w: Array) -> None:
         """Sample loop and condition at w (k,): the entries of the block for G and mu of 0 and 1, and their slopes."""
         self.conditions, m = w, self.loop.channels
-        self._delayed["conditions"] = self._responses(w)
+        self._sample("conditions", w)
         self._known.clear()
         self._last: tuple[Array, Array, Complex] | None = None
         z, shape = on_circle(w)[None], (1, w.size, m, m)
@@ -135,19 +138,22 @@ class SampledLoop:
         none, of_G, of_mu = entries(0, 0), entries(1, 0), entries(0, 1)
         self._affine = none, of_G - none, of_mu - none, entries(1, 1) - of_G - of_mu + none
 
-    def _responses(self, w: Array) -> Sampled:
-        """Return Psi E at exp(jw)."""
-        return Sampled.of(delay(self.loop.psi, self.loop.T) @ self.E, on_circle(w)[None])
+    def _sample(self, where: str, w: Array) -> None:
+        """Sample Psi E at exp(jw)."""
+        delayed = Sampled.of(delay(self.loop.psi, self.loop.T) @ self.E, on_circle(w)[None])
+        self._delayed[where] = delayed
+        self._rate[where] = damper_rate(delayed.z[0], delayed.T)[:, None] * self.delta
 
     def _around(self, x: Array, where: str) -> _Around:
         """Return the loop at the frequencies of the band or of the condition, cached for the last x."""
         gains, known = self._gains(x), self._known.get(where)
         if known is None or not np.array_equal(known.x, gains):
             coupling, delayed = self.coupling(x), self._delayed[where]
-            V = np.diagonal(coupling.sampled(delayed.z, delayed.T).G[0], axis1=1, axis2=2)
-            of_b = damper_rate(delayed.z[0], delayed.T)[:, None] * self.delta
-            by = V**2 * np.stack([np.broadcast_to(coupling.K, of_b.shape), of_b])
-            known = self._known[where] = _Around(gains.copy(), coupling.around(delayed).G[0], by)
+            V = coupling.sampled(delayed.z, delayed.T)
+            of_b = self._rate[where]
+            by: Any = np.diagonal(V.G[0], axis1=1, axis2=2) ** 2
+            by = by * np.stack([np.broadcast_to(coupling.K, of_b.shape), of_b])
+            known = self._known[where] = _Around(gains.copy(), delayed.feedback(V).G[0], by)
         return known
 
     def square_mismatch(self, x: Array) -> float:
@@ -350,7 +356,7 @@ class KnownDeviceLoop(SampledLoop):
 
     def _impose(self, w: Array) -> None:
         self.conditions = w
-        self._delayed["conditions"] = self._responses(w)
+        self._sample("conditions", w)
         self._known.clear()
         z, m = on_circle(w), self.loop.channels
         one = Sampled(z[None], np.broadcast_to(np.eye(m, dtype=np.complex128), (1, w.size, m, m)), self.loop.T)
