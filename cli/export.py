@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from haptic_loop.cli import options, render
+from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
 from haptic_loop.design.certificate import Verdict, named, verify
 from haptic_loop.design.coupling_file import Stored
@@ -79,9 +80,12 @@ def main(argv: list[str]) -> int:
 
     forces = "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
     if block.limiter:
-        forces = f"limited to {listed(block.limiter.limit)} N by the limiter"
+        limits = [float(block.limiter.limit[own.start]) for own in stored.loop.devices]
+        forces = (
+            f"limited to {listed(limits if block.limiter.balls else block.limiter.limit.tolist())} N by the limiter"
+        )
         if stored.loop.axes:
-            forces += ", axis by axis: a limit L of the length of n axes is L/sqrt(n) here"
+            forces += ", the length of each device's vector" if block.limiter.balls else ", axis by axis"
     exported = _Exported(
         block.name,
         block.system.order,
@@ -114,7 +118,8 @@ def _parser() -> options.Parser:
     parser.add_argument("--process", action="store_true", help="coupling, environment and delays as one block (6)")
     link = "leave out Theta, where the link to the devices is that delay"
     parser.add_argument("--without-theta", action="store_true", help=link)
-    limit = "with the limiter that the certificate covers, for forces of up to so much [N]; one is for all channels"
+    limit = "with the limiter that the certificate covers, for forces of up to so much [N]: one for all, one for each "
+    limit += "device (the length of the vector of its axes) or one for each axis"
     parser.add_argument("--force-limit", type=options.several(float, 1e-3, 1e6, "N"), metavar="N,N,..", help=limit)
     single = "compute in single precision, for processors without double; its error is printed"
     parser.add_argument("--float", action="store_true", help=single)
@@ -127,13 +132,24 @@ def _parser() -> options.Parser:
 
 def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: str | None) -> ExportedBlock:
     """Return the block to export, with comment lines on its source. Raises InputError."""
-    limit = options.per_channel("--force-limit", args.force_limit, stored.loop.channels) if args.force_limit else None
+    limits = _force_limits(args.force_limit, stored.loop) if args.force_limit else ()
     try:
-        block = process_block(stored, not args.without_theta, limit) if args.process else coupling_block(stored)
+        block = process_block(stored, not args.without_theta, *limits) if args.process else coupling_block(stored)
     except ValueError as error:  # also coefficients beyond floating point
         raise InputError(f"{args.coupling}: {error}") from None
     block = with_origin(block, Path(args.coupling).name, stored, verdict, claim)
     return in_single_precision(block) if args.float else block
+
+
+def _force_limits(given: tuple[float, ...], loop: Loop) -> tuple[tuple[float, ...], tuple[slice, ...]]:
+    """Return limits (m,) [N] and the vectors to which they apply, for one number, one per device or one per channel."""
+    vectors = tuple(own for own in loop.devices if own.stop > own.start + 1)
+    if not vectors or len(given) == loop.channels:
+        return options.per_channel("--force-limit", given, loop.channels), ()
+    if len(given) not in (1, len(loop.devices)):
+        expected = f"1, {len(loop.devices)} (of each device's vector) or {loop.channels} (of each axis)"
+        raise InputError(f"--force-limit has {len(given)} values, expected {expected}")
+    return loop.per_channel(given * len(loop.devices) if len(given) == 1 else given), vectors
 
 
 def _error(block: ExportedBlock) -> str:

@@ -237,11 +237,11 @@ class BallProblem(_Problem):
     def __post_init__(self) -> None:
         object.__setattr__(self, "M", frozen(self.M, 2))
         object.__setattr__(self, "limit", frozen(self.limit, 1))
-        _ = self._blocks
+        _ = self.blocks
 
     @cached_property
-    def _blocks(self) -> list[_BallBlock]:
-        """The blocks of M, each after those that act on it."""
+    def blocks(self) -> list[_BallBlock]:
+        """The blocks of M in the order in which they are solved: each after those that act on it."""
         owner = np.repeat(np.arange(len(self.balls)), self.balls)
         joined = np.zeros((len(self.balls),) * 2, dtype=bool)
         np.logical_or.at(joined, (owner[:, None], owner[None]), self.M != 0)
@@ -260,7 +260,7 @@ class BallProblem(_Problem):
     def solve(self, q: Array) -> tuple[Array, Array]:
         """Return (v, f), both (n, nsim), for every column of q."""
         v, f = np.zeros_like(q), q.copy()
-        for block in self._blocks:
+        for block in self.blocks:
             asked = q[block.at] - self.M[block.at] @ v
             v[block.at], f[block.at], missed = block.solve(asked)
             self.unsolved[0] += missed
@@ -288,7 +288,7 @@ class _BallBlock:
             raise SingularLoop(f"forces {rows} that are limited as vectors are not determined: {own.tolist()}")
         self.M = own + max(0.0, GROUNDED - least) * np.diag(tau)  # f is unique nevertheless
         self._radial = len(balls) == 1 and not (self.M - np.diag(tau)).any()
-        self._by_tau, self._tau = self.M / tau, tau[:, None]
+        self._by_tau, self.tau = self.M / tau, tau[:, None]
         self._inverse = np.linalg.inv(self.M)
 
     def _missing(self, v: Array, f: Array, q: Array) -> Any:
@@ -300,7 +300,7 @@ class _BallBlock:
 
     def _of(self, u: Array) -> tuple[Array, Array]:
         f = _within_balls(u, self.limit, self.balls)
-        return (u - f) / self._tau, f
+        return (u - f) / self.tau, f
 
     def solve(self, q: Array) -> tuple[Array, Array, int]:
         """Return (v, f) for every column of q, and of how many none was found."""

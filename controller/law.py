@@ -279,7 +279,7 @@ class Limiter(Law):
         _ = self.problem
 
     @cached_property
-    def _sizes(self) -> tuple[int, ...]:
+    def sizes(self) -> tuple[int, ...]:
         """The number of channels of each limited vector; () if none has several."""
         sizes, at = [], 0
         while self.balls and at < self.channels:
@@ -298,7 +298,7 @@ class Limiter(Law):
 
     @property
     def bounds(self) -> list[tuple[int, float]]:
-        return list(zip(self.sent_rows.tolist(), _inner_box(self.limit, self._sizes).tolist(), strict=True))
+        return list(zip(self.sent_rows.tolist(), _inner_box(self.limit, self.sizes).tolist(), strict=True))
 
     def limited(self, z: Array, force: Array, most: Array) -> NDArray[np.bool_]:
         """Return where the contact slipped, which is before the force arrives."""
@@ -324,7 +324,7 @@ class Limiter(Law):
         """The problem of a tick for [e; p]; all its limits are in N."""
         m, w = self.channels, len(self.walls)
         if self.balls:
-            return BallProblem(-self._step.D[:, m:], self.limit, self._sizes)
+            return BallProblem(-self._step.D[:, m:], self.limit, self.sizes)
         scale = np.concatenate([np.ones(m), self.steepness])[:, None]
         M = -scale * self._step.D[:, m:] + np.diag(np.concatenate([np.zeros(m), np.ones(w)]))
         lower = np.concatenate([-self.limit, np.full(w, -np.inf)])
@@ -346,7 +346,7 @@ class Limiter(Law):
     def transition(self) -> Transition:
         m, w, F, step, whole = self.channels, len(self.walls), self.open, self._step, self._block
         linear, kick, sent = self.linear.dot, self.kick, self.sent_rows
-        limit, solve, balls = self.limit[:, None], self.problem.solve, self._sizes
+        limit, solve, balls = self.limit[:, None], self.problem.solve, self.sizes
         if not w:
 
             def tick(before: Array, after: Array) -> None:
@@ -397,7 +397,7 @@ class Limiter(Law):
         def together(before: Array, after: Array) -> None:
             linear(before, after)
             free = after[sent]
-            for i in np.flatnonzero((magnitudes(free, self._sizes) > limit).any(axis=0)).tolist():
+            for i in np.flatnonzero((magnitudes(free, self.sizes) > limit).any(axis=0)).tolist():
                 slip, force = limiters[i].problem.solve(free[:, i : i + 1])
                 after[:, i : i + 1] += limiters[i].kick @ slip
                 after[sent, i] = force[:, 0]
@@ -413,7 +413,7 @@ class Limiter(Law):
         free = Lti(G.A, G.B[:, :m], G.C[:m], G.D[:m, :m], G.T)
         stiffness = np.stack([free.C @ free.at_rest(unit) for unit in np.eye(m)], axis=1) + free.D
         problem = (
-            BallProblem(stiffness, self.limit, self._sizes)
+            BallProblem(stiffness, self.limit, self.sizes)
             if self.balls
             else BoxProblem(stiffness, -self.limit, self.limit)
         )

@@ -11,11 +11,11 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from string import Template
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from haptic_loop.controller.complementarity import GROUNDED, PIVOT_ROUNDING, BoxProblem
+from haptic_loop.controller.complementarity import GROUNDED, PIVOT_ROUNDING, BallProblem, BoxProblem, magnitudes
 from haptic_loop.controller.law import Limiter
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array, Lti
@@ -35,12 +35,17 @@ from haptic_loop.design.result import listed, switching_guarantee
 # Where forces are limited, a tick that asks for more solves the box problem of controller.complementarity by switching
 # the first wrong limit, which ends (docs/theory.md), with elimination in the order of the channels, which needs no
 # pivots since all principal minors are positive. e then moves [y; z+] by its kick, and the forces that leave are set to
-# f_e.
+# f_e. Where the force of a device is limited as a vector, the tick alternates Newton's method in u = f + tau e, whose
+# steps are taken back unless they halve the residual, with the iteration of Douglas and Rachford, which converges. A
+# force that misses its tolerance after _MOST_STEPS is 0, and `unsolved` counts its tick.
 
 
 _TICKS = 64  # of a test vector: longer than the delays and the fast modes of a loop
 _MOST_TURNS = 100_000  # of a tick's box problem; a handful are needed
 _SINGLE_ROUNDING = 1e-5  # PIVOT_ROUNDING in single precision: 170 units in the last place
+_RESIDUAL = 1e-12  # of the limit, in a vector's force; single precision has its rounding, _BALL_ROUNDING units
+_BALL_ROUNDING = 16  # units in the last place of the terms of a residual
+_MOST_STEPS = 1000  # of a vector's force; five are usual, 93 the most for well-conditioned random problems
 _COMPARED = 4096  # ticks over which single and double precision are compared
 
 
@@ -98,11 +103,16 @@ def coupling_block(stored: Stored) -> ExportedBlock:
     return ExportedBlock("coupling", _with_a_state(V), _FORCE, _GIVEN_WAY, about)
 
 
-def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence[float] | None = None) -> ExportedBlock:
+def process_block(
+    stored: Stored,
+    with_theta: bool = True,
+    force_limit: Sequence[float] | None = None,
+    balls: Sequence[slice] = (),
+) -> ExportedBlock:
     """F(z) (6), device displacements to forces; Theta is left out where the link to the devices is the delay.
 
-    With `force_limit` (m,) [N] they leave through the limiter of the certificate. Raises NothingToExport where that
-    covers none.
+    With `force_limit` (m,) [N] they leave through the limiter of the certificate, which limits the channels of each of
+    `balls` as one vector. Raises NothingToExport where the certificate covers none.
     """
     loop, delays = stored.loop, _delays(stored.loop, with_theta)
     if not with_theta:
@@ -112,7 +122,7 @@ def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence
     if loop.environment.walls:
         raise NothingToExport("environment.walls: contact that makes and breaks is not a linear block")
     if force_limit is not None:
-        return _limited_block(stored, loop, force_limit, delays)
+        return _limited_block(stored, loop, force_limit, balls, delays)
     about = (
         "f = F x: the whole discrete process; the devices get -f, held for T. Forces are not limited here.",
         delays,
@@ -120,13 +130,16 @@ def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence
     return ExportedBlock("process", _with_a_state(loop.F(stored.built())), _DISPLACEMENT, _FORCE, about)
 
 
-def _limited_block(stored: Stored, loop: Loop, force_limit: Sequence[float], delays: str) -> ExportedBlock:
+def _limited_block(
+    stored: Stored, loop: Loop, force_limit: Sequence[float], balls: Sequence[slice], delays: str
+) -> ExportedBlock:
     rho = lag(stored.loop, stored.certificate)
     if rho is None:
         raise NothingToExport("its certificate covers no limited forces: design it anew, or leave out --force-limit")
-    limiter = Limiter(loop.sent(stored.built()), loop.theta, limit=force_limit, rho=rho)
+    limiter = Limiter(loop.sent(stored.built()), loop.theta, limit=force_limit, rho=rho, balls=balls)
+    what = "Lengths of a device's force vector" if balls else "Forces"
     about = (
-        "f: the whole discrete process with its limiter; the devices get -f, held for T. Forces never exceed "
+        f"f: the whole discrete process with its limiter; the devices get -f, held for T. {what} never exceed "
         f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead, and the certificate holds there.",
         delays,
     )
@@ -146,7 +159,7 @@ def trial(block: ExportedBlock, seed: int = 0) -> _Trial:
     rng = np.random.default_rng(seed)
     inputs = block.input.size * rng.standard_normal((_TICKS, block.system.inputs))
     if block.limiter:
-        share = np.abs(sequential(block.system, inputs)) / block.limiter.limit
+        share = magnitudes(sequential(block.system, inputs).T, block.limiter.sizes).T / block.limiter.limit
         inputs = inputs / np.quantile(share.max(axis=1), 2 / 3)
     inputs = inputs.astype(block.dtype)
     return _Trial(inputs, sequential(block.system, inputs, block.limiter, block.dtype))
@@ -185,15 +198,16 @@ def sequential(
     rows = np.block([[system.C, system.D], [system.A, system.B]]).astype(dtype)
     z, outputs = np.zeros(system.order, dtype), []
     limits = _limits(limiter, dtype) if limiter else None
+    table = _Balls.of(limiter, dtype) if limiter and limiter.balls else None
+    M = [list(row) for row in _box_matrix(limiter).astype(dtype)] if limiter and not table else []
     for u in inputs.astype(dtype):
         sums = np.zeros(len(rows), dtype)
         for column, value in zip(rows.T, [*z, *u], strict=True):
             sums = sums + column * value
         if limiter and limits is not None:
             free = sums[limiter.sent_rows]
-            if (np.abs(free) > limits).any():
-                M = _box_matrix(limiter).astype(dtype)
-                e, f = _boxed([list(row) for row in M], list(limits), list(free))
+            if limiter.balls or (np.abs(free) > limits).any():
+                e, f = _balled(table, list(free)) if table else _boxed(M, list(limits), list(free))
                 for column, value in zip(limiter.kick.astype(dtype).T, e, strict=True):
                     sums = sums + column * value
                 sums[limiter.sent_rows] = f
@@ -266,6 +280,142 @@ def _boxed(M: list[list[Any]], limit: list[Any], q: list[Any]) -> tuple[list[Any
     return e, f
 
 
+class _Balls(NamedTuple):
+    """The problem of limited vectors, with the channels in the order in which its blocks are solved."""
+
+    at: list[int]  # (m,) channels
+    first: list[int]  # (m,) where the vector of each entry begins
+    last: list[int]  # (m,) and where it ends
+    end: list[int]  # where each block ends
+    M: list[list[Any]]
+    resolvent: list[list[Any]]  # (1 + M/tau)^-1 of each block
+    tau: list[Any]
+    limit: list[Any]
+
+    @classmethod
+    def of(cls, limiter: Limiter, dtype: type[np.floating]) -> _Balls:
+        problem = limiter.problem
+        assert isinstance(problem, BallProblem)
+        blocks = problem.blocks
+        at = np.concatenate([block.at for block in blocks])
+        end, sizes = np.cumsum([block.at.size for block in blocks]), [n for block in blocks for n in block.balls]
+        M, resolvent = problem.M[np.ix_(at, at)], np.eye(at.size)
+        for block, last in zip(blocks, end.tolist(), strict=True):
+            own = slice(last - block.at.size, last)
+            M[own, own], resolvent[own, own] = block.M, np.linalg.inv(resolvent[own, own] + block.M / block.tau[:, 0])
+        last, tau = np.repeat(np.cumsum(sizes), sizes), np.concatenate([block.tau[:, 0] for block in blocks])
+        whole = (part.tolist() for part in (at, last - np.repeat(sizes, sizes), last, end))
+        rows = ([list(row) for row in part.astype(dtype)] for part in (M, resolvent))
+        return cls(*whole, *rows, list(tau.astype(dtype)), list(_limits(limiter, dtype)[at]))
+
+
+def _eliminated(a: list[list[Any]], begin: int, end: int, x: list[Any]) -> None:
+    """Write to x the solution of the rows [A, b] from begin to end, with b in column `end`, as the C file does."""
+    for k in range(begin, end):
+        pivot = k
+        for i in range(k + 1, end):
+            if abs(a[i][k]) > abs(a[pivot][k]):
+                pivot = i
+        a[k], a[pivot] = a[pivot], a[k]
+        for i in range(k + 1, end):
+            ratio = a[i][k] / a[k][k]
+            for j in range(k + 1, end + 1):
+                a[i][j] -= ratio * a[k][j]
+    for i in reversed(range(begin, end)):
+        x[i] = a[i][end]
+        for j in range(i + 1, end):
+            x[i] -= a[i][j] * x[j]
+        x[i] /= a[i][i]
+
+
+def _balled(problem: _Balls, q: list[Any]) -> tuple[list[Any], list[Any]]:
+    """Return (e, f) of f = q - M e as the C file computes it, operation by operation, in the precision of q."""
+    at, first, last, ends, M, resolvent, tau, limit = problem
+    m, real = len(q), type(q[0])
+    zero, one, two = real(0), real(1), real(2)
+    residual, rounding = real(_RESIDUAL), real(_ball_rounding(real is np.float32))
+    u, g, v, r, x, asked, back, normal = ([zero] * m for _ in range(8))
+    e, f, share, a = [zero] * m, [zero] * m, [one] * m, [[zero] * (m + 1) for _ in range(m)]
+
+    begin = 0
+    for end in ends:
+        rows, solved, tried, best = range(begin, end), False, False, zero
+        for i in rows:
+            asked[i] = q[at[i]]
+            for j in range(begin):
+                asked[i] -= M[i][j] * v[j]
+            u[i] = asked[i]
+        for _ in range(_MOST_STEPS):
+            size, worst = zero, zero
+            for i in rows:
+                square = zero
+                for k in range(first[i], last[i]):
+                    square += u[k] * u[k]
+                length = np.sqrt(square)
+                share[i], normal[i], g[i] = one, zero, u[i]
+                if length > limit[i]:
+                    share[i], normal[i] = limit[i] / length, u[i] / length
+                    g[i] = share[i] * u[i]
+                v[i] = (u[i] - g[i]) / tau[i]
+            for i in rows:
+                terms = abs(g[i]) + abs(asked[i])
+                r[i] = g[i] - asked[i]
+                for j in rows:
+                    r[i] += M[i][j] * v[j]
+                    terms += abs(M[i][j] * v[j])
+                size = max(size, terms)
+            for i in rows:
+                worst = max(worst, abs(r[i]) / max(residual * limit[i], rounding * size))
+            if worst <= one:
+                solved = True
+                break
+            if tried and two * worst > best:
+                for i in rows:
+                    u[i] = back[i]
+                tried = False
+                continue
+            if tried or best == zero:
+                best = worst
+            for i in rows:
+                x[i] = asked[i]
+                for j in rows:
+                    x[i] += M[i][j] * ((two * g[j] - u[j]) / tau[j])
+            for i in rows:
+                back[i] = u[i] - g[i]
+                for j in rows:
+                    back[i] += resolvent[i][j] * x[j]
+                for j in rows:
+                    a[i][j] = zero
+                    for k in range(first[j], last[j]):
+                        same = slope = one if k == j else zero
+                        if share[j] < one:
+                            slope = share[j] * (same - normal[k] * normal[j])
+                        if k == i:
+                            a[i][j] += slope
+                        a[i][j] += M[i][k] / tau[k] * (same - slope)
+                a[i][end] = r[i]
+            _eliminated(a, begin, end, x)
+            for i in rows:
+                u[i] -= x[i]
+            tried = True
+        if not solved:
+            for i in rows:
+                for j in rows:
+                    a[i][j] = M[i][j]
+                a[i][end] = asked[i]
+                g[i] = zero
+            _eliminated(a, begin, end, v)
+        begin = end
+    for i in range(m):
+        e[at[i]], f[at[i]] = v[i], g[i]
+    return e, f
+
+
+def _ball_rounding(single: bool) -> float:
+    """Return the rounding error of a vector's residual, relative to its largest terms."""
+    return _BALL_ROUNDING * float(np.finfo(np.float32 if single else np.float64).eps)
+
+
 def _delays(loop: Loop, with_theta: bool) -> str:
     def shown(steps: Sequence[int]) -> str:
         return ", ".join(map(str, steps))
@@ -286,7 +436,7 @@ $about
  * states z[0], z[1], .. and then the inputs, product by product. Compiled with IEEE ${real}s (FLT_EVAL_METHOD 0),
  * without contraction of a*b + c and without -ffast-math, it repeats Python's test vector to the last bit:
  *
- *     cc -std=c99 -O2 -ffp-contract=off -DHAPTIC_LOOP_TEST $file -o test && ./test
+ *     cc -std=c99 -O2 -ffp-contract=off -DHAPTIC_LOOP_TEST $file -o test$libm && ./test
  *
  * For its declarations alone: #define HAPTIC_LOOP_DECLARATIONS_ONLY, then #include "$file".
  */
@@ -299,7 +449,7 @@ enum { ${NAME}_CHANNELS = $m, ${NAME}_STATES = $n };
 
 typedef struct {
     ${real} z[${NAME}_STATES];
-} ${name}_state;
+$more_state} ${name}_state;
 
 /* To rest. */
 void ${name}_reset(${name}_state *state);
@@ -309,14 +459,14 @@ void ${name}_step(${name}_state *state, const ${real} $u[${NAME}_CHANNELS], ${re
 $more_declared
 #ifndef HAPTIC_LOOP_DECLARATIONS_ONLY
 
-$tables
+$include$tables
 
 void ${name}_reset(${name}_state *state)
 {
     int i;
     for (i = 0; i < ${NAME}_STATES; i++)
         state->z[i] = 0.0${f};
-}
+$more_reset}
 
 $limit_defined
 void ${name}_step(${name}_state *state, const ${real} $u[${NAME}_CHANNELS], ${real} $y[${NAME}_CHANNELS])
@@ -454,15 +604,156 @@ static void ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_C
     }
 }
 """
+#: the problem of vectors that are limited
+_BALLS_DEFINED = """
+static ${real} ${name}_size(${real} a)
+{
+    return a < 0.0${f} ? -a : a;
+}
+
+/* The solution x of the rows [A, b] from begin to end, with b in column end. */
+static void ${name}_eliminate(${real} a[${NAME}_CHANNELS][${NAME}_CHANNELS + 1], int begin, int end, ${real} *x)
+{
+    int i, j, k, pivot;
+    for (k = begin; k < end; k++) {
+        pivot = k;
+        for (i = k + 1; i < end; i++)
+            if (${name}_size(a[i][k]) > ${name}_size(a[pivot][k]))
+                pivot = i;
+        for (j = begin; j <= end; j++) {
+            ${real} other = a[k][j];
+            a[k][j] = a[pivot][j];
+            a[pivot][j] = other;
+        }
+        for (i = k + 1; i < end; i++) {
+            ${real} ratio = a[i][k] / a[k][k];
+            for (j = k + 1; j <= end; j++)
+                a[i][j] -= ratio * a[k][j];
+        }
+    }
+    for (i = end - 1; i >= begin; i--) {
+        x[i] = a[i][end];
+        for (j = i + 1; j < end; j++)
+            x[i] -= a[i][j] * x[j];
+        x[i] /= a[i][i];
+    }
+}
+
+/* f = q - M e, every device's vector f within its limit, and e along it where it is at the limit: by Newton's steps in
+ * u = f + tau e while these halve the residual, else by those of Douglas and Rachford. Where neither ends, f is 0. */
+static int ${name}_limit(const ${real} q[${NAME}_CHANNELS], ${real} e[${NAME}_CHANNELS], ${real} f[${NAME}_CHANNELS])
+{
+    ${real} u[${NAME}_CHANNELS], g[${NAME}_CHANNELS], v[${NAME}_CHANNELS], r[${NAME}_CHANNELS], x[${NAME}_CHANNELS];
+    ${real} asked[${NAME}_CHANNELS], back[${NAME}_CHANNELS], normal[${NAME}_CHANNELS], share[${NAME}_CHANNELS];
+    ${real} a[${NAME}_CHANNELS][${NAME}_CHANNELS + 1];
+    int block, turn, i, j, k, begin = 0, found = 1;
+    for (block = 0; block < $blocks; block++) {
+        ${real} best = 0.0${f};
+        int end = ${name}_END[block], solved = 0, tried = 0;
+        for (i = begin; i < end; i++) {
+            asked[i] = q[${name}_AT[i]];
+            for (j = 0; j < begin; j++)
+                asked[i] -= ${name}_M[i][j] * v[j];
+            u[i] = asked[i];
+        }
+        for (turn = 0; turn < $turns; turn++) {
+            ${real} size = 0.0${f}, worst = 0.0${f};
+            for (i = begin; i < end; i++) {
+                ${real} square = 0.0${f}, length;
+                for (k = ${name}_FIRST[i]; k < ${name}_LAST[i]; k++)
+                    square += u[k] * u[k];
+                length = sqrt${f}(square);
+                share[i] = 1.0${f};
+                normal[i] = 0.0${f};
+                g[i] = u[i];
+                if (length > ${name}_LIMIT[0][i]) {
+                    share[i] = ${name}_LIMIT[0][i] / length;
+                    normal[i] = u[i] / length;
+                    g[i] = share[i] * u[i];
+                }
+                v[i] = (u[i] - g[i]) / ${name}_TAU[0][i];
+            }
+            for (i = begin; i < end; i++) {
+                ${real} terms = ${name}_size(g[i]) + ${name}_size(asked[i]);
+                r[i] = g[i] - asked[i];
+                for (j = begin; j < end; j++) {
+                    r[i] += ${name}_M[i][j] * v[j];
+                    terms += ${name}_size(${name}_M[i][j] * v[j]);
+                }
+                size = terms > size ? terms : size;
+            }
+            for (i = begin; i < end; i++) {
+                ${real} allowed = $residual * ${name}_LIMIT[0][i], part;
+                allowed = $rounding * size > allowed ? $rounding * size : allowed;
+                part = ${name}_size(r[i]) / allowed;
+                worst = part > worst ? part : worst;
+            }
+            if (worst <= 1.0${f}) {
+                solved = 1;
+                break;
+            }
+            if (tried && 2.0${f} * worst > best) {
+                for (i = begin; i < end; i++)
+                    u[i] = back[i];
+                tried = 0;
+                continue;
+            }
+            if (tried || best == 0.0${f})
+                best = worst;
+            for (i = begin; i < end; i++) {
+                x[i] = asked[i];
+                for (j = begin; j < end; j++)
+                    x[i] += ${name}_M[i][j] * ((2.0${f} * g[j] - u[j]) / ${name}_TAU[0][j]);
+            }
+            for (i = begin; i < end; i++) {
+                back[i] = u[i] - g[i];
+                for (j = begin; j < end; j++)
+                    back[i] += ${name}_R[i][j] * x[j];
+                for (j = begin; j < end; j++) {
+                    a[i][j] = 0.0${f};
+                    for (k = ${name}_FIRST[j]; k < ${name}_LAST[j]; k++) {
+                        ${real} same = k == j ? 1.0${f} : 0.0${f}, slope = same;
+                        if (share[j] < 1.0${f})
+                            slope = share[j] * (same - normal[k] * normal[j]);
+                        if (k == i)
+                            a[i][j] += slope;
+                        a[i][j] += ${name}_M[i][k] / ${name}_TAU[0][k] * (same - slope);
+                    }
+                }
+                a[i][end] = r[i];
+            }
+            ${name}_eliminate(a, begin, end, x);
+            for (i = begin; i < end; i++)
+                u[i] -= x[i];
+            tried = 1;
+        }
+        if (!solved) {
+            for (i = begin; i < end; i++) {
+                for (j = begin; j < end; j++)
+                    a[i][j] = ${name}_M[i][j];
+                a[i][end] = asked[i];
+                g[i] = 0.0${f};
+            }
+            ${name}_eliminate(a, begin, end, v);
+            found = 0;
+        }
+        begin = end;
+    }
+    for (i = 0; i < ${NAME}_CHANNELS; i++) {
+        e[${name}_AT[i]] = v[i];
+        f[${name}_AT[i]] = g[i];
+    }
+    return found;
+}
+"""
 _LIMITED = """    {
         ${real} q[${NAME}_CHANNELS], e[${NAME}_CHANNELS], f[${NAME}_CHANNELS];
-        int more = 0;
+        int more = $always;
         for (i = 0; i < ${NAME}_CHANNELS; i++) {
             q[i] = ${name}_SENT[i] < ${NAME}_CHANNELS ? out[${name}_SENT[i]] : next[${name}_SENT[i] - ${NAME}_CHANNELS];
-            more |= ${name}_size(q[i]) > ${name}_LIMIT[0][i];
-        }
+$reached        }
         if (more) {
-            ${name}_limit(q, e, f);
+            $limit;
             for (j = 0; j < ${NAME}_CHANNELS; j++) {
                 for (i = 0; i < ${NAME}_CHANNELS; i++)
                     out[i] += ${name}_KICK[i][j] * e[j];
@@ -509,15 +800,33 @@ def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
         ),
     }
     loose = name == "coupling"
-    words["limit_defined"] = words["limited"] = ""
+    for word in ("limit_defined", "limited", "libm", "include", "more_state", "more_reset"):
+        words[word] = ""
     if limiter := block.limiter:
-        words |= {"turns": str(_turns(system.inputs)), "rounding": _rounding(block.single).hex() + words["f"]}
-        tables = (("LIMIT", _limits(limiter, dtype)[None]), ("M", _box_matrix(limiter)), ("KICK", limiter.kick))
-        of_limiter = (_table("static const", f"{name}_{of}", rows, dtype) for of, rows in tables)
-        words["tables"] += "".join("\n\n" + table for table in of_limiter)
-        rows = ", ".join(map(str, limiter.sent_rows))
-        words["tables"] += f"\n\nstatic const int {name}_SENT[{system.inputs}] = {{{rows}}};"
-        words["limit_defined"] = Template(_LIMIT_DEFINED).substitute(words)
+        integers, defined = {"SENT": limiter.sent_rows.tolist()}, _LIMIT_DEFINED
+        if limiter.balls:
+            balls, defined = _Balls.of(limiter, dtype), _BALLS_DEFINED
+            tables = {"LIMIT": [balls.limit], "M": balls.M, "R": balls.resolvent, "TAU": [balls.tau]}
+            integers |= {"AT": balls.at, "FIRST": balls.first, "LAST": balls.last, "END": balls.end}
+            words |= {"turns": str(_MOST_STEPS), "blocks": str(len(balls.end)), "libm": " -lm", "always": "1"}
+            words |= {
+                "residual": _RESIDUAL.hex() + words["f"],
+                "rounding": _ball_rounding(block.single).hex() + words["f"],
+            }
+            words |= {"include": "#include <math.h>\n\n", "more_reset": "    state->unsolved = 0;\n", "reached": ""}
+            words["more_state"] = "    unsigned long unsolved; /* ticks in which a force was set to 0 */\n"
+            words["limit"] = f"state->unsolved += !{name}_limit(q, e, f)"
+        else:
+            tables = {"LIMIT": _limits(limiter, dtype)[None], "M": _box_matrix(limiter)}
+            words |= {"turns": str(_turns(system.inputs)), "rounding": _rounding(block.single).hex() + words["f"]}
+            reached = f"            more |= {name}_size(q[i]) > {name}_LIMIT[0][i];\n"
+            words |= {"always": "0", "reached": reached, "limit": f"{name}_limit(q, e, f)"}
+        for of, rows in {**tables, "KICK": limiter.kick}.items():
+            words["tables"] += "\n\n" + _table("static const", f"{name}_{of}", np.asarray(rows), dtype)
+        for of, values in integers.items():
+            row = ", ".join(map(str, values))
+            words["tables"] += f"\n\nstatic const int {name}_{of}[{len(values)}] = {{{row}}};"
+        words["limit_defined"] = Template(defined).substitute(words)
         words["limited"] = Template(_LIMITED).substitute(words)
     words["more_declared"] = Template(_FREE_DECLARED).substitute(words) if loose else ""
     words["more_defined"] = Template(_FREE_DEFINED).substitute(words) if loose else ""

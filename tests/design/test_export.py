@@ -5,7 +5,9 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from asked import prove_limiter
@@ -15,13 +17,14 @@ from haptic_loop.cli.export import main
 from haptic_loop.controller.coupling import Compliance, NoCoupling, SpringDamper
 from haptic_loop.controller.coupling import SpringDamper as Gains
 from haptic_loop.controller.environment import GROUND, Network, Spring, environment
-from haptic_loop.controller.law import Law
+from haptic_loop.controller.law import Law, Limiter
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.tick import Process, StepBuffer
+from haptic_loop.design import export as export_module
 from haptic_loop.design.certificate import prove
 from haptic_loop.design.coupling_file import Stored, load, save
-from haptic_loop.design.export import process_block, sequential, single_precision_error, trial
+from haptic_loop.design.export import c_source, process_block, sequential, single_precision_error, trial
 from haptic_loop.design.files import InputError, one_command
 
 SPRINGS = SpringDamper((300.0, 200.0), (0.0, 0.0))  # no state at all
@@ -128,6 +131,73 @@ def test_limited_c_code_repeats_its_test_vector(limited_files, name, limit):
     assert "also while forces are limited" in out.read_text()
     done = run(compiled([out], "-O2", "-DHAPTIC_LOOP_TEST"))
     assert (done.returncode, done.stdout) == (0, "process: 64 ticks repeat to the last bit\n")
+
+
+@pytest.fixture(scope="module")
+def space(tmp_path_factory):
+    """Two planar devices that hold a body, one of them with full damping."""
+    tips = tuple(f"{tip}.{axis}" for tip in "ab" for axis in "xy")
+    held = tuple(Spring((tip, f"body.{tip[2]}"), 700.0 if tip[0] == "a" else 400.0, 0.5) for tip in tips)
+    ground = (Spring(("body.x", GROUND), 200.0, 0.1), Spring(("body.y", GROUND), 90.0, 0.1))
+    network = Network(tips, (*held, *ground), {"body.x": 0.1, "body.y": 0.1})
+    levels = ((9.0, 2.0), (2.0, 8.0)), ((9.0, 0.0), (0.0, 9.0))
+    loop = Loop(T, (1, 1, 2, 2), (0,) * 4, (0,) * 4, (9.0, 8.0, 9.0, 9.0), network, axes=(2, 2), levels=levels)
+    coupling = SpringDamper((6000.0,) * 4, (0.5,) * 4)
+    stored = Stored.of(loop, coupling, prove_limiter(loop, coupling))
+    save(stored, path := tmp_path_factory.mktemp("space") / "space.json")
+    return stored, path
+
+
+def vectors(stored, psi):
+    """The limited process, also where the object answers the first device a sample late: M is block triangular then."""
+    block, loop = process_block(stored, force_limit=(2.0, 2.0, 1.0, 1.0), balls=stored.loop.devices), stored.loop
+    G = msgspec.structs.replace(loop, psi=psi).sent(stored.built())
+    limiter = Limiter(G, loop.theta, limit=block.limiter.limit, rho=10 * block.limiter.rho, balls=loop.devices)
+    return replace(block, system=limiter.open, limiter=limiter)
+
+
+@pytest.mark.parametrize("psi", [(0, 0, 0, 0), (1, 1, 0, 0)])
+def test_limited_vectors_are_those_of_the_simulator(space, psi):
+    """The simulator begins with full steps of Newton's method, and has a bisection behind it."""
+    block = vectors(space[0], psi)
+    test = trial(block)
+    buffer = StepBuffer(Process(block.limiter, np.full(4, np.inf), np.zeros(4)), len(test.inputs), 4)
+    for k, x in enumerate(test.inputs):
+        buffer.x[k, :, 0] = x
+        buffer.tick(k)
+    np.testing.assert_allclose(buffer.f[:-1, :, 0], test.outputs, atol=1e-9)
+    lengths = np.linalg.norm(test.outputs.reshape(-1, 2, 2), axis=2) / [2.0, 1.0]
+    assert lengths.max() <= 1 + 1e-15
+    assert 0.2 < (lengths >= 1 - 1e-12).any(axis=1).mean() < 0.9
+
+
+@needs_cc
+@pytest.mark.parametrize("psi", [(0, 0, 0, 0), (1, 1, 0, 0)])
+@pytest.mark.parametrize("single", [False, True])
+def test_limited_vectors_in_c_repeat_their_test_vector(space, tmp_path, psi, single):
+    block = replace(vectors(space[0], psi), single=single)
+    out = tmp_path / "process.c"
+    out.write_text(c_source(block, trial(block), out.name))
+    done = run(compiled([out], "-O2", "-DHAPTIC_LOOP_TEST"))
+    assert (done.returncode, done.stdout) == (0, "process: 64 ticks repeat to the last bit\n")
+
+
+def test_force_limits_are_of_vectors_or_axes(space, tmp_path, capsys):
+    for values, words in (("2", "2, 2 N"), ("2,1", "2, 1 N"), ("2,2,1,1", "2, 2, 1, 1 N")):
+        asked = [str(space[1]), "--process", "--force-limit", values, "--out", str(tmp_path / "x.c"), "--json", "-"]
+        assert main(asked) == 0
+        said = json.loads(capsys.readouterr().out)["forces"]
+        assert words in said
+        assert ("vector" in said) == (values.count(",") < 3)
+    with pytest.raises(InputError, match=r"expected 1, 2 \(of each device's vector\) or 4 \(of each axis\)"):
+        main([str(space[1]), "--process", "--force-limit", "2,1,1"])
+
+
+def test_a_vector_without_solution_is_zero(space, monkeypatch):
+    block = vectors(space[0], (0,) * 4)
+    inputs = trial(block).inputs
+    monkeypatch.setattr(export_module, "_MOST_STEPS", 1)
+    assert (np.linalg.norm(sequential(block.system, inputs, block.limiter)[:, :2], axis=1) < 2).all()
 
 
 def test_force_limits_that_no_certificate_covers_are_refused(place, limited_files):
