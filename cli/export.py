@@ -132,9 +132,9 @@ def _parser() -> options.Parser:
 
 def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict, claim: str | None) -> ExportedBlock:
     """Return the block to export, with comment lines on its source. Raises InputError."""
-    limits = _force_limits(args.force_limit, stored.loop) if args.force_limit else ()
+    limit, balls = _force_limits(args.force_limit, stored.loop) if args.force_limit else (None, ())
     try:
-        block = process_block(stored, not args.without_theta, *limits) if args.process else coupling_block(stored)
+        block = process_block(stored, not args.without_theta, limit, balls) if args.process else coupling_block(stored)
     except ValueError as error:  # also coefficients beyond floating point
         raise InputError(f"{args.coupling}: {error}") from None
     block = with_origin(block, Path(args.coupling).name, stored, verdict, claim)

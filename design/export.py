@@ -304,9 +304,10 @@ class _Balls(NamedTuple):
             own = slice(last - block.at.size, last)
             M[own, own], resolvent[own, own] = block.M, np.linalg.inv(resolvent[own, own] + block.M / block.tau[:, 0])
         last, tau = np.repeat(np.cumsum(sizes), sizes), np.concatenate([block.tau[:, 0] for block in blocks])
-        whole = (part.tolist() for part in (at, last - np.repeat(sizes, sizes), last, end))
-        rows = ([list(row) for row in part.astype(dtype)] for part in (M, resolvent))
-        return cls(*whole, *rows, list(tau.astype(dtype)), list(_limits(limiter, dtype)[at]))
+        M, resolvent = ([list(row) for row in part.astype(dtype)] for part in (M, resolvent))
+        first, limits = last - np.repeat(sizes, sizes), list(_limits(limiter, dtype)[at])
+        places = at.tolist(), first.tolist(), last.tolist(), end.tolist()
+        return cls(*places, M, resolvent, list(tau.astype(dtype)), limits)
 
 
 def _eliminated(a: list[list[Any]], begin: int, end: int, x: list[Any]) -> None:

@@ -76,16 +76,17 @@ def host_controller(
     cap: Sequence[float],
     lag: Sequence[float] | None = None,
     behind: Sequence[int] = (),
+    balls: Sequence[slice] = (),
 ) -> Controller:
     """Return the loop as the host runs it, at rest and without the delay of `link` ticks that the link adds.
 
     Of several boards it adds link + `behind` (m,) ticks.
 
-    With `lag`, which is rho (m,) [N/m], a limiter of `cap` (m,) [N] limits the forces. Raises ValueError where the
-    link is slower than a delay of the loop.
+    With `lag`, which is rho (m,) [N/m], a limiter of `cap` (m,) [N] limits the forces, those of the channels of each
+    of `balls` as a vector. Raises ValueError where the link is slower than a delay of the loop.
     """
     waits = tuple(n - link - more for n, more in zip(loop.theta, behind or (0,) * len(loop.theta), strict=True))
-    return _HostController(loop.delayed(waits).law(coupling, cap, lag))
+    return _HostController(loop.delayed(waits).law(coupling, cap, lag, balls))
 
 
 def _fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tuple[float, ...]]:
@@ -171,7 +172,7 @@ class WorldController:
         V = coupling.compliance(scenario.T)
         scene = scene_of(scenario, coupling)  # raises InputError for a coupling without V
         assert V is not None
-        self.T, self.port, self.shell = scenario.T, scene.port(cap), Shell(V, start=start)
+        self.T, self.port, self.shell = scenario.T, scene.port(cap, scenario.balls), Shell(V, start=start)
         self.least = 0.0  # [J] least value so far of the sum of f'(u - u_-)
         self.seconds: list[float] = []  # CPU time of each step of the scene
         self._start, self._sent = start, np.zeros((len(waits), 1))
@@ -309,7 +310,7 @@ class Drive:
                 test = self._last_test.force(state, ticks)
             self.ended = self.gain.value == 0 and test is None
         shaped = self.limits.shape(asked, self.force, self.gain.value, self.T, test)
-        force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap)
+        force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap, self.limits.vectors)
         if self._budget:
             whole = self._budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)
             if whole != steps:
@@ -425,7 +426,8 @@ class CertifiedCoupling:
         if is_world(self.scenario):
             waits = [n - self.link for n in self.scenario.theta]
             return WorldController(self.scenario, self.chosen.coupling, start or 0.0, cap, waits)
-        return host_controller(self.scenario.loop(self.case), self.chosen.coupling, self.link, cap, lag, self.behind)
+        loop, balls = self.scenario.loop(self.case), self.scenario.limiter_limits[1]
+        return host_controller(loop, self.chosen.coupling, self.link, cap, lag, self.behind, balls)
 
     def capped(self, cap: Sequence[float]) -> Assessment:
         """Return the assessment with the force cap (m,) [N] of a session in its report; no proof depends on it."""
@@ -436,8 +438,10 @@ class CertifiedCoupling:
         said = [*self.chosen.remarks(self.assessment.requirements)]
         if torques := self.assessment.held_torques:
             said.append(f"held torques: {torques}")
-        if self.scenario.balls:
-            said.append("forces are limited axis by axis, to the box inside the limit of each force vector")
+        if self.scenario.balls and self.scenario.environment.walls:
+            said.append(
+                "before walls forces are limited axis by axis, to the box inside the limit of each force vector"
+            )
         if self.scenario.latency:
             least, most = (1e6 * t for t in self.scenario.latency[0])
             kept = f"periods up to {1e6 * (self.scenario.T_max or self.scenario.T):.0f} us"

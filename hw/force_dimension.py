@@ -83,6 +83,8 @@ class ForceDimension:
         Raises InputError.
         """
         self._where = _axes(axes, scenario)
+        #: channels whose cap is that of the vector of a channel before
+        self._shared = {i for ball in scenario.limiter_limits[1] for i in range(ball.start + 1, ball.stop)}
         self._sdk = sdk or library()
         self._clock, self._sleep, self._begun = clock, sleep, clock()
         self._ids: dict[str, int] = {}
@@ -175,8 +177,9 @@ class ForceDimension:
 
     def _strongest(self, config: Config, index: str) -> float:
         """Return the length [N] of the largest force that a device may be asked for, plus 1 % for rounding."""
-        each = zip(self._where, config.cap, self._info.force_step, strict=True)
-        return 1.01 * math.sqrt(sum((1e-6 * cap * step) ** 2 for (own, _), cap, step in each if own == index))
+        each = enumerate(zip(self._where, config.cap, self._info.force_step, strict=True))
+        caps = {i: 1e-6 * cap * step for i, ((own, _), cap, step) in each if own == index and i not in self._shared}
+        return 1.01 * math.hypot(*caps.values())
 
     def _check_status(self) -> None:
         """Raise SafetyStop where a device has an error, was reset or has switched its forces off."""

@@ -12,6 +12,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from haptic_loop.hw.protocol import (
     MAX_RELEASE_NS,
     MAX_THETA,
@@ -30,6 +33,7 @@ _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
 _FEWEST_STEPS = 16  # least number of force steps up to the cap; with fewer, the loop is not the certified linear one
 _COARSEST = 0.1  # largest encoder count, as a part of the largest displacement in a tick that a hand can make
 _LARGEST_MARGIN_US = 30_000  # ages are computed from margins, which are i16 in microseconds
+_ROUNDED = 1e-12  # relative error of the length of a vector that is limited
 _HOLD, _RAMP_US = 4, 5000  # ticks and then microseconds in which a device without answers holds and releases a force
 
 
@@ -73,7 +77,7 @@ def _require_finite(force: Sequence[float]) -> None:
 class SafetyLimits:
     """The host's limits on forces and motion. The device has its own force limits in its firmware."""
 
-    cap: tuple[float, ...]  # (m,) [N] largest force
+    cap: tuple[float, ...]  # (m,) [N] largest force, of a vector its largest length
     slew: float = 2000.0  # [N/s] fastest change of a force
     jump: float = 3e-3  # [m] largest displacement from tick to tick: 2.5 m/s at T = 1.2 ms
     watchdog_us: int = 6000  # [us] longest silence of a device that is streaming; see watchdog_for
@@ -82,6 +86,7 @@ class SafetyLimits:
     speed: float = 1.0  # [m/s] fastest motion while forces act
     continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold for ever; empty: no heat check
     thermal: float = 10.0  # [s] time constant of the motors
+    vectors: tuple[tuple[int, int], ...] = ()  # first channel and end of each vector that is limited as a whole
 
     def __post_init__(self) -> None:
         for i, cap in enumerate(self.cap, start=1):
@@ -108,6 +113,7 @@ class SafetyLimits:
     ) -> _Shaped:
         """Return the force to send for `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
 
+        A vector keeps its direction at its cap, and moves straight on at the slew rate of its fastest axis.
         `test` (m,) [N] is the force of the encoder test, which is added after the gain. Raises SafetyStop where
         `asked`, its sum with `test`, or the result is not finite, or the gain is outside of [0, 1].
         """
@@ -119,6 +125,15 @@ class SafetyLimits:
             wishes = [one + more for one, more in zip(wishes, test, strict=True)]
             _require_finite(wishes)
         step, clipped, slowed, force = self.slew * T, False, False, []
+        for first, end in self.vectors:
+            length, cap = math.hypot(*wishes[first:end]), self.cap[first]
+            if not length < cap:
+                clipped, wishes[first:end] = True, [one * (cap / length) for one in wishes[first:end]]
+            change = max(abs(one - last) for one, last in zip(wishes[first:end], previous[first:end], strict=True))
+            if change > step:
+                slowed, share = True, step / change
+                ends = zip(wishes[first:end], previous[first:end], strict=True)
+                wishes[first:end] = [last + share * (one - last) for one, last in ends]
         for wanted, last, cap in zip(wishes, previous, self.cap, strict=True):
             sent = wanted
             if not -cap < sent < cap:
@@ -128,6 +143,13 @@ class SafetyLimits:
             force.append(sent)
         _require_finite(force)
         return _Shaped(tuple(force), clipped, slowed)
+
+    def capped(self, forces: NDArray[np.float64], at: float = 1.0) -> NDArray[np.bool_]:
+        """Return where forces (ticks, m) [N] reach the share `at` of their caps, axes of a vector together."""
+        size = np.abs(forces)
+        for first, end in self.vectors:
+            size[:, first:end] = (1 + _ROUNDED) * np.linalg.norm(forces[:, first:end], axis=1, keepdims=True)
+        return size >= at * np.array(self.cap)
 
     def check_jump(self, x: Sequence[float], previous: Sequence[float], ticks: int) -> None:
         """Raise SafetyStop where an encoder moved from `previous` to x (m,) [m] in `ticks` ticks faster than a hand."""
@@ -271,10 +293,20 @@ class Units:
         """Return the forces fed back f (m,) [N] for the motors' forces (m,) [steps]."""
         return tuple(-n * step for n, step in zip(steps, self.force_step, strict=True))
 
-    def steps(self, f: Sequence[float], cap: tuple[int, ...]) -> tuple[int, ...]:
-        """Return the motors' forces (m,) [steps], at most `cap` (m,), for the forces fed back f (m,) [N]."""
+    def steps(
+        self, f: Sequence[float], cap: tuple[int, ...], vectors: Sequence[tuple[int, int]] = ()
+    ) -> tuple[int, ...]:
+        """Return the motors' forces (m,) [steps], at most `cap` (m,), for the forces fed back f (m,) [N].
+
+        A vector that rounding would lengthen beyond its cap is rounded towards zero.
+        """
         each = zip(f, self.force_step, cap, strict=True)
-        return tuple([max(-most, min(most, round(-force / step))) for force, step, most in each])
+        steps = [max(-most, min(most, round(-force / step))) for force, step, most in each]
+        for first, end in vectors:
+            own = range(first, end)
+            if math.hypot(*(steps[i] * self.force_step[i] for i in own)) > cap[first] * self.force_step[first]:
+                steps[first:end] = [int(-f[i] / self.force_step[i]) for i in own]
+        return tuple(steps)
 
     def check_range(self, counts: Sequence[int]) -> None:
         """Raise SafetyStop where encoder counts (m,) are outside of the device's workspace."""

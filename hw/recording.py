@@ -60,14 +60,14 @@ class Recorder:
         rows = np.frombuffer(bytes(self._rows), self._row)
         return {name: rows[name] for name in rows.dtype.names or ()}
 
-    def steady_ticks(self, force_step: Sequence[float], cap: Sequence[float]) -> list[list[int]]:
+    def steady_ticks(self, force_step: Sequence[float], limits: SafetyLimits) -> list[list[int]]:
         """[first, stop) of each arming in which the loop was one linear loop: full gain, until cap or slew rate cuts.
 
-        Missed ticks are not left out. `force_step` and `cap` (m,) [N].
+        Missed ticks are not left out. `force_step` (m,) [N].
         """
         link = self.link()
         asked = -np.round(link["asked"] / np.array(force_step))
-        cut = link["received"] & np.any((link["sent"] != asked) | (np.abs(link["asked"]) >= cap), axis=1)
+        cut = link["received"] & np.any((link["sent"] != asked) | limits.capped(link["asked"]), axis=1)
         stretches = []
         for arming in np.unique(link["arming"]):
             full = np.flatnonzero((link["arming"] == arming) & (link["gain"] == 1.0))
@@ -76,7 +76,7 @@ class Recorder:
                 stretches.append([int(full[0]), int(full[0]) + count])
         return stretches
 
-    def trace(self, units: Units, T: float, meta: dict[str, Any]) -> Trace:
+    def trace(self, units: Units, T: float, meta: dict[str, Any], names: tuple[str, ...] = ()) -> Trace:
         """The trace in the terms of sim.run. Handles and outside forces are not measured: nan, and no column."""
         link = self.link()
         n, m = len(self), self.channels
@@ -86,14 +86,13 @@ class Recorder:
         f = -link["applied"][last] * np.array(units.force_step)
         unknown = np.full((n, m), np.nan)
         t = np.arange(n, dtype=float) * T
-        return Trace(t, link["x"], f, unknown, unknown, np.zeros((n, 0)), meta)
+        return Trace(t, link["x"], f, unknown, unknown, np.zeros((n, 0)), meta, names=names)
 
     def save(self, path: Path, result: Trace) -> Path:
         """An npz that sim.trace reads, with the arrays of _LINK beside its own."""
         recorded = self.link()
         link = {f"link_{name}": recorded[name] for name in _LINK}
-        own = {name: getattr(result, name) for name in ("t", "x", "f", "x_handle", "v_handle", "w")}
-        arrays: dict[str, Any] = {**own, **link, "meta": np.array(json.dumps(result.meta))}
+        arrays: dict[str, Any] = {**result.arrays, **link}
 
         def content(file: BinaryIO) -> None:
             np.savez_compressed(file, allow_pickle=False, digest=np.array(_digest(arrays)), **arrays)
@@ -190,7 +189,7 @@ def _again(
     if recipe.scenario.environment.world:
         raise ValueError("its forces came from a MuJoCo world, which is not in the trace")
     m, coupling, (asked, sent) = len(recipe.cap), recipe.coupling.build(recipe.scenario.T), into
-    loop, added = recipe.scenario.loop("I"), (recipe.lag, recipe.behind)
+    loop, added = recipe.scenario.loop("I"), (recipe.lag, recipe.behind, recipe.scenario.limiter_limits[1])
     controller = host_controller(loop, coupling, recipe.link_delay, recipe.limits.cap, *added)
     units, force = Units((1.0,) * m, recipe.force_step, (1,) * m), (0.0,) * m
     budget, missed = recipe.energy_budget and SentBudget(recipe.energy_budget), 0
@@ -201,7 +200,7 @@ def _again(
             continue
         gain, test = float(link["gain"][k]), link["test"][k].tolist()
         force = recipe.limits.shape(asked[k].tolist(), force, gain, recipe.scenario.T, test).force
-        steps = units.steps(force, recipe.cap)
+        steps = units.steps(force, recipe.cap, recipe.limits.vectors)
         if budget:
             whole = budget.limit(steps, result.x[k].tolist(), result.f[k], missed)
             if whole != steps:

@@ -378,6 +378,8 @@ def _outcome(
         latency=first.scenario.latency[0] if first and first.scenario.latency else None,
         coupling=first and first.chosen.coupling,
         assessment=first and first.assessment,
-        result=recorder.trace(session.units, scenario.T, meta) if ran and len(recorder) else None,
+        result=recorder.trace(session.units, scenario.T, meta, scenario.channel_names)
+        if ran and len(recorder)
+        else None,
         zero_after=rehearsal.zero_after(stopped[0]) if stopped and ran else None,
     )

@@ -392,10 +392,14 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONG
         InputError: A limit or T is impossible, or the damping of a device is a full matrix, which INFO cannot state.
     """
     if scenario.loop("I").levels is not None:
-        raise InputError("damping is a full matrix: a session states it axis by axis; give one number for each axis")
-    caps = tuple(min(cap, limit) for limit in scenario.box_limits)
+        least = ", ".join(f"{d:.3g}" for d in scenario.loop("I").least_damping)
+        advice = f"give delta as numbers below the matrix, {least} are its least eigenvalues"
+        raise InputError(f"delta is a full matrix, but a device states its damping axis by axis: {advice}")
+    limits, balls = scenario.limiter_limits
+    caps, vectors = tuple(min(cap, limit) for limit in limits), tuple((ball.start, ball.stop) for ball in balls)
     try:
-        return Session(scenario, SafetyLimits(caps, watchdog_us=watchdog_for(scenario.T), **more), settings)
+        safety = SafetyLimits(caps, vectors=vectors, watchdog_us=watchdog_for(scenario.T), **more)
+        return Session(scenario, safety, settings)
     except ValueError as error:
         raise InputError(str(error)) from None
 

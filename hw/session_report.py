@@ -184,7 +184,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     log = [_Event(1e-6 * (e.t_us - begin), str(e.stage), e.cause) for e in session.log]
     ticks, T = len(recorder), session.scenario.T
     coupled = session.program if isinstance(session.program, CertifiedCoupling) else None
-    steady = recorder.steady_ticks(session.units.force_step, session.limits.cap) if coupled and ticks else []
+    steady = recorder.steady_ticks(session.units.force_step, session.limits) if coupled and ticks else []
     step = list(session.units.encoder_step) if ticks else None
     ran = _Ran(ticks, ticks * T, T, session.scenario.digest, pace, step, steady)
     trace = recorder.trace(session.units, T, {"run": asdict(ran)}) if coupled and ticks else None
@@ -217,7 +217,7 @@ def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str |
     if 2 * session.counters.slowed > ticks > 0:
         return f"{100 * session.counters.slowed / ticks:.0f} % of its forces were cut by the slew rate"
     second = min(ticks, round(1 / session.scenario.T))
-    capped = np.abs(link["gain"][:, None] * link["asked"]) >= _AT_CAP * np.array(session.limits.cap)
+    capped = session.limits.capped(link["gain"][:, None] * link["asked"], _AT_CAP)
     cut = np.convolve(capped.any(axis=1), np.ones(second) / second, "valid").max() if ticks else 0.0
     if cut > 0.5:
         advice = "raise --force-cap, or ask for less; or a sign has changed"
@@ -237,7 +237,8 @@ def save(out: Path, session: Session, recorder: Recorder, report: SessionReport,
     files = []
     if len(recorder):
         replay = [Recipe.of(arming, session.limits, session.units) for arming in session.armings]
-        result = recorder.trace(session.units, session.scenario.T, plain(report) | {"replay": replay})
+        names = session.scenario.channel_names
+        result = recorder.trace(session.units, session.scenario.T, plain(report) | {"replay": replay}, names)
         files += [recorder.save(out / "trace.npz", result), result.save_csv(out / "trace.csv")]
         if not plot:
             remove(out / "figure.png")  # of an earlier session

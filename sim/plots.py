@@ -38,6 +38,8 @@ class Run(Protocol):
     def f(self) -> Array: ...  # (N, m) [N]
     @property
     def x_handle(self) -> Array: ...  # (N, m) [m]
+    @property
+    def names(self) -> tuple[str, ...]: ...  # (m,) of the channels, or none
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -183,7 +185,7 @@ def draw_run(
     grows the oscillation's amplitude is drawn over time beside its prediction, in place of the displacements' zoom.
     """
     last, growth = result.t.size, onset.growth if onset else None
-    around = around or Contacts()
+    around = around or Contacts(result.names)
     if onset and onset.until is not None:
         last = int(np.searchsorted(result.t, onset.until))
     if onset and growth is not None:

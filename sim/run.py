@@ -153,8 +153,7 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
     if scenario.environment.world:  # The forces of the scene come from a net (sim.world).
         law = Law(Lti.constant(np.zeros((scenario.channels,) * 2), scenario.T), scenario.theta)
     else:
-        box = bool(scenario.environment.walls)  # vectors are not solved together with walls
-        most, balls = (scenario.box_limits, ()) if box else (limits, scenario.balls)
+        most, balls = scenario.limiter_limits
         law = scenario.loop("I").law(coupling, most, lag, balls)
     process = Process(law, limits, steps, balls=scenario.balls)
     scene = build(scenario.device, scenario.human, scenario.person)

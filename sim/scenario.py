@@ -179,12 +179,17 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return tuple(slice(a, b) for device, a, b in zip(self.device, ends, ends[1:], strict=False) if device.ball)
 
     @property
-    def box_limits(self) -> tuple[float, ...]:
-        """(m,) [N] limits of single channels that keep every force vector within its device's limit."""
+    def limiter_limits(self) -> tuple[tuple[float, ...], tuple[slice, ...]]:
+        """Limits (m,) [N] of a limiter, and the channels of each vector that it limits as a whole.
+
+        Vectors are not solved together with walls, where each axis has the limit of the box inside.
+        """
         limits = [device.force_limit for device in self.axis_devices]
+        if not self.environment.walls:
+            return tuple(limits), self.balls
         for ball in self.balls:
             limits[ball] = [limit / (ball.stop - ball.start) ** 0.5 for limit in limits[ball]]
-        return tuple(limits)
+        return tuple(limits), ()
 
     @property
     def lead(self) -> list[int]:

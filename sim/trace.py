@@ -98,6 +98,8 @@ class Trace(ReadOnly):
                 raise ValueError(f"{name} has {len(value)} samples, t has {self.t.shape[0]}")
         if self.f.shape != self.x.shape:
             raise ValueError(f"f has {self.f.shape[1]} channels, x has {self.x.shape[1]}")
+        if len(self.names) not in (0, self.x.shape[1]):
+            raise ValueError(f"names has {len(self.names)} entries, x has {self.x.shape[1]} channels")
 
     def __repr__(self) -> str:
         n, m = self.x.shape
@@ -169,12 +171,17 @@ class Trace(ReadOnly):
         words = (self.meta.get("scenario"), stability.get("verdict"))
         return ": ".join(word for word in words if word) or "run"
 
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays of its file: what was measured, the metadata as JSON text, and the channels' names if any."""
+        found = {name: getattr(self, name) for name in _MEASURED} | {"meta": np.array(json.dumps(self.meta))}
+        return found | ({"names": np.array(self.names)} if self.names else {})
+
     def save_npz(self, path: Path) -> Path:
         """Write the measured arrays and the metadata (as JSON text), compressed, without pickle."""
 
         def content(file: BinaryIO) -> None:
-            arrays = {name: getattr(self, name) for name in _MEASURED}
-            np.savez_compressed(file, allow_pickle=False, meta=np.array(json.dumps(self.meta)), **arrays)
+            np.savez_compressed(file, allow_pickle=False, **self.arrays)
 
         return write(path, content)
 
@@ -188,7 +195,8 @@ class Trace(ReadOnly):
         """Build a trace from the arrays of its file. Raises InputError where they are not those of a trace."""
         try:
             measured: dict[str, Any] = {name: _real(name, arrays[name]) for name in _MEASURED}
-            return cls(**measured, meta=json.loads(str(arrays["meta"])))
+            names = tuple(str(name) for name in arrays.get("names", np.zeros(0)))
+            return cls(**measured, meta=json.loads(str(arrays["meta"])), names=names)
         except (KeyError, ValueError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: not a trace of this program ({error})") from None
 

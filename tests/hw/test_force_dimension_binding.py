@@ -57,6 +57,15 @@ with ForceDimension(load(), "sn4711x,sn4712x", sdk, clock, sleep) as device:
     for command, force in ((Command.ARM, (0, 0)), (Command.RUN, (1000, -500))):
         state = device.exchange(Force(command, state.tick, state.tick, force))
     said["pair"] = [stub.stub_force(0, 0), stub.stub_force(1, 0)]
+six = ",".join(f"sn{serial}{axis}" for serial in (4711, 4712) for axis in "xyz")
+with ForceDimension(load("omega-space"), six, sdk, clock, sleep) as device:
+    said["held"] = device.unused_axes
+    device.configure(Config(0, 4, 5, 0, (5000,) * 3 + (2500,) * 3, (5000,) * 6))
+    said["vectors"] = [stub.stub_limit(0), stub.stub_limit(1)]
+    state = device.exchange(None)
+    for command, force in ((Command.ARM, (0,) * 6), (Command.RUN, (1000, -500, 250, 100, 200, -300))):
+        state = device.exchange(Force(command, state.tick, state.tick, force))
+    said["space"] = [stub.stub_force(index, axis) for index in (0, 1) for axis in range(3)]
 print(json.dumps(said))
 """
 
@@ -102,6 +111,12 @@ def test_forces_reach_the_axes_they_are_for(session):
     assert session["refused"] == 0
     assert session["forces"] == pytest.approx([0.4, -0.2])  # 1000 and -500 steps of 0.4 mN
     assert session["limits"] == pytest.approx([2.02, 1.01])  # 1 % above the caps of 2 and 1 N
+
+
+def test_three_axes_of_a_device_share_a_limit(session):
+    assert session["held"] == []
+    assert session["space"] == pytest.approx([0.4, -0.2, 0.1, 0.04, 0.08, -0.12])
+    assert session["vectors"] == pytest.approx([2.02, 1.01])  # 1 % above the lengths of 2 and 1 N
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -43,6 +44,35 @@ def test_forces_are_finite_and_within_the_cap(asked, previous, gain):
     for force, last, cap in zip(shaped.force, before, LIMITS.cap, strict=True):
         assert abs(force) <= cap
         assert abs(force - last) <= LIMITS.slew * T * (1 + 1e-12)  # one rounding of last +- step
+
+
+@given(st.tuples(*[numbers] * 5), st.tuples(*[st.floats(-4, 4)] * 5), st.floats(0, 1))
+def test_vectors_keep_within_their_cap_and_slew(asked, previous, gain):
+    """The first channel stands for itself, the others are a plane and a plane."""
+    limits = SafetyLimits((2.0, 6.0, 6.0, 3.0, 3.0), vectors=((1, 3), (3, 5)))
+    if not all(map(math.isfinite, asked)):
+        return
+    before = [min(2.0, max(-2.0, previous[0]))]
+    for (first, end), cap in zip(limits.vectors, (6.0, 3.0), strict=True):
+        length = math.hypot(*previous[first:end])
+        before += [p * min(1.0, cap / length) if length else p for p in previous[first:end]]
+    force = limits.shape(asked, before, gain, T).force
+    assert all(abs(now - last) <= limits.slew * T * (1 + 1e-12) for now, last in zip(force, before, strict=True))
+    assert math.hypot(*force[1:3]) <= 6.0 * (1 + 1e-12)
+    assert math.hypot(*force[3:5]) <= 3.0 * (1 + 1e-12)
+    units = Units((1e-6,) * 5, (4e-4,) * 5, (10**5,) * 5)
+    sent = units.forces(units.steps(force, (5000, 15000, 15000, 7500, 7500), limits.vectors))
+    assert math.hypot(*sent[1:3]) <= 6.0 * (1 + 1e-12)
+    assert math.hypot(*sent[3:5]) <= 3.0 * (1 + 1e-12)
+
+
+def test_a_vector_keeps_its_direction_at_its_cap():
+    limits = SafetyLimits((5.0,) * 3, vectors=((0, 3),))
+    shaped = limits.shape((6.0, -12.0, 12.0), (0.0,) * 3, 1.0, 1.0)
+    assert shaped.force == pytest.approx((5 / 3, -10 / 3, 10 / 3))
+    assert (shaped.clipped, shaped.slowed) == (True, False)
+    forces = np.array([[3.0, 4.0, 0.0], [3.0, 0.0, 3.9]])
+    assert limits.capped(forces).tolist() == [[True] * 3, [False] * 3]
 
 
 def test_the_trap_that_the_order_of_checks_avoids():

@@ -16,13 +16,14 @@ from haptic_loop.design.files import plain
 from haptic_loop.hw.control import CertifiedCoupling, _fill, certified_coupling
 from haptic_loop.hw.emulator import Emulator
 from haptic_loop.hw.limits import SafetyLimits, Stage, Units
+from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.recording import Recorder, _digest, _recipes_of, load, replay
 from haptic_loop.hw.rehearsal import Rehearsal
-from haptic_loop.hw.session import Session
+from haptic_loop.hw.session import Session, session_for
 from haptic_loop.hw.session_report import outcome, save
 from haptic_loop.sim.couplings import assessed, choose
 from haptic_loop.sim.run import assemble, run
-from haptic_loop.sim.scenario import InputError
+from haptic_loop.sim.scenario import InputError, parse
 from haptic_loop.sim.scenario import load as scenario_of
 from haptic_loop.sim.stability import close, dominant_mode
 from haptic_loop.sim.trace import Trace
@@ -204,7 +205,7 @@ def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
 
     session.record = record
     Rehearsal(session, Emulator(scenario), lambda ages: rungs).run_until_armed(1.4)
-    ((first, stop),) = recorder.steady_ticks(session.units.force_step, session.limits.cap)
+    ((first, stop),) = recorder.steady_ticks(session.units.force_step, session.limits)
     assert (recorder.link()["gain"][first:] == 1.0).all()
     full = np.diff(cuts, prepend=0)[first:]
     assert 0 <= stop - first - int(np.argmax(full > 0)) <= 2
@@ -252,6 +253,41 @@ def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, 
     assert part["trend"] == "grows"
     bridge._print_session(report, Console(width=200), details=False)
     assert re.search(r"growth at full gain, arming 1, ticks \d+ to \d+ .*: \+1.48", capsys.readouterr().out)
+
+
+PLANAR = """
+name = "planar"
+T = 1e-3
+theta = [1, 2]
+device = [{ kind = "rigid", axes = 2 }, { kind = "rigid", axes = 2 }]
+[environment]
+contacts = ["left", "right"]
+springs = [{ between = ["left", "right"], stiffness = 800.0, damping = 1.0 },
+           { between = ["left", "ground"], stiffness = [100.0, 300.0], damping = 0.5 }]
+"""
+
+
+def test_sessions_limit_vectors(tmp_path):
+    """By the limiter of the proof; the channels keep their names, and a replay computes the same forces."""
+    scenario = parse(PLANAR)
+    settings = LinkSettings(measure=60, test_encoders=False)
+    session, recorder = session_for(scenario, settings, 0.3), Recorder(4)
+    session.record = recorder
+    made = certified_coupling(scenario, "I", None, "any-environment", 1)
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: [made])
+    rehearsal.run_until_armed(1.0)
+    rehearsal.run(1e-6 * session.now + 0.5)
+    asked = np.linalg.norm(recorder.link()["asked"].reshape(-1, 2, 2), axis=2)
+    assert 0.3 * (1 - 1e-12) < asked.max() <= 0.3 * (1 + 1e-12)
+    result = recorder.trace(session.units, scenario.T, {}, scenario.channel_names)
+    lengths = np.linalg.norm(result.f.reshape(-1, 2, 2), axis=2)
+    assert 0.299 < lengths.max() <= 0.3 * (1 + 1e-12)
+    report = outcome("I", session, recorder, 0)
+    path = save(tmp_path, session, recorder, report, False)[0]
+    again, link = load(path)
+    assert again.names == ("left.x", "left.y", "right.x", "right.y")
+    assert (tmp_path / "trace.csv").read_text().startswith("t [s],x left.x [m],x left.y [m]")
+    assert replay(again, link).identical
 
 
 def test_the_report_is_json_and_names_its_end(trace):
