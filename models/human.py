@@ -429,6 +429,13 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit_d
         if several and along and {len(along)} != several:
             raise ValueError(f"voluntary.along is {list(along)}, expected {max(several)} numbers as the links have")
 
+    @property
+    def axes(self) -> int | None:
+        """How many free axes a device must have; None where nothing of the hand has a direction."""
+        along = self.voluntary.along if self.voluntary else None
+        most = max(link.axes for link in self.links)
+        return len(along) if along else most if most > 1 else None
+
     def port(self) -> Port:
         """Return the mechanics that the handle feels."""
         axes = max(link.axes for link in self.links)

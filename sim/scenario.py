@@ -122,6 +122,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
                 total = self.theta[i] + self.psi[i]
                 raise ValueError(f"lam #{i + 1} is {lam}, allowed are 0 to theta + psi = {total} samples")
         check_holds([person.holds for person in self.person], len(self.device))
+        for i, (human, device) in enumerate(zip(self.human, self.device, strict=True), start=1):
+            axes, has = human.axes if isinstance(human, Human) else None, len(device.free)
+            if axes not in (None, has):
+                raise ValueError(
+                    f"human #{i} has vectors of {axes} numbers, expected {has}, as the device has free axes"
+                )
         if self.varying_delay:
             self._check_varying_delay(self.varying_delay)
         if self.ranges and self.environment.walls:

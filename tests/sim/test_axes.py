@@ -111,6 +111,23 @@ def test_refuses_impossible_axes_in_one_line(first: str, more: str, words: tuple
         assert word in str(refused.value)
 
 
+ALIKE = "damping = 1.0, stiffness = 9.0"
+
+
+@pytest.mark.parametrize(
+    ("link", "more"),
+    [
+        ("damping = 1.0, stiffness = [9.0, 8.0]", ""),
+        (ALIKE, ", voluntary = { amplitude = 0.01, frequency = 1.0, along = [1, 0] }"),
+    ],
+)
+def test_hands_have_the_axes_of_their_devices(link: str, more: str) -> None:
+    hands = f"{{ links = [{{ mass = 0.1, {link} }}]{more} }}, {{ links = [{{ mass = 0.1, {ALIKE} }}] }}"
+    text = f"human = [{hands}]\n" + TEXT.replace("FIRST", "").replace("SECOND", "").replace("MORE", "")
+    with pytest.raises(InputError, match="human #1 has vectors of 2 numbers, expected 3"):
+        parse(text)
+
+
 def test_delays_are_one_for_each_device() -> None:
     space = scenario()
     assert (space.theta, space.psi, space.delta) == ((1, 1, 1, 2, 2, 2), (0,) * 6, (1.37,) * 6)
