@@ -6,7 +6,7 @@
 # make validate  every check that a verdict rests on, and the slow pages: half an hour
 # make firmware  the sketches, compiled and run on a simulated ATmega328P and Cortex-M7; the packages that it needs: .ci/run
 # make mutate  small mistakes in what verdicts rest on, and whether a test notices: about ten minutes
-# make kernels  six designs under load, on one core and twice at once, byte by byte; then the numerical tests under every
+# make kernels  six designs under load, on one core and three at once, byte by byte; then the numerical tests under every
 #   kernel of OpenBLAS that this processor runs, and a table: an hour
 # make oldest  the tests of models, blocks and files with the oldest packages that pyproject.toml allows, in .venv-oldest
 # make installed  the wheel in an empty environment, run beside a user's own models/, sim.py and cli.py

@@ -82,12 +82,13 @@ def draw_once(folder: Path) -> None:
 
 def _remembering(folder: Path, make):
     """The same function, with its results kept in the folder; failures and loops without a digest are not."""
+    from haptic_loop.design import budgets
     from haptic_loop.design.coupling_file import digest
 
     @functools.wraps(make)
     def remembered(loop, *asked, **options):
         try:
-            loop_and_asked = digest(loop), make.__name__, _asked(make, loop, *asked, **options)
+            loop_and_asked = digest(loop), make.__name__, budgets.GROWTH, _asked(make, loop, *asked, **options)
         except TypeError:  # an environment or a design of a test's own
             return make(loop, *asked, **options)
         file = folder / hashlib.sha256(repr(loop_and_asked).encode()).hexdigest()

@@ -1,6 +1,6 @@
 """Design the same couplings under different conditions of the machine, and compare the stored files byte for byte.
 
-    python tests/tools/same_designs.py     six designs: idle, under load, on one core, twice at once (ten minutes)
+    python tests/tools/same_designs.py     six designs: idle, under load, three at once of which one is on a single core
 
 Exit code 1 if a file differs. Designs run through the public command, so each file is what a user stores.
 """
@@ -56,21 +56,19 @@ def busy(count: int) -> Iterator[None]:
 
 def files(words: tuple[str, ...], folder: Path) -> dict[str, bytes]:
     """What the design stores under each condition of the machine."""
-    found = {}
 
-    def once(name: str, core: int | None = None) -> None:
-        out = folder / f"{name}.json"
-        found[name] = stored(begun(words, out, core), out)
+    def made(*names: str, core: int | None = None) -> dict[str, bytes]:
+        """Of as many processes at once, the last one on one core if `core` says which."""
+        outs = [folder / f"{name}.json" for name in names]
+        cores = [*[None] * (len(names) - 1), core]
+        begins = [begun(words, out, core) for out, core in zip(outs, cores, strict=True)]
+        return {name: stored(one, out) for name, one, out in zip(names, begins, outs, strict=True)}
 
-    core = min(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else None
-    once("idle")
+    found = made("idle")
     with busy(8):
-        once("under load")
-    once("on one core", core)
-    outs = [folder / f"twice-{i}.json" for i in range(2)]
-    both = [begun(words, out) for out in outs]
-    found |= {f"at once, {i + 1}": stored(one, out) for i, (one, out) in enumerate(zip(both, outs, strict=True))}
-    return found
+        found |= made("under load")
+    core = min(os.sched_getaffinity(0)) if hasattr(os, "sched_setaffinity") else None
+    return found | made("at once", "with it", "on one core", core=core)
 
 
 def main() -> int:
