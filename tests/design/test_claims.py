@@ -145,10 +145,10 @@ def test_without_coupling_only_the_compliant_device_oscillates():
     """Figure 5 needs what a first-order device model leaves out."""
     base, unstable = load(), {}
     for name, devices in (("compliant", base.device), ("rigid", (RigidDevice(), RigidDevice()))):
-        loops = [assemble(base.replace(human=pair, device=devices), NoCoupling()) for pair in random_pairs(1, 100)]
+        loops = [assemble(base.replace(human=pair, device=devices), NoCoupling()) for pair in random_pairs(1, 200)]
         unstable[name] = sum(dominant_mode(close(a.plant, a.F)).spectral_radius > 1 for a in loops)
     assert unstable["rigid"] == 0
-    assert 70 < unstable["compliant"] < 88
+    assert 140 < unstable["compliant"] < 175
 
 
 def test_figure_6_is_quiet_with_the_printed_gains():

@@ -1,6 +1,7 @@
 """design.compare: curves against formulas evaluated by hand, their maxima against the conditions' figures."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -159,7 +160,7 @@ def test_other_devices_other_delays_and_no_pictures(tmp_path):
 def test_a_missing_design_leaves_the_others(tmp_path, capsys):
     base = ["--psi", "1,1", "--no-plot", "--out", str(tmp_path)]
     assert main(["--coupling", "none,spring-damper:any-environment", *base]) == 1
-    assert "spring-damper: not possible" in capsys.readouterr().out
+    assert re.search(r"spring-damper\S*( \S+)?: not possible", " ".join(capsys.readouterr().out.split()))
     with pytest.raises(DesignFailed):
         main(["--coupling", "spring-damper:any-environment", *base])
 
