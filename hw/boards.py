@@ -54,10 +54,10 @@ class _Board:
         self._start: tuple[int, float, int] | None = None  # step, lead [us] and offset from which clocks are compared
         self._steps = self._shifted = 0  # since it was paired first, and at the last shift
 
-    def configure(self, whole: wire.Config) -> None:
+    def configure(self, config: wire.Config) -> None:
         """Begin anew with this board's part of a configuration."""
-        theta = min(wire.MAX_THETA, whole.theta + self.behind)
-        self.config = whole._replace(theta=theta, cap=whole.cap[self.axes], slew=whole.slew[self.axes])
+        theta = min(wire.MAX_THETA, config.theta + self.behind)
+        self.config = config._replace(theta=theta, cap=config.cap[self.axes], slew=config.slew[self.axes])
         self.told = CommandMonitor(self.config)
         self.answer: int | None = None  # to the configuration
         self.last = None
@@ -154,9 +154,9 @@ class _Board:
         self.device.send(wire.Force(force.command, apply_at, source, steps))
 
 
-def _forget(entries: dict[int, Any], kept: int) -> None:
+def _forget(entries: dict[int, Any], count: int) -> None:
     """Drop the oldest entries but `kept`."""
-    while len(entries) > kept:
+    while len(entries) > count:
         entries.pop(next(iter(entries)))
 
 

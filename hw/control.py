@@ -148,14 +148,14 @@ class SentBudget:
         moved = (now - self._before)[:, None]
         sent = self._budget.limit(wanted, moved, None if missed else self._applied[:, None])[:, 0]
         self._before, self._applied = now, applied
-        whole = np.where(sent == wanted[:, 0], steps, np.trunc(sent / self._unit))
-        return tuple(int(n) for n in whole)
+        rounded = np.where(sent == wanted[:, 0], steps, np.trunc(sent / self._unit))
+        return tuple(int(n) for n in rounded)
 
     def figures(self) -> BudgetFigures:
         """Return what the budget has done since arming."""
-        given = f"more than {self.plan.start:g} J" if self.plan.start else "any energy"
+        loss = f"more than {self.plan.start:g} J" if self.plan.start else "any energy"
         dissipated = "in an arming beyond what the devices dissipate, whatever computes the forces"
-        return self._budget.figures(f"no passive hand is given {given} {dissipated}")
+        return self._budget.figures(f"no passive hand is given {loss} {dissipated}")
 
 
 class WorldController:
@@ -297,7 +297,7 @@ class Drive:
             self._heat.check(self.units.forces(state.applied), ticks)
         if ticks > 1 and self.x is not None:
             self._miss(state, _fill(self.x, x, ticks)[:-1])
-        asked = self.controller.step(x)
+        wanted = self.controller.step(x)
         test = None
         if direction > 0:
             test = self._test.force(state, ticks) if self._test else None
@@ -309,24 +309,24 @@ class Drive:
             if closing and self._last_test and self.gain.value == 0:
                 test = self._last_test.force(state, ticks)
             self.ended = self.gain.value == 0 and test is None
-        shaped = self.limits.shape(asked, self.force, self.gain.value, self.T, test)
+        shaped = self.limits.shape(wanted, self.force, self.gain.value, self.T, test)
         force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap, self.limits.vectors)
         if self._budget:
-            whole = self._budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)
-            if whole != steps:
-                force, steps = self.units.forces(whole), whole
+            limited = self._budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)
+            if limited != steps:
+                force, steps = self.units.forces(limited), limited
                 self._counters.limited += 1
         if self.world:
-            whole = self.world.limit(steps, self.units.force_step)
-            if whole != steps:
-                force, steps = self.units.forces(whole), whole
+            limited = self.world.limit(steps, self.units.force_step)
+            if limited != steps:
+                force, steps = self.units.forces(limited), limited
             steps = self.world.later(steps, ticks)
         self._before, self.x, self.force = self.x if ticks == 1 else None, x, force
         self._counters.clipped += shaped.clipped
         self._counters.slowed += shaped.slowed
         if self._commands:
             self._commands.tell(state.tick, steps)
-        self._record(TraceRow(state.tick, x, asked, self.gain.value, steps, state, self._arming, test))
+        self._record(TraceRow(state.tick, x, wanted, self.gain.value, steps, state, self._arming, test))
         return steps
 
     def _check_motion(self, x: tuple[float, ...], ticks: int) -> None:
@@ -346,8 +346,8 @@ class Drive:
     def _miss(self, state: State, positions: list[tuple[float, ...]]) -> None:
         """Advance the controller through ticks without a STATE, at interpolated positions (m,) [m]."""
         for back, x in zip(range(len(positions), 0, -1), positions, strict=True):
-            tick, asked = (state.tick - back) & 0xFFFF, self.controller.step(x)
-            self._record(TraceRow(tick, x, asked, self.gain.value, (), None, self._arming))
+            tick, wanted = (state.tick - back) & 0xFFFF, self.controller.step(x)
+            self._record(TraceRow(tick, x, wanted, self.gain.value, (), None, self._arming))
 
 
 # couplings that are certified for a link
@@ -444,9 +444,9 @@ class CertifiedCoupling:
             )
         if self.scenario.latency:
             least, most = (1e6 * t for t in self.scenario.latency[0])
-            kept = f"periods up to {1e6 * (self.scenario.T_max or self.scenario.T):.0f} us"
-            kept += f" and forces that act {least:.0f} to {most:.0f} us after their sample"
-            return [*said, f"forces act as they come: certified for {kept}, as measured"]
+            facts = f"periods up to {1e6 * (self.scenario.T_max or self.scenario.T):.0f} us"
+            facts += f" and forces that act {least:.0f} to {most:.0f} us after their sample"
+            return [*said, f"forces act as they come: certified for {facts}, as measured"]
         if self.held < 1:
             return said
         answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
@@ -490,11 +490,11 @@ def certified_coupling(
         assessment = assessed(alone, case, chosen, limiter=limiter)
     spare = (n - more for n, more in zip(slower.theta, later, strict=True))
     waits = min(MAX_THETA, *spare) if link else 0  # the host adds the rest of longer delays
-    made = CertifiedCoupling(waits, slower, case, chosen, assessment, behind)
-    if not made.certified:
+    certified = CertifiedCoupling(waits, slower, case, chosen, assessment, behind)
+    if not certified.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
-        raise SafetyStop(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(made)}")
-    return made
+        raise SafetyStop(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(certified)}")
+    return certified
 
 
 def certified_couplings(
@@ -516,20 +516,20 @@ def certified_couplings(
     the list ends. Raises SafetyStop where the first coupling is not certified.
     """
     more: dict[str, Any] = {"limiter": limiter, "start": start, "behind": behind}
-    found = [certified_coupling(scenario, case, name, condition, link, **more)]
+    candidates = [certified_coupling(scenario, case, name, condition, link, **more)]
     wanted: list[tuple[str | None, str | Condition | None]] = [(name, condition), _FALLBACK]
-    while len(found) <= spare and wanted:
+    while len(candidates) <= spare and wanted:
         kind, by = wanted[0]
         try:
-            reserve = certified_coupling(scenario, case, kind, by, found[-1].link + 1, **more)
+            reserve = certified_coupling(scenario, case, kind, by, candidates[-1].link + 1, **more)
         except (SafetyStop, InputError):
             wanted.pop(0)
             continue
-        if _softer(reserve, found[-1]):
-            found.append(reserve)
+        if _softer(reserve, candidates[-1]):
+            candidates.append(reserve)
         else:
             wanted.pop(0)
-    return tuple(found)
+    return tuple(candidates)
 
 
 _EQUAL = 1e-9  # relative rounding error of static stiffnesses
@@ -541,28 +541,28 @@ def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:
     Both couplings are compared in the loop with the reserve's delays. The stiffness is the coupling's K, or without
     one the static stiffness that the devices feel.
     """
-    own, other = (made.assessment.gains for made in (reserve, than))
+    own, other = (each.assessment.gains for each in (reserve, than))
     K, before = (np.array(gains.get("K", np.nan)) for gains in (own, other))
     if np.isnan(K).any() or np.isnan(before).any():
-        K, before = (np.diag(_felt_at_rest(made)) for made in (reserve, than))
+        K, before = (np.diag(_felt_at_rest(each)) for each in (reserve, than))
     later = np.greater(reserve.scenario.theta, than.scenario.theta)
     if (before * (1 + _EQUAL) < K).any() or (later & (before * (1 - _EQUAL) <= K)).any():
         return False
     loop = reserve.scenario.loop(reserve.case)
-    needs = [required_damping(loop, made.chosen.coupling, than.chosen.asked).ratio for made in (reserve, than)]
+    needs = [required_damping(loop, each.chosen.coupling, than.chosen.asked).ratio for each in (reserve, than)]
     return needs[0] < needs[1]
 
 
-def _felt_at_rest(made: CertifiedCoupling) -> Array:
+def _felt_at_rest(certified: CertifiedCoupling) -> Array:
     """Return the static stiffness (m, m) [N/m] that the devices feel; in a world, that against fixed bodies."""
-    loop = made.scenario.loop(made.case)
-    V = made.chosen.coupling.compliance(loop.T) if is_world(made.scenario) else None
-    return loop.F(made.chosen.coupling).dc() if V is None else np.linalg.inv(V.dc())
+    loop = certified.scenario.loop(certified.case)
+    V = certified.chosen.coupling.compliance(loop.T) if is_world(certified.scenario) else None
+    return loop.F(certified.chosen.coupling).dc() if V is None else np.linalg.inv(V.dc())
 
 
-def _shortfall(made: CertifiedCoupling) -> str:
+def _shortfall(certified: CertifiedCoupling) -> str:
     needs = []
-    for name, requirement in made.assessment.requirements.items():
+    for name, requirement in certified.assessment.requirements.items():
         figures = ", ".join(f"{b:.4g}" for b in requirement.required)
         needs.append(requirement.reason or f"{name} needs {figures} of {requirement.available[0]:g} N s/m")
     return "; ".join(needs)

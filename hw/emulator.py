@@ -111,17 +111,17 @@ class FaultInjection:
             raise InputError(f"--fault {text}: {kind} does not happen to one axis; {', '.join(_AXIS)} do")
         what, low, high, default = KINDS[kind]
         try:
-            given = default if value is None else float(value)
+            number = default if value is None else float(value)
             begins = None if start is None else float(start)
             lasts = _FOREVER if duration is None else float(duration)
-            require(f"{kind} ({what})", given, low, high, "")
+            require(f"{kind} ({what})", number, low, high, "")
             require("START", begins or 0.0, 0.0, _FOREVER, "s")
             require("DURATION", lasts, 1e-6, _FOREVER, "s")
-            if kind == "leap" and given != int(given):
-                raise ValueError(f"VALUE is {given:g}, expected a whole number of ticks")
+            if kind == "leap" and number != int(number):
+                raise ValueError(f"VALUE is {number:g}, expected a whole number of ticks")
         except ValueError as error:
             raise InputError(f"--fault {text}: {str(error).strip()}") from None
-        return cls(kind, given, where or ("axis1" if kind in _AXIS else "both"), begins, lasts)
+        return cls(kind, number, where or ("axis1" if kind in _AXIS else "both"), begins, lasts)
 
     @property
     def axis(self) -> int:
@@ -316,8 +316,8 @@ class Emulator:
     def _move(self, now: float) -> None:
         """The plant moves on up to `now` [us], within the tick."""
         period = 1e-3 * self.info.period_ns * self.stretch
-        done = min(1.0, (now - self._begun) / period)
-        share = min(self._rest, max(0.0, done - (1.0 - self._rest)))
+        portion = min(1.0, (now - self._begun) / period)
+        share = min(self._rest, max(0.0, portion - (1.0 - self._rest)))
         if share:
             self.plant.advance(-self.applied, share, self._at_tick)
             self._rest, self._at_tick = self._rest - share, False

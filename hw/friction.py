@@ -240,13 +240,13 @@ def _fitted(balance: _Balance, dry: Array, periodic: list[_Pair]) -> _Fit:
 def _strongest(pairs: list[_Pair], columns: Array, residual: Array) -> tuple[float, _Pair]:
     """The pair that explains most of what `columns` (rows, p) leave of `residual` (rows,), and which part of it."""
     q = np.linalg.qr(columns)[0]
-    left, most, found = residual - q @ (q.T @ residual), 0.0, pairs[0]
+    left, most, strongest = residual - q @ (q.T @ residual), 0.0, pairs[0]
     for pair in pairs:
         own = np.linalg.qr(pair.columns - q @ (q.T @ pair.columns))[0]
         gain = float(np.sum((own.T @ left) ** 2) / (left @ left))
         if gain > most:
-            most, found = gain, pair
-    return most, found
+            most, strongest = gain, pair
+    return most, strongest
 
 
 def _disturbances(balance: _Balance, fit: _Fit) -> list[_Pair]:
@@ -254,18 +254,18 @@ def _disturbances(balance: _Balance, fit: _Fit) -> list[_Pair]:
 
     Among noise the best of n pairs explains about 2 log n of `independent` parts: one that counts has _CHANCE more.
     """
-    found: list[_Pair] = []
+    pairs: list[_Pair] = []
     grid = balance.waves(_PERIODS[np.ptp(balance.x) > _PERIODS])
     needed = -np.expm1(-2 * (np.log(len(grid) * len(_NEAR) + 1) + _CHANCE) / balance.independent)
-    while grid and len(found) < _PERIODIC:
-        columns = np.hstack([fit.columns, *(pair.columns for pair in found)])
+    while grid and len(pairs) < _PERIODIC:
+        columns = np.hstack([fit.columns, *(pair.columns for pair in pairs)])
         _, near = _strongest(grid, columns, fit.residual)
         # between two of the grid a long record loses count of the periods
         gain, pair = _strongest(balance.waves(near.period * _NEAR), columns, fit.residual)
         if gain < needed:
             break
-        found.append(pair)
-    return found
+        pairs.append(pair)
+    return pairs
 
 
 def _scatter(fit: _Fit, force: Array) -> Array:

@@ -189,22 +189,22 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool) -> Esti
     """
     if np.ptp(x) < 20 * step:
         raise ValueError(f"the axis moved by {np.ptp(x) / step:.0f} encoder steps, at least 20 are needed")
-    found = friction(x, force, T, step)
+    law = friction(x, force, T, step)
     # one that is too uncertain to exclude a hand is refused as well
-    if (most := found.stiffness + 2 * found.errors["stiffness"]) > _SPRUNG:
+    if (most := law.stiffness + 2 * law.errors["stiffness"]) > _SPRUNG:
         raise ValueError(
-            f"the handle is sprung by {found.stiffness:.3g} N/m (up to {most:.3g}, at most {_SPRUNG:g} may be): a hand "
+            f"the handle is sprung by {law.stiffness:.3g} N/m (up to {most:.3g}, at most {_SPRUNG:g} may be): a hand "
             "or a finger rests on it? Its damping would be taken for the device's; let go, or loosen the spring"
         )
-    if found.delta <= 0:
+    if law.delta <= 0:
         raise ValueError(
-            f"the record does not tell viscous from dry friction: {found.viscous:.3g} N s/m viscous, "
-            f"{found.coulomb:.3g} N dry, {1e3 * found.rms:.2g} mN unexplained; take one with more force or a longer one"
+            f"the record does not tell viscous from dry friction: {law.viscous:.3g} N s/m viscous, "
+            f"{law.coulomb:.3g} N dry, {1e3 * law.rms:.2g} mN unexplained; take one with more force or a longer one"
         )
-    examined = viscosity(x, force, T, step, found)
-    if reason := doubt(examined, found):
+    examined = viscosity(x, force, T, step, law)
+    if reason := doubt(examined, law):
         raise ValueError(reason)
-    return Estimate(found, None if rigid else _transmission(x, force, T, found), examined)
+    return Estimate(law, None if rigid else _transmission(x, force, T, law), examined)
 
 
 # The transmission. The encoder is the motor's, where dry friction acts, so that the force less that friction drives a
@@ -285,14 +285,14 @@ def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> lis
     Of an honest device the estimate scatters about what is declared, and one bound in twenty lies above it: that alone
     is no reason to ask.
     """
-    found = []
+    causes = []
     for i, (e, said) in enumerate(zip(estimates, _declared(scenario, session), strict=False), start=1):
         if e.viscous > (1 + _SUSPICIOUS) * said:
-            found.append(
+            causes.append(
                 f"axis {i}: {e.viscous:.4g} N s/m estimated, {said:.4g} declared (scenario, INFO): is a hand "
                 "on it? No bound is offered; where the device really has more, declare it and take another record"
             )
-    return found
+    return causes
 
 
 def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], list[str]]:
@@ -304,7 +304,7 @@ def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], lis
     """
     if len(sittings) < 2:
         raise ValueError("one sitting tells no hand that only damps from more damping of the device: take two")
-    found, words = [], []
+    axes, words = [], []
     for i, axis in enumerate(zip(*sittings, strict=True), start=1):
         least, *others = sorted(axis, key=lambda e: e.viscous)
         figures = ", ".join(f"{e.viscous:.4g}" for e in axis)
@@ -315,8 +315,8 @@ def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], lis
             words.append(f"{told} {', '.join(hands)}, which did not count")
         slowest = min(axis, key=lambda e: e.viscosity.speed).viscosity  # no sitting's bound holds beyond its speed
         bound = replace(least.friction, delta=min(e.delta for e in axis))
-        found.append(replace(least, friction=bound, viscosity=slowest))
-    return found, words
+        axes.append(replace(least, friction=bound, viscosity=slowest))
+    return axes, words
 
 
 def unbounded(estimates: Sequence[Estimate]) -> str:

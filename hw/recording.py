@@ -38,8 +38,8 @@ class Recorder:
     def __init__(self, channels: int) -> None:
         m = self.channels = channels
         floats = [("x", "<f8", m), ("asked", "<f8", m), ("test", "<f8", m), ("gain", "<f8")]
-        whole = [("sent", "<i4", m), ("applied", "<i4", m), *((name, "<i4") for name in _ONCE), ("received", "?")]
-        self._row, self._form = np.dtype([*floats, *whole]), Struct(f"<{3 * m + 1}d{2 * m + len(_ONCE)}i?")
+        fields = [("sent", "<i4", m), ("applied", "<i4", m), *((name, "<i4") for name in _ONCE), ("received", "?")]
+        self._row, self._form = np.dtype([*floats, *fields]), Struct(f"<{3 * m + 1}d{2 * m + len(_ONCE)}i?")
         self._rows, self._zero = bytearray(), (0,) * m
 
     def __call__(self, row: TraceRow) -> None:
@@ -66,8 +66,8 @@ class Recorder:
         Missed ticks are not left out. `force_step` (m,) [N].
         """
         link = self.link()
-        asked = -np.round(link["asked"] / np.array(force_step))
-        cut = link["received"] & np.any((link["sent"] != asked) | limits.capped(link["asked"]), axis=1)
+        wanted = -np.round(link["asked"] / np.array(force_step))
+        cut = link["received"] & np.any((link["sent"] != wanted) | limits.capped(link["asked"]), axis=1)
         stretches = []
         for arming in np.unique(link["arming"]):
             full = np.flatnonzero((link["arming"] == arming) & (link["gain"] == 1.0))
@@ -102,10 +102,10 @@ class Recorder:
 
 def _digest(arrays: Mapping[str, Array]) -> str:
     """SHA-256 of everything in a trace: it tells a record from one that was changed, cut or put together."""
-    whole = hashlib.sha256()
+    digest = hashlib.sha256()
     for name in sorted(arrays):
-        whole.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape} ".encode() + arrays[name].tobytes())
-    return whole.hexdigest()
+        digest.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape} ".encode() + arrays[name].tobytes())
+    return digest.hexdigest()
 
 
 def load(path: Path) -> tuple[Trace, dict[str, Array]]:
@@ -163,17 +163,17 @@ def replay(result: Trace, link: dict[str, Array]) -> _Comparison:
 
     Raises InputError where the trace has no recipe for that.
     """
-    asked, sent, arming = np.zeros_like(link["asked"]), np.zeros_like(link["sent"]), link["arming"]
+    wanted, sent, arming = np.zeros_like(link["asked"]), np.zeros_like(link["sent"]), link["arming"]
     try:
         recipes = _recipes_of(result)
         if len(recipes) != arming[-1] + 1:
             raise ValueError(f"it has {len(recipes)} recipes for {arming[-1] + 1} armings")
         for i, recipe in enumerate(recipes):
-            _again(recipe, np.flatnonzero(arming == i), result, link, (asked, sent))
+            _again(recipe, np.flatnonzero(arming == i), result, link, (wanted, sent))
     except (SafetyStop, msgspec.ValidationError, LookupError, ValueError, TypeError) as error:
         raise InputError(f"the trace cannot be replayed: {counted(str(error))}") from None
-    different = asked.view(np.int64) != link["asked"].view(np.int64)
-    largest = float(np.abs(asked - link["asked"]).max(initial=0.0))
+    different = wanted.view(np.int64) != link["asked"].view(np.int64)
+    largest = float(np.abs(wanted - link["asked"]).max(initial=0.0))
     return _Comparison(different.any(axis=1), (sent != link["sent"]).any(axis=1), largest)
 
 
@@ -188,22 +188,22 @@ def _again(
     """The `ticks` of one arming: forces asked for and steps sent, written to `into`."""
     if recipe.scenario.environment.world:
         raise ValueError("its forces came from a MuJoCo world, which is not in the trace")
-    m, coupling, (asked, sent) = len(recipe.cap), recipe.coupling.build(recipe.scenario.T), into
+    m, coupling, (wanted, sent) = len(recipe.cap), recipe.coupling.build(recipe.scenario.T), into
     loop, added = recipe.scenario.loop("I"), (recipe.lag, recipe.behind, recipe.scenario.limiter_limits[1])
     controller = host_controller(loop, coupling, recipe.link_delay, recipe.limits.cap, *added)
     units, force = Units((1.0,) * m, recipe.force_step, (1,) * m), (0.0,) * m
     budget, missed = recipe.energy_budget and SentBudget(recipe.energy_budget), 0
     for k in ticks:
-        asked[k] = controller.step(result.x[k].tolist())
+        wanted[k] = controller.step(result.x[k].tolist())
         if not link["received"][k]:
             missed += 1
             continue
         gain, test = float(link["gain"][k]), link["test"][k].tolist()
-        force = recipe.limits.shape(asked[k].tolist(), force, gain, recipe.scenario.T, test).force
+        force = recipe.limits.shape(wanted[k].tolist(), force, gain, recipe.scenario.T, test).force
         steps = units.steps(force, recipe.cap, recipe.limits.vectors)
         if budget:
-            whole = budget.limit(steps, result.x[k].tolist(), result.f[k], missed)
-            if whole != steps:
-                force, steps = units.forces(whole), whole
+            limited = budget.limit(steps, result.x[k].tolist(), result.f[k], missed)
+            if limited != steps:
+                force, steps = units.forces(limited), limited
             missed = 0
         sent[k] = steps

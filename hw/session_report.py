@@ -102,14 +102,14 @@ class _Link:
         measured, T = session.measurement, session.scenario.T
         counters = asdict(session.counters) | {"host_dropped_bytes": dropped}
         ages, ticks = (_percentiles(np.array(times)) for times in (measured.ages, measured.result.ticks))
-        found = cls(ages, measured.missing, ticks, counters)
+        figures = cls(ages, measured.missing, ticks, counters)
         if not (len(recorder) and session.config):
-            return found
+            return figures
         arrays = recorder.link()
         received = arrays["received"]
         margins, answered = arrays["margin_us"][received & (arrays["margin_us"] != NO_MARGIN)], received.sum()
         return replace(
-            found,
+            figures,
             age_us=_percentiles(session.config.due * 1e6 * T - margins),
             rate_hz=float(received.mean() / T),
             missed_percent=float(100 * session.missed_while_driving / answered) if answered else None,
@@ -138,16 +138,16 @@ class WorldSession(WorldRecord):
     @classmethod
     def all_of(cls, session: Session, trace: Trace, arming: np.ndarray) -> list[WorldSession]:
         """One for each arming; `trace` is that of the session, `arming` (N,) counts them from 0."""
-        found, delta, T = [], np.array(session.scenario.delta), session.scenario.T_max or session.scenario.T
+        sessions, delta, T = [], np.array(session.scenario.delta), session.scenario.T_max or session.scenario.T
         for i, world in enumerate(session.worlds):
             x, f = trace.x[arming == i], trace.f[arming == i]
             dx = np.diff(x, axis=0)
-            given = -(f[:-1] * dx + delta / T * dx**2).sum(axis=1)
-            found.append(
+            energy = -(f[:-1] * dx + delta / T * dx**2).sum(axis=1)
+            sessions.append(
                 cls(
                     ticks=world.shell.ticks,
                     ticks_acted=int(world.shell.limited[0]),
-                    given_J=float(np.cumsum(given).max(initial=0.0)),
+                    given_J=float(np.cumsum(energy).max(initial=0.0)),
                     port_least_J=world.least,
                     released_J=world.port.released,
                     created_J=world.port.created,
@@ -156,7 +156,7 @@ class WorldSession(WorldRecord):
                     step_us=_percentiles(1e6 * np.array(world.seconds)),
                 )
             )
-        return found
+        return sessions
 
 
 @dataclass(frozen=True)

@@ -65,8 +65,8 @@ class _Joint:
         import scipy
 
         def error(p: Array) -> Array:
-            kept = np.concatenate([e[some] for e, some in zip(self.errors(p), keep, strict=True)])
-            return np.concatenate([kept.real, kept.imag])
+            errors = np.concatenate([e[some] for e, some in zip(self.errors(p), keep, strict=True)])
+            return np.concatenate([errors.real, errors.imag])
 
         T = self.records[0].T
         low, high = np.append(_FIXED, -0.2 * T), np.array([25.0] * 4 + [np.inf, 2 * T, 2 * T])

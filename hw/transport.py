@@ -101,8 +101,8 @@ def preflight(paths: Sequence[str]) -> str:
 
     It asks the system for real-time scheduling and locked memory, and measures for two seconds how late it wakes us.
     """
-    found = _scheduling(), _locked_memory(), *map(_latency_timer, paths), _clock_source(), _stalls()
-    return "pre-flight: " + "; ".join(found)
+    checks = _scheduling(), _locked_memory(), *map(_latency_timer, paths), _clock_source(), _stalls()
+    return "pre-flight: " + "; ".join(checks)
 
 
 def _stalls() -> str:
