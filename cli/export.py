@@ -15,6 +15,7 @@ import numpy as np
 from haptic_loop.cli import options, render
 from haptic_loop.controller.loop import Loop
 from haptic_loop.controller.lti import Array
+from haptic_loop.controller.units import comments_in_unit, speak
 from haptic_loop.design.certificate import Verdict, named, verify
 from haptic_loop.design.coupling_file import Stored
 from haptic_loop.design.designs import name_and_own
@@ -67,6 +68,7 @@ def main(argv: list[str]) -> int:
     """Export a stored coupling. 0: written, 1: written, but the certificate in its file does not hold."""
     args = _parser().parse_args(argv)
     stored = read_coupling(args.coupling)
+    speak(stored.loop.unit)
     own = name_and_own(args.condition)[1]
     try:
         verdict = verify(stored, args.condition and named(args.condition))
@@ -76,7 +78,7 @@ def main(argv: list[str]) -> int:
     block = _block(args, stored, verdict, claim)
     path = out_file(args.out, f"out/export/{options.name_of(args.coupling)}-{block.name}.c")
     test = trial(block, args.seed)
-    write(path, c_source(block, test, path.name))
+    write(path, comments_in_unit(c_source(block, test, path.name)))
 
     forces = "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
     if block.limiter:

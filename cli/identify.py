@@ -106,6 +106,8 @@ def main(argv: list[str]) -> int:
     """Identify every axis. 0: each has a bound above zero, 1: not, or a session did not end as planned."""
     args = _parser().parse_args(argv)
     scenario, settings = steady_scenario(args, "hw.identify"), check_link(args)
+    if scenario.unit == "rad":
+        raise InputError('unit is "rad": hw.identify records handles in metres; measure the damping of a wheel by hand')
     if boards_behind(args, scenario):
         raise InputError(f"--port is {args.port}: identify one board at a time, with a scenario of its device")
     low, high = args.band

@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from haptic_loop.cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, UNFINISHED, did_you_mean
 from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.controller.units import in_unit
 from haptic_loop.design.files import nobody_reads, one_command, one_line
 from haptic_loop.design.own import is_refusal, place_of
 from haptic_loop.design.result import DesignFailed
@@ -133,7 +134,7 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
 
 
 def _say(message: str, code: int) -> int:
-    print(one_line(message), file=sys.stderr)
+    print(in_unit(one_line(message)), file=sys.stderr)
     return code
 
 

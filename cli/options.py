@@ -21,6 +21,7 @@ import msgspec
 
 from haptic_loop.controller.delay import LOST, Periods, VaryingDelay
 from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.units import speak
 from haptic_loop.design.files import check_file, folder, read_text
 from haptic_loop.design.own import called, named, place_of
 from haptic_loop.design.result import CONDITIONS, DesignFailed
@@ -425,6 +426,7 @@ def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) 
 def scenario_from(args: argparse.Namespace) -> Scenario:
     """Return the scenario that the loop options describe. Raises InputError."""
     scenario = load(args.scenario)
+    speak(scenario.unit)
     if args.environment is not None:
         scenario = with_environment(scenario, args.environment)
     names = ("theta", "psi", "lam", "latency", "delta", "T", "T_max")

@@ -10,6 +10,7 @@ from rich.errors import MarkupError
 from rich.table import Table
 from rich.text import Text
 
+from haptic_loop.controller.units import in_unit
 from haptic_loop.design.files import nobody_reads, printable
 
 _CUT = "…"  # rich's mark for a cut word
@@ -18,12 +19,22 @@ _STEP = 2
 _OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # an opening bracket that begins no tag of reports
 
 
+def _in_unit(shown: Any) -> Any:
+    """Return a text or table in the unit of this command."""
+    if isinstance(shown, Table):
+        shown.title = shown.title and in_unit(str(shown.title))
+        for column in shown.columns:
+            column.header = in_unit(str(column.header))
+            column._cells = [in_unit(cell) if isinstance(cell, str) else cell for cell in column._cells]
+    return in_unit(shown) if isinstance(shown, str) else shown
+
+
 class Screen(Console):
     """A console that breaks words, but no numbers, and lets tables be wider than the terminal."""
 
     def print(self, *objects: Any, **how: Any) -> None:
         """Print as rich does, but widen until no table loses a character."""
-        own = self._width
+        own, objects = self._width, tuple(map(_in_unit, objects))
         self._width = max([self.width, *(self._needed(one) for one in objects if isinstance(one, Table))])
         try:
             super().print(*objects, **how)

@@ -21,6 +21,7 @@ import numpy as np
 
 from haptic_loop.cli import options
 from haptic_loop.cli.render import console, progress
+from haptic_loop.controller.units import in_unit
 from haptic_loop.hw.boards import Boards, ticks_behind
 from haptic_loop.hw.control import Armable
 from haptic_loop.hw.driver import Operator
@@ -75,9 +76,9 @@ def add_link_options(parser: options.Parser) -> None:
 def add_safety_options(parser: options.Parser) -> None:
     """Limits of force and speed, and the switch that the user has to hold."""
     add, number = parser.add_argument_group("safety").add_argument, options.number
-    cap = "largest force (default 2, for first sessions)"
+    cap = "largest force, of rotary devices at the radius of the hand (default 2, for first sessions)"
     add("--force-cap", type=number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
-    speed = "fastest motion of a handle while forces act (default 1, or the least credible_speed of the devices)"
+    speed = "fastest motion of a hand while forces act (default 1, or the least credible_speed of the devices)"
     add("--max-speed", type=number(1e-3, 2.5), metavar="M/S", help=speed)
     heat = "force that each motor stands for ever, one is for all; above it, I2t (default: not watched)"
     add("--continuous-force", type=options.several(float), metavar="N,N,..", help=heat)
@@ -117,16 +118,16 @@ def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
 
 
 def _speed(args: argparse.Namespace, scenario: Scenario) -> float:
-    """The speed [m/s] at which a session stops, within what the devices' damping is known for. Raises InputError."""
-    known = min(device.credible_speed for device in scenario.axis_devices)
+    """Return the speed at which a session stops, where the damping is known. Raises InputError."""
+    known = scenario.lever * min(device.credible_speed for device in scenario.axis_devices)
     if args.max_speed is None:
-        return min(1.0, known)
+        return min(1.0, known) / scenario.lever
     if args.max_speed > known:
         raise InputError(
             f"--max-speed is {args.max_speed:g} m/s, the least credible_speed of the devices is {known:g}: "
             "their damping is not known beyond it (hw.identify --speed)"
         )
-    return args.max_speed
+    return args.max_speed / scenario.lever
 
 
 def touched(path: str) -> Callable[[], bool]:
@@ -343,7 +344,7 @@ def _show(session: Session) -> None:
         words += [f"{1e3 * x:+.3f} mm" for x in session.units.positions(session.link.last.counts)]
     words += [f"margin {margin} us"] if (margin := session.link.least_margin) is not None else []
     words += [f"{name} {n}" for name in _SHOWN if (n := getattr(counters, name))]
-    line = " · ".join(words)[: shutil.get_terminal_size().columns - 1]
+    line = in_unit(" · ".join(words))[: shutil.get_terminal_size().columns - 1]
     if select.select([], [sys.stderr], [], 0)[1]:
         os.write(sys.stderr.fileno(), f"\r\x1b[K{line}".encode())
 

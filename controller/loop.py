@@ -26,6 +26,7 @@ from haptic_loop.controller.environment import RIGID_WALL, Environment, Network,
 from haptic_loop.controller.law import Law, Limiter
 from haptic_loop.controller.lti import Array, Block, Complex, Lti, Sampled, as_like
 from haptic_loop.controller.ranges import Member, Ranges, members
+from haptic_loop.controller.units import PositionUnit, in_unit
 
 MOST_SAMPLES = 1000  # longest delay of a channel; every sample is a state
 _Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=MOST_SAMPLES)], ...]
@@ -86,6 +87,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
     known_devices: tuple[DeviceBounds, ...] | None = None  # (m,) guaranteed bounds of the devices
     axes: tuple[int, ...] | None = None  # number of channels of each device; None: one
     levels: tuple[Rows, ...] | None = None  # Delta_i per device [N s/m], its diagonal in delta; None: diag(delta)
+    unit: PositionUnit = "m"  # of positions; "rad": N m, N m s/rad and kg m2 stand for N, N s/m and kg
 
     def __post_init__(self) -> None:
         m = len(self.environment.contacts)
@@ -169,7 +171,8 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
 
     def __repr__(self) -> str:
         shown = f"T = {1e3 * self.T:g} ms, theta = {list(self.theta)}, psi = {list(self.psi)}"
-        return f"Loop({shown}, damping {list(self.delta)} N s/m, contacts {', '.join(self.environment.contacts)})"
+        shown += f", damping {list(self.delta)} {in_unit('N s/m', self.unit)}"
+        return f"Loop({shown}, contacts {', '.join(self.environment.contacts)})"
 
     @property
     def channels(self) -> int:

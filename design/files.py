@@ -29,6 +29,8 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from haptic_loop.controller.units import keys_in_unit
+
 _MOST_TEXT = 2_000_000  # bytes: scenarios, humans, recorded delays
 _MOST_STORED = 50_000_000  # bytes: a proof over 200 states takes a tenth of it
 _MOST_UNPACKED = 4_000_000_000  # bytes of a trace: ten hours of two channels take 3e9
@@ -375,7 +377,7 @@ def _part(report: Any) -> dict[str, Any]:
 
 def write_json(destination: str | Path, report: Any) -> None:
     """Write a report as JSON to a file, or to standard output for '-'."""
-    text = json.dumps(plain(report), indent=2, allow_nan=False) + "\n"
+    text = json.dumps(keys_in_unit(plain(report)), indent=2, allow_nan=False) + "\n"
     if str(destination) == "-":
         try:
             sys.stdout.write(text)

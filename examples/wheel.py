@@ -1,6 +1,6 @@
 """A force-feedback wheel whose game sends torques at 60 or 360 Hz: which delay theta stands for a held torque?
 
-The equations are those of handles; rad, N m, N m s/rad and kg m2 stand in the places of m, N, N s/m and kg. A torque
+`unit = "rad"` in wheel.toml: rad, N m, N m s/rad and kg m2 stand in the places of m, N, N s/m and kg. A torque
 that is computed within a period of the game and held for the next (n ticks of the wheel's 1 kHz loop) has a mean age of
 3 n/2 ticks. A tick holds for half a tick by itself, so theta = 3 n/2 - 1/2 stands for it. The exact loop, whose period
 is the game's (theta = 1), is certified; the 1 kHz loop with that theta needs nearly the same damping.
@@ -8,22 +8,14 @@ is the game's (theta = 1), is certified; the 1 kHz loop with that theta needs ne
 
 import math
 import sys
+from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 
 from haptic_loop import Scenario, SpringDamper, certify, design_coupling, load
 
-BASE = load("omega-pair").replace(
-    name="wheel",
-    T=1e-3,
-    theta=(1,),
-    psi=(0,),
-    device=[{"kind": "rigid", "mass": 0.02, "damping": 0.1, "force_limit": 8.0}],  # kg m2, N m s/rad, N m: assumptions
-    human=[{"links": [{"mass": 0.02, "damping": 0.3, "stiffness": 10.0}]}],
-    environment={"contacts": ["rim"], "springs": [{"between": ["rim", "ground"], "stiffness": 20.0, "damping": 0.02}]},
-    tap=None,
-)
+BASE = load(Path(__file__).with_name("wheel.toml"))
 RIGID = SpringDamper([1e6], [0.0])  # as good as no coupling
 
 

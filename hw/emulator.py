@@ -251,7 +251,9 @@ def nobody(scenario: Scenario, damping: float = 0.0, mass: float = 0.0) -> Scena
 
 def info_of(scenario: Scenario) -> Info:
     """The INFO of the emulated device: the scenario's devices, in the units of the wire."""
-    encoder = [round(1e12 * (device.encoder_step or _ENCODER_STEP)) for device in scenario.axis_devices]
+    r, limits = scenario.lever, [device.force_limit for device in scenario.axis_devices]
+    encoder = [round(1e12 * (device.encoder_step or _ENCODER_STEP / r)) for device in scenario.axis_devices]
+    step = _FORCE_STEP if scenario.unit == "m" else max(1, round(1e6 * max(limits) / 30000))
     return Info(
         version=PROTOCOL,
         firmware="emulator",
@@ -259,9 +261,9 @@ def info_of(scenario: Scenario) -> Info:
         period_ns=round(1e9 * scenario.T),
         osp_damping=tuple(round(1e6 * delta) for delta in scenario.delta),
         encoder_step=tuple(encoder),
-        force_step=(_FORCE_STEP,) * scenario.channels,
-        hard_limit=tuple(min(0x7FFF, round(1e6 * d.force_limit / _FORCE_STEP)) for d in scenario.axis_devices),
-        range=tuple(round(1e12 * _REACH / step) for step in encoder),
+        force_step=(step,) * scenario.channels,
+        hard_limit=tuple(min(0x7FFF, round(1e6 * limit / step)) for limit in limits),
+        range=tuple(round(1e12 * _REACH / r / each) for each in encoder),
     )
 
 

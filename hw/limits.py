@@ -87,21 +87,23 @@ class SafetyLimits:
     continuous: tuple[float, ...] = ()  # (m,) [N] forces that the motors can hold for ever; empty: no heat check
     thermal: float = 10.0  # [s] time constant of the motors
     vectors: tuple[tuple[int, int], ...] = ()  # first channel and end of each vector that is limited as a whole
+    lever: float = 1.0  # [m] of rotary devices, whose ranges are those of a hand at this radius
 
     def __post_init__(self) -> None:
+        r = self.lever
         for i, cap in enumerate(self.cap, start=1):
-            require(f"cap #{i}", cap, 1e-3, 12.0, "N")
-        require("slew", self.slew, 1.0, 2000.0, "N/s")
-        require("jump", self.jump, 1e-6, 3e-3, "m")
+            require(f"cap #{i}", cap, 1e-3 * r, 12.0 * r, "N")
+        require("slew", self.slew, 1.0 * r, 2000.0 * r, "N/s")
+        require("jump", self.jump, 1e-6 / r, 3e-3 / r, "m")
         require("watchdog_us", self.watchdog_us, 1000, 20000, "us")
         require("ramp_in", self.ramp_in, 0.1, 0.25, "s")
         require("ramp_out", self.ramp_out, 0.1, 0.25, "s")
-        require("speed", self.speed, 1e-3, 2.5, "m/s")
+        require("speed", self.speed, 1e-3 / r, 2.5 / r, "m/s")
         require("thermal", self.thermal, 0.1, 1000.0, "s")
         if self.continuous and len(self.continuous) != len(self.cap):
             raise ValueError(f"continuous has {len(self.continuous)} entries, cap {len(self.cap)}")
         for i, (most, cap) in enumerate(zip(self.continuous, self.cap, strict=False), start=1):
-            require(f"continuous #{i}", most, 1e-3, cap, "N")
+            require(f"continuous #{i}", most, 1e-3 * r, cap, "N")
 
     def shape(
         self,

@@ -488,13 +488,15 @@ class EncoderTest:
         expected: Expected,
         still: Sequence[int] | None = None,
         at_once: bool = False,
+        lever: float = 1.0,
         alive: bool = False,
     ) -> None:
         """Test within `cap` (m,) [N]; a motion within `still` (m,) [counts] is noise.
 
         A STATE tells the force that acts after it, or with `at_once` (theta = 0) the one that acted before it.
+        `lever` [m] turns a force into the torque of a rotary device.
         """
-        self._at_once = at_once
+        self._at_once, self._strongest = at_once, _TEST_FORCE * lever
         self._cap, self._T, self._units, self._expected, self._alive = cap, T, units, expected, alive
         self._still = tuple(still or (1,) * len(cap))
         self._axis, self._last = -1, None
@@ -528,7 +530,7 @@ class EncoderTest:
         since = self._ticks - before
         if since <= 0:
             return (0.0,) * len(self._cap)
-        size = min(self._cap[self._axis], _TEST_FORCE * 2.0 ** (self._block + 1 - _BLOCKS))
+        size = min(self._cap[self._axis], self._strongest * 2.0 ** (self._block + 1 - _BLOCKS))
         sign = -1 if (since + half // 2) // half % 2 else 1
         return tuple(sign * size if i == self._axis else 0.0 for i in range(len(self._cap)))
 
@@ -569,7 +571,7 @@ class EncoderTest:
 
     def _unanswered(self) -> str:
         """Return a message about an axis whose encoder has not answered."""
-        axis, at = self._axis + 1, f"a test force of up to {min(_TEST_FORCE, self._cap[self._axis]):g} N"
+        axis, at = self._axis + 1, f"a test force of up to {min(self._strongest, self._cap[self._axis]):g} N"
         if self._alive:
             return f"motor or encoder of axis {axis} did not answer {at} at the end of the session"
         if (moved := self._counted(self._axis)) > self._still[self._axis]:
@@ -588,9 +590,15 @@ class EncoderMonitor:
     """
 
     def __init__(
-        self, encoder_step: Sequence[float], force_step: Sequence[float], T: float, still: Sequence[int] | None = None
+        self,
+        encoder_step: Sequence[float],
+        force_step: Sequence[float],
+        T: float,
+        still: Sequence[int] | None = None,
+        lever: float = 1.0,
     ) -> None:
-        """`still` (m,) [counts] are within noise."""
+        """`still` (m,) [counts] are within noise; `lever` [m] turns a force into a torque."""
+        self._lever = lever
         self._still = tuple(still or (1,) * len(force_step))
         self._quiet = [0.0] * len(force_step)  # [s] under a force without a motion
         self._encoder_step, self._force_step, self._T = encoder_step, force_step, T
@@ -613,13 +621,13 @@ class EncoderMonitor:
             elif n < band[0]:
                 band[0] = n
             change = abs(force - self._reference[i])
-            if change > _CHANGE:
+            if change > _CHANGE * self._lever:
                 self._impulse[i] += change * ticks * self._T
             q = self._encoder_step[i] * still
-            if self._impulse[i] > max(_IMPULSE, 8.0 * (q * _HEAVIEST * change) ** 0.5):
+            if self._impulse[i] > max(_IMPULSE * self._lever, 8.0 * (q * _HEAVIEST * self._lever**2 * change) ** 0.5):
                 doing = f"it stands still while the force changes by {change:.3g} N"
                 raise SafetyStop(f"encoder of axis {i + 1} does not follow: {doing}")
-            self._quiet[i] = self._quiet[i] + ticks * self._T if abs(force) > _PRESSING else 0.0
+            self._quiet[i] = self._quiet[i] + ticks * self._T if abs(force) > _PRESSING * self._lever else 0.0
 
     @property
     def dead(self) -> str | None:

@@ -97,7 +97,11 @@ class Session:
         if last is None:
             return "no STATE has come yet"
         places = zip(last.counts, before, self.units.encoder_step, strict=True)
-        near = [f"{i}" for i, (n, then, step) in enumerate(places, 1) if abs(n - then) * step < _ELSEWHERE]
+        near = [
+            f"{i}"
+            for i, (n, then, step) in enumerate(places, 1)
+            if abs(n - then) * step < _ELSEWHERE / self.limits.lever
+        ]
         where = f"within {1e3 * _ELSEWHERE:g} mm of where it was in the sitting before"
         return f"handle {', '.join(near)} is {where}: take it elsewhere and let go" if near else None
 
@@ -386,7 +390,7 @@ def _check_state(state: wire.State, config: wire.Config, stage: Stage, gain: flo
 
 
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
-    """Return a session that asks for at most `cap` [N].
+    """Return a session that asks for at most `cap` [N] at the hand.
 
     Raises:
         InputError: A limit or T is impossible, or the damping of a device is a full matrix, which INFO cannot state.
@@ -395,10 +399,14 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONG
         least = ", ".join(f"{d:.3g}" for d in scenario.loop("I").least_damping)
         advice = f"give delta as numbers below the matrix, {least} are its least eigenvalues"
         raise InputError(f"delta is a full matrix, but a device states its damping axis by axis: {advice}")
+    if scenario.unit == "rad" and scenario.radius is None:
+        raise InputError("radius is missing: give the distance in metres from the axis to the hand, for its limits")
     limits, balls = scenario.limiter_limits
-    caps, vectors = tuple(min(cap, limit) for limit in limits), tuple((ball.start, ball.stop) for ball in balls)
+    r, vectors = scenario.lever, tuple((ball.start, ball.stop) for ball in balls)
+    scaled: dict[str, Any] = {"slew": 2000.0 * r, "jump": 3e-3 / r, "speed": 1.0 / r, "lever": r} | more
+    caps = tuple(min(cap * r, limit) for limit in limits)
     try:
-        safety = SafetyLimits(caps, vectors=vectors, watchdog_us=watchdog_for(scenario.T), **more)
+        safety = SafetyLimits(caps, vectors=vectors, watchdog_us=watchdog_for(scenario.T), **scaled)
         return Session(scenario, safety, settings)
     except ValueError as error:
         raise InputError(str(error)) from None

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from haptic_loop.controller.budget import BudgetFigures
+from haptic_loop.controller.units import keys_in_unit
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table, plain, remove, write_json
 from haptic_loop.hw.control import CertifiedCoupling
@@ -60,7 +61,7 @@ class IncidentLog:
 
     def _write(self, line: dict[str, Any]) -> None:
         with suppress(OSError):  # a full disk is no reason to drop the forces
-            os.write(self._file, (json.dumps(line) + "\n").encode())
+            os.write(self._file, (json.dumps(keys_in_unit(line)) + "\n").encode())
 
     def close(self) -> None:
         os.close(self._file)

@@ -174,6 +174,7 @@ def simulate(
     linear = not (scenario.switches or environment or is_world(scenario))
     meta = {
         "scenario": scenario.name,
+        **({"unit": "rad"} if scenario.unit == "rad" else {}),
         "scenario_digest": scenario.digest,
         "engine": engine_name(engine),
         "integrator": done.settings.integrator,

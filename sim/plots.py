@@ -21,6 +21,7 @@ from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array
+from haptic_loop.controller.units import PositionUnit, in_unit
 from haptic_loop.design.files import InputError, printable, write
 from haptic_loop.design.guarantees import ANY
 
@@ -84,6 +85,12 @@ def _entries(axis: Axes) -> dict[str, Any]:
 _FORMATS = (".png", ".pdf", ".svg")
 
 
+def relabel(figure: Figure, unit: PositionUnit | None = None) -> None:
+    """Write the texts of a figure in `unit`, by default that of this command."""
+    for text in figure.findobj(Text):
+        text.set_text(in_unit(text.get_text(), unit))
+
+
 def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     """Write the figure in the format of the suffix, with its texts taken literally; the file is complete or absent.
 
@@ -97,6 +104,7 @@ def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     if kind not in _FORMATS:
         raise InputError(f"picture {path}: the suffix is {kind!r}, allowed are {', '.join(_FORMATS)}")
     _literal(figure)
+    relabel(figure)
     if kind != ".png":
         _fit_paper(figure)
     return write(path, lambda file: figure.savefig(file, format=kind[1:], dpi=dpi))

@@ -9,7 +9,9 @@ from __future__ import annotations
 import difflib
 import hashlib
 import re
+import tomllib
 from collections.abc import Sequence
+from contextlib import suppress
 from inspect import isfunction
 from pathlib import Path
 from typing import Any, Self, get_args
@@ -30,6 +32,7 @@ from haptic_loop.controller.environment import (
 from haptic_loop.controller.loop import MOST_SAMPLES, DelayRange, DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
+from haptic_loop.controller.units import PositionUnit, in_unit
 from haptic_loop.design.files import InputError, counted, read_text, toml, write
 from haptic_loop.design.own import called, named, place_of
 from haptic_loop.models.device import AXES, MOST_DAMPING, Device, Mechanics, fields_of, require, symmetric
@@ -74,6 +77,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """
 
     name: str
+    unit: PositionUnit = "m"  # of positions; "rad" for rotary devices, with N m, N m s/rad and kg m2
+    radius: float | None = None  # [m] from the axis of rotary devices to the hand; whose limits a session has
     T: float  # sampling period [s]
     theta: _Delays  # transmission delays [samples] (4)
     psi: _Delays = _UNSAID  # environment delays [samples] (5); none unless given
@@ -99,6 +104,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         if self.channels > _MOST_CHANNELS:
             raise ValueError(f"environment.contacts has {self.channels} entries, allowed are 1 to {_MOST_CHANNELS}")
         require("T", self.T, 1e-6, 0.1, "s")
+        if self.radius is not None:
+            require("radius", self.radius, 1e-3, 1.0, "metres")
+            if self.unit == "m":
+                raise ValueError(f'radius is {self.radius:g}, which is for unit = "rad" only')
+        if self.unit == "rad" and is_world(self):
+            raise ValueError('unit is "rad", a world in MuJoCo is in metres')
         require("duration", self.duration, self.T, 1e6, "s")
         if self.psi is _UNSAID:
             msgspec.structs.force_setattr(self, "psi", (0,) * self.channels)
@@ -319,6 +330,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             "period",
         }  # left out where they are not given: scenarios keep their digest
         contents = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in newer or value}
+        if self.unit == "m":
+            del contents["unit"], contents["radius"]
         contents["device"] = [_given_fields(device) for device in self.device]
         if self.environment.world:  # the contents of its files count, not where they are
             contents["environment"] = _nowhere(self.environment)
@@ -341,6 +354,11 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             return f"{self.name}, case {case}"
         return self.name + {"none": ", no coupling", "II": ", reference without delay"}.get(case, "")
 
+    @property
+    def lever(self) -> float:
+        """Return the radius [m] at which a hand holds a rotary device, 1 without one: N to N m, and m to rad."""
+        return self.radius or 1.0
+
     def loop(self, case: str) -> Loop:
         """Return all that a design may know: no device but its damping, no human. `case` is "none", "I" or "II".
 
@@ -350,7 +368,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         varying = span if self.switches and span.lo != span.hi else None
         delays = (self.theta, self.psi, self.reference_delays(case))
         rest = (self.delta, _nowhere(self.environment), self.ranges, varying)
-        more = {**self._known(), **self._axes}
+        more = {**self._known(), **self._axes, "unit": self.unit}
         return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency, **more)
 
     def _known(self, channels: int | None = None) -> dict[str, Any]:
@@ -370,7 +388,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         if self.device[0].axes > 1:
             least = np.linalg.eigvalsh(self.device[0].matrix("delta"))[0]
             delta = (min(float(least) * (1 - 1e-12), *self.delta[: len(self.device[0].free)]),)  # rounding of eigvalsh
-        rest: dict[str, Any] = {"T_max": self.longest_period, **self._known(1)}
+        rest: dict[str, Any] = {"T_max": self.longest_period, "unit": self.unit, **self._known(1)}
         return Loop(self.T, theta, psi, theta, delta, RIGID_WALL, latency=late, **rest)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
@@ -430,7 +448,13 @@ def parse(text: str, source: str = "scenario", folder: Path = Path()) -> Scenari
     """
     if not isinstance(text, str):
         raise TypeError(f"text is of type {type(text).__name__}, expected a str: the scenario itself, in TOML")
-    scenario: Scenario = _converted(text, Scenario, source, folder)
+    try:
+        scenario: Scenario = _converted(text, Scenario, source, folder)
+    except InputError as error:
+        with suppress(tomllib.TOMLDecodeError):
+            if tomllib.loads(text).get("unit") == "rad":
+                raise InputError(in_unit(str(error), "rad")) from None
+        raise
     try:
         scenario.environment.check(scenario.psi, scenario.T)
     except ValueError as error:

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array, ReadOnly, frozen
 from haptic_loop.controller.tick import Net, at_limit
+from haptic_loop.controller.units import in_unit, with_unit
 from haptic_loop.design.files import InputError, read_arrays, write
 
 _MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep
@@ -140,7 +141,7 @@ class Trace(ReadOnly):
         except ImportError:
             raise ImportError("Trace.to_frame needs pandas, which is not installed: pip install pandas") from None
         columns = {
-            f"{name}{i} [{unit}]": column
+            in_unit(f"{name}{i} [{unit}]", self.meta.get("unit")): column
             for name, unit in _UNITS.items()
             for i, column in zip(self._channels, getattr(self, name).T, strict=True)
         }
@@ -159,9 +160,10 @@ class Trace(ReadOnly):
         Raises:
             InputError: Another suffix, or the file cannot be written.
         """
-        from haptic_loop.sim.plots import draw_run, save
+        from haptic_loop.sim.plots import draw_run, relabel, save
 
         figure = draw_run(self, title or self._title(), self.dominant_frequency_hz() or 10.0)
+        relabel(figure, self.meta.get("unit"))
         if path is not None:
             save(figure, Path(path))
         return figure
@@ -174,7 +176,7 @@ class Trace(ReadOnly):
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of its file: what was measured, the metadata as JSON text, and the channels' names if any."""
-        found = {name: getattr(self, name) for name in _MEASURED} | {"meta": np.array(json.dumps(self.meta))}
+        found = {name: getattr(self, name) for name in _MEASURED} | {"meta": np.array(json.dumps(with_unit(self.meta)))}
         return found | ({"names": np.array(self.names)} if self.names else {})
 
     def save_npz(self, path: Path) -> Path:
@@ -208,11 +210,15 @@ class Trace(ReadOnly):
     def save_csv(self, path: Path) -> Path:
         """Write time, displacements and forces, one line per sample, with SI units in the header."""
         channels = self._channels
-        names = ["t [s]", *(f"x{i} [m]" for i in channels), *(f"f{i} [N]" for i in channels)]
+        names = [
+            in_unit(f"{name}{i} [{unit}]", self.meta.get("unit"))
+            for name, unit in (("x", "m"), ("f", "N"))
+            for i in channels
+        ]
         table = np.column_stack([self.t, self.x, self.f])
 
         def content(file: BinaryIO) -> None:
-            np.savetxt(file, table, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
+            np.savetxt(file, table, fmt="%.9g", delimiter=",", header=",".join(["t [s]", *names]), comments="")
 
         return write(path, content)
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from haptic_loop.controller.environment import RIGID_WALL, Network
 from haptic_loop.controller.lti import Array
+from haptic_loop.controller.units import in_unit
 from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table, write
 from haptic_loop.design.guarantees import CAVEATS
@@ -285,4 +286,4 @@ def save_csv(drawn: Map, path: Path) -> Path:
         i = point.get(cell)
         row += ["", ""] if i is None else [drawn.points.verdicts[i], f"{drawn.points.amplitude[i]:.4g}"]
         table.writerow(row)
-    return write(path, text.getvalue())
+    return write(path, in_unit(text.getvalue()))

@@ -1,0 +1,68 @@
+"""The unit of positions: m, or rad for rotary devices, with N m, N m s/rad and kg m2 in place of N, N s/m and kg.
+
+The equations are the same for both. Every text of the program is written for metres; `in_unit` writes it for radians
+where it leaves the program: on the screen, in a picture, in a file's header or key.
+"""
+
+from __future__ import annotations
+
+import re
+from contextvars import ContextVar
+from typing import Any, Literal
+
+PositionUnit = Literal["m", "rad"]
+_spoken: ContextVar[PositionUnit] = ContextVar("unit", default="m")
+#: unit in a text -> the rotary one; of N, m and g alone only after a number, a list or an opening bracket
+_ROTARY = {"N s/m": "N m s/rad", "N/m": "N m/rad", "m/N": "rad/(N m)", "m/s": "rad/s", "kg": "kg m2"}
+_ALONE = {"N": "N m", "m": "rad", "g": "g m2"}
+_WORDS = re.compile(
+    r"(?<![\w/])(?P<prefix>[mu]?)(?P<unit>N s/m|N/m|m/N|m/s|kg(?! m2))(?![\w/])"
+    r"|(?<![\w/])(?P<small>[mu])m(?![\w/])"
+    r"|(?:(?<=[\d\])}] )|(?<=\[))(?P<milli>[mu]?)(?P<alone>N(?! m\b)|m|g(?! m2))(?![\w/²]| s/)"
+)
+_KEY = re.compile(r"_(n_per_m|mm|um|m|n|N)$")
+_KEYS = {"n_per_m": "nm_per_rad", "mm": "mrad", "um": "urad", "m": "rad", "n": "nm", "N": "Nm"}
+
+
+def speak(unit: PositionUnit) -> None:
+    """Set the unit of what this command prints and writes."""
+    _spoken.set(unit)
+
+
+def spoken() -> PositionUnit:
+    """Return the unit of what this command prints and writes."""
+    return _spoken.get()
+
+
+def in_unit(text: str, unit: PositionUnit | None = None) -> str:
+    """Return a text about metres in the unit `unit`, by default that of this command. Applying it twice is once."""
+    return _WORDS.sub(_rotary, text) if (unit or spoken()) == "rad" else text
+
+
+def with_unit(meta: dict[str, Any]) -> dict[str, Any]:
+    """Return a trace's meta data with "unit" where it is that of rotary devices."""
+    return meta | {"unit": "rad"} if spoken() == "rad" else meta
+
+
+def comments_in_unit(source: str) -> str:
+    """Return a C source with the comments in this command's unit; its code is unchanged."""
+    return re.sub(r"/\*.*?\*/", lambda comment: in_unit(comment[0]), source, flags=re.DOTALL)
+
+
+def _rotary(found: re.Match[str]) -> str:
+    if small := found["small"]:
+        return f"{small}rad"
+    if found["unit"]:
+        return found["prefix"] + _ROTARY[found["unit"]]
+    return found["milli"] + _ALONE[found["alone"]]
+
+
+def keys_in_unit(report: Any) -> Any:
+    """Return plain data with the keys and texts of this command's unit: encoder_step_m becomes encoder_step_rad."""
+    if spoken() == "m":
+        return report
+    if isinstance(report, dict):
+        return {_KEY.sub(lambda key: f"_{_KEYS[key[1]]}", k): keys_in_unit(value) for k, value in report.items()}
+    if isinstance(report, list):
+        return [keys_in_unit(value) for value in report]
+    return in_unit(report) if isinstance(report, str) else report

@@ -1,0 +1,125 @@
+"""Scenarios in radians: the numbers of metres, and the units of rotary devices in all that leaves the program."""
+
+import json
+import re
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from haptic_loop import certify, design_coupling, simulate
+from haptic_loop.controller.units import in_unit, keys_in_unit, speak
+from haptic_loop.hw.monitor import LinkSettings
+from haptic_loop.hw.session import session_for
+from haptic_loop.sim.couplings import read_coupling
+from haptic_loop.sim.scenario import InputError, load, parse
+
+WHEEL = Path(__file__).parents[2] / "examples/wheel.toml"
+LINEAR = re.compile(r"N s/m|N/m\b|m/N|(?<!\w)[mu]m\b|(?<!\w)m/s|kg(?! m2)|\d N(?! m)|\[N\]|\[m\]|_(m|n|N|mm)\b")
+
+
+@pytest.fixture(autouse=True)
+def _metres():
+    yield
+    speak("m")
+
+
+@pytest.mark.parametrize(
+    ("linear", "rotary"),
+    [
+        ("needs 1.2 of 3 N s/m", "needs 1.2 of 3 N m s/rad"),
+        ("K [N/m], B [N s/m]", "K [N m/rad], B [N m s/rad]"),
+        ("mass is 7 kg, 3 mm off", "mass is 7 kg m2, 3 mrad off"),
+        ("at 2 m/s, 12 N, 0.5 m", "at 2 rad/s, 12 N m, 0.5 rad"),
+        ("limited to [8, 9] N and [1] m", "limited to [8, 9] N m and [1] rad"),
+        ("force [N], x [m], x [mm], x [um]", "force [N m], x [rad], x [mrad], x [urad]"),
+        ("3 mN of 2 mJ in 4 ms; m channels, N draws", "3 mN m of 2 mJ in 4 ms; m channels, N draws"),
+        ("5e-4 m/N, 9 mm/s, 1 um", "5e-4 rad/(N m), 9 mrad/s, 1 urad"),
+    ],
+)
+def test_texts_take_the_rotary_units(linear, rotary):
+    assert in_unit(linear) == linear
+    assert in_unit(linear, "rad") == in_unit(rotary, "rad") == rotary
+
+
+def test_keys_take_the_rotary_units():
+    speak("rad")
+    report = {
+        "encoder_step_m": [1.0],
+        "peak_force_N": 2.0,
+        "largest_difference_n": 0.0,
+        "T_s": 1.0,
+        "of": {"x_m": "1 N"},
+    }
+    assert keys_in_unit(report) == {
+        **{"encoder_step_rad": [1.0], "peak_force_Nm": 2.0, "largest_difference_nm": 0.0, "T_s": 1.0},
+        "of": {"x_rad": "1 N m"},
+    }
+
+
+def test_radians_change_no_number():
+    """The wheel and the same numbers in metres: equal gains, requirement and trace; digests that differ."""
+    wheel = load(WHEEL)
+    handle = parse(WHEEL.read_text().replace('unit = "rad"', "").replace("radius = 0.15", ""))
+    gains, needs, forces = [], [], []
+    for scenario in (wheel, handle):
+        design = design_coupling(scenario.loop("I"))
+        gains.append((design.coupling.K.tolist(), design.coupling.B.tolist()))
+        needs.append(certify(scenario.loop("I"), design.coupling)["this-environment"].required)
+        forces.append(simulate(scenario.replace(duration=0.2), design).f.tolist())
+    assert gains[0] == gains[1]
+    assert needs[0] == needs[1]
+    assert forces[0] == forces[1]
+    assert wheel.digest != handle.digest
+    assert repr(wheel.loop("I")).count("N m s/rad") == 1
+
+
+def test_every_output_of_a_wheel_is_rotary(tmp_path, capsys):
+    """Tables, reports, headers, texts of pictures, C comments and logs of the commands that a wheel goes through."""
+    stored, out = tmp_path / "wheel.json", tmp_path / "out"
+    for command, *words in (
+        ("run", "--duration", "0.2", "--out", str(out)),
+        ("audit", "--K", "10", "--B", "0.01", "--out", str(out)),
+        ("design", "--case", "I", "--out", str(stored)),
+        ("check", str(stored)),
+        ("export", str(stored), "--out", str(tmp_path / "wheel.c")),
+        ("bridge", "--rehearse", "--duration", "0.3", "--measure", "60", "--out", str(out), "--no-plot"),
+        ("trace", str(out / "trace.npz"), "--plot", str(tmp_path / "trace.svg")),
+    ):
+        speak("m")
+        of = [] if command in ("check", "export", "trace") else ["--scenario", str(WHEEL)]
+        assert import_module(f"haptic_loop.cli.{command}").main([*words, *of]) == 0
+        report = out / "report.json"
+        told = " ".join(capsys.readouterr().out.split()) + (report.read_text() if report.exists() else "")
+        assert not (found := LINEAR.search(told)), (command, told[found.start() - 80 : found.end() + 80])
+    assert (out / "trace.csv").read_text().splitlines()[0] == "t [s],x1 [rad],f1 [N m]"
+    assert json.loads(report.read_text())["session"]["stage"] == "finished"
+    assert not LINEAR.search((out / "incidents.jsonl").read_text())
+    comments = re.findall(r"/\*.*?\*/", (tmp_path / "wheel.c").read_text(), flags=re.DOTALL)
+    assert not LINEAR.search(" ".join(comments))
+    assert read_coupling(stored).loop.unit == "rad"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("radius = 0.15", "radius = 3"), "radius is 3, allowed are"),
+        (('unit = "rad"', ""), 'radius is 0.15, which is for unit = "rad" only'),
+        (('"rad"', '"deg"'), "unit"),
+        (("mass = 0.02\ndamping = 0.1", "mass = 1e9\ndamping = 0.1"), "mass is 1e+09, allowed are 1e-06 to 1000 kg m2"),
+    ],
+)
+def test_wrong_rotary_fields_are_named(change, words):
+    with pytest.raises(InputError) as error:
+        parse(WHEEL.read_text().replace(*change))
+    assert words in str(error.value)
+
+
+def test_sessions_ask_for_the_radius():
+    """Limits are those of a hand: 2 N at 0.15 m are 0.3 N m, 1 m/s there is 6.7 rad/s."""
+    limits = session_for(load(WHEEL), LinkSettings(), cap=2.0).limits
+    assert limits.cap == (0.3,)
+    assert limits.speed == pytest.approx(1 / 0.15)
+    assert limits.jump == pytest.approx(0.02)
+    with pytest.raises(InputError, match="radius is missing"):
+        session_for(parse(WHEEL.read_text().replace("radius = 0.15", "")), LinkSettings())
