@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from haptic_loop.cli import render
 from haptic_loop.controller.environment import RIGID_WALL, Environment
-from haptic_loop.design.assessment import Assessment, Guarantee, RangesResult
+from haptic_loop.design.assessment import BELOW_LIMITS, Assessment, Guarantee, RangesResult
 from haptic_loop.design.guarantees import ANY, HERE, RANGES, EncoderSteps
 from haptic_loop.design.result import MAKING, Chosen, finite
 from haptic_loop.design.robustness import Nearby
@@ -84,6 +84,8 @@ def verdict(
     words = [f"[green]Stable[/] for {_who(guarantee)}{': ' + felt if felt else ''}."]
     if not assessment.holds:
         words.append(f"[red]Not certified[/] {_missing(assessment)}")
+    if guarantee.forces == BELOW_LIMITS and assessment.force_limits.force_limit:
+        words.append("Only while forces stay below their limits.")
     if guarantee.proof != "rational":
         words.append("By a refined sweep, without an exact proof.")
     if encoder and not encoder.covered:

@@ -219,6 +219,7 @@ class ForceLimits:
         force_limit: (m,) largest forces [N].
         less: Whether it is proved in one environment, while the guarantee holds in more.
         energy_budget: The energy W0 [J] that forces may give in all; None without a budget.
+        void: Whether nothing is guaranteed of the loop that runs, so that the limiter's proof says nothing of it.
     """
 
     rho: tuple[float, ...] | None
@@ -229,6 +230,7 @@ class ForceLimits:
     force_limit: tuple[float, ...] = ()
     less: bool = False
     energy_budget: float | None = None
+    void: bool = False
 
     def within(self, force_limit: Sequence[float]) -> ForceLimits:
         """Return the record with other limits (m,) [N], which no proof depends on."""
@@ -239,8 +241,11 @@ class ForceLimits:
         """One line for a report."""
         amounts = [f"{f:.4g}" for f in self.force_limit]
         limit = f"{', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N"
+        how = "clipped" if self.rho is None else "limited"
+        if self.void:
+            scaled = "" if self.energy_budget is None else " and scaled by an energy account"
+            return f"{how} to {limit}{scaled}, without a guarantee"
         if self.energy_budget is not None:
-            how = "clipped" if self.rho is None else "limited"
             return f"{how} to {limit}, and scaled so that they give at most {self.energy_budget:g} J"
         if self.rho is None:
             why = self.reason.removeprefix("limiter: ")
@@ -442,7 +447,7 @@ class Assessment:
 
     def without_guarantee(self, reason: str) -> Assessment:
         """Return the record without its guarantee, for a reason that the loop does not describe."""
-        return replace(self, guarantee=None, reason=reason)
+        return replace(self, guarantee=None, reason=reason, force_limits=replace(self.force_limits, void=True))
 
     def part(self) -> dict[str, Any]:
         """Return the fields of its JSON."""
@@ -553,7 +558,9 @@ def assess(
     if guarantee and guarantee.environments == RANGES and by_itself and environment is not None:
         assessment = replace(assessment, force_limits=replace(assessment.force_limits, less=True))
         guarantee, reason = _guarantee(assessment)
-    return replace(assessment, guarantee=guarantee, reason=reason)
+    if guarantee is None:
+        return assessment.without_guarantee(str(reason))
+    return replace(assessment, guarantee=guarantee)
 
 
 def _force_limits(
@@ -611,7 +618,7 @@ def _facts_of(
 _EVERYONE = "every passive hand"
 _LIMITED = "also while they are limited"
 _LIMITED_HERE = "also while they are limited, in this environment"
-_BELOW = "while they stay below their limits"
+BELOW_LIMITS = "while they stay below their limits"
 
 
 def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
@@ -648,7 +655,7 @@ def _within(assessment: Assessment) -> bool:
 def _stated(assessment: Assessment, by: Requirement, environments: str) -> Guarantee:
     """Return the guarantee of a certified requirement in these environments."""
     loop, limits = assessment.loop, assessment.force_limits
-    forces = _BELOW if limits.rho is None else _LIMITED_HERE if limits.less else _LIMITED
+    forces = BELOW_LIMITS if limits.rho is None else _LIMITED_HERE if limits.less else _LIMITED
     longest = loop.T_max or loop.T
     facts = tuple(fact for fact in assessment.facts if environments != ANY or fact not in ("walls", "ranges"))
     bounded = by.condition in KNOWN_CONDITIONS

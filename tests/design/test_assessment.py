@@ -9,6 +9,7 @@ from haptic_loop.cli.audit import main as audit
 from haptic_loop.cli.compare import main as compare
 from haptic_loop.cli.run import main as run
 from haptic_loop.cli.validate import main as validate
+from haptic_loop.cli.verdict import verdict
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.delay import VaryingDelay
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
@@ -74,6 +75,21 @@ def test_a_guarantee_names_the_forces_that_run():
     assert clipped.force_limits.rho is None
     assert limited.guarantee.forces != clipped.guarantee.forces
     assert "below" in clipped.guarantee.forces
+
+
+def test_a_clipped_guarantee_says_where_it_ends():
+    scenario = load()
+    loop, coupling = scenario.loop("I"), SpringDamper([600.0, 400.0], [0.5, 0.5])
+    clipped = assess(loop, coupling, limiter=False, force_limit=(12.0, 12.0))
+    limited = assess(loop, coupling, force_limit=(12.0, 12.0))
+    ends = "Only while forces stay below their limits."
+    assert ends in verdict(clipped)
+    assert ends not in verdict(limited)
+    assert "proved, also while forces are limited" in limited.force_limits.words
+    lost = limited.without_guarantee("a packet is lost")
+    assert lost.force_limits.words == "limited to 12 N, without a guarantee"
+    unstable = assess(loop, SpringDamper([1e5, 1e5], [0.0, 0.0]), force_limit=(12.0, 12.0))
+    assert unstable.force_limits.words == "clipped to 12 N, without a guarantee"
 
 
 def test_lost_packets_end_the_guarantee():
