@@ -74,7 +74,7 @@ def main(argv: list[str]) -> int:
         return _audited_world(args, scenario)
     loop = options.rigid_loop(args, scenario) if args.rigid else scenario.loop(args.case)
     coupling = _coupling(args, loop, scenario)
-    asked = named(args.condition) if args.condition else None
+    condition = named(args.condition) if args.condition else None
     with options.refused("--varying-delay: "):
         loop = loop.switching(_switching(args, loop))
     out = options.out_folder(args, "audit")
@@ -83,28 +83,28 @@ def main(argv: list[str]) -> int:
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
         limits = () if args.rigid else [device.force_limit for device in scenario.axis_devices]
         with options.refused():
-            found = audit(loop, coupling, asked, args.seed, limits, move)
+            audited = audit(loop, coupling, condition, args.seed, limits, move)
     notes = ()
     if args.coupling and not _is_own(args):  # judge the file in the audited loop
-        notes = from_file(read_coupling(args.coupling), loop, own=asked).notes
-    _, own = name_and_own(asked)
-    notes = (*notes, own.said(found.assessment.requirements[own.name])) if own else notes
+        notes = from_file(read_coupling(args.coupling), loop, own=condition).notes
+    _, own = name_and_own(condition)
+    notes = (*notes, own.said(audited.assessment.requirements[own.name])) if own else notes
     report = _Report(
         args.case,
         None if args.rigid else scenario.name,
         _CatalogueDevice(args.device, CATALOGUE[args.device]) if args.device else None,
         args.source if args.device else None,
-        found,
+        audited,
         None if args.rigid else encoder_steps(scenario, args.case, coupling),
         notes,
         time.perf_counter() - begin,
     )
-    said = verdicts.verdict(found.assessment, encoder=report.encoder)
+    said = verdicts.verdict(audited.assessment, encoder=report.encoder)
     if args.rigid and isinstance(coupling, SpringDamper):
-        said = f"{said} {_stiffest_wall(found, coupling)}"
-    caveats = [found.not_covered, *([found.switching.not_covered or ""] if found.switching else [])]
-    render.publish(args, report, _tables(found), _remarks(report), out, verdict=said, details=caveats)
-    return options.exit_code(found.assessment.holds)
+        said = f"{said} {_stiffest_wall(audited, coupling)}"
+    caveats = [audited.not_covered, *([audited.switching.not_covered or ""] if audited.switching else [])]
+    render.publish(args, report, _tables(audited), _remarks(report), out, verdict=said, details=caveats)
+    return options.exit_code(audited.assessment.holds)
 
 
 def _parser() -> options.Parser:
@@ -138,18 +138,18 @@ def _with_device(args: argparse.Namespace) -> argparse.Namespace:
         return args
     with options.refused("--"):
         name, device = listed_device(args.device)
-    found: dict[str, Any] = {"device": name, "source": None}
+    fields: dict[str, Any] = {"device": name, "source": None}
     if args.delta is None:
         if device.damping is None:
             raise InputError(f"--device {name}: nobody publishes its damping: give --delta, as measured by hw.identify")
-        found["delta"] = (device.damping.value,)
+        fields["delta"] = (device.damping.value,)
     gained = args.coupling or args.case == "none" or (args.K and args.B)
     if device.stiffness and device.framework_damping and not gained:
-        found["source"] = f"K and B: {device.stiffness.source}; T: the 1 kHz that haptic loops customarily run at"
+        fields["source"] = f"K and B: {device.stiffness.source}; T: the 1 kHz that haptic loops customarily run at"
         largest = {"K": (device.stiffness.value,), "B": (device.framework_damping.value,)}
-        given = {key: value for key, value in vars(args).items() if value is not None and value is not False}
-        found |= {key: value for key, value in (largest | _FRAMEWORK_LOOP).items() if key not in given}
-    return argparse.Namespace(**(vars(args) | found))
+        options_given = {key: value for key, value in vars(args).items() if value is not None and value is not False}
+        fields |= {key: value for key, value in (largest | _FRAMEWORK_LOOP).items() if key not in options_given}
+    return argparse.Namespace(**(vars(args) | fields))
 
 
 _FRAMEWORK_LOOP: dict[str, Any] = {"T": 1e-3, "theta": (0,), "rigid": True}
@@ -187,8 +187,8 @@ def _audited_world(args: argparse.Namespace, scenario: Scenario) -> int:
     if args.coupling and Path(args.coupling).exists():
         chosen = choose(scenario, args.case, args.coupling)
     elif args.K or args.B or args.coupling or args.case == "none":
-        made = _coupling(args, scenario.loop(args.case), scenario)
-        chosen = Chosen(made, ANY_ENVIRONMENT.name, kind=args.coupling or "spring-damper")
+        coupling = _coupling(args, scenario.loop(args.case), scenario)
+        chosen = Chosen(coupling, ANY_ENVIRONMENT.name, kind=args.coupling or "spring-damper")
     else:
         chosen = choose(scenario, args.case)
     return world.audit(args, scenario, chosen, options.out_folder(args, "audit"))
@@ -204,14 +204,14 @@ def _coupling(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> Coupl
     from haptic_loop.sim.couplings import fitted, own_of, read_coupling
 
     gains = [name for name in ("K", "B") if getattr(args, name) is not None]
-    given = [f"--{name}" for name in (*gains, *(["coupling"] if args.coupling else []))]
+    names = [f"--{name}" for name in (*gains, *(["coupling"] if args.coupling else []))]
     if args.case == "none":
-        if given or args.rigid:
-            raise InputError(f"{(given or ['--rigid'])[0]} with --case none: that case is the loop without coupling")
+        if names or args.rigid:
+            raise InputError(f"{(names or ['--rigid'])[0]} with --case none: that case is the loop without coupling")
         return NoCoupling()
     if args.coupling:
         if gains:
-            raise InputError(f"{given[0]} with --coupling: give one of them")
+            raise InputError(f"{names[0]} with --coupling: give one of them")
         if _is_own(args):
             return own_of(args.coupling, loop).coupling
         if args.coupling in KINDS and not Path(args.coupling).exists():
@@ -300,10 +300,10 @@ _ROWS: dict[str, Callable[[Requirement, Margins], str]] = {
 
 
 def _remarks(report: _Report) -> Iterator[str]:
-    found = report.audit
+    audited = report.audit
     yield from (f"{note}." for note in report.notes)
-    requirements = found.assessment.requirements
-    for condition, part in found.margins.items():
+    requirements = audited.assessment.requirements
+    for condition, part in audited.margins.items():
         needs = requirements[condition]
         sensitivity = part.sensitivity.reason if needs.certified else None
         reasons = {
@@ -312,13 +312,13 @@ def _remarks(report: _Report) -> Iterator[str]:
             ", sensitivity": sensitivity,
         }
         yield from (f"{condition}{of}: {reason}." for of, reason in reasons.items() if reason)
-    if not found.assessment.holds:
-        yield from _proposed(found.helps)
-    if found.switching:
-        yield from _switching_remarks(found.switching)
-    if torques := found.assessment.held_torques:
+    if not audited.assessment.holds:
+        yield from _proposed(audited.helps)
+    if audited.switching:
+        yield from _switching_remarks(audited.switching)
+    if torques := audited.assessment.held_torques:
         yield f"Held torques: {torques}."
-    if left := found.left_over:
+    if left := audited.left_over:
         yield f"{left.words[0].upper()}{left.words[1:]}."
     if part := report.encoder:
         yield f"{part.words[0].upper()}{part.words[1:]}."
@@ -342,5 +342,5 @@ def _switching_remarks(found: Switching) -> Iterator[str]:
         yield f"any switching: {needs.reason}."
         return
     enough = "certified" if buffered.certified else "not certified"
-    asked = listed(buffered.required_damping)
-    yield f"A playout buffer to the constant {listed(found.hi)} needs {asked} N s/m: {enough}."
+    needed = listed(buffered.required_damping)
+    yield f"A playout buffer to the constant {listed(found.hi)} needs {needed} N s/m: {enough}."

@@ -116,9 +116,9 @@ def _assessed(stored: Stored, own: Condition | None, searched: Searched | None) 
     claim = stored.certificate
     assert claim
     condition = own or claim.condition
-    found = searched if stored.loop.ranges else None
+    ranges = searched if stored.loop.ranges else None
     built = stored.built()
-    return assess(stored.loop, built, certificate=claim, condition=condition, ranges_samples=0, searched=found)
+    return assess(stored.loop, built, certificate=claim, condition=condition, ranges_samples=0, searched=ranges)
 
 
 def _searched(stored: Stored, condition: Condition | None) -> Searched | None:

@@ -45,8 +45,8 @@ def _parser() -> options.Parser:
         "design.compare", what, "python -m design.compare", two, first="scenario coupling condition reference out json"
     )
     parser.add_loop()
-    given = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION asks for a condition"
-    parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"over frequency: {given}")
+    names = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION asks for a condition"
+    parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"over frequency: {names}")
     parser.add_condition("of designs that name none; one of your own judges all couplings")
     parser.add_output(picture=True)
     return parser
@@ -70,12 +70,12 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
         raise InputError("--condition is for the designs of --coupling; without it every coupling is a row")
     out = options.out_folder(args, "compare")
     with render.progress("running every coupling") as move:
-        made = alternatives(scenario, args.case, move, args.condition)
+        rows = alternatives(scenario, args.case, move, args.condition)
     files = []
-    if render.is_drawn(args, out / "couplings.png", any(each.trace is not None for each in made)):
-        files.append(_side_by_side(made, out / "couplings.png", scenario.environment.contacts))
-    report = _Alternatives(scenario.name, args.case, made)
-    render.publish(args, report, [_beside(made, args.condition)], (), out, files, _nearest(made))
+    if render.is_drawn(args, out / "couplings.png", any(each.trace is not None for each in rows)):
+        files.append(_side_by_side(rows, out / "couplings.png", scenario.environment.contacts))
+    report = _Alternatives(scenario.name, args.case, rows)
+    render.publish(args, report, [_beside(rows, args.condition)], (), out, files, _nearest(rows))
     return options.exit_code(True)
 
 

@@ -150,15 +150,15 @@ def _for_switching(args: argparse.Namespace) -> bool:
 def _asked_of(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     """Return the options of a design by argument name. Raises InputError for options of another coupling."""
     known = dict.fromkeys(name for design in KINDS.values() for name in design.options)
-    given = {name: value for name in known if options.given(value := getattr(args, name, None))}
+    values = {name: value for name in known if options.given(value := getattr(args, name, None))}
     if kind_of(kind).limited and args.limiter is not None:
-        given["limiter"] = args.limiter
-    for name in given:
+        values["limiter"] = args.limiter
+    for name in values:
         taking = [other for other, design in KINDS.items() if name in design.options]
         if kind not in taking:
             shown = name.removesuffix("_hz").replace("_", "-")
             raise InputError(f"--{shown} is for --coupling {' or '.join(taking)}, not {kind}")
-    return given
+    return values
 
 
 def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[Design, Ringing | None]:
@@ -168,18 +168,18 @@ def _design(args: argparse.Namespace, loop: Loop, scenario: Scenario) -> tuple[D
     """
     from haptic_loop.design.api import proved
 
-    asked = _asked_of(args, args.coupling)
+    further = _asked_of(args, args.coupling)
     if loop.varying_delay and _for_switching(args):
-        asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
+        further["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
     with options.refused(args=args), render.designing(loop, args.coupling, args.condition) as progress:
-        made = partial(design_by_kind, kind=args.coupling, condition=args.condition, progress=progress, **asked)
+        make = partial(design_by_kind, kind=args.coupling, condition=args.condition, progress=progress, **further)
         if args.decay is None:
-            return proved(loop, made(loop)), None
+            return proved(loop, make(loop)), None
         if not kind_of(args.coupling).softened:
             able = " or ".join(name for name, kind in KINDS.items() if kind.softened)
             raise InputError(f"--decay is for --coupling {able}, not {args.coupling}")
     with render.progress("designing softer and softer couplings"):  # its failure names no other coupling
-        design, dies_away = _that_decays(scenario, loop, made, args.decay)
+        design, dies_away = _that_decays(scenario, loop, make, args.decay)
         return proved(loop, design), dies_away
 
 
@@ -262,15 +262,15 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
     band, best = args.band_hz or BAND_HZ, design if isinstance(design, Optimal) else None
     known = assessment.requirements.get("switching")
     switching = coverage.Switching.of(loop, design.coupling, known) if loop.varying_delay else None
-    asked = Options(**_asked_of(args, "optimal")) if best else DEFAULT
+    chosen_options = Options(**_asked_of(args, "optimal")) if best else DEFAULT
     nearby, limit, interrupted = Nearby(), None, False
     kept = f"{stored.file} is stored (Ctrl-C leaves out what follows)"
     try:
         if best:
             with render.progress(f"{kept}: working out the bound"):
-                limit = BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, asked)
+                limit = BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, chosen_options)
         with render.progress(f"{kept}: working out robustness and its price"):
-            nearby = nearby_of(loop, design.coupling, asked, named(design.asked))
+            nearby = nearby_of(loop, design.coupling, chosen_options, named(design.asked))
     except KeyboardInterrupt:
         interrupted = True
     nominal = None
@@ -412,8 +412,8 @@ def _both(name: str, form: str) -> Callable[[coverage.OverRanges], str]:
     """Return the cell of a figure: nominal environment / worst of the ranges."""
 
     def cell(row: coverage.OverRanges) -> str:
-        found: coverage.NominalWorst = getattr(row, name)
-        return " / ".join(render.optional(finite(value), form) for value in (found.nominal, found.worst))
+        figures: coverage.NominalWorst = getattr(row, name)
+        return " / ".join(render.optional(finite(value), form) for value in (figures.nominal, figures.worst))
 
     return cell
 

@@ -247,16 +247,16 @@ def _with_transmissions(
     """The report with bounds of every motor and transmission, or with the reason why there are none."""
     if reason := "; ".join(sitting.reason for sitting in clamped if sitting.reason):
         return replace(report, no_transmissions=reason)
-    found = list[TransmissionBounds]()
+    bounds = list[TransmissionBounds]()
     for i in range(scenario.channels):
         free = min((s for s in sittings if s.axes), key=lambda s: s.axes[i].viscous)  # the one without a hand
         try:
             first, *others = (records_of(s.recorder, s.session)[i] for s in (free, *clamped))
             step = free.session.units.encoder_step[i]
-            found.append(transmission_bounds(first, others, scenario.T, step, free.axes[i].friction))
+            bounds.append(transmission_bounds(first, others, scenario.T, step, free.axes[i].friction))
         except ValueError as error:
             return replace(report, no_transmissions=f"axis {i + 1}: {error}")
-    return replace(report, transmissions=found)
+    return replace(report, transmissions=bounds)
 
 
 def _table(e: Estimate, scenario: Scenario, i: int, bounds: Sequence[TransmissionBounds] | None) -> str:
@@ -276,8 +276,8 @@ def _table(e: Estimate, scenario: Scenario, i: int, bounds: Sequence[Transmissio
         lines += [f"{name} = {np.floor(1e6 * getattr(known, name)) / 1e6:.6f}" for name in least]
         lines += [f"{most} = {np.ceil(1e6 * getattr(known, most)) / 1e6:.6f}"]
         return "\n".join([*lines, f"transmission_stiffness_max = {np.ceil(known.transmission_stiffness_max):.1f}", ""])
-    if (found := e.transmission) is not None:
-        motor, handle, stiffness = found.motor_mass, found.handle_mass, found.stiffness
+    if (transmission := e.transmission) is not None:
+        motor, handle, stiffness = transmission.motor_mass, transmission.handle_mass, transmission.stiffness
     else:
         lines.insert(0, "# no transmission explained the record: its stiffness and how masses are shared are declared")
         motor = mass * device.motor_mass / (device.motor_mass + device.handle_mass)
@@ -300,10 +300,10 @@ def _bounds(known: Sequence[TransmissionBounds]) -> render.Table:
 def _figures(report: _Report) -> render.Table:
     cells = []
     for i, axis in enumerate(report.axes, start=1):
-        found = axis.friction
+        friction = axis.friction
         mode = "-" if axis.transmission is None else f"{axis.transmission.mode_hz:.2f}"
         names = ("mass", "viscous", "coulomb", "stiffness")
-        figures = [f"{getattr(found, name):.5g} ± {2 * found.errors[name]:.2g}" for name in names]
+        figures = [f"{getattr(friction, name):.5g} ± {2 * friction.errors[name]:.2g}" for name in names]
         bound = f"{np.floor(1e4 * axis.delta) / 1e4:.4f}" if report.bounded else "-"  # never above the bound
         cells.append((str(i), *figures, mode, bound, f"{np.floor(1e2 * axis.viscosity.speed) / 1e2:.2f}"))
     heads = (

@@ -90,25 +90,25 @@ class Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # parse_args calls it
         """Parse as argparse does; refuse empty values, and a --json file that cannot be written."""
-        found, rest = super().parse_known_args(*args, **how)
+        parsed, rest = super().parse_known_args(*args, **how)
         if rest:
             what = "option" if rest[0].startswith("-") else "word"
             raise InputError(f"unknown {what} {rest[0]}{self._near(rest[0])} (--help lists the options)")
-        if "reference" in found:
-            _translate(found)
-        if ":" in (getattr(found, "condition", None) or ""):
-            found.condition = own_condition(found.condition)
+        if "reference" in parsed:
+            _translate(parsed)
+        if ":" in (getattr(parsed, "condition", None) or ""):
+            parsed.condition = own_condition(parsed.condition)
         for action in self._actions:
-            if getattr(found, action.dest, None) == "":
+            if getattr(parsed, action.dest, None) == "":
                 raise InputError(f"{action.option_strings[-1] if action.option_strings else action.dest} is empty")
         for where, acts, names in self._only:
-            for name in names if not acts(found) else ():
-                if getattr(found, name) != self.get_default(name):
+            for name in names if not acts(parsed) else ():
+                if getattr(parsed, name) != self.get_default(name):
                     option = next(a.option_strings[-1] for a in self._actions if a.dest == name and a.option_strings)
                     raise InputError(f"{option} is only {where}")
-        if getattr(found, "json", None) not in (None, "-"):
-            check_file("--json", Path(found.json), "a file or -")
-        return found, rest
+        if getattr(parsed, "json", None) not in (None, "-"):
+            check_file("--json", Path(parsed.json), "a file or -")
+        return parsed, rest
 
     def _near(self, word: str) -> str:
         known = [name for action in self._actions if action.help != argparse.SUPPRESS for name in action.option_strings]
@@ -292,10 +292,10 @@ def _parts(text: str, kind: Callable[[str], _Number], expected: str, within: str
 
 def pair(text: str) -> tuple[float, float]:
     """Parse two numbers separated by a comma."""
-    found = _parts(text, float, expected := "two numbers separated by a comma")
-    if len(found) != 2:
+    numbers = _parts(text, float, expected := "two numbers separated by a comma")
+    if len(numbers) != 2:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}")
-    return found[0][0], found[1][0]
+    return numbers[0][0], numbers[1][0]
 
 
 def _band_of(text: str) -> tuple[float, float]:
@@ -347,12 +347,12 @@ def own_condition(text: str) -> Condition:
     from haptic_loop.design.certificate import named as checked
     from haptic_loop.design.conditions import Condition
 
-    found = named("--condition", text)
-    made = called(f"--condition {text}", found) if isinstance(found, type) else found
-    if not isinstance(made, Condition):
-        raise InputError(f"--condition {text} is {made!r}, expected a design.conditions.Condition")
+    loaded = named("--condition", text)
+    condition = called(f"--condition {text}", loaded) if isinstance(loaded, type) else loaded
+    if not isinstance(condition, Condition):
+        raise InputError(f"--condition {text} is {condition!r}, expected a design.conditions.Condition")
     with refused(f"--condition {text}: "):
-        return checked(made)
+        return checked(condition)
 
 
 def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
@@ -404,8 +404,8 @@ def delay_range(pairs: tuple[tuple[int, int], ...], loop: Loop, most: int) -> De
         pairs = loop.per_channel(pairs)
     lo, hi = zip(*per_channel("--varying-delay", pairs, loop.channels, "ranges"), strict=True)
     if any(not 0 <= a <= b <= most for a, b in zip(lo, hi, strict=True)):
-        asked = ",".join(f"{a}-{b}" for a, b in pairs)
-        raise InputError(f"--varying-delay is {asked}, expected 0 <= LO <= HI <= {most} samples")
+        spans = ",".join(f"{a}-{b}" for a, b in pairs)
+        raise InputError(f"--varying-delay is {spans}, expected 0 <= LO <= HI <= {most} samples")
     return DelayRange(lo, hi)
 
 
@@ -464,9 +464,9 @@ def in_world(scenario: Scenario, file: str) -> Scenario:
     with refused("--world: "):
         bodies = touchable_bodies(Path(file))
     if len(bodies) != scenario.channels:
-        found = f"{len(bodies)} named bodies without a joint ({', '.join(bodies) or 'none'})"
+        listed = f"{len(bodies)} named bodies without a joint ({', '.join(bodies) or 'none'})"
         need = f"{scenario.name} has {scenario.channels} contact{'s' if scenario.channels > 1 else ''}"
-        raise InputError(f"--world {file} has {found}, {need}: name contacts in a scenario, as in world-cube")
+        raise InputError(f"--world {file} has {listed}, {need}: name contacts in a scenario, as in world-cube")
     return scenario.replace(environment=world_environment({"world": str(Path(file).resolve()), "contacts": bodies}))
 
 

@@ -107,9 +107,9 @@ def publish(
     """
     outcome = plain(report)
     if folder:
-        kept = folder / "report.json"
-        outcome["files"] = [*map(str, files), str(kept)]
-        write_json(kept, outcome)
+        file = folder / "report.json"
+        outcome["files"] = [*map(str, files), str(file)]
+        write_json(file, outcome)
     if verdict:
         announce(args, verdict)
     screen = console(args)
@@ -144,12 +144,12 @@ def pictures(
     args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, str], content: bool = True
 ) -> list[Path]:
     """Draw the pictures of a report: file -> function of sim.plots. With --no-plot matplotlib is not loaded."""
-    wanted = {folder / file: name for file, name in drawn.items() if is_drawn(args, folder / file, content)}
-    if not wanted:
+    drawn_files = {folder / file: name for file, name in drawn.items() if is_drawn(args, folder / file, content)}
+    if not drawn_files:
         return []
     from haptic_loop.sim import plots
 
-    return [getattr(plots, name)(report, path) for path, name in wanted.items()]
+    return [getattr(plots, name)(report, path) for path, name in drawn_files.items()]
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -50,17 +50,17 @@ def main(argv: list[str]) -> int:
     chosen = chosen_by(args, scenario)  # V, Q or R
     budget = args.energy_budget[0] if args.energy_budget else None
     assessment = assessment_of(args, scenario, chosen, simulated.environment, budget)
-    done = _run(args, simulated, assessment)  # sample, compute, limit, hold, advance
+    run = _run(args, simulated, assessment)  # sample, compute, limit, hold, advance
     nearby = _nearby(scenario.loop(args.case), chosen, assessment)
-    report = run_report(scenario, args.case, chosen, assessment, done, environment, args.cross_check)
+    report = run_report(scenario, args.case, chosen, assessment, run, environment, args.cross_check)
     report = replace(report, nearby=nearby)
     if args.paper:
         report = replace(report, paper=_paper(args, simulated, report))
     render.announce(args, verdicts.verdict(assessment, nearby, report.ideal_force.error_percent, report.encoder))
     with render.progress("storing the trace and drawing the picture"):
-        files = _save(args, out, done, report)
+        files = _save(args, out, run, report)
     render.publish(args, report, _tables(scenario, report), report.remarks, out, files, details=_details(report))
-    return options.exit_code(True, done.trace.interrupted)
+    return options.exit_code(True, run.trace.interrupted)
 
 
 def _parser() -> options.Parser:
@@ -82,8 +82,8 @@ def _parser() -> options.Parser:
     steps = "MuJoCo steps per period (default: what the plant asks)"
     add("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
     add("--duration", type=options.number(), metavar="SECONDS", help="simulated time (default: the scenario's)")
-    asked = "compare engines and steps on this scene, run with the cheapest that keeps this relative rms error"
-    add("--error", type=options.number(1e-18, 1.0), metavar="E", help=asked)
+    error = "compare engines and steps on this scene, run with the cheapest that keeps this relative rms error"
+    add("--error", type=options.number(1e-18, 1.0), metavar="E", help=error)
     check = "run RK4 beside the exponential engine, with which it shares no matrix"
     add("--cross-check", action="store_true", help=check)
     parser.add_human()
@@ -178,15 +178,15 @@ def _walls(run: ScenarioRun) -> tuple[list[tuple[int, float, str]], Any]:
     law, network = run.simulation.process.law, run.simulation.scenario.environment
     if not network.walls:
         return [], None
-    found = []
+    walls = []
     for number, wall in enumerate(network.walls, start=1):
         (first, second), sign = wall.between, 1.0
         if first == GROUND:
             (first, second), sign = (second, first), -1.0
         if second == GROUND and first in network.contacts:
             name = f"wall {number}, {1e3 * wall.gap:g} mm from {first} at rest"
-            found.append((network.contacts.index(first), sign * wall.gap, name))
-    return found, (law.depths(run.trace.z) > 0).any(axis=1)
+            walls.append((network.contacts.index(first), sign * wall.gap, name))
+    return walls, (law.depths(run.trace.z) > 0).any(axis=1)
 
 
 def _title(what: str, report: RunReport) -> str:

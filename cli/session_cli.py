@@ -238,8 +238,8 @@ def hold_session(
         device = _device(args, session, stack)
         if args.port and not args.no_preflight:
             with progress("looking at this machine"):
-                found = preflight(_ports(args))
-            console(args).print(found, soft_wrap=True, highlight=False)
+                problems = preflight(_ports(args))
+            console(args).print(problems, soft_wrap=True, highlight=False)
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
         seen = sys.stderr.isatty()
         if seen and keyboard is not None:

@@ -31,19 +31,19 @@ def main(argv: list[str]) -> int:
         check_file("--plot", Path(args.plot))
     result = Trace.load_npz(Path(args.trace))
     speak(result.meta.get("unit", "m"))
-    found = growths(result)
+    rates = growths(result)
     if not result.t.size:
         raise InputError(f"{args.trace}: it has no ticks")
     if args.plot:
         from haptic_loop.sim.plots import draw_run, save
 
-        strongest = next((one.frequency_hz for one in found if one.frequency_hz), _ZOOM_HZ)
+        strongest = next((one.frequency_hz for one in rates if one.frequency_hz), _ZOOM_HZ)
         save(draw_run(result, args.trace, strongest), Path(args.plot))
-    traced = _Traced(args.trace, result.t.size, float(result.t[-1]), found)
+    traced = _Traced(args.trace, result.t.size, float(result.t[-1]), rates)
     T = traced.duration_s / max(1, traced.ticks - 1)
-    lines = [f"growth, {one.words(T)}" for one in found]
+    lines = [f"growth, {one.words(T)}" for one in rates]
     none = "No loop was closed at full gain: there is no growth to report."
-    render.publish(args, traced, (), lines, verdict=_verdict(found) if found else none)
+    render.publish(args, traced, (), lines, verdict=_verdict(rates) if rates else none)
     return options.DONE
 
 

@@ -79,23 +79,29 @@ def _parser() -> options.Parser:
         "python -m sim.validate --coupling none --humans 200 --duration 0",
         first="scenario coupling condition humans adversary json",
     )
-    add, whole = parser.add_argument, options.whole
+    add, whole_number = parser.add_argument, options.whole
     parser.add_loop()
     parser.add_varying_delays()
     parser.add_coupling(", ".join(NAMES))
     parser.add_human(", or a population with draw(rng, n), in a .py")
     parser.add_limiter()
     many = f"random humans per device (default {_HUMANS}, in a world {_IN_A_WORLD})"
-    add("--humans", type=whole(1, 1_000_000), metavar="N", help=many)
+    add("--humans", type=whole_number(1, 1_000_000), metavar="N", help=many)
     add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
     add("--engine", choices=ENGINES, default="both", help="who decides (default both)")
     seconds = "length of the traces (default 2; 0 for none)"
     add("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
-    made = "hands that MuJoCo simulates, too: sampled (default: nearest to the limit, lossless, 64 others) or all"
-    add("--traces", choices=("sampled", "all"), default="sampled", help=made)
-    add("--shards", type=whole(1, 256), default=1, metavar="K", help="local processes, for the same result (default 1)")
+    traced = "hands that MuJoCo simulates, too: sampled (default: nearest to the limit, lossless, 64 others) or all"
+    add("--traces", choices=("sampled", "all"), default="sampled", help=traced)
+    add(
+        "--shards",
+        type=whole_number(1, 256),
+        default=1,
+        metavar="K",
+        help="local processes, for the same result (default 1)",
+    )
     add("--adversary", action="store_true", help="also search for the worst passive human")
-    add("--generations", type=whole(1, 10_000), metavar="N", help="length of that search (default 150)")
+    add("--generations", type=whole_number(1, 10_000), metavar="N", help="length of that search (default 150)")
     met = "nominal (default), or ranges: in turn all vertices of the scenario's ranges and as many others inside"
     add("--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
     parser.add_output(picture=True)
@@ -161,22 +167,22 @@ def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, as
     """Search the worst humans in the environment that needs the most damping, until Ctrl-C or the end."""
     from haptic_loop.sim.adversary import search, search_population
 
-    asked = [need for need in assessment.requirements.values() if need.condition in _OF_HERE]
-    scenario, ratio = question.scenario, min(need.ratio for need in asked)
+    judged = [need for need in assessment.requirements.values() if need.condition in _OF_HERE]
+    scenario, ratio = question.scenario, min(need.ratio for need in judged)
     if question.environments and assessment.ranges:
         member, requirement = assessment.ranges.worst_found
         scenario, ratio = scenario.replace(environment=member.network, ranges=None), requirement.ratio
-    found: list[Worst] = []
+    worst: list[Worst] = []
     try:
         for seek in (search, search_population)[: 1 if isinstance(scenario.population, Population) else 2]:
             with render.progress("searching the worst human") as move:
                 frozen = assemble(scenario, chosen.coupling).process.law.frozen().values()
                 loop = scenario.loop(args.case)
                 F = max(frozen, key=lambda F: this_environment(F, loop).ratio)  # the state that needs the most damping
-                found.append(seek(scenario, F, args.seed, args.generations or 150, progress=move))
+                worst.append(seek(scenario, F, args.seed, args.generations or 150, progress=move))
     except KeyboardInterrupt:
-        return _Searched(*found, ratio=ratio, interrupted=True)
-    return _Searched(*found, ratio=ratio)
+        return _Searched(*worst, ratio=ratio, interrupted=True)
+    return _Searched(*worst, ratio=ratio)
 
 
 def _save(
@@ -322,7 +328,7 @@ def _reported(
     both, bad, grows = question.engine != "exact", unstable(findings.exact), unstable(findings.mujoco)
     disagreements, wrong = int(findings.disagreements.sum()), bad | (both & grows & (findings.mujoco > 1e-3))
     interrupted = findings.interrupted or searched.interrupted
-    kept = f"{findings.index.size} humans were finished before"
+    finished = f"{findings.index.size} humans were finished before"
     return _Report(
         case=args.case,
         scenario=scenario.name,
@@ -352,8 +358,8 @@ def _reported(
         holds=also and not disagreements and not (certified and wrong.any()) if any_done else None,
         reason=None if any_done else _NOTHING,
         interrupted=interrupted,
-        kept=kept,
-        ended=kept if interrupted else None,
+        kept=finished,
+        ended=finished if interrupted else None,
         unfinished=findings.lost or None,
         wall_s=wall,
         simulated_s_per_s=findings.simulated / wall,

@@ -58,8 +58,8 @@ def main(argv: list[str]) -> int:
         args.script = args.script or "0:restart"
     label, script = _beginning(args, scenario.channels)
     # --case none begins without a coupling; keys choose couplings for case I.
-    given = args.coupling if label == GIVEN else None
-    menu = Menu("I" if args.case == "none" else args.case, args.condition, given, args.limiter)
+    file = args.coupling if label == GIVEN else None
+    menu = Menu("I" if args.case == "none" else args.case, args.condition, file, args.limiter)
     prepared = first_loop(menu, scenario, label)
     executor = ThreadPoolExecutor(1)
     try:
@@ -232,8 +232,8 @@ def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
             move(i + 1, count)
 
     with closing(artist), render.progress("filming") as move:
-        made = save_film(Path(args.video), pictures(move), args.fps)
-    return _Ended(interrupted, _Film(args.video, made, args.fps))
+        pictures_made = save_film(Path(args.video), pictures(move), args.fps)
+    return _Ended(interrupted, _Film(args.video, pictures_made, args.fps))
 
 
 def _window(session: LiveLoop, duration: float | None) -> _Ended:

@@ -140,15 +140,17 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
         peak_force_N=np.abs(trace.f).max(axis=0, initial=0.0).tolist(),
         wall_s=time.perf_counter() - began,
     )
-    kept = replace(trace, meta=render.plain(report))
-    files = [kept.save_npz(out / "trace.npz"), kept.save_csv(out / "trace.csv")]
+    labelled = replace(trace, meta=render.plain(report))
+    files = [labelled.save_npz(out / "trace.npz"), labelled.save_csv(out / "trace.csv")]
     written = scene_xml(finished.simulation), scene_of(scenario, chosen.coupling).xml
     files += [write(out / name, xml) for name, xml in zip(_WRITTEN, written, strict=True)]
     if not args.no_plot and trace.t.size > 1:
         from haptic_loop.sim.plots import Contacts, draw_run, save
 
         around = Contacts(scenario.environment.contacts)
-        files.append(save(draw_run(kept, f"{scenario.name}: a MuJoCo world", 1.0, around=around), out / "figure.png"))
+        files.append(
+            save(draw_run(labelled, f"{scenario.name}: a MuJoCo world", 1.0, around=around), out / "figure.png")
+        )
     title = f"{report.guarantee} The shell acted on {figures.limited_ticks} of {figures.ticks} ticks."
     render.publish(args, report, [render.facts(title, _run_rows(report, figures, scenario), left=True)], (), out, files)
     return options.exit_code(True, trace.interrupted)
@@ -219,9 +221,9 @@ def design(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
     loop, kind = scenario.loop(args.case), args.coupling
     condition = args.condition or ANY_ENVIRONMENT.name
     with options.refused(args=args), render.designing(loop, kind, condition) as progress:
-        made = proved(loop, design_by_kind(loop, kind, condition, progress))
-    filed = store(loop, made, out)
-    report = _reported(args, scenario, replace(made, kind=kind), START_J)
+        design_made = proved(loop, design_by_kind(loop, kind, condition, progress))
+    filed = store(loop, design_made, out)
+    report = _reported(args, scenario, replace(design_made, kind=kind), START_J)
     rows = [*_common_rows(report), ("stored", f"{out} (proof: {filed.proof or 'none'})")]
     render.publish(args, report, [render.facts(report.guarantee, rows, left=True)])
     return options.exit_code(report.guaranteed)

@@ -61,8 +61,8 @@ def main(argv: list[str]) -> int:
     )
     with render.progress("certificates") as move:
         drawn = zwidth.draw_map(sweep, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
-    found = [] if drawn.interrupted else [zwidth.evaluate_point(sweep, crowd, K, B, grid.K) for K, B in marks]
-    report = MapReport.of(scenario, sweep, drawn, plan, fixed, found, args.humans, args.seed)
+    points = [] if drawn.interrupted else [zwidth.evaluate_point(sweep, crowd, K, B, grid.K) for K, B in marks]
+    report = MapReport.of(scenario, sweep, drawn, plan, fixed, points, args.humans, args.seed)
     files = [save_csv(drawn, out / "map.csv")]
     if render.is_drawn(args, out / "zwidth.png"):
         from haptic_loop.sim.map_plot import plot_zwidth
@@ -177,9 +177,11 @@ def _share(count: int, report: MapReport) -> str:
 
 def _designed_rows(fixed: FixedCoupling) -> render.Rows:
     """Yield the rows of the fixed coupling in the environment of its design."""
-    asked, guarantee = [*fixed.assessment.requirements.items()], fixed.assessment.guarantee
+    needs_by_name, guarantee = [*fixed.assessment.requirements.items()], fixed.assessment.guarantee
     needs = "; ".join(
-        f"{name} needs {100 / need.margin:.4g} % of the damping ({need.proof})" for name, need in asked if need.margin
+        f"{name} needs {100 / need.margin:.4g} % of the damping ({need.proof})"
+        for name, need in needs_by_name
+        if need.margin
     )
     yield "coupling", f"{fixed.kind}, fixed"
     yield (

@@ -187,11 +187,11 @@ def times(left: Array, right: Array) -> Array:
 def _cleared(M: Array) -> tuple[list[list[int]], list[int]]:
     """Return every row as integers, and the common denominator of each row."""
     common = [math.lcm(*(v.denominator for v in row if v)) for row in M.tolist()]
-    whole = [
+    integers = [
         [v.numerator * (den // v.denominator) if v else 0 for v in row]
         for row, den in zip(M.tolist(), common, strict=True)
     ]
-    return whole, common
+    return integers, common
 
 
 def solve(M: Array, right: Array) -> Array:

@@ -189,8 +189,8 @@ class EnergyBudget(_Net):
         if not ((delta > 0) & (delta < np.inf)).all() or not 0 < T < np.inf:
             raise ValueError(f"delta is {delta.tolist()} and T is {T:g}, expected positive numbers")
         if hold < 0 or not ((lo >= 0) & (lo <= oldest - hold)).all():
-            given = f"{lo.tolist()} to {(oldest - hold).tolist()} samples, held for {hold} more"
-            raise ValueError(f"delays are {given}, expected 0 <= lo <= hi and hold >= 0")
+            span = f"{lo.tolist()} to {(oldest - hold).tolist()} samples, held for {hold} more"
+            raise ValueError(f"delays are {span}, expected 0 <= lo <= hi and hold >= 0")
         steps = np.broadcast_to(np.array(encoder_step, dtype=float), delta.shape)
         if not ((steps >= 0) & (steps < np.inf)).all():
             raise ValueError(f"encoder_step is {steps.tolist()}, expected steps >= 0 in m")

@@ -261,8 +261,8 @@ class BallProblem(_Problem):
         """Return (v, f), both (n, nsim), for every column of q."""
         v, f = np.zeros_like(q), q.copy()
         for block in self.blocks:
-            asked = q[block.at] - self.M[block.at] @ v
-            v[block.at], f[block.at], missed = block.solve(asked)
+            right = q[block.at] - self.M[block.at] @ v
+            v[block.at], f[block.at], missed = block.solve(right)
             self.unsolved[0] += missed
         return v, f
 

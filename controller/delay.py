@@ -140,8 +140,8 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if len(self.lo) != len(self.hi):
-            given = f"varying_delay.lo has {len(self.lo)} entries and varying_delay.hi {len(self.hi)}"
-            raise ValueError(f"{given}: one each per channel")
+            lengths = f"varying_delay.lo has {len(self.lo)} entries and varying_delay.hi {len(self.hi)}"
+            raise ValueError(f"{lengths}: one each per channel")
         for i, (lo, hi) in enumerate(zip(self.lo, self.hi, strict=True)):
             if not 0 <= lo <= hi <= _LONGEST:
                 raise ValueError(

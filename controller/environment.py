@@ -114,10 +114,10 @@ def parts_of(element: Any) -> list[Spring | Wall]:
     Nodes besides its ends belong to the element. A hardening spring is a spring with walls in parallel, which push
     beyond their gaps.
     """
-    made = element.parts() if callable(getattr(element, "parts", None)) else None
-    parts = list(made) if isinstance(made, list | tuple) else []
+    listed = element.parts() if callable(getattr(element, "parts", None)) else None
+    parts = list(listed) if isinstance(listed, list | tuple) else []
     if not parts or not all(type(part) in (Spring, Wall) for part in parts):
-        what = f"parts() is {made!r}" if made is not None else f"it is {element!r}"
+        what = f"parts() is {listed!r}" if listed is not None else f"it is {element!r}"
         raise ValueError(
             f"element {type(element).__name__}: {what}, expected a class whose parts() is a list of Spring and Wall"
         )
@@ -189,11 +189,11 @@ def _correction(block: Block) -> Any:
     A, B, C, D = (numbers(part, T) for part in block._arrays())
     E = Lti(A, B, C, D, T)
     m = E.inputs
-    kept = solve((eye(E.order, T) - E.A).T, E.C.T).T if E.order else E.C  # C (I - A)^-1
-    gain = times(kept, E.B)
+    settled = solve((eye(E.order, T) - E.A).T, E.C.T).T if E.order else E.C  # C (I - A)^-1
+    gain = times(settled, E.B)
     static = E.D + gain
     even = (static + static.T) / 2
-    H = Lti(E.A, E.B, -times(kept, E.A), even / 2 - gain, T).floats()
+    H = Lti(E.A, E.B, -times(settled, E.A), even / 2 - gain, T).floats()
 
     plain = E.floats()
     responses = np.linalg.norm(plain.at(np.exp(1j * np.linspace(0.01, np.pi, 64))), axis=(1, 2))
@@ -450,9 +450,9 @@ class Network(
             amounts = spring.amounts(number)
             for ends in self._lengths(spring):
                 places = [(index[node], int(sign) if sign in (1, -1) else number(sign)) for node, sign in ends]
-                for whole, amount in zip((M, D, K), amounts, strict=True):
+                for matrix, amount in zip((M, D, K), amounts, strict=True):
                     for (i, one), (j, other) in itertools.product(places, places):
-                        whole[i, j] += one * other * amount
+                        matrix[i, j] += one * other * amount
         return M, D, K
 
     def _lengths(self, part: Spring | Wall) -> list[list[tuple[str, float]]]:
@@ -477,8 +477,8 @@ class Network(
         """
         index = {name: i for i, name in enumerate(self.nodes())}
         lengths = [self._lengths(part) for part in parts]
-        whole = all(sign in (1, -1) for ends in lengths for _, sign in ends[0])
-        rows = np.zeros((len(parts), len(index)), dtype=int if whole else float)
+        unweighted = all(sign in (1, -1) for ends in lengths for _, sign in ends[0])
+        rows = np.zeros((len(parts), len(index)), dtype=int if unweighted else float)
         for row, ends in zip(rows, lengths, strict=True):
             for node, sign in ends[0]:
                 row[index[node]] = sign
@@ -644,8 +644,8 @@ def _realise(
     inputs = c + w
     after = np.concatenate([np.broadcast_to(part, (*M.shape[:-2], *part.shape[-2:])) for part in (q, v, x, vx)], -2)
     keep = _remembered(after, force, inputs)
-    kept, rest = after[..., keep, :], force[..., inputs:]
-    return kept[..., inputs:][..., keep], kept[..., :inputs], rest[..., keep], force[..., :inputs]
+    states, rest = after[..., keep, :], force[..., inputs:]
+    return states[..., inputs:][..., keep], states[..., :inputs], rest[..., keep], force[..., :inputs]
 
 
 def _quarters(c: int) -> tuple[tuple[slice, slice], ...]:

@@ -344,7 +344,7 @@ class Limiter(Law):
         return np.where(np.array(self.theta) == 0, np.arange(m), lines)
 
     def transition(self) -> Transition:
-        m, w, F, step, whole = self.channels, len(self.walls), self.open, self._step, self._block
+        m, w, F, step, block = self.channels, len(self.walls), self.open, self._step, self._block
         linear, kick, sent = self.linear.dot, self.kick, self.sent_rows
         limit, solve, balls = self.limit[:, None], self.problem.solve, self.sizes
         if not w:
@@ -366,19 +366,19 @@ class Limiter(Law):
         gap = np.array([wall.gap for wall in self.walls])[:, None]
         steep = self.steepness[:, None]
         memory = np.array([wall.damping / F.T for wall in self.walls])[:, None]
-        way_of = np.hstack([step.C[m:], np.zeros((w, whole.order - step.order + w)), step.D[m:, :m]]).dot
-        give, depth = step.D[m:, m:], slice(whole.order, whole.order + w)
+        way_of = np.hstack([step.C[m:], np.zeros((w, block.order - step.order + w)), step.D[m:, :m]]).dot
+        give, depth = step.D[m:, m:], slice(block.order, block.order + w)
         assert isinstance(self.problem, BoxProblem)
         upper, lower = self.problem.upper[:, None], self.problem.lower[:, None]
 
         def walled_tick(before: Array, after: Array) -> None:
             way = way_of(before) - gap  # into the walls, if these did not push and nothing slipped
             linear(before, after)
-            asked = np.vstack([after.take(sent, axis=0), steep * way - memory * before[depth]])
-            touched = ((asked > upper) | (asked[: m + w] < lower)).any(axis=0)
+            right = np.vstack([after.take(sent, axis=0), steep * way - memory * before[depth]])
+            touched = ((right > upper) | (right[: m + w] < lower)).any(axis=0)
             at = np.flatnonzero(touched)
             if at.size:
-                v, f = solve(asked[:, at])
+                v, f = solve(right[:, at])
                 bent = after[:, at] + kick @ v
                 bent[sent] = f[:m]
                 after[:, at] = bent

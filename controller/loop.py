@@ -219,12 +219,12 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # defaults are left out of
         """Return G = (I + Psi E V)^-1 Psi E, the map to the forces as they leave. Raises SingularLoop."""
         if not exact:
             return self.environment.sent(coupling, self.psi, self.T)
-        asked = (self.environment, coupling, self.psi, self.T)
-        known, found = _exactly
-        if found is None or not all(one is other for one, other in zip(asked, known, strict=True)):
-            found = self.environment.sent(coupling, self.psi, self.period(exact))
-            _exactly[:] = asked, found
-        return found
+        key = (self.environment, coupling, self.psi, self.T)
+        known, block = _exactly
+        if block is None or not all(one is other for one, other in zip(key, known, strict=True)):
+            block = self.environment.sent(coupling, self.psi, self.period(exact))
+            _exactly[:] = key, block
+        return block
 
     def sent_at(self, coupling: Coupling, z: Complex) -> Sampled:
         """Return G at points z of the circle, (n, k) or (1, k)."""

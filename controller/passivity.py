@@ -157,7 +157,7 @@ def sizes_around(G: Lti, w: Array, radius: Array) -> tuple[Array, Array]:
         size = np.full(w.shape, np.linalg.norm(G.D))
         return size, 8 * m * _UNIT * size
     norms, parts = _norms(G), max(1, _TOGETHER // n**2)
-    found = np.full((2, w.size), np.inf)
+    sizes = np.full((2, w.size), np.inf)
     for first in range(0, w.size, parts):
         here = slice(first, first + parts)
         R = np.linalg.inv(np.exp(1j * w[here])[:, None, None] * np.eye(n) - G.A)
@@ -167,12 +167,12 @@ def sizes_around(G: Lti, w: Array, radius: Array) -> tuple[Array, Array]:
             left, right = _INFLATED * _size(CR @ L), _INFLATED * _size(back @ RB)
             near = _INFLATED * away * _size(back @ R @ L) <= _REACH
             bound = _INFLATED * size + away * left * right / (1 - _REACH)
-            found[0, here] = np.minimum(found[0, here], np.where(near, bound, np.inf))
+            sizes[0, here] = np.minimum(sizes[0, here], np.where(near, bound, np.inf))
             error = (
                 16 * (n + m) * _UNIT * ((1 + np.linalg.norm(G.A)) * _size(CR) * _size(RB) / (1 - _REACH) ** 2 + size)
             )
-            found[1, here] = np.minimum(found[1, here], np.where(near, error, np.inf))
-    return found[0], found[1]
+            sizes[1, here] = np.minimum(sizes[1, here], np.where(near, error, np.inf))
+    return sizes[0], sizes[1]
 
 
 def _size(M: NDArray[np.inexact[Any]]) -> Array:

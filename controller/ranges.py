@@ -168,14 +168,14 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
         if node not in (*network.points, *network.nodes(), GROUND):
             names = network.points or network.nodes()
             raise ValueError(f"{field}: there is no node {node!r}; nodes: {', '.join(names)}, ground")
-    found = [spring for spring in network.springs if set(spring.between) == {a, b}]
-    if any(spring.inertance for spring in found):
+    springs = [spring for spring in network.springs if set(spring.between) == {a, b}]
+    if any(spring.inertance for spring in springs):
         raise ValueError(f"{field}: the spring there has an inertance, and ranges are of stiffness and damping")
-    if len(found) > 1:
-        raise ValueError(f"{field}: the environment has {len(found)} springs there, expected one")
+    if len(springs) > 1:
+        raise ValueError(f"{field}: the environment has {len(springs)} springs there, expected one")
     nothing = Spring((a, b), 0.0, 0.0)
-    if found:
-        own, present = found[0], found[0]
+    if springs:
+        own, present = springs[0], springs[0]
         _check_inside(field, uncertain, own)
     elif uncertain.absent and uncertain.stiffness:
         own, present = nothing, nothing
@@ -206,8 +206,8 @@ def _spring_state(own: Spring, stiffness: _Range, damping: _Range) -> _State:
     free = [low < high for low, high in (stiffness, damping)]
 
     def value(point: Sequence[float]) -> Spring:
-        given = iter(point)
-        k, d = (next(given) if f else limits[0] for f, limits in zip(free, (stiffness, damping), strict=True))
+        coordinates = iter(point)
+        k, d = (next(coordinates) if f else limits[0] for f, limits in zip(free, (stiffness, damping), strict=True))
         return Spring(own.between, float(k), float(d), along=own.along)
 
     return _State(tuple(r for f, r in zip(free, (stiffness, damping), strict=True) if f), value)

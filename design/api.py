@@ -66,8 +66,8 @@ def design_coupling(
     one_of("kind", kind, KINDS)
     named(condition or usual_condition(loop, kind))  # refuses a taken name
     known(options, KINDS[kind].options, f"kind {kind!r}")
-    made = design_by_kind(loop, kind, condition, **options)
-    return replace(made, certified_for=certified_for(loop, made.requirement.certified))
+    design = design_by_kind(loop, kind, condition, **options)
+    return replace(design, certified_for=certified_for(loop, design.requirement.certified))
 
 
 def certified_for(loop: Loop, certified: bool) -> str:
@@ -90,19 +90,19 @@ def instead(loop: Loop, kind: str, condition: str | Condition | None = None) -> 
 
     Every other kind and condition is designed and certified here. For delays that vary nothing is tried.
     """
-    failed, found = (kind, condition or usual_condition(loop, kind)), []
+    failed, designs = (kind, condition or usual_condition(loop, kind)), []
     for other, target, options in _QUICK:
         if (other, target) == failed or loop.varying_delay:
             continue
         try:
-            made = design_coupling(loop, other, target, **options)
-            needs = certify(loop, made)
+            design = design_coupling(loop, other, target, **options)
+            needs = certify(loop, design)
         except (ValueError, ArithmeticError):
             continue
         if needs[target].certified:
-            error = decibels(transparency_of(loop, made).rms_mismatch)
-            found.append((error, f"--coupling {other} --condition {target} ({error:.2f} dB rms)"))
-    return "certified instead: " + ", ".join(words for _, words in sorted(found)) if found else ""
+            error = decibels(transparency_of(loop, design).rms_mismatch)
+            designs.append((error, f"--coupling {other} --condition {target} ({error:.2f} dB rms)"))
+    return "certified instead: " + ", ".join(words for _, words in sorted(designs)) if designs else ""
 
 
 def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None = None) -> dict[str, Requirement[str]]:
@@ -127,10 +127,10 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     alone = fitting(loop, coupling)
     _, asked = name_and_own(condition)
     requirements: dict[str, Requirement[str]] = dict(requirements_of(loop, alone, own=asked or own))
-    if whole := check_ranges(loop, alone, samples=0):
-        _, worst = whole.worst if whole.proved else whole.worst_found
+    if ranges := check_ranges(loop, alone, samples=0):
+        _, worst = ranges.worst if ranges.proved else ranges.worst_found
         here = requirements[worst.condition].guarantee
-        proof, held = ("rational", RANGES) if whole.proved else ("sampled", here)
+        proof, held = ("rational", RANGES) if ranges.proved else ("sampled", here)
         requirements[worst.condition] = replace(worst, proof=proof, guarantee=held)
     if loop.varying_delay:
         requirements["switching"] = judged(loop, alone, SWITCHING)
@@ -190,10 +190,10 @@ def store(
     Without a proof for the ranges or for switching delays the file is for the nominal environment or for constant
     delays. Raises InputError if the file cannot be written.
     """
-    whole = assessment and assessment.ranges
+    ranges = assessment and assessment.ranges
     limiter = assessment and assessment.force_limits.certificate
-    if whole and whole.proved and whole.certificate and whole.certificate.condition == design.condition:
-        certificate, reason = whole.certificate, None
+    if ranges and ranges.proved and ranges.certificate and ranges.certificate.condition == design.condition:
+        certificate, reason = ranges.certificate, None
     else:
         loop = loop if named(design.asked).guarantee(loop) == ANY else loop.at(loop.environment)
         certificate, reason = _proved(loop, design, limiter)
@@ -240,16 +240,16 @@ COUPLING = "a coupling (controller.coupling), or a Design"
 
 def bare(coupling: Coupling | Design, expected: str = COUPLING) -> Coupling:
     """Return the coupling of a design, or the coupling itself. Raises TypeError for anything else."""
-    found = coupling.coupling if isinstance(coupling, Design) else coupling
-    if isinstance(found, Lti):
+    bare = coupling.coupling if isinstance(coupling, Design) else coupling
+    if isinstance(bare, Lti):
         raise TypeError("coupling is an Lti, expected a coupling: wrap it in Compliance(...) (controller.coupling)")
-    if not isinstance(found, Coupling):
-        if hasattr(found, "compliance") and not isinstance(found, type):
+    if not isinstance(bare, Coupling):
+        if hasattr(bare, "compliance") and not isinstance(bare, type):
             raise TypeError(
-                f"coupling is a {type(found).__name__}, which is not derived from controller.coupling.Coupling"
+                f"coupling is a {type(bare).__name__}, which is not derived from controller.coupling.Coupling"
             )
         raise TypeError(f"coupling is {shown(coupling)}, expected {expected}")
-    return found
+    return bare
 
 
 def fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:

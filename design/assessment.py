@@ -144,10 +144,10 @@ class SearchFigures:
         return cls(searched.tried, worst.ratio, worst.member.name, not suffices(worst.ratio), searched.ended)
 
     def __str__(self) -> str:
-        found = "[red]violated[/]" if self.violated else "no violation found"
+        verdict = "[red]violated[/]" if self.violated else "no violation found"
         ratio = f"worst ratio {self.worst_ratio:.4f}" if math.isfinite(self.worst_ratio) else "no damping is enough"
         ended = ", until its budget was spent" if self.ended_by_clock else ""
-        return f"searched, not proved: {found}, {ratio} in {self.environments} points{ended}, at {self.worst}"
+        return f"searched, not proved: {verdict}, {ratio} in {self.environments} points{ended}, at {self.worst}"
 
 
 def check_ranges(
@@ -284,10 +284,10 @@ def covered_limits(
     if not extended:
         return ForceLimits(None, "no guarantee that it could extend")
     less = any(each.certified and each.guarantee == ANY for each in requirements.values())
-    found = [_by_its_own_block(loop, coupling, proof, known, extended[0])]
-    if found[0].rho is None and len(extended) > 1:
-        found.insert(0, _by_its_own_block(loop, coupling, None, known, extended[1]))
-    covered = next((each for each in found if each.rho is not None), found[-1])
+    candidates = [_by_its_own_block(loop, coupling, proof, known, extended[0])]
+    if candidates[0].rho is None and len(extended) > 1:
+        candidates.insert(0, _by_its_own_block(loop, coupling, None, known, extended[1]))
+    covered = next((each for each in candidates if each.rho is not None), candidates[-1])
     return replace(covered, less=less)
 
 
@@ -517,10 +517,10 @@ def assess(
     if isinstance(coupling, Design):
         certificate, condition = certificate or coupling.certificate, condition or coupling.asked
         searched, coupling = searched or coupling.searched, coupling.coupling
-    asked = named(condition or (KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT))
+    wanted_condition = named(condition or (KNOWN_DEVICE if loop.known_devices else THIS_ENVIRONMENT))
     network = loop.environment if environment is None or callable(environment) else environment
     here = loop.at(network).switching(None)
-    own = None if asked.name in CONDITIONS else asked
+    own = None if wanted_condition.name in CONDITIONS else wanted_condition
     by = own if own and certificate and own.name == certificate.condition else None
     known = certificate if certificate and proves(loop, coupling, certificate, by) else None
     requirements = requirements_of(here, coupling, known, own=own)
@@ -551,7 +551,7 @@ def assess(
         known or (ranges and ranges.certificate),
         None,
         None,
-        asked.name,
+        wanted_condition.name,
     )
     guarantee, reason = _guarantee(assessment)
     by_itself = limits.requirement is not None and limits.rho is not None  # The limiter is proved where it runs.

@@ -187,8 +187,8 @@ def sensitivity(loop: Loop, coupling: Coupling, condition: _Asked) -> _Sensitivi
         f"certified with {MOST_EXTRA_SAMPLES} samples more, the most that were tried" if extra is None else "",
     ]
     error = None if largest is None else largest / loop.T - 1
-    found = _of_delta(needs, "; ".join(filter(None, reasons)) or None)
-    return replace(found, largest_T_s=largest, T_error=error, extra_samples=extra)
+    of_delta = _of_delta(needs, "; ".join(filter(None, reasons)) or None)
+    return replace(of_delta, largest_T_s=largest, T_error=error, extra_samples=extra)
 
 
 def _of_delta(needs: Requirement, reason: str | None) -> _Sensitivity:
@@ -283,22 +283,22 @@ def remedies(loop: Loop, coupling: Coupling, condition: _Asked) -> list[_Remedy]
     asked, needs = named(condition), requirement(loop, coupling, condition)
     if needs.certified or asked.not_varied(loop):
         return []
-    found = [_fewer_samples(loop, coupling, asked, name) for name in ("theta", "psi")]
+    candidates = [_fewer_samples(loop, coupling, asked, name) for name in ("theta", "psi")]
     if any(B := coupling.figures(loop.T).get("B", ())):
-        found.append(
+        candidates.append(
             _smaller(
                 lambda x: requirement(loop, coupling.scaled(damping=x), asked),
                 lambda x: f"smaller B: {listed([x * b for b in B], 5)} N s/m",
             )
         )
-    found.append(
+    candidates.append(
         _smaller(
             lambda x: _at_period(loop, coupling, asked, x * loop.T),
             lambda x: f"faster: T = {1e3 * x * loop.T:.5g} ms",
         )
     )
     least = 0.9 * needs.ratio
-    return [r for r in found if r and (r.requirement.certified or r.requirement.ratio < least)]
+    return [r for r in candidates if r and (r.requirement.certified or r.requirement.ratio < least)]
 
 
 def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:

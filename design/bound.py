@@ -212,16 +212,16 @@ class _Dual:
         bounds of |Lambda E| in the disk of _DISK half-widths around the middle, and of its rounding.
         """
         E, half = self.loop.E(), np.diff(self.grid) / 2
-        middle, found = self.grid[:-1] + half, []
+        middle, nodes = self.grid[:-1] + half, []
         while middle.size:
             bounds = np.stack(sizes_around(E, middle, _DISK * half))
-            done = np.isfinite(bounds[0]) | (
-                sum(part[0].size for part in found) + 2 * middle.size > budgets.BOUND_INTERVALS
+            settled = np.isfinite(bounds[0]) | (
+                sum(part[0].size for part in nodes) + 2 * middle.size > budgets.BOUND_INTERVALS
             )
-            found.append((middle[done], half[done], bounds[:, done]))
-            half = np.repeat(half[~done] / 2, 2)
-            middle = np.repeat(middle[~done], 2) + half * np.tile([-1.0, 1.0], half.size // 2)
-        middle, half, bounds = (np.concatenate([part[i] for part in found], axis=-1) for i in range(3))
+            nodes.append((middle[settled], half[settled], bounds[:, settled]))
+            half = np.repeat(half[~settled] / 2, 2)
+            middle = np.repeat(middle[~settled], 2) + half * np.tile([-1.0, 1.0], half.size // 2)
+        middle, half, bounds = (np.concatenate([part[i] for part in nodes], axis=-1) for i in range(3))
         longest, m = max(self.loop.lam), self.loop.channels
         w = (middle[:, None] + half[:, None] * _POINTS).ravel()
         late = on_circle(w)[:, None] ** -np.asarray(self.loop.lam)
@@ -275,7 +275,7 @@ class _Dual:
         imposed, swept = self.imposed(), self.swept()
         looked = self.block(swept)
         A, b, c = self.objective()
-        nothing, found, remains, x, t = float(b @ b), 0.0, 0.0, self.start, 0.0
+        nothing, sampled, remains, x, t = float(b @ b), 0.0, 0.0, self.start, 0.0
         for _ in range(budgets.BOUND_SWEEPS):
             program = Program(A, b, c, (self.block(imposed),))
             t, path = max(t, _FIRST * program.degree / nothing), [towards(self.start, x, program)]
@@ -287,20 +287,20 @@ class _Dual:
                     break
                 t = min(_STEEPER * t, last)
             rooms = [np.linalg.eigvalsh(looked.at(x))[:, 0] for x in path]
-            kept = [_between(inner, room, path[-1], rooms[-1]) for inner, room in zip(path, rooms, strict=True)]
-            kept.append(_between(self.start, np.ones(swept.size), path[-1], rooms[-1]))
-            some = [(nothing - program.value(x), x) for x in kept if x is not None]
+            inside = [_between(inner, room, path[-1], rooms[-1]) for inner, room in zip(path, rooms, strict=True)]
+            inside.append(_between(self.start, np.ones(swept.size), path[-1], rooms[-1]))
+            some = [(nothing - program.value(x), x) for x in inside if x is not None]
             missing = _worst(-rooms[-1], swept)
             if some:
                 best, point = max(some, key=lambda pair: pair[0])
                 charged, where, least = self.charged(point, best, swept)
-                found, remains = max(found, best), max(remains, charged)
+                sampled, remains = max(sampled, best), max(remains, charged)
                 missing = np.union1d(missing, _worst(-least, where))
-            if (remains if self.exact else found) >= (1 - _LARGEST_CHARGE) * value:
+            if (remains if self.exact else sampled) >= (1 - _LARGEST_CHARGE) * value:
                 break
             imposed = np.union1d(imposed, missing)
             x, t = path[-2], t / _STEEPER
-        return found, remains
+        return sampled, remains
 
 
 def _gauss(grid: Array) -> tuple[Array, Array, Array]:
@@ -362,15 +362,15 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
     import scipy
 
     m, span = E.inputs, min(max(loop.psi), budgets.BOUND_SUMS // E.inputs)
-    found: list[tuple[int, Array]] = []
+    rows: list[tuple[int, Array]] = []
     for i, theta in enumerate(loop.theta):
         for k in range(1, theta + 1):
             for unit in np.eye(m):
                 weights = np.zeros((theta + span + 1, m))
                 weights[k] = unit
-                found.append((i, weights))
+                rows.append((i, weights))
     if not span:
-        return _first(found), True
+        return _first(rows), True
     G = delay(loop.psi, loop.T) @ E
     impulse = [G.D, *(G.C @ np.linalg.matrix_power(G.A, k) @ G.B for k in range(span - 1))]
     reach = np.zeros((span * m, span * m))  # coefficient l of R's row by step k of F's row
@@ -384,8 +384,8 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[tuple[int, Array], ...], bool]
                 weights[theta + k + 1] += row
                 if k:
                     weights[theta + k] -= row
-            found.append((i, weights))
-    return _first(found), not reach.any()
+            rows.append((i, weights))
+    return _first(rows), not reach.any()
 
 
 def _first(sums: list[tuple[int, Array]]) -> tuple[tuple[int, Array], ...]:
@@ -448,7 +448,7 @@ class BoundBeside:
             "the limiter": asked.limiter,
             "the cap above 100 Hz": asked.high_gain is not None,
         }
-        without = tuple(name for name, given in more.items() if given)
+        without = tuple(name for name, present in more.items() if present)
         if asked.objective == "sup":  # |M|_F <= sqrt(m) |M|, and |E|_F >= |E|
             return cls(
                 least.rms_db,

@@ -362,21 +362,21 @@ def _check_part(
     """
     _require_limits(loop, coupling, condition)
     multiplier = _on_file(condition, loop, claim.multipliers)
-    found, place = required_damping(loop, coupling, condition, multiplier), condition.place(loop)
-    reason = found.reason or _other_figures(claim, found)
-    if not (reason or found.certified):
-        reason = f"the sweep asks {found.ratio:.6g} times the available damping, whatever the matrices prove"
+    requirement, place = required_damping(loop, coupling, condition, multiplier), condition.place(loop)
+    reason = requirement.reason or _other_figures(claim, requirement)
+    if not (reason or requirement.certified):
+        reason = f"the sweep asks {requirement.ratio:.6g} times the available damping, whatever the matrices prove"
     if reason := reason or _another_system(loop, coupling):
         raise NotProved(_placed(place, reason))
     if matrices is None:
-        return replace(found, proof="rational")
+        return replace(requirement, proof="rational")
     blocks = _blocks(loop, coupling, condition, multiplier)
     if set(matrices) != set(blocks):
         raise NotProved(f"matrices are {', '.join(matrices) or 'none'}, expected {', '.join(sorted(blocks))}")
     for name, real in blocks.items():
         if reason := refuted_rows(name, real, matrices[name]):
             raise NotProved(f"{condition.place(loop, name)}{reason}")
-    return replace(found, proof="rational")
+    return replace(requirement, proof="rational")
 
 
 def _other_figures(claim: Certificate, found: Requirement) -> str | None:
@@ -417,11 +417,11 @@ def _is_ours(condition: Condition) -> bool:
 def named(condition: str | Condition) -> Condition:
     """Return the condition of a name, or the condition itself. Raises ValueError for an unknown or a taken name."""
     if not isinstance(condition, str):
-        name, taken = getattr(condition, "name", None), {*_NAMED, *(each.name for each in _PARTS)}
-        free = isinstance(name, str) and name.strip() and name not in taken
+        name, reserved = getattr(condition, "name", None), {*_NAMED, *(each.name for each in _PARTS)}
+        free = isinstance(name, str) and name.strip() and name not in reserved
         if not (free or _is_ours(condition)):
             own = f"condition {type(condition).__name__}: its name is {name!r}"
-            raise ValueError(f"{own}, expected one of its own, not {', '.join(sorted(taken))}")
+            raise ValueError(f"{own}, expected one of its own, not {', '.join(sorted(reserved))}")
         return condition
     if condition not in _NAMED:
         raise ValueError(
@@ -438,8 +438,12 @@ def required_damping(
     With ranges this-environment returns the largest requirement of all members. It is infinite for a loop without a
     solution.
     """
-    found = named(condition).judge(loop, coupling, multiplier)
-    return found if found.reason else replace(found, required=tuple(found.ratio * d for d in found.available))
+    requirement = named(condition).judge(loop, coupling, multiplier)
+    return (
+        requirement
+        if requirement.reason
+        else replace(requirement, required=tuple(requirement.ratio * d for d in requirement.available))
+    )
 
 
 def _blocks(loop: Loop, coupling: Coupling, condition: Condition, multiplier: Any) -> dict[str, Lti]:
@@ -484,7 +488,7 @@ def requirements_of(
     conditions = (*(each for each in _NAMED.values() if each not in known_only), *([named(own)] if own else []))
     proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
 
-    asked = [(each, each.judge(loop, coupling)) for each in conditions]
+    pairs = [(each, each.judge(loop, coupling)) for each in conditions]
 
     def judged(each: Condition, needs: Requirement) -> Requirement:
         if each.name == proved:
@@ -492,4 +496,4 @@ def requirements_of(
         return _with_proof(loop, filed(loop, coupling), each, needs) if more or not proved else needs
 
     with within(budgets.EXACT):  # one budget for all proofs
-        return {each.name: judged(each, needs) for each, needs in asked}
+        return {each.name: judged(each, needs) for each, needs in pairs}

@@ -82,8 +82,8 @@ def grid(loop: Loop, couplings: Sequence[Demands], low_hz: float = _LOWEST_HZ) -
     systems = (loop.E(), *(judged.F for judged in couplings))
     even = frequencies(*systems, low=low_hz * per_hz, high=np.pi, points=200) / per_hz
     binding = [r.frequency_hz for judged in couplings for r in judged.requirements.values()]
-    wanted = (*FEEL_HZ, *(hz for hz in binding if hz is not None))
-    return np.unique([*even, *(hz for hz in wanted if low_hz <= hz <= even[-1])])
+    shown = (*FEEL_HZ, *(hz for hz in binding if hz is not None))
+    return np.unique([*even, *(hz for hz in shown if low_hz <= hz <= even[-1])])
 
 
 def curves(loop: Loop, judged: Demands, hz: Array) -> Curves:

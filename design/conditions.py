@@ -118,8 +118,8 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
 
     V1, gain = excess(V, np.diag(1 / shortage[paid]))
     inverted = inverse(level)[np.ix_(paid, paid)] if loop.levels else np.diag(1 / damping[paid])
-    _, taken = excess(as_like(V, theta_hat(loop.theta, level, T)), inverted)
-    return Demand(-taken, gain, {"V(1)": V1})
+    _, demand = excess(as_like(V, theta_hat(loop.theta, level, T)), inverted)
+    return Demand(-demand, gain, {"V(1)": V1})
 
 
 def delayed_environment_demand(delayed: Lti, phi: Sequence[Any] | Array) -> Demand[Lti]:
@@ -264,17 +264,19 @@ class Condition(ABC):
     def required(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """Return the damping that the devices need, from a refined sweep. Raises SingularLoop."""
         demands = [self.is_demand(self.demand(each, coupling)) for each in self._loops(loop)]
-        found = [_least_damping(self.name, demand.free, lambda d=demand: d, loop.delta) for demand in demands]
-        return max(found, key=lambda requirement: requirement.ratio)
+        shares = [_least_damping(self.name, demand.free, lambda d=demand: d, loop.delta) for demand in demands]
+        return max(shares, key=lambda requirement: requirement.ratio)
 
     def judge(self, loop: Loop, coupling: Coupling, multiplier: Any = None) -> Requirement:
         """Return `required` with its guarantee; a loop that is not covered or has no solution gets an infinite one."""
         reason = self.beyond(loop)
         try:
-            found = refusal(self.name, loop.delta, reason) if reason else self.required(loop, coupling, multiplier)
+            requirement = (
+                refusal(self.name, loop.delta, reason) if reason else self.required(loop, coupling, multiplier)
+            )
         except SingularLoop as error:
-            found = refusal(self.name, loop.delta, str(error))
-        return replace(found, guarantee=self.words(loop), lag=self.lag(loop))
+            requirement = refusal(self.name, loop.delta, str(error))
+        return replace(requirement, guarantee=self.words(loop), lag=self.lag(loop))
 
     def ratio(self, loop: Loop, coupling: Coupling, thin: int = 1) -> float:
         """Return required over available damping; `thin` allows a sweep over every thin-th frequency only."""
@@ -341,11 +343,11 @@ class Condition(ABC):
 
     def by_name(self, loop: Loop, multiplier: Sequence[Any]) -> dict[str, tuple[float, ...]]:
         """Return the concatenated multipliers as one tuple for each name."""
-        found, start = dict[str, tuple[float, ...]](), 0
+        named_values, start = dict[str, tuple[float, ...]](), 0
         for name, count in self.multiplier_sizes(loop).items():
-            found[name] = tuple(float(v) for v in multiplier[start : start + count])
+            named_values[name] = tuple(float(v) for v in multiplier[start : start + count])
             start += count
-        return found
+        return named_values
 
     def least_multiplier(self, loop: Loop) -> tuple[Array | None, str | None]:
         """Return (the multiplier that serves every coupling or None, the reason why the loop is not covered)."""
@@ -390,12 +392,12 @@ def _least_damping(name: str, system: Lti, demand: Callable[[], Demand[Lti]], de
     if reason := unsound(system, available):
         return refusal(name, available, reason)
     try:
-        asked = demand()
+        needed = demand()
     except SingularLoop as error:  # rounding has kept the largest pole inside the unit circle
         return refusal(name, available, f"the force map is singular in floating point: {error}")
-    if reason := unsound_static(system, asked, available):
+    if reason := unsound_static(system, needed, available):
         return refusal(name, available, reason)
-    ratio, w = supremum(lambda w: least_scale(asked, w), np.concatenate([[0.0], frequencies(system)]))
+    ratio, w = supremum(lambda w: least_scale(needed, w), np.concatenate([[0.0], frequencies(system)]))
     return from_ratio(name, max(ratio, 0.0), available, w / (2 * np.pi * system.T))
 
 

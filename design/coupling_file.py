@@ -65,9 +65,9 @@ class Stored(Strict, frozen=True):
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, certificate: Certificate | None = None) -> Stored:
         """Return the stored form of a coupling in its loop."""
-        made = cls(loop, coupling.form(), certificate)
+        stored = cls(loop, coupling.form(), certificate)
         filed(loop, coupling)
-        return made
+        return stored
 
     def built(self) -> Coupling:
         """Return the coupling."""
@@ -87,8 +87,8 @@ def filed(loop: Loop, coupling: Coupling) -> Coupling:
     if type(built) is type(coupling):
         return coupling
     through = loop.walled if loop.environment.walls else loop.sent
-    V, kept = coupling.compliance(loop.T), built.compliance(loop.T)
-    for what, own, other in (("around", through(coupling), through(built)), ("compliance", V, kept)):
+    V, rebuilt = coupling.compliance(loop.T), built.compliance(loop.T)
+    for what, own, other in (("around", through(coupling), through(built)), ("compliance", V, rebuilt)):
         if own is None:
             continue
         name = f"coupling {type(coupling).__name__}: form(), which a file keeps, is another system than {what}()"
@@ -163,10 +163,10 @@ def _once(pairs: list[tuple[str, Any]]) -> None:
 
 def _place(content: bytes, message: str) -> str:
     """Return the number and beginning of the line that a message names as "(byte N)", or ""."""
-    found = re.search(r"\(byte (\d+)\)", message)
-    if not found:
+    match = re.search(r"\(byte (\d+)\)", message)
+    if not match:
         return ""
-    above = content[: int(found[1])].count(b"\n")
+    above = content[: int(match[1])].count(b"\n")
     return f"line {above + 1}, {content.splitlines()[above].decode(errors='replace').strip()[:40]!r}: "
 
 

@@ -49,13 +49,13 @@ class Switching:
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, known: Requirement | None = None) -> Switching:
         """Evaluate a coupling; `known` is its requirement from an assessment in this loop, if there is one."""
-        found, span = known or judged(loop, coupling, SWITCHING), loop.delays
-        if found.reason:
-            return cls(found, span.lo, span.hi)
+        requirement, span = known or judged(loop, coupling, SWITCHING), loop.delays
+        if requirement.reason:
+            return cls(requirement, span.lo, span.hi)
         latest = loop.delayed(span.hi)
         buffered = THIS_ENVIRONMENT.judge(latest, coupling)
         playout = _Playout(span.hi, buffered.required, buffered.certified)
-        return cls(found, span.lo, span.hi, found.multiplier, playout, _NOT_COVERED)
+        return cls(requirement, span.lo, span.hi, requirement.multiplier, playout, _NOT_COVERED)
 
 
 # ----------------------------------------------------------------------------------------------------

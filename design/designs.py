@@ -226,21 +226,21 @@ def _in_principal_axes(
         delta=tuple(((1 - _ROUNDED) * values).tolist()),
         levels=None,
     )
-    found = design_by_kind(straight, kind, condition, progress, **options)
-    coupling = found.coupling.turned(Q)
+    design = design_by_kind(straight, kind, condition, progress, **options)
+    coupling = design.coupling.turned(Q)
     requirement = condition.judge(loop, coupling)
     if not requirement.certified:
         why = f"the designed coupling is not certified by {condition.name}: {requirement.shortfall}"
         raise DesignFailed(None, (), why)
-    return replace(found, coupling=coupling, requirement=requirement, certificate=None)
+    return replace(design, coupling=coupling, requirement=requirement, certificate=None)
 
 
 def _instead(loop: Loop, words: str, kind: str, **options: Any) -> str:
     """Return an error suffix that names a design that succeeds for this loop, or ""."""
     with suppress(ValueError, DesignFailed):
-        found = design_by_kind(loop, kind, **options)
-        if found.requirement.certified:
-            return f"; {words} gives one that needs {found.requirement.ratio:.4g} of the damping"
+        design = design_by_kind(loop, kind, **options)
+        if design.requirement.certified:
+            return f"; {words} gives one that needs {design.requirement.ratio:.4g} of the damping"
     return ""
 
 
@@ -275,11 +275,11 @@ def _with_less_damping(loop: Loop, made: Callable[[Loop], Design], condition: Co
     for _ in range(budgets.LESS_DAMPING_ROUNDS):
         constant = loop.delayed(loop.delays.hi) if condition.guarantee(loop) == ANY else loop
         part = msgspec.structs.replace(constant, latency=None, delta=tuple(share * d for d in loop.delta))
-        found = made(part)
-        needs = condition.judge(loop.at(loop.environment), found.coupling)
+        design = made(part)
+        needs = condition.judge(loop.at(loop.environment), design.coupling)
         shortfall = needs.shortfall
         if needs.certified:
-            best = replace(found, requirement=needs)
+            best = replace(design, requirement=needs)
             if needs.ratio > 1 - _UNUSED:
                 return best
         if np.isinf(needs.ratio):

@@ -201,13 +201,13 @@ class _Search:
                 break
             blocks.append(self._inequality(w))
             try:
-                found = ConeProgram(np.eye(count + 1)[-1], blocks).solve(
+                solution = ConeProgram(np.eye(count + 1)[-1], blocks).solve(
                     f"the multiplier {self._names}", settings=LIGHT
                 )
             except DesignFailed:  # No multiplier within the bounds makes the block positive.
                 break
-            stalled = 0 if found[-1] > bound + _SETTLED * max(bound, 1.0) else stalled + 1
-            bound, values = max(bound, float(found[-1])), self._values(found)
+            stalled = 0 if solution[-1] > bound + _SETTLED * max(bound, 1.0) else stalled + 1
+            bound, values = max(bound, float(solution[-1])), self._values(solution)
             top, w = self._worst(values, bound)
             best, least = min((best, least), (values, top), key=lambda one: one[1])
         return bound, tuple(best)
@@ -232,9 +232,11 @@ class _Search:
         values[self._searched] = [float(f"{v:.{_DIGITS}g}") for v in x * self._units[self._searched]]
         if not self._hands:
             return tuple(values.tolist())
-        found = self._named(values.tolist())
+        values_by_name = self._named(values.tolist())
         own = {each.name for each in self._hands.unknowns(self._loop)}
-        parts = {name: [v / max(s, _NOTHING) for v in part] if name in own else part for name, part in found.items()}
+        parts = {
+            name: [v / max(s, _NOTHING) for v in part] if name in own else part for name, part in values_by_name.items()
+        }
         return tuple(v for part in self._hands.allowed(self._loop, parts).values() for v in part)
 
     def _worst(self, values: Sequence[float], bound: float) -> tuple[float, Array]:
@@ -249,9 +251,9 @@ class _Search:
         at = needed(w)
         if (top := float(at.max(initial=-np.inf))) > bound + _SETTLED * max(bound, 1.0):
             return top, w[np.argsort(-at)[:_MOST_PEAKS]]
-        most, between = found = supremum(needed, self._grid)
+        most, between = peak = supremum(needed, self._grid)
         if not self._spare.any():
-            self._last = tuple(values), found
+            self._last = tuple(values), peak
         return most, np.array([between] if most > bound + 2 * _SETTLED * max(bound, 1.0) else [])
 
     def _parts(self, w: Array) -> tuple[Any, Any]:

@@ -391,13 +391,13 @@ def reached(G: Lti) -> Lti:
 
     Behind a contact that is lost a filter's states are such. No equation of Riccati is in need of them.
     """
-    found = np.array([any(row) for row in G.B != 0], dtype=bool)
+    reached_states = np.array([any(row) for row in G.B != 0], dtype=bool)
     pattern = (G.A != 0).astype(bool)
-    while (more := found | (pattern & found).any(axis=1)).sum() > found.sum():
-        found = more
-    if found.all():
+    while (more := reached_states | (pattern & reached_states).any(axis=1)).sum() > reached_states.sum():
+        reached_states = more
+    if reached_states.all():
         return G
-    return Lti(G.A[np.ix_(found, found)], G.B[found], G.C[:, found], G.D, G.T)
+    return Lti(G.A[np.ix_(reached_states, reached_states)], G.B[reached_states], G.C[:, reached_states], G.D, G.T)
 
 
 class Violated(str):
@@ -463,11 +463,11 @@ def _double(parts: _Parts) -> Lti:
 
 def _extended(M: Any) -> Array:
     """Return Fractions or floats in extended precision: 64 binary digits where the machine has it."""
-    found = np.asarray(M, dtype=np.float64).astype(np.longdouble)
+    extended = np.asarray(M, dtype=np.float64).astype(np.longdouble)
     if M.dtype == object:
         for place in zip(*np.nonzero(M), strict=True):
-            found[place] += float(M[place] - Fraction(float(found[place])))
-    return found
+            extended[place] += float(M[place] - Fraction(float(extended[place])))
+    return extended
 
 
 def _scaled(G: Lti) -> tuple[_Parts, NDArray[np.int64]]:

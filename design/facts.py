@@ -136,12 +136,12 @@ class Latency(HandsSide):
 
     def room(self, loop: Loop, values: Values, s: Any) -> list[Array]:
         """s - D Q D with D = diag(tau, T_max - tau)^(1/2), at latencies of the range."""
-        found = []
+        bounds = []
         for d in _varies(loop):
             tau = np.linspace(*_ranges(loop)[d], _LATENCIES)
             D, Q = np.sqrt([tau, (loop.T_max or loop.T) - tau]).T, _entries(values, d)
-            found.append(s * np.eye(2) - D[:, :, None] * Q * D[:, None, :])
-        return found
+            bounds.append(s * np.eye(2) - D[:, :, None] * Q * D[:, None, :])
+        return bounds
 
     def allowed(self, loop: Loop, values: Values) -> Values:
         shrunk = {name: list(values[name]) for name in ("q11", "q12", "q22")}
@@ -189,11 +189,11 @@ def _separate(loop: Loop, d: int) -> tuple[float, float]:
     if d not in _varies(loop):
         return 0.0, 0.0
     (first, last), T = _ranges(loop)[d], rational(loop.T_max or loop.T)
-    found = []
+    shares = []
     for longest_part in (rational(last), T - rational(first)):
         q = float(1 / longest_part)
-        found.append(q if rational(q) * longest_part <= 1 else float(np.nextafter(q, 0)))
-    return found[0], found[1]
+        shares.append(q if rational(q) * longest_part <= 1 else float(np.nextafter(q, 0)))
+    return shares[0], shares[1]
 
 
 def _entries(values: Values, d: int) -> Array:

@@ -178,8 +178,8 @@ def read_text(path: str | Path, named: str | None = None, hint: str = "") -> str
 
 def toml(text: str, named: str) -> dict[str, Any]:
     """Return the content of TOML text. Raises InputError."""
-    if found := _DEEP_KEY.search(text):
-        line = text.count("\n", 0, found.start()) + 1
+    if match := _DEEP_KEY.search(text):
+        line = text.count("\n", 0, match.start()) + 1
         raise InputError(f"{named}: line {line}: a key of more than {_DEEPEST_KEY} names joined by dots")
     try:
         return tomllib.loads(text)

@@ -86,11 +86,11 @@ class FixedOrder:
 
     def unit_coupling(self, p: Array) -> Lti:
         """Return V in units T = 1 and usable damping = I."""
-        found = [np.zeros(shape) for shape in self._shapes]
+        parts = [np.zeros(shape) for shape in self._shapes]
         ends = np.cumsum([rows.size for rows, _ in self._free])[:-1]
-        for matrix, free, values in zip(found, self._free, np.split(p, ends), strict=True):
+        for matrix, free, values in zip(parts, self._free, np.split(p, ends), strict=True):
             matrix[free] = values
-        A, B, V1 = found
+        A, B, V1 = parts
         return Lti.with_rest(A, B, self.F, V1 + np.triu(V1, 1).T, 1.0)
 
     def coupling(self, p: Array) -> Lti:
@@ -294,12 +294,12 @@ def _bisect(family: FixedOrder, p: Array, norm: float, holds: _Judge, budget: in
     low, high, best, sdps = 0.5 * norm, norm, p, 0
     while high - low > _WIDTH * high and sdps < budget:
         mu = (low + high) / 2
-        found, spent = _complementary(lemmas, mu, holds, min(budgets.COMPLEMENTARITY_PROBLEMS, budget - sdps))
+        candidate, spent = _complementary(lemmas, mu, holds, min(budgets.COMPLEMENTARITY_PROBLEMS, budget - sdps))
         sdps += spent
-        if found is None:
+        if candidate is None:
             low = mu
         else:
-            best, high = found, mu
+            best, high = candidate, mu
     return best, sdps
 
 
@@ -374,8 +374,8 @@ class FixedPoles:
                 return np.inf
 
         options = {"maxfev": evaluations, "xatol": 1e-3, "fatol": 1e-4}
-        found = scipy.optimize.minimize(norm, np.arctanh(start), method="Nelder-Mead", options=options)
-        return self.best([[a] for a in np.tanh(found.x)])
+        result = scipy.optimize.minimize(norm, np.arctanh(start), method="Nelder-Mead", options=options)
+        return self.best([[a] for a in np.tanh(result.x)])
 
     def _solve(self, poles: Sequence[Sequence[float]]) -> tuple[Lti, float]:
         import scipy

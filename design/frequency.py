@@ -30,22 +30,22 @@ def integral(response: Callable[[Array], Array], grid: Array, error: float = _ER
     """
     left, right = grid[:-1], grid[1:]
     length = grid[-1] - grid[0]
-    coarse, done = _gauss(response, left, right), 0.0
+    coarse, settled = _gauss(response, left, right), 0.0
     for _ in range(budgets.INTEGRAL_ROUNDS):
         middle = (left + right) / 2
         first, second = np.split(_gauss(response, np.append(left, middle), np.append(middle, right)), 2)
         fine = first + second
-        share = max(error * (done + fine.sum()) / length, _ROUNDING) * (right - left)
+        share = max(error * (settled + fine.sum()) / length, _ROUNDING) * (right - left)
         excess = np.abs(fine - coarse) - share
         rough = excess > 0
         if rough.sum() > budgets.INTEGRAL_INTERVALS:
             rough &= excess > np.sort(excess)[-budgets.INTEGRAL_INTERVALS - 1]
-        done += fine[~rough].sum()
+        settled += fine[~rough].sum()
         left, right = np.append(left[rough], middle[rough]), np.append(middle[rough], right[rough])
         coarse = np.append(first[rough], second[rough])
         if not left.size:
             break
-    return float(done + coarse.sum())
+    return float(settled + coarse.sum())
 
 
 def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Array:
@@ -72,10 +72,12 @@ def suprema(responses: _Responses, common: Array, own: Array) -> Array:
     """
     n = own.shape[0]
     parts = [np.broadcast_to(w, (n, w.shape[-1])) for w in (common[None], own)]
-    found = [responses(common[None]), responses(own)] if own.size else [responses(common[None])]
+    pieces = [responses(common[None]), responses(own)] if own.size else [responses(common[None])]
     order = np.argsort(np.concatenate(parts, axis=1), axis=1, kind="stable")
     grid = np.take_along_axis(np.concatenate(parts, axis=1), order, axis=1)
-    values = np.take_along_axis(np.concatenate([np.broadcast_to(v, (n, v.shape[-1])) for v in found], axis=1), order, 1)
+    values = np.take_along_axis(
+        np.concatenate([np.broadcast_to(v, (n, v.shape[-1])) for v in pieces], axis=1), order, 1
+    )
     endless = ~np.isfinite(values).all(axis=1)
     values = np.where(np.isfinite(values), values, -np.inf)
     padded = np.pad(values, ((0, 0), (1, 1)), constant_values=-np.inf)
@@ -85,9 +87,9 @@ def suprema(responses: _Responses, common: Array, own: Array) -> Array:
     top = values.max(axis=1)
     for _ in range(_ROUNDS):
         trial = np.linspace(left, right, _POINTS, axis=-1)  # (n, peaks, points)
-        found = responses(trial.reshape(trial.shape[0], -1)).reshape(trial.shape)
-        at = np.argmax(np.where(np.isfinite(found), found, -np.inf), axis=2)[..., None]
-        top = np.maximum(top, np.take_along_axis(found, at, axis=2)[..., 0].max(axis=1))
+        pieces = responses(trial.reshape(trial.shape[0], -1)).reshape(trial.shape)
+        at = np.argmax(np.where(np.isfinite(pieces), pieces, -np.inf), axis=2)[..., None]
+        top = np.maximum(top, np.take_along_axis(pieces, at, axis=2)[..., 0].max(axis=1))
         left = np.take_along_axis(trial, np.maximum(at - 1, 0), axis=2)[..., 0]
         right = np.take_along_axis(trial, np.minimum(at + 1, _POINTS - 1), axis=2)[..., 0]
     return np.where(endless, np.inf, top)
@@ -192,11 +194,11 @@ def rounding(G: Lti, z: NDArray[np.complex128], meant: Lti | None = None) -> flo
 
 def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Return one of each group of poles that lie within a hundredth of their distance to the circle."""
-    kept = np.zeros(0, dtype=np.complex128)
+    poles_kept = np.zeros(0, dtype=np.complex128)
     for pole in poles[poles.imag >= 0]:
-        if not (np.abs(kept - pole) < 0.01 * max(1 - abs(pole), 1e-9)).any():
-            kept = np.append(kept, pole)
-    return kept
+        if not (np.abs(poles_kept - pole) < 0.01 * max(1 - abs(pole), 1e-9)).any():
+            poles_kept = np.append(poles_kept, pole)
+    return poles_kept
 
 
 def supremum(response: Response, grid: Array) -> tuple[float, float]:
@@ -257,10 +259,10 @@ def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Arr
     """
     trial = np.linspace(left, right, 17)
     spend(_POINT * trial.size)
-    found = response(trial.ravel()).reshape(trial.shape)
-    at, column = np.argmax(found, axis=0), np.arange(left.size)
-    below, above, best = np.maximum(at - 1, 0), np.minimum(at + 1, 16), found[at, column]
-    lower = np.minimum(found[below, column], found[above, column])
+    values = response(trial.ravel()).reshape(trial.shape)
+    at, column = np.argmax(values, axis=0), np.arange(left.size)
+    below, above, best = np.maximum(at - 1, 0), np.minimum(at + 1, 16), values[at, column]
+    lower = np.minimum(values[below, column], values[above, column])
     # where all are infinite nothing drops
     reach = best + np.subtract(best, lower, out=np.zeros_like(best), where=lower < best)
     return best, trial[at, column], (trial[below, column], trial[above, column]), reach

@@ -235,8 +235,8 @@ class SampledLoop:
             schur = first + np.conj(np.swapaxes(below, 1, 2)) @ follows
             values, v = least_eigenpair(self.root[:, None] * schur * self.root)
             v = v * self.root
-            whole = np.concatenate([v, np.einsum("kij,kj->ki", follows, v)], axis=1)
-            self._last = x.copy(), values, whole
+            vectors = np.concatenate([v, np.einsum("kij,kj->ki", follows, v)], axis=1)
+            self._last = x.copy(), values, vectors
         return self._last[1], self._last[2]
 
     def stability(self, x: Array) -> float:
@@ -409,8 +409,8 @@ def _optimum(sampled: SampledLoop, start: SpringDamper, below: float = np.inf) -
     """
     x, curvature = sampled.point(start), None
     for searches in range(1, budgets.GAIN_ROUNDS + 1):
-        found = sampled.search(x, budgets.GAIN_STEPS[1 + (sampled.loop.channels <= FEW)], curvature)
-        x, curvature = found.x, found.curvature
+        optimum = sampled.search(x, budgets.GAIN_STEPS[1 + (sampled.loop.channels <= FEW)], curvature)
+        x, curvature = optimum.x, optimum.curvature
         if sampled.square_mismatch(x) >= below:
             return None, searches
         requirement = sampled.judged(x)

@@ -52,9 +52,9 @@ class EncoderSteps:
             return None
         widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
         published = tuple(friction_max or [None] * len(steps))
-        given = tuple(steps), tuple(friction), published
+        values = tuple(steps), tuple(friction), published
         if loop.environment.walls:
-            return cls(*given, None, False, f"encoder steps of {widths} um: with walls nothing is proved of them")
+            return cls(*values, None, False, f"encoder steps of {widths} um: with walls nothing is proved of them")
         needed = encoder_friction(loop.F(coupling), steps, loop.axes or ())
         covered = bool((needed <= np.asarray(friction)).all())
         amounts, has = (", ".join(f"{f:.4g}" for f in some) for some in (needed, friction))
@@ -65,4 +65,4 @@ class EncoderSteps:
         else:
             has += " N"
         enough = f"friction of {amounts} N is enough for {widths} um, the devices declare {has}"
-        return cls(*given, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")
+        return cls(*values, tuple(needed.tolist()), covered, f"encoder steps {verdict}: {enough}")

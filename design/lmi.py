@@ -391,19 +391,19 @@ class _AnyEnvironment(Multiplied):
             return refusal(self.name, loop.delta, str(reason))
         if len(multiplier) != loop.channels:
             raise NotProved("any-environment with psi >= 1 needs a multiplier Phi, one entry per channel")
-        found = conditions.any_environment(V, loop, np.array([float(p) for p in multiplier]))
-        return replace(found, multiplier=tuple(multiplier))
+        requirement = conditions.any_environment(V, loop, np.array([float(p) for p in multiplier]))
+        return replace(requirement, multiplier=tuple(multiplier))
 
     def _in_frame(self, V: Lti, loop: Loop, multiplier: Any) -> Requirement:
         if self.unknowns(loop):
-            found = self.required_of(V, loop, multiplier)
-            if multiplier or loop.latency or found.certified:
-                return found
+            needs = self.required_of(V, loop, multiplier)
+            if multiplier or loop.latency or needs.certified:
+                return needs
             spans = [(loop.delays.lo[own.start], loop.delays.hi[own.start]) for own in loop.devices]
             mean = [float(np.mean(even_damping(loop)[own])) * (1 - RESERVE) / loop.T for own in loop.devices]
             alpha = [float(f"{stiffest_alpha(*span, d):.10g}") for span, d in zip(spans, mean, strict=True)]
             closed = self.required_of(V, loop, alpha)  # A search finds no room near the stiffest coupling.
-            return min(found, replace(closed, bound=found.bound), key=lambda requirement: requirement.ratio)
+            return min(needs, replace(closed, bound=needs.bound), key=lambda requirement: requirement.ratio)
         asked = self.block(V, loop)
         if not V.is_stable():
             return refusal(self.name, loop.delta, "the coupling V has a pole on or outside the unit circle")
@@ -525,13 +525,13 @@ def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matri
 
 def symmetric(rows: list[list[_Matrix]]) -> _Matrix:
     """Return the block matrix, made exactly symmetric; an array if every block is one. Empty blocks are left out."""
-    kept = [[block for block in row if 0 not in block.shape] for row in rows]
-    kept = [row for row in kept if row]
-    numbers = all(isinstance(block, np.ndarray) for row in kept for block in row)
+    blocks = [[block for block in row if 0 not in block.shape] for row in rows]
+    blocks = [row for row in blocks if row]
+    numbers = all(isinstance(block, np.ndarray) for row in blocks for block in row)
     if numbers:
-        M = np.block(kept)
+        M = np.block(blocks)
     else:
         import cvxpy as cp  # loaded only for expressions
 
-        M = cp.bmat(kept)
+        M = cp.bmat(blocks)
     return (M + M.T) / 2

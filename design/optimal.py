@@ -399,14 +399,14 @@ class _Search:
         if not here.proved:
             return 0, str(here.reason)
         worst_first = sorted(range(1, len(needs)), key=lambda i: -needs[i])
-        for done, i in enumerate(worst_first, start=1):
-            if done * _PROOF * candidate.states**2.7 > work:
-                return done, None
+        for count, i in enumerate(worst_first, start=1):
+            if count * _PROOF * candidate.states**2.7 > work:
+                return count, None
             swept = from_ratio("this-environment", needs[i], self.loop.delta, 0.0)
             try:
                 prove(self.cases[i].loop, candidate.coupling, "this-environment", swept=swept)
             except NotProved as error:
-                return done, str(error)
+                return count, str(error)
         return len(needs), None
 
     def between(self, candidate: Optimal) -> Optimal:

@@ -294,11 +294,11 @@ def _zeros(E: Lti) -> Complex:
 
 
 def _distinct(modes: Complex) -> list[complex]:
-    kept: list[complex] = []
+    distinct: list[complex] = []
     for mode in modes:
-        if all(abs(mode - other) >= 0.05 * (1 - abs(other)) for other in kept):
-            kept.append(mode)
-    return kept
+        if all(abs(mode - other) >= 0.05 * (1 - abs(other)) for other in distinct):
+            distinct.append(mode)
+    return distinct
 
 
 _Pairs = list[tuple["Case", _Constraint]]
@@ -378,14 +378,14 @@ class Problem:
 
         L contains weight/|E|, and for the mismatch also `_evened`; the target of soft rows is zero.
         """
-        loop, found = case.loop, []
+        loop, weights = case.loop, []
 
         def add(w: Array, weight: Array, ideal: bool) -> None:
             E, z = case.E.at(on_circle(w)), on_circle(w)
             size = np.linalg.norm(E, axis=(1, 2))
             L = (weight / size)[:, None, None] * (_evened(E, size) if ideal else np.eye(case.E.inputs))
             target = (z[:, None] ** -np.asarray(loop.lam))[..., None] * E if ideal else np.zeros_like(E)
-            found.append((case, w, L, target @ L))
+            weights.append((case, w, L, target @ L))
 
         low, high = _band(loop, self.options.band_hz)
         if self.options.objective == "rms":
@@ -396,7 +396,7 @@ class Problem:
         edge = 2 * np.pi * HIGH_HZ * loop.T
         if edge < np.pi and self.soft > 0:
             add(np.geomspace(edge, np.pi, 20), np.full(20, self.soft * np.sqrt(case.weight / 20)), ideal=False)
-        return found
+        return weights
 
     def _force_rows(self, case: Case, w: Array, L: Complex, target: Complex, i: int, mine: NDArray[np.intp]) -> Array:
         """Return row i of F L for each of the unknowns `mine`, and row i of `target`, as real rows."""
@@ -538,15 +538,15 @@ class Problem:
 
     def missed(self, x: Array) -> tuple[list[Array], float]:
         """Return (frequencies of the violations of each constraint in each case, largest violation)."""
-        found, own, worst = [], iter(self.own), 0.0
+        missing, own, worst = [], iter(self.own), 0.0
         for case in self.cases:
             for constraint in case.constraints:
                 mine = next(own)
                 w = self._sweep(case, constraint)
                 fails = lambda w, case=case, constraint=constraint, mine=mine: -self.least(case, constraint, mine, x, w)  # noqa: E731
-                found.append(peaks(fails, w, above=0.0))
-                worst = max(worst, float(fails(found[-1]).max(initial=0.0)))
-        return found, worst
+                missing.append(peaks(fails, w, above=0.0))
+                worst = max(worst, float(fails(missing[-1]).max(initial=0.0)))
+        return missing, worst
 
     def solve(self, start: Array, forgiven: float = _FORGIVEN, until: float = math.inf) -> Array:
         """Find the optimum from a strictly feasible start, with violations below `forgiven` on a dense sweep.

@@ -71,7 +71,7 @@ def vertices(network: Network, percent: float = 10.0) -> dict[str, Network]:
 
 
 def _vertices(network: Network, percent: float) -> dict[str, Network]:
-    found = {}
+    vertices = {}
     stiff = [i for i, spring in enumerate(network.springs) if spring.stiffness > 0]
     for sign, factor in (("+", 1 + percent / 100), ("-", 1 - percent / 100)):
 
@@ -83,14 +83,14 @@ def _vertices(network: Network, percent: float) -> dict[str, Network]:
             return msgspec.structs.replace(network, springs=tuple(springs))
 
         for i in stiff:
-            found[f"{sign}{percent:g} % stiffness between {' and '.join(network.springs[i].between)}"] = stiffer([i])
+            vertices[f"{sign}{percent:g} % stiffness between {' and '.join(network.springs[i].between)}"] = stiffer([i])
         if len(stiff) > 1:
-            found[f"{sign}{percent:g} % stiffness of all springs"] = stiffer(stiff)
+            vertices[f"{sign}{percent:g} % stiffness of all springs"] = stiffer(stiff)
         for node, mass in network.masses.items():
             if mass > 0:
                 masses = {**network.masses, node: mass * factor}
-                found[f"{sign}{percent:g} % mass of {node}"] = msgspec.structs.replace(network, masses=masses)
-    return found
+                vertices[f"{sign}{percent:g} % mass of {node}"] = msgspec.structs.replace(network, masses=masses)
+    return vertices
 
 
 def robustness(

@@ -80,10 +80,10 @@ class _Channel:
         """Return c with k/2 + b >= |c|^2 on |z| = 1; its C and D are affine in the gains, its A and B are fixed."""
         k, b = gains
         late = theta_hat((self.theta,), np.ones(1), 1.0)  # a delay line: D and C are its coefficients
-        taken = taps(np.convolve(np.append(late.D, late.C), [k + b, -b]).tolist(), 1.0)
+        window = taps(np.convolve(np.append(late.D, late.C), [k + b, -b]).tolist(), 1.0)
         if not self.shortage:
-            return taken
-        return vstack(taken, (np.eye(1) - taken) * (1 / np.sqrt(1 / self.shortage - 1)))
+            return window
+        return vstack(window, (np.eye(1) - window) * (1 / np.sqrt(1 / self.shortage - 1)))
 
     def exactly(self, unknowns: Sequence[int]) -> Inequality:
         """Return the inequality at all frequencies; the unknowns after the gains are a storage."""
@@ -421,14 +421,14 @@ def _stiffest_channel(loop: Loop) -> tuple[float, float]:
         cost = period_cost(loop, np.full(z.size, 1 - _STIFF_RESERVE), beta)
         limits = chi(z, loop.theta, cost, beta)[:, 0]
         most = 1 / (limits * steps).max()
-        found = minimize_scalar(lambda B: -stiffest(B, limits), bounds=(0.0, most), method="bounded")
-        return float(found.fun), float(found.x)
+        optimum = minimize_scalar(lambda B: -stiffest(B, limits), bounds=(0.0, most), method="bounded")
+        return float(optimum.fun), float(optimum.x)
 
     tried = [at(eta) for eta in _ETAS]
     best = int(np.argmin([value for value, _ in tried]))
     ends = _ETAS[max(best - 1, 0)], _ETAS[min(best + 1, _ETAS.size - 1)]
-    found: Any = minimize_scalar(lambda eta: at(eta)[0], bounds=ends, method="bounded", options={"xatol": 1e-6})
-    K, B = min(at(float(found.x)), tried[best])
+    optimum: Any = minimize_scalar(lambda eta: at(eta)[0], bounds=ends, method="bounded", options={"xatol": 1e-6})
+    K, B = min(at(float(optimum.x)), tried[best])
     return float(f"{-K:.{_STIFF_DIGITS}g}"), float(f"{B:.{_STIFF_DIGITS}g}")
 
 
@@ -458,14 +458,14 @@ def _stiffest_linear(loop: Loop) -> Design:
 
         best = int(np.argmin([needed(eta).mean() for eta in _ETAS]))
         ends = _ETAS[max(best - 1, 0)], _ETAS[min(best + 1, _ETAS.size - 1)]
-        found: Any = minimize_scalar(lambda eta: needed(eta).mean(), bounds=ends, method="bounded")
-        eta = float(found.x)
+        optimum: Any = minimize_scalar(lambda eta: needed(eta).mean(), bounds=ends, method="bounded")
+        eta = float(optimum.x)
         limits = needed(eta)
         series = np.fft.rfft(limits).real / _TAPS
         left = 2 * np.cumsum(np.abs(series[::-1]))[::-1]  # sums of the terms from each one on
         count = int(np.argmax(left < _SLACK / 2 * limits.max()))
-        kept = series[1:count]
-        weights = -2 * np.diff(np.append(kept, 0.0), prepend=0.0)
+        coefficients = series[1:count]
+        weights = -2 * np.diff(np.append(coefficients, 0.0), prepend=0.0)
         weights[0] += 2 * series[0] + 2 * _SLACK * limits.max()
         channels.append(taps([float(f"{v:.{_TAP_DIGITS}g}") for v in weights], loop.T))
     V = Lti.diag(*channels)
@@ -600,8 +600,8 @@ def _best_charge(loop: Loop, i: int, theta: int) -> Array:
     objective = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 1.0])
     blocks = [Inequality.of(allowed, range(6)), Inequality.of(cost, range(6))]
     x = ConeProgram(objective, blocks).solve("the charge of a latency")
-    found = hands.allowed(one, {name: (scale * v,) for name, v in zip(_Q, x[:3], strict=True)})
-    return symmetric_from(np.array([found[name][0] for name in _Q]), 2)
+    admissible = hands.allowed(one, {name: (scale * v,) for name, v in zip(_Q, x[:3], strict=True)})
+    return symmetric_from(np.array([admissible[name][0] for name in _Q]), 2)
 
 
 _Q = "q11", "q12", "q22"
@@ -643,11 +643,11 @@ def _start(loop: Loop, certified: GainSet, start: SpringDamper | None) -> Array:
     N, more = loop.channels, []
     cost = np.repeat([-1.0, 0.0], N)
     if start is not None:  # minimise t with |gains - wanted| <= t
-        wanted = np.concatenate([start.K * loop.T, start.B]) / np.tile(usable(loop), 2)
+        target = np.concatenate([start.K * loop.T, start.B]) / np.tile(usable(loop), 2)
         cost = np.append(np.zeros(2 * N), 1.0)
 
         def near(x: Array) -> Array:
-            away = (x[:-1] - wanted)[:, None]
+            away = (x[:-1] - target)[:, None]
             return np.block([[x[-1] * np.eye(2 * N), away], [away.T, x[-1:, None]]])
 
         more = [Inequality.of(near, range(2 * N + 1))]

@@ -116,10 +116,10 @@ def _elastic(H: Array, g: Array, rows: Array, least: Array) -> tuple[Array, Arra
     wide[:n, :n], wide[n, n] = H, _ELASTIC * max(np.abs(H).max(), 1.0)
     left = np.hstack([rows, np.maximum(least, 0.0)[:, None]])
     ends = np.eye(2, n + 1, k=n) - np.eye(2, n + 1, k=n - 1)  # the share from 0 to 1
-    found = quadratic(wide, np.append(g, 0.0), np.vstack([left, ends]), np.append(least, [0.0, -1.0]), [])
-    if found is None:  # rounding
+    solution = quadratic(wide, np.append(g, 0.0), np.vstack([left, ends]), np.append(least, [0.0, -1.0]), [])
+    if solution is None:  # rounding
         return np.zeros(n), np.zeros(least.size), []
-    return found[0][:n], found[1][: least.size], []
+    return solution[0][:n], solution[1][: least.size], []
 
 
 def quadratic(

@@ -99,10 +99,10 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
         if w is grid and known:
             return known[0]
         E = np.linalg.svd(environment.at(on_circle(w)), compute_uv=False)
-        found = np.linalg.norm(mismatch(w), 2, axis=(1, 2)), E[:, 0], E[:, -1]
+        rows = np.linalg.norm(mismatch(w), 2, axis=(1, 2)), E[:, 0], E[:, -1]
         if w is grid:
-            known.append(found)
-        return found
+            known.append(rows)
+        return rows
 
     def relative(w: Array) -> Array:
         M, E, _ = sizes(w)

@@ -122,7 +122,7 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
             return (self,)
         damping, level = np.diag(self.matrix("damping")), np.diag(self.matrix("delta"))
         alone: dict[str, Any] = {"axes": 1, "clamped": ()}
-        made = []
+        devices = []
         for k, i in enumerate(self.free):
             per_axis = {
                 name: value[i]
@@ -130,8 +130,8 @@ class _Device(msgspec.Struct, frozen=True, forbid_unknown_fields=True, repr_omit
                 if isinstance(value := getattr(self, name), tuple)
             }
             delta = None if self.delta is None else float(level[k])
-            made.append(msgspec.structs.replace(self, **alone, **per_axis, damping=float(damping[k]), delta=delta))
-        return tuple(made)
+            devices.append(msgspec.structs.replace(self, **alone, **per_axis, damping=float(damping[k]), delta=delta))
+        return tuple(devices)
 
 
 class CompliantDevice(_Device, frozen=True, forbid_unknown_fields=True, tag="compliant", tag_field="kind"):

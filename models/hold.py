@@ -112,8 +112,8 @@ def expm_each(matrices: _Array) -> _Array:
     odd = a @ (a6 @ (b[13] * a6 + b[11] * a4 + b[9] * a2) + b[7] * a6 + b[5] * a4 + b[3] * a2 + b[1] * one)
     even = a6 @ (b[12] * a6 + b[10] * a4 + b[8] * a2) + b[6] * a6 + b[4] * a4 + b[2] * a2 + b[0] * one
     result = np.linalg.solve(even - odd, even + odd)
-    for done in range(halvings.max(initial=0)):
-        unfinished = halvings > done
+    for count in range(halvings.max(initial=0)):
+        unfinished = halvings > count
         result[unfinished] = result[unfinished] @ result[unfinished]
     return result
 
@@ -158,9 +158,9 @@ def product_of(matrices: _Array) -> Product:
     parts = matrices[:, rows[:, :, None], columns[:, None, :]] * valid
     blocks = np.ascontiguousarray(np.moveaxis(parts, 0, -1))  # (blocks, rows, columns, nsim)
     moved = np.empty((*rows.shape, matrices.shape[0]))
-    kept, index = rows >= 0, ...
-    if not kept.all():
-        index, rows = kept, rows[kept]
+    inside, index = rows >= 0, ...
+    if not inside.all():
+        index, rows = inside, rows[inside]
 
     def multiply(slab: _Array, out: _Array) -> None:
         np.einsum("crkn,ckn->crn", blocks, slab.take(columns, axis=0), out=moved)

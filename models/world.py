@@ -72,21 +72,21 @@ def files_of(path: Path) -> list[Path]:
 
     A mesh that several folders hold is listed from each. Raises ValueError where a file cannot be read or is no XML.
     """
-    found: dict[Path, None] = {}
+    files: dict[Path, None] = {}
     folders: list[Path] = []
     assets: list[str] = []
 
     def visit(file: Path, base: Path) -> None:
-        if file in found:
+        if file in files:
             raise ValueError(f"world {path}: {file.name} is included twice")
-        found[file] = None
+        files[file] = None
         folders.append(base)
         for node in _xml(file, path).iter():
             name = node.get("file")
             if node.tag == "include" and name:
                 visit(base / name, base)
             elif node.tag == "model" and name and (part := base / name).suffix == ".xml":
-                if part not in found:
+                if part not in files:
                     visit(part, part.parent)
             elif node.tag == "compiler":
                 named = (node.get(key) for key in ("assetdir", "meshdir", "texturedir"))
@@ -97,8 +97,8 @@ def files_of(path: Path) -> list[Path]:
     visit(path, path.parent)
     for name in assets:
         places = [folder / part for folder in folders for part in (name, Path(name).name)]  # the latter by strippath
-        found.update(dict.fromkeys(place for place in places if place.is_file()))
-    return list(found)
+        files.update(dict.fromkeys(place for place in places if place.is_file()))
+    return list(files)
 
 
 def _xml(file: Path, world: Path) -> ElementTree.Element:
@@ -261,13 +261,13 @@ class World:
             if pose not in self._keys:
                 named = ", ".join(name for name in self._keys if name) or "none"
                 raise ValueError(f"pose is {pose!r}, keyframes of {self.path.name}: {named}")
-            whole = self.model.qpos0.copy()
-            whole[np.setdiff1d(np.arange(self.model.nq), self._qpos)] = self._keys[pose]
-            return whole
-        whole = self.model.qpos0.copy() if pose is None else np.array(pose, dtype=float)
-        if whole.shape != (self.model.nq,):
-            raise ValueError(f"pose has the shape {whole.shape}, expected ({self.model.nq},) positions")
-        return whole
+            qpos = self.model.qpos0.copy()
+            qpos[np.setdiff1d(np.arange(self.model.nq), self._qpos)] = self._keys[pose]
+            return qpos
+        qpos = self.model.qpos0.copy() if pose is None else np.array(pose, dtype=float)
+        if qpos.shape != (self.model.nq,):
+            raise ValueError(f"pose has the shape {qpos.shape}, expected ({self.model.nq},) positions")
+        return qpos
 
     # -------------------------------------------------------------------------------------------- what is in it
 
@@ -423,11 +423,11 @@ def _off_rest(model: mujoco.MjModel) -> None:
 
 def _blockdiag(blocks: Sequence[Array]) -> Array:
     size = sum(len(block) for block in blocks)
-    whole, at = np.zeros((size, size)), 0
+    matrix, at = np.zeros((size, size)), 0
     for block in blocks:
-        whole[at : at + len(block), at : at + len(block)] = block
+        matrix[at : at + len(block), at : at + len(block)] = block
         at += len(block)
-    return whole
+    return matrix
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -537,13 +537,13 @@ class Port:
             mujoco.mj_step(model, data)
             free = self._spring(goal)
             limited = self._used(free) > np.where(pushed, 1 - _LIMIT_SLACK, 1 + _LIMIT_SLACK)
-            wanted = np.where(np.repeat(limited, self._axes), self._within(free), 0.0)
-            off = np.abs(wanted - push) > _DIRECTION_SLACK * np.where(held, self._limits, np.inf)
+            force = np.where(np.repeat(limited, self._axes), self._within(free), 0.0)
+            off = np.abs(force - push) > _DIRECTION_SLACK * np.where(held, self._limits, np.inf)
             if settled := bool((limited == pushed).all() and not off.any()):
                 break
             if repetition == MOST_REPETITIONS:
                 break
-            repetition, pushed, push = repetition + 1, limited, wanted
+            repetition, pushed, push = repetition + 1, limited, force
             mujoco.mj_setState(model, data, saved, _STATE)
         self.unsettled += not settled
         model.jnt_stiffness[world._joint], data.qfrc_applied[world._dof] = world._g, 0.0

@@ -133,8 +133,8 @@ def measure_all(
     settings = list(dict.fromkeys((*_SETTINGS, ("mujoco", "RK4", default))))
     try:
         truth = reference(coupled, uncoupled)
-        for done, (engine, integrator, substeps) in enumerate(settings):
-            progress(done, len(settings))
+        for index, (engine, integrator, substeps) in enumerate(settings):
+            progress(index, len(settings))
             try:
                 if integrator and substeps and _step_radius(coupled, integrator, substeps) > 1 + _NEUTRAL:
                     raise InputError("outside the stable region")
@@ -263,8 +263,8 @@ def credible(simulation: Simulation, trace: Trace) -> Credible:
     most_forces = [device.most_credible_force for device in devices]
     most_speeds = [device.credible_speed for device in devices]
     until = float(trace.t[np.argmax(outside)]) if outside.any() else None
-    found = Credible(until, forces, speeds, most_forces, most_speeds)
-    return found if until is None else replace(found, reason=_not_credible(found, until))
+    credible_part = Credible(until, forces, speeds, most_forces, most_speeds)
+    return credible_part if until is None else replace(credible_part, reason=_not_credible(credible_part, until))
 
 
 def _not_credible(found: Credible, until: float) -> str:
@@ -315,8 +315,8 @@ def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> For
     if process.walls:
         return ForceError.of(trace.f, trace.f, "walls have no linear ideal to compare with")
     F = process.F
-    asked = trace.f if process.delays is not None or process.law.bounds else trace.z @ F.C.T + trace.x @ F.D.T
-    return ForceError.of(asked, response(delay(lam, F.T) @ simulation.E, trace.x))
+    wanted_force = trace.f if process.delays is not None or process.law.bounds else trace.z @ F.C.T + trace.x @ F.D.T
+    return ForceError.of(wanted_force, response(delay(lam, F.T) @ simulation.E, trace.x))
 
 
 def response(G: Lti, x: Array) -> Array:
@@ -407,9 +407,9 @@ def compare_engines(
 
 def pick(choices: Sequence[EngineChoice], error: float) -> EngineChoice:
     """Return the cheapest setting with a small enough error and the right verdict. Raises InputError."""
-    kept = [choice for choice in choices if choice.verdict_correct and choice.position_relative_rms <= error]
-    if kept:
-        return min(kept, key=lambda choice: choice.cost)
+    right = [choice for choice in choices if choice.verdict_correct and choice.position_relative_rms <= error]
+    if right:
+        return min(right, key=lambda choice: choice.cost)
     best = min(choices, key=lambda choice: choice.position_relative_rms)
     raise InputError(f"--error {error:g}: the nearest, {best.name}, is within {best.position_relative_rms:.1g}")
 
@@ -538,8 +538,8 @@ def settle(
     Raises InputError for impossible settings.
     """
     if engine != "mujoco":
-        for name, asked in (("integrator", integrator), ("substeps", substeps)):
-            if asked is not None:
+        for name, value in (("integrator", integrator), ("substeps", substeps)):
+            if value is not None:
                 raise InputError(f"--{name} with --engine {engine_name(engine)}: it is MuJoCo's; leave it out")
         if engine == "exact" and simulation.friction:
             raise InputError(

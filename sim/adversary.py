@@ -92,7 +92,7 @@ def search(
         logarithms = [_MASS, _STIFFNESS] * (m * kind.links) + [_MASS, _STIFFNESS, _STIFFNESS] * kind.held
         known = all(device.guaranteed for device in scenario.device)
         ranges = [*np.log(logarithms), *[(-1.0, 1.0)] * (_WITHIN * m * known)]
-        found = differential_evolution(
+        optimum = differential_evolution(
             partial(_losses, scenario=scenario, F=F, kind=kind),
             ranges,
             rng=np.random.default_rng(np.random.SeedSequence((seed, trial))),
@@ -105,8 +105,8 @@ def search(
             callback=stop,
         )
         done = (trial + 1) * generations
-        evaluated += (found.nit + 1) * (_CANDIDATES // len(ranges)) * len(ranges)
-        worst = _worst(scenario, F, _ladders(found.x[:, None], scenario.device, kind), evaluated)
+        evaluated += (optimum.nit + 1) * (_CANDIDATES // len(ranges)) * len(ranges)
+        worst = _worst(scenario, F, _ladders(optimum.x[:, None], scenario.device, kind), evaluated)
         best = worst if best is None or worst.growth > best.growth else best
         if first and best.destabilises:
             break

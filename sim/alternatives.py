@@ -123,7 +123,7 @@ def _alternative(
     simulation = assemble(scenario, chosen.coupling, assessment.force_limits.rho)
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
-    made = Alternative(
+    row = Alternative(
         kind,
         condition,
         guarantee=assessment.guarantee.words if assessment.guarantee else None,
@@ -134,8 +134,8 @@ def _alternative(
         requirements=dict(requirements),
     )
     if scenario.environment.walls or simulation.friction:
-        return made
+        return row
     trace = run(simulation, "exact")
     alike, until = force_error(simulation, trace, loop.lam), credible(simulation, trace).until_s
     error = None if unstable(growth) else alike.error_percent
-    return replace(made, force_error_percent=error, trace=trace, ideal=alike.ideal, until_s=until)
+    return replace(row, force_error_percent=error, trace=trace, ideal=alike.ideal, until_s=until)

@@ -87,8 +87,8 @@ def run_scenario(
     ran = simulation if net is None else netted(simulation, net)
     if settings.error is not None:
         choices = compare_engines(ran, settings.error, progress=progress)
-        kept = pick(choices, settings.error)
-        integrator, substeps = kept.integrator, kept.substeps
+        choice = pick(choices, settings.error)
+        integrator, substeps = choice.integrator, choice.substeps
     else:
         integrator, substeps, remarks = settle(simulation, settings.engine, settings.integrator, settings.substeps)
     settled = EngineSettings(settings.engine, integrator, substeps)
@@ -169,20 +169,20 @@ def simulate(
     elif energy_budget is not None:
         net = EnergyNet(energy_budget, guarantee=claim(assessment))
     settings, rho = EngineSettings(engine, integrator, substeps), assessment.force_limits.rho
-    done = run_scenario(scenario, chosen.coupling, rho, settings, seed, net)
-    trace = done.trace
+    outcome = run_scenario(scenario, chosen.coupling, rho, settings, seed, net)
+    trace = outcome.trace
     linear = not (scenario.switches or environment or is_world(scenario))
     meta = {
         "scenario": scenario.name,
         **({"unit": "rad"} if scenario.unit == "rad" else {}),
         "scenario_digest": scenario.digest,
         "engine": engine_name(engine),
-        "integrator": done.settings.integrator,
-        "substeps": done.settings.substeps,
+        "integrator": outcome.settings.integrator,
+        "substeps": outcome.settings.substeps,
         "seed": seed,
         "assessment": plain(assessment),
-        "stability": plain(stability_of(done.simulation, trace)) if linear else None,
-        "remarks": done.remarks,
+        "stability": plain(stability_of(outcome.simulation, trace)) if linear else None,
+        "remarks": outcome.remarks,
         "energy_budget": plain(trace.net.figures()) if trace.net else None,
     }
     if isinstance(trace.net, InWorld):

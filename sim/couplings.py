@@ -48,15 +48,15 @@ def choose(
     Raises InputError for contradicting options, DesignFailed if no coupling was found.
     """
     try:
-        asked, own = name_and_own(condition)
-        found = _choose(scenario, case, name, asked, own, limiter, progress)
+        target, own = name_and_own(condition)
+        chosen = _choose(scenario, case, name, target, own, limiter, progress)
     except (DesignFailed, InputError):
         raise
     except ValueError as error:
         if place_of(error):  # in a class of the user's own
             raise
         raise InputError(str(error)) from None
-    return replace(found, own=own)
+    return replace(chosen, own=own)
 
 
 def _choose(
@@ -86,8 +86,8 @@ def _choose(
     if name in KINDS:
         loop = scenario.loop(case)
         condition = condition or usual_condition(loop, name)
-        asked: dict[str, Any] = {"limiter": limiter} if limiter is not None and KINDS[name].limited else {}
-        return replace(design_by_kind(loop, name, own or condition, progress, **asked), kind=name)
+        further: dict[str, Any] = {"limiter": limiter} if limiter is not None and KINDS[name].limited else {}
+        return replace(design_by_kind(loop, name, own or condition, progress, **further), kind=name)
     if Path(name).suffix != ".json":
         raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)}, a FILE.json or FILE.py:NAME")
     stored = read_coupling(name)
@@ -98,9 +98,9 @@ def _choose(
 
 def own_of(name: str, loop: Loop) -> Chosen:
     """Return the coupling that a user's own function makes for a loop. Raises InputError."""
-    found = own_coupling(name, loop)
-    called(f"--coupling {name}", fitting, loop, found)
-    return given(found, name)
+    coupling = own_coupling(name, loop)
+    called(f"--coupling {name}", fitting, loop, coupling)
+    return given(coupling, name)
 
 
 def given(coupling: Any, kind: str = "given") -> Chosen:
@@ -150,9 +150,9 @@ def from_file(
     claim, coupling = stored.certificate, coupling or stored.built()
     # A condition of the user's own has to be given again.
     made_for = claim.condition if claim and claim.condition in CONDITIONS else THIS_ENVIRONMENT.name
-    asked = own if claim and own and claim.condition == own.name else None
+    condition = own if claim and own and claim.condition == own.name else None
     try:
-        reason = verify(stored, asked).reason if claim else None
+        reason = verify(stored, condition).reason if claim else None
     except (ValueError, ArithmeticError) as error:
         reason = str(error)
     notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []

@@ -376,17 +376,17 @@ def validate(question: Validation, shards: int = 1, progress: Progress = lambda 
 
 
 def _here(question: Validation, parts: dict[int, Findings], progress: Progress) -> None:
-    batches, ticks, done = question.batches(), max(1, question.ticks), 0
+    batches, ticks, ticks_done = question.batches(), max(1, question.ticks), 0
 
     def ticked(count: int) -> None:
-        nonlocal done
-        done += count
-        progress(done, ticks * len(batches))
+        nonlocal ticks_done
+        ticks_done += count
+        progress(ticks_done, ticks * len(batches))
 
     for number, batch in enumerate(batches):
         parts[number] = _examine(question, batch, ticked)
-        done = (number + 1) * ticks
-        progress(done, ticks * len(batches))
+        ticks_done = (number + 1) * ticks
+        progress(ticks_done, ticks * len(batches))
 
 
 def _in_processes(question: Validation, shards: int, parts: dict[int, Findings], progress: Progress) -> None:

@@ -244,9 +244,9 @@ def _trials(F: Lti, processes: Sequence[Process], held: HeldDevices, plan: Plan)
     """Return one trial for each cell, with the human nearest to oscillating, and the growth with that human."""
     slowest, trials, growth = slowest_seen(plan.duration), [], []
     for i, process in enumerate(processes):
-        whole, swinging = held.growth(F[i], min_frequency_hz=slowest)
-        runs_away = whole > plan.runaway_growth  # without an oscillation: what pushes outwards at rest
-        shown = np.where(runs_away, whole, swinging)
+        fastest, swinging = held.growth(F[i], min_frequency_hz=slowest)
+        runs_away = fastest > plan.runaway_growth  # without an oscillation: what pushes outwards at rest
+        shown = np.where(runs_away, fastest, swinging)
         human = int(np.argmax(shown))
         mode = held.mode(F[i], human, 0.0 if runs_away[human] else slowest)
         trials.append(_Trial(process, held.links(human), _START * mode))
@@ -268,8 +268,12 @@ def _points(
     links = np.array([trial.links.shape[1] for trial in trials])
     for count in np.unique(links):
         which = np.flatnonzero(links == count)
-        found = _simulate([trials[i] for i in which], held, press, plan, ticked)
-        lasting[which], amplitude[which], frequency[which] = found.sustained, found.amplitude, found.frequency_hz
+        oscillations = _simulate([trials[i] for i in which], held, press, plan, ticked)
+        lasting[which], amplitude[which], frequency[which] = (
+            oscillations.sustained,
+            oscillations.amplitude,
+            oscillations.frequency_hz,
+        )
     return Points(cells, lasting, amplitude, frequency, growth)
 
 
@@ -289,19 +293,19 @@ def _simulate(
     buffer.s[0] = starts[:n]
     if not (law.walls or law.bounds):  # A process with walls or a limiter has other states and begins at rest.
         buffer.z[0] = starts[n:]
-    seen, kept, done = list(_motors_and_handles(scene)), [], 0
+    seen, displacements, first = list(_motors_and_handles(scene)), [], 0
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
         engine = MujocoBatchEngine(held_by, T, substeps=substeps, timing=timing)
         engine.start(buffer)
-        while done < ticks:
-            count = min(buffer.ticks, ticks - done)
-            buffer.w[:count] = _press_forces(scene, T, press, done, count)[:, :, None]
+        while first < ticks:
+            count = min(buffer.ticks, ticks - first)
+            buffer.w[:count] = _press_forces(scene, T, press, first, count)[:, :, None]
             run_block(buffer, engine, count)
-            kept.append(buffer.s[:count, seen].copy())
+            displacements.append(buffer.s[:count, seen].copy())
             buffer.rewind(count)
-            done += count
+            first += count
             ticked(count)
-    return oscillation(np.concatenate(kept)[ticks // 2 :], T, plan.threshold)
+    return oscillation(np.concatenate(displacements)[ticks // 2 :], T, plan.threshold)
 
 
 def _press_forces(scene: Scene, T: float, press: Array, first: int, ticks: int) -> Array:

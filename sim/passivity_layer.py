@@ -50,14 +50,14 @@ class EnergyNet:
         loop, lost = simulation.loop, bool((process.delays == LOST).any())
         hold, span = _HELD if lost else 0, loop.delays
         packets, longest = Packets(span.lo, span.hi, hold), loop.T_max or loop.T  # a longer tick may lose more
-        given: dict[str, Any] = {"start": self.start, "cap": self.cap, "nsim": nsim}
+        settings: dict[str, Any] = {"start": self.start, "cap": self.cap, "nsim": nsim}
         try:
             budget = EnergyBudget(
                 loop.Delta() if loop.levels else loop.delta,
                 longest,
                 packets,
                 encoder_step=process.encoder_step,
-                **given,
+                **settings,
             )
         except ValueError as error:
             raise InputError(f"energy budget: {error}") from None

@@ -289,16 +289,16 @@ def run_blocks(
 
 def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
     """Close the loop for the first `ticks` rows of the buffer."""
-    done = 0
+    first = 0
     if buffer.calm and isinstance(engine, RunsBlocks) and engine.run_block:
         engine.run_block(ticks)  # the linear law, whose forces are checked afterwards
-        done = buffer.linear_until(ticks)
-        if done == ticks:
+        first = buffer.linear_until(ticks)
+        if first == ticks:
             return
-        engine.back(done)
+        engine.back(first)
         buffer.calm = False
     tick, advance = buffer.tick, engine.advance
-    for k in range(done, ticks):
+    for k in range(first, ticks):
         tick(k)  # sample x, compute f and z+, limit f
         advance(k)  # hold -f on the actuators for T, move the plant
 

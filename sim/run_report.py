@@ -135,7 +135,7 @@ def run_report(
         stability = stability_of(simulation, trace)
     net = trace.net.figures() if trace.net else None
     budget = net if isinstance(net, BudgetFigures) else None
-    found = RunReport(
+    report = RunReport(
         case=case,
         scenario=scenario.name,
         kind=chosen.kind,
@@ -152,7 +152,7 @@ def run_report(
         energy_budget=budget and replace(budget, idle=idle(simulation, requirements.values(), budget)),
         remarks=(*run.remarks, *chosen.remarks(requirements), *friction_left_out(scenario.device)),
     )
-    return replace(found, remarks=(*found.remarks, *found.notes()))
+    return replace(report, remarks=(*report.remarks, *report.notes()))
 
 
 def _ran(run: ScenarioRun, lam: tuple[int, ...], environment: str, check: bool) -> Ran:

@@ -411,8 +411,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
                 fields["environment"] = _network(fields["environment"], fields["T"])
             if "human" in own:
                 fields["human"] = [_NOBODY] * len(own["human"])
-            made = _strictly(fields, type(self))
-            return msgspec.structs.replace(made, **{name: _kept(value) for name, value in own.items()})
+            scenario = _strictly(fields, type(self))
+            return msgspec.structs.replace(scenario, **{name: _kept(value) for name, value in own.items()})
         except InputError:
             raise
         except ValueError as error:
@@ -561,35 +561,35 @@ def _load_humans(text: str, devices: int) -> _HumanFile:
 def _humans_of(text: str, source: str) -> _HumanFile:
     """Return the humans of a file: measured transfer functions (A, B, C, D) and chains."""
     people: _HumanFile = _converted(text, _HumanFile, source)
-    made = []
+    humans = []
     for i, human in enumerate(people.human, start=1):
         kind = MeasuredHand if isinstance(human, dict) and "A" in human else Human
         try:
-            made.append(msgspec.convert(human, kind))
+            humans.append(msgspec.convert(human, kind))
         except msgspec.ValidationError as error:
             joint = "." if re.search(r" - at `\$\.", str(error)) else ": "
             place = _located(str(error), human if isinstance(human, dict) else {})
             raise InputError(f"{source}: human #{i}{joint}{place}") from None
         except ValueError as error:
             raise InputError(f"{source}: human #{i}: {error}") from None
-    return _HumanFile(tuple(made), people.person, None, people.device)
+    return _HumanFile(tuple(humans), people.person, None, people.device)
 
 
 def _own_humans(text: str) -> _HumanFile:
     """Return the people of FILE.py:NAME: hands and persons, a population with draw(rng, n), or a function of them."""
     people: Any = named("--human", text)
     if isinstance(people, type) or isfunction(people):
-        made: Any = called(f"--human {text}", people)
+        people_made: Any = called(f"--human {text}", people)
     else:
-        made = people
-    if callable(getattr(made, "draw", None)):
-        if len(_kept(tuple(made.draw(np.random.default_rng(0), 2)))) != 2:
+        people_made = people
+    if callable(getattr(people_made, "draw", None)):
+        if len(_kept(tuple(people_made.draw(np.random.default_rng(0), 2)))) != 2:
             raise ValueError("draw(rng, 2) gives not two humans")
-        return _HumanFile((), (), made)
-    if not isinstance(made, list | tuple):
-        raise ValueError(f"it is {made!r}, expected a list of hands, or a population with draw(rng, n)")
-    persons = tuple(person for person in made if isinstance(person, Person))
-    return _HumanFile(_kept(tuple(hand for hand in made if not isinstance(hand, Person))), persons)
+        return _HumanFile((), (), people_made)
+    if not isinstance(people_made, list | tuple):
+        raise ValueError(f"it is {people_made!r}, expected a list of hands, or a population with draw(rng, n)")
+    persons = tuple(person for person in people_made if isinstance(person, Person))
+    return _HumanFile(_kept(tuple(hand for hand in people_made if not isinstance(hand, Person))), persons)
 
 
 def _toml(value: Any) -> str:
@@ -662,32 +662,32 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
         return raw
     made = []
     for i, one in enumerate(devices, start=1):
-        given = {"device": one} if isinstance(one, str) else one
-        if isinstance(given, dict) and isinstance(name := given.get("device"), str):
+        fields = {"device": one} if isinstance(one, str) else one
+        if isinstance(fields, dict) and isinstance(name := fields.get("device"), str):
             try:
-                given = fields_of(name, {key: value for key, value in given.items() if key != "device"})
+                fields = fields_of(name, {key: value for key, value in fields.items() if key != "device"})
             except ValueError as error:
                 raise InputError(f"device #{i}: {error}") from None
-        made.append(given)
+        made.append(fields)
     return raw | {"device": made}
 
 
 def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
     """Place the points of the environment in space if devices have several axes. Raises ValueError."""
-    devices, given = raw.get("device"), raw.get("environment")
+    devices, table = raw.get("device"), raw.get("environment")
     tables = [one for one in devices if isinstance(one, dict)] if isinstance(devices, list) else []
     counts = [one.get("axes", 1) for one in tables]
     if all(n == 1 for n in counts) or not all(type(n) is int and 1 <= n <= len(AXES) for n in counts):
         return raw  # one axis, or what the fields' own checks refuse
-    if not isinstance(given, dict) or given.get("points"):
+    if not isinstance(table, dict) or table.get("points"):
         return raw
     for i, n in enumerate(counts, start=1):
         if n != counts[0]:
             raise ValueError(f"device #{i}.axes is {n}, expected {counts[0]} as of device #1: clamp axes of it instead")
     names = AXES[: counts[0]]
     held = [one.get("clamped", []) for one in tables]
-    contacts, walls = given.get("contacts", []), given.get("walls", [])
-    springs = [part for i, one in enumerate(given.get("springs", []), 1) for part in _along_axes(i, one, len(names))]
+    contacts, walls = table.get("contacts", []), table.get("walls", [])
+    springs = [part for i, one in enumerate(table.get("springs", []), 1) for part in _along_axes(i, one, len(names))]
     parts = [*springs, *(walls if isinstance(walls, list) else [])]
     if not isinstance(contacts, list) or not all(isinstance(name, str) for name in contacts):
         return raw
@@ -696,13 +696,13 @@ def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
             f"environment.contacts has {len(contacts)} points, expected {len(tables)}, one for each device"
         )
     ends = [end for part in parts if isinstance(part, dict) for end in _listed(part.get("between")) if end != GROUND]
-    masses = given.get("masses", {})
+    masses = table.get("masses", {})
     points = {name: [f"{name}.{axis}" for axis in names] for name in (*contacts, *ends, *masses)}
     for name, clamped in zip(contacts, held, strict=True):
         free = [axis for axis in names if axis not in _listed(clamped)]
         points[name] = [f"{name}.{axis}" if axis in free else GROUND for axis in names]
     flat = [node for name in contacts for node in points[name] if node != GROUND]
-    return raw | {"environment": {**given, "contacts": flat, "springs": springs, "points": points}}
+    return raw | {"environment": {**table, "contacts": flat, "springs": springs, "points": points}}
 
 
 def _listed(value: Any) -> list[str]:
@@ -721,7 +721,7 @@ def _along_axes(number: int, spring: Any, axes: int) -> list[Any]:
     if "along" in spring:
         raise ValueError(f"environment.springs #{number}: along with a list of {several[0]}: give one of them")
     rest = {key: value for key, value in spring.items() if key not in several}
-    found: dict[tuple[float, ...], dict[str, float]] = {}
+    by_direction: dict[tuple[float, ...], dict[str, float]] = {}
     for name in several:
         field = f"environment.springs #{number}.{name}"
         value = spring[name]
@@ -735,9 +735,9 @@ def _along_axes(number: int, spring: Any, axes: int) -> list[Any]:
             raise ValueError(f"{field} is {value!r} with the eigenvalue {amounts.min():g}, expected none below 0")
         for amount, direction in zip(amounts.tolist(), directions.T.tolist(), strict=True):
             if amount > 1e-12 * most:
-                found.setdefault(tuple(direction), {})[name] = amount
+                by_direction.setdefault(tuple(direction), {})[name] = amount
     plain = [rest | {"stiffness": rest.get("stiffness", 0.0)}] if set(rest) - {"between"} else []
-    directed = [{"stiffness": 0.0} | rest_of | {"along": list(n)} for n, rest_of in found.items()]
+    directed = [{"stiffness": 0.0} | rest_of | {"along": list(n)} for n, rest_of in by_direction.items()]
     return [*plain, *({"between": spring.get("between")} | one for one in directed)]
 
 
@@ -746,29 +746,29 @@ _ALONG = [1.0, 0.0, 0.0]  # x, unless a scenario says otherwise
 
 def _with_world(raw: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Add the path and the digest of a world's MJCF file, and a direction for each coordinate of a contact."""
-    given = raw.get("environment")
-    if not isinstance(given, dict) or "world" not in given:
-        return _without_along(raw, given)
+    table = raw.get("environment")
+    if not isinstance(table, dict) or "world" not in table:
+        return _without_along(raw, table)
     from haptic_loop.models.world import check_contacts, digest_of  # MuJoCo, which other scenarios do without
 
-    name, contacts = given["world"], given.get("contacts", [])
+    name, contacts = table["world"], table.get("contacts", [])
     if not isinstance(name, str) or not isinstance(contacts, list) or not all(isinstance(c, str) for c in contacts):
         raise ValueError("environment.world: expected world = 'FILE.xml' and contacts, names of bodies in that file")
-    points = given.get("points", {})
-    if points and "along" in given:
+    points = table.get("points", {})
+    if points and "along" in table:
         allowed = "contacts of devices with several axes slide along x, y and z; leave it out and clamp axes"
-        raise ValueError(f"environment.along is {given['along']!r}: {allowed}")
-    given_along = given.get("along", [_ALONG] * len(contacts))
+        raise ValueError(f"environment.along is {table['along']!r}: {allowed}")
+    given_along = table.get("along", [_ALONG] * len(contacts))
     along = [_free_axes(nodes) for nodes in points.values()] or [
         [_direction(*row)] for row in enumerate(given_along, 1)
     ]
     path = (folder / name).resolve()
     try:
-        world = {"file": str(path), "digest": digest_of(path), "along": along, "every": given.get("every", 1)}
+        world = {"file": str(path), "digest": digest_of(path), "along": along, "every": table.get("every", 1)}
         check_contacts(path, list(points) or contacts)
     except ValueError as error:
         raise ValueError(f"environment: {error}") from None
-    rest = {key: value for key, value in given.items() if key not in ("along", "every")}
+    rest = {key: value for key, value in table.items() if key not in ("along", "every")}
     return raw | {"environment": rest | {"world": world}}
 
 

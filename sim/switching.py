@@ -222,15 +222,15 @@ def switched_crowd(
         return Switched(exact, np.where(clipped, np.nan, own))
 
     ticks = round(max(duration, _SHORTEST_CROWD) / scenario.T)
-    found = judged(ticks, np.arange(len(held_by)), True)
-    slow = np.flatnonzero(np.abs(found.exact) * ticks * scenario.T < SETTLED)
+    growth = judged(ticks, np.arange(len(held_by)), True)
+    slow = np.flatnonzero(np.abs(growth.exact) * ticks * scenario.T < SETTLED)
     if slow.size:
         longer = judged(_LONGER * ticks, slow, False).exact
-        changed = slow[unstable(longer) != unstable(found.exact[slow])]
+        changed = slow[unstable(longer) != unstable(growth.exact[slow])]
         if changed.size:
             again = judged(_LONGER * ticks, changed, True)
-            found.exact[changed], found.mujoco[changed] = again.exact, again.mujoco
-    return found
+            growth.exact[changed], growth.mujoco[changed] = again.exact, again.mujoco
+    return growth
 
 
 def _crowd_delays(

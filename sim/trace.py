@@ -377,15 +377,15 @@ def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
     seen = np.sqrt(np.square(amplitude[..., 0]).sum(axis=2))  # (windows, octaves): a mode moves all channels
     # rounding is white with a variance of step^2/12, and a sinusoid's amplitude is the root of twice its power
     floor = _FLOOR * np.sqrt(2 * part[0] * np.square(encoder_step).sum() / 12)
-    found = []
+    lines = []
     for k in range(seen.shape[1]):
         at = _longest(seen[:, k] > floor[k])
         if len(at) >= _NEEDED:
             rate, error = _slope(np.log(seen[at, k]), hop * T)
             strongest = np.argmax(amplitude[at[-1], k, :, 0])
-            found.append((rate, error, float(line[at[-1], k, strongest, 0]), float(seen[at[-1], k])))
+            lines.append((rate, error, float(line[at[-1], k, strongest, 0]), float(seen[at[-1], k])))
     on = (seen > floor.max()).any(axis=1)  # the size that a reason names
-    return _Lines(found, bool(on.any()), not on[-1], float(floor.max()), _PERIODS / (2 * hop * T))
+    return _Lines(lines, bool(on.any()), not on[-1], float(floor.max()), _PERIODS / (2 * hop * T))
 
 
 def _longest(on: NDArray[np.bool_]) -> NDArray[np.intp]:

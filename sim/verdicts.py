@@ -207,10 +207,10 @@ class EnergyAudit:
 
     @classmethod
     def of(cls, question: Validation, findings: Findings) -> EnergyAudit:
-        asked = (findings.clipped == 0) | (question.lag is not None)
-        violated = int((asked & ~(findings.energy >= -_ROUNDING * findings.audited)).sum())
-        least = float(findings.energy[asked].min()) if asked.any() else None
-        return cls(int(asked.sum()), int((~asked).sum()), violated, least, not violated)
+        unclipped = (findings.clipped == 0) | (question.lag is not None)
+        violated = int((unclipped & ~(findings.energy >= -_ROUNDING * findings.audited)).sum())
+        least = float(findings.energy[unclipped].min()) if unclipped.any() else None
+        return cls(int(unclipped.sum()), int((~unclipped).sum()), violated, least, not violated)
 
     def __str__(self) -> str:
         left = f", {self.clipped} clipped left out" if self.clipped else ""
@@ -274,9 +274,9 @@ class Attacked:
 
     def __str__(self) -> str:
         grows = f"a human that grows at {self.growth_rate_per_s:+.4g} 1/s"
-        ratio, found = self.required_over_available_damping, grows if self.found else "no destabilising human"
+        ratio, verdict = self.required_over_available_damping, grows if self.found else "no destabilising human"
         close = "no damping is enough" if ratio is None else f"the loop needs {ratio:.4g} of the damping it has"
-        return f"{found} among {self.evaluated}; {close}"
+        return f"{verdict} among {self.evaluated}; {close}"
 
 
 def _held(humans: tuple[Hand, ...]) -> list[_Held]:

@@ -319,7 +319,7 @@ def thrown(
 
     links = getattr(scenario.population, "links", 1)
     question = Validation(scenario, coupling, seed, humans, links, "exact", duration)
-    nobody, found = assemble(scenario, coupling), []
+    nobody, runs = assemble(scenario, coupling), []
     for i in range(humans):
         crowd, rng = question.crowd(i), np.random.default_rng(np.random.SeedSequence((seed, _STREAM, i)))
         hands, kind = crowd.humans(0), LOSSLESS if i % 2 else RANDOM
@@ -334,9 +334,9 @@ def thrown(
         trace = run(simulation, engine, quiet, round(duration / scenario.T), first)
         figures = trace.net.figures() if trace.net else None
         assert isinstance(figures, WorldFigures)
-        found.append(HandsInWorld(kind, i, figures))
+        runs.append(HandsInWorld(kind, i, figures))
         progress(i + 1, humans)
-    return found
+    return runs
 
 
 def _lossless(hand: Any) -> Any:
@@ -367,11 +367,11 @@ def hit_and_brake(scenario: Scenario, coupling: Coupling, seed: int, runs: int =
 
 def least_at_port(scenario: Scenario, coupling: Coupling, seed: int, humans: int = 20) -> dict[str, float]:
     """Return the least energy at the port [J] by each adversary while no shell acts: 0 if the scene gave nothing."""
-    found = {"hit and brake": hit_and_brake(scenario, coupling, seed)}
+    least = {"hit and brake": hit_and_brake(scenario, coupling, seed)}
     hands = thrown(scenario, coupling, humans, seed, 1.0, _NEVER)
     for kind in (RANDOM, LOSSLESS):
-        found[f"thrown {kind}"] = min(each.figures.port_least_J for each in hands if each.kind == kind)
-    return found
+        least[f"thrown {kind}"] = min(each.figures.port_least_J for each in hands if each.kind == kind)
+    return least
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -138,18 +138,18 @@ class CouplingSweep(_Sweep):
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Return required over available damping (n,), or inf, for walls that make and break contact."""
-        asked, (given, reason) = self.asked[condition], self._multipliers[condition]
+        judge, (multiplier_of, reason) = self.asked[condition], self._multipliers[condition]
         if reason:
             return np.full(K.size, np.inf)
         couplings, loops = self._couplings(K, B), [(self.loop, None)]
-        if asked.separable:
-            each = [None] * self.loop.channels if given is None else [(p,) for p in given.tolist()]
+        if judge.separable:
+            each = [None] * self.loop.channels if multiplier_of is None else [(p,) for p in multiplier_of.tolist()]
             loops = [*set(zip(map(self.loop.channel, range(self.loop.channels)), each, strict=True))]
             couplings = self._couplings(K, B, 1)
-        elif self.walls and asked.guarantee(self.loop) != ANY:  # Every coupling has its own multipliers.
+        elif self.walls and judge.guarantee(self.loop) != ANY:  # Every coupling has its own multipliers.
             return self._one_by_one(condition, K, B)
-        found = [asked.ratios(loop, couplings, multiplier) for loop, multiplier in loops]
-        known = [ratios for ratios in found if ratios is not None]
+        shares = [judge.ratios(loop, couplings, multiplier) for loop, multiplier in loops]
+        known = [ratios for ratios in shares if ratios is not None]
         return np.max(known, axis=0) if known else self._one_by_one(condition, K, B)
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
@@ -224,8 +224,8 @@ class EnvironmentSweep(_Sweep):
         """Return required over available damping (n,), or inf."""
         if condition in self._everywhere:
             return np.full(K.size, self._everywhere[condition].ratio)
-        found = self._judge(condition).ratios(self._at(K, B), self._facing(condition))
-        return self._one_by_one(condition, K, B) if found is None else found
+        shares = self._judge(condition).ratios(self._at(K, B), self._facing(condition))
+        return self._one_by_one(condition, K, B) if shares is None else shares
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """Return the requirement of a condition in one environment, by a separate sweep."""
@@ -239,13 +239,13 @@ class EnvironmentSweep(_Sweep):
     @cached_property
     def _everywhere(self) -> dict[str, Requirement]:
         """Requirements that do not depend on the springs, by condition, and refusals of those that do not apply."""
-        found: dict[str, Requirement] = {}
+        requirements: dict[str, Requirement] = {}
         for name, each in self.asked.items():
             reason = each.not_varied(self.loop) or each.beyond(self.loop)
             if reason or each.guarantee(self.loop) == ANY:
                 loop = self.loop
-                found[name] = refusal(name, loop.delta, reason) if reason else each.judge(loop, self.coupling)
-        return found
+                requirements[name] = refusal(name, loop.delta, reason) if reason else each.judge(loop, self.coupling)
+        return requirements
 
     def _judge(self, condition: str) -> Condition:
         return THIS_ENVIRONMENT if condition == MODEL_KEPT else self.asked[condition]
@@ -337,11 +337,11 @@ def make_grid(sweep: Sweep, n: int, K: _Range | None, B: _Range | None, marks: t
     of_marks = tuple(zip(*marks, strict=True)) if marks else ((), ())
     ends = []
     of_axes = zip("KB", (K, B), wide, (_STIFFNESSES, _DAMPINGS), of_marks, strict=True)
-    for name, given, usual, allowed, marked in of_axes:
-        low, high = given or _with_room(usual, marked)
+    for name, bounds, usual, allowed, marked in of_axes:
+        low, high = bounds or _with_room(usual, marked)
         _check(name, low, high, allowed, scale)
         for mark in marked:
-            if given and not low <= mark <= high:
+            if bounds and not low <= mark <= high:
                 raise InputError(f"--mark has {name} = {mark:g}, outside --{name}-range {low:g},{high:g}")
         ends.append((low, high))
     spread = np.linspace if scale == "linear" else np.geomspace
@@ -411,8 +411,8 @@ def draw_map(
 
     begin = time.perf_counter()
     _ = sweep.refusals  # once, before threads ask for it
-    done, stopped = _in_slices(ratios, n, 1 if sweep.walls else _SLICE, lambda k, of: progress("certificates", k, of))
-    for part, values in done:
+    parts, stopped = _in_slices(ratios, n, 1 if sweep.walls else _SLICE, lambda k, of: progress("certificates", k, of))
+    for part, values in parts:
         for name, value in zip(sweep.conditions, values, strict=True):
             ratio[name][part] = value
     seconds["certificates"] = time.perf_counter() - begin
@@ -421,8 +421,8 @@ def draw_map(
         maps = sweep.force_maps(K, B)
         sample = np.unique(np.linspace(0, n - 1, min(_SAMPLE, n)).astype(int))
         leading = held.leading([maps[0][i] for i in sample])
-        done, stopped = _in_slices(population, n, 1, lambda k, of: progress("population", k, of))
-        for part, values in done:
+        parts, stopped = _in_slices(population, n, 1, lambda k, of: progress("population", k, of))
+        for part, values in parts:
             growth[part], unstable[part] = values
         seconds["population"] = time.perf_counter() - begin
     if not stopped and plan.points:
@@ -458,7 +458,7 @@ def _in_slices(
 
     On all cores, since NumPy's kernels leave Python to other threads; what was finished is returned.
     """
-    done: list[tuple[slice, _Part]] = []
+    finished_parts: list[tuple[slice, _Part]] = []
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     pool = ThreadPoolExecutor(cores)
     slices = [slice(first, min(first + size, count)) for first in range(0, count, size)]
@@ -468,14 +468,14 @@ def _in_slices(
         while waiting:
             ready, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
             for future in ready:
-                done.append((futures[future], future.result()))
+                finished_parts.append((futures[future], future.result()))
                 finished += futures[future].stop - futures[future].start
             progress(finished, count)
     except KeyboardInterrupt:
-        return done, True
+        return finished_parts, True
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-    return done, False
+    return finished_parts, False
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -205,7 +205,7 @@ class MapReport:
         seed: int,
     ) -> MapReport:
         """The report of a map; `humans` were drawn for each device."""
-        loop, whole, rigid = sweep.loop, not drawn.interrupted, sweep.loop.environment is RIGID_WALL
+        loop, complete, rigid = sweep.loop, not drawn.interrupted, sweep.loop.environment is RIGID_WALL
         ratios = {name: _ratio(sweep, drawn, name) for name in drawn.ratio}
         simulation = _Simulated.of(sweep, drawn, plan)
         certified = all(mark.requirement[sweep.decisive].certified for mark in marks)
@@ -229,8 +229,8 @@ class MapReport:
             "environment" if fixed else "coupling",
             ratios,
             fixed,
-            {name: map_error(sweep, drawn, name) for name in drawn.ratio} if whole else None,
-            [_Marked.of(mark) for mark in marks] if whole else None,
+            {name: map_error(sweep, drawn, name) for name in drawn.ratio} if complete else None,
+            [_Marked.of(mark) for mark in marks] if complete else None,
             sweep.own.claim if sweep.own and ratios[sweep.own.name].certified_cells else None,
         )
 

@@ -213,8 +213,8 @@ def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
             raise InputError("there is no coupling from a file (start with --coupling FILE.json)")
         return choose(scenario, menu.case, menu.given, name_and_own(menu.condition)[1])
     name = COUPLINGS[label]
-    asked = menu.condition if name in KINDS else name_and_own(menu.condition)[1]
-    return choose(scenario, menu.case, name, asked, menu.limiter)
+    condition = menu.condition if name in KINDS else name_and_own(menu.condition)[1]
+    return choose(scenario, menu.case, name, condition, menu.limiter)
 
 
 def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> PreparedLoop:
@@ -371,8 +371,8 @@ class LiveLoop:
         push = self._pushed.copy()
         if grip:
             push[list(grip.channels)] += grip.force(self.prepared.simulation.scene, self.state)
-        made = self._history[-min(self._tick - first, len(self._history)) :] if self._tick > first else None
-        recent = self._history[-1:] if made is None else made
+        history = self._history[-min(self._tick - first, len(self._history)) :] if self._tick > first else None
+        recent = self._history[-1:] if history is None else history
         shown = self._history[-max(1, min(self._tick, len(self._history))) :]
         n, limit = self.prepared.simulation.scene.model.nq, self.prepared.simulation.process.force_limit
         world = self.world
@@ -509,10 +509,10 @@ class LiveLoop:
 
 def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, _Event, PreparedLoop | None]]:
     """Return the script with the tick of each event and the loop that it leads to."""
-    made = []
+    events = []
     for time, event in script:
         into = None
         if isinstance(event, Couple | _Delay):
             into = prepared = _changed(prepared, event)
-        made.append((round(time / prepared.scenario.T), event, into))
-    return made
+        events.append((round(time / prepared.scenario.T), event, into))
+    return events

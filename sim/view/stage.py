@@ -209,8 +209,8 @@ class ShownScene:
         channels = _own(self.scene, self.device[joint])
         handles = np.array(self.scene.handles)[channels]
         turn = self.data.xmat[perturb.select].reshape(3, 3)
-        taken = self.data.xpos[perturb.select] + turn @ perturb.localpos
-        drawn = self.model.jnt_axis[handles] @ (perturb.refselpos - taken)
+        held_at = self.data.xpos[perturb.select] + turn @ perturb.localpos
+        drawn = self.model.jnt_axis[handles] @ (perturb.refselpos - held_at)
         return Grip(channels[0], tuple((self.data.qpos[handles] + drawn).tolist()))
 
     def draw(self, drawn: mujoco.MjvScene, frame: Frame) -> None:
@@ -447,10 +447,10 @@ class NoWindow(Exception):
 def _display() -> bool:
     """Return whether a window can be opened here."""
     try:
-        done = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, timeout=_PATIENCE, check=False)
+        probe = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, timeout=_PATIENCE, check=False)
     except subprocess.TimeoutExpired:
         return False
-    return done.returncode == 0
+    return probe.returncode == 0
 
 
 def show(session: LiveLoop, stage: ShownScene, until: float | None = None) -> None:
@@ -668,9 +668,9 @@ class WorldPictures(FlatPictures):
         """Return the pixels (height, width, 3) of scene and devices alone."""
         stage, size = self.stage, mujoco.MjrRect(0, 0, width, height)
         stage.show(frame)
-        whole = int(mujoco.mjtCatBit.mjCAT_ALL)
+        everything = int(mujoco.mjtCatBit.mjCAT_ALL)
         pixels, depth = np.empty((height, width, 3), dtype=np.uint8), np.empty((height, width), dtype=np.float32)
-        mujoco.mjv_updateScene(stage.model, stage.data, self._option, None, self._camera, whole, self._drawn)
+        mujoco.mjv_updateScene(stage.model, stage.data, self._option, None, self._camera, everything, self._drawn)
         stage.draw(self._drawn, frame)
         self._gl.make_current()
         mujoco.mjr_render(size, self._drawn, self._context)
@@ -751,16 +751,16 @@ def _palette(first: Picture) -> Image.Image:
 def _mp4(path: Path, pictures: Iterable[Picture], fps: float) -> int:
     """Write an MP4 film with ffmpeg elsewhere, and put it in its place when it is complete."""
     with tempfile.TemporaryDirectory() as folder:
-        raw, whole, count = Path(folder) / "film.rgb", Path(folder) / "film.mp4", 0
+        raw, film, count = Path(folder) / "film.rgb", Path(folder) / "film.mp4", 0
         with raw.open("wb") as file:
             for picture in pictures:
                 file.write(picture.tobytes())
                 count += 1
         size = "{}x{}".format(*_SIZE)
         source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{fps:g}", "-i", str(raw)]
-        command = ["ffmpeg", "-loglevel", "error", "-y", *source, "-pix_fmt", "yuv420p", str(whole)]
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise InputError(f"--video {path}: ffmpeg: {done.stderr.strip() or done.returncode}")
-        write(path, whole.read_bytes())
+        command = ["ffmpeg", "-loglevel", "error", "-y", *source, "-pix_fmt", "yuv420p", str(film)]
+        ffmpeg = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+        if ffmpeg.returncode:
+            raise InputError(f"--video {path}: ffmpeg: {ffmpeg.stderr.strip() or ffmpeg.returncode}")
+        write(path, film.read_bytes())
     return count

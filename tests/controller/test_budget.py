@@ -138,7 +138,7 @@ def test_varying_delays_and_losses_keep_the_guarantee(told, hold, loss):
         budget = EnergyBudget(DELTA, T, Packets(lo, hi, hold), start=W0, nsim=30)
         line, force, x, acted = Line(rng, lo, hi, hold, loss, 30), controller(hands, rng), hands.x, [np.zeros((2, 30))]
         worked = np.zeros(30)
-        for k in range(600):
+        for k in range(1200):
             sent = budget.limit(force(), hands.x - x, acted[-1] if told == "at once" else None)
             x = hands.x
             if told == "late" and k > late:
