@@ -58,7 +58,7 @@ class Transparency:
         if self.relative_mismatch == 0:
             return "the devices see the reference exactly: the mismatch is zero, minus infinity in dB"
         if math.isinf(self.tau):
-            return "tau (25) divides by inf sigma_min(E), which is 0: some motion costs no static force"
+            return "some motion of the object costs no static force; tau (25) divides by the least one, so it does not exist"
         return None
 
     def part(self) -> dict[str, Any]:
