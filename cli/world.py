@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,6 +36,9 @@ from haptic_loop.sim.world import (
     scene_of,
     thrown,
 )
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 @dataclass(frozen=True)
@@ -101,6 +105,19 @@ def _common_rows(report: _Report) -> Iterator[tuple[str, str | None]]:
     yield "held torques", report.assessment.held_torques
 
 
+def _publish(
+    args: argparse.Namespace,
+    report: _Report,
+    verdict: str,
+    rows: Iterable[tuple[str, str | None]],
+    out: Path | None = None,
+    files: Iterable[Path] = (),
+    tables: Iterable[Table] = (),
+) -> None:
+    facts = render.facts(f"{report.scenario}: coupling {report.kind}", rows)
+    render.publish(args, report, [facts, *tables], (), out, files, verdict=verdict)
+
+
 def _energy(joules: float) -> str:
     return f"{1e3 * joules:.3g} mJ"
 
@@ -152,7 +169,7 @@ def run(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
             save(draw_run(labelled, f"{scenario.name}: a MuJoCo world", 1.0, around=around), out / "figure.png")
         )
     title = f"{report.guarantee} The shell acted on {figures.limited_ticks} of {figures.ticks} ticks."
-    render.publish(args, report, [render.facts(title, _run_rows(report, figures, scenario), left=True)], (), out, files)
+    _publish(args, report, title, _run_rows(report, figures, scenario), out, files)
     return options.exit_code(True, trace.interrupted)
 
 
@@ -196,7 +213,7 @@ def validate(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
     )
     whom = f"of {len(hands)} sets of hands none" if holds else f"hands {worst.number} ({worst.kind})"
     title = f"{report.guarantee} Measured: {whom} was given more than that."
-    render.publish(args, report, [render.facts(title, _hands_rows(report, hands), left=True)], (), out)
+    _publish(args, report, title, _hands_rows(report, hands), out)
     return options.exit_code(holds)
 
 
@@ -225,7 +242,7 @@ def design(args: argparse.Namespace, scenario: Scenario, out: Path) -> int:
     filed = store(loop, design_made, out)
     report = _reported(args, scenario, replace(design_made, kind=kind), START_J)
     rows = [*_common_rows(report), ("stored", f"{out} (proof: {filed.proof or 'none'})")]
-    render.publish(args, report, [render.facts(report.guarantee, rows, left=True)])
+    _publish(args, report, report.guarantee, rows)
     return options.exit_code(report.guaranteed)
 
 
@@ -241,5 +258,5 @@ def audit(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, out: Pat
     parts = [(str(part["part"]), str(part["count"]), str(part["at_the_port"])) for part in report.scene.parts]
     heads = ("part", "count", "at the port")
     table = render.grid(f"{report.scene.file}: {report.scene.settings}", heads, parts, (0, 2))
-    render.publish(args, report, [render.facts(report.guarantee, rows, left=True), table], (), out)
+    _publish(args, report, report.guarantee, rows, out, tables=[table])
     return options.exit_code(report.guaranteed)

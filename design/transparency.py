@@ -58,7 +58,7 @@ class Transparency:
         if self.relative_mismatch == 0:
             return "the devices see the reference exactly: the mismatch is zero, minus infinity in dB"
         if math.isinf(self.tau):
-            return "some motion of the object costs no static force; tau (25) divides by the least one, so it does not exist"
+            return "some motion of the object costs no static force; tau (25), which divides by it, does not exist"
         return None
 
     def part(self) -> dict[str, Any]:
