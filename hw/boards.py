@@ -46,29 +46,29 @@ class _Board:
 
     def __init__(self, device: SerialDevice, axes: slice, behind: int) -> None:
         self.device, self.axes, self.behind = device, axes, behind
-        self.period = 0.0  # [us]
-        self.ages: list[int] = []  # [us] of its answers, without the time that they waited for other boards
+        self.period = 0.0  # [us] of the configuration
+        self.ages: list[int] = []  # [us] ages of its answers, without the time that they waited for other boards
         self.has_deadman = False
         self.last: wire.State | None = None  # None before it was configured
-        self.misses = 0  # as the sample of the last step counts them
+        self.misses = 0  # the count in the sample of the last step
         self._start: tuple[int, float, int] | None = None  # step, lead [us] and offset from which clocks are compared
-        self._steps = self._shifted = 0  # since it was paired first, and at the last shift
+        self._steps = self._shifted = 0  # steps since it was first paired; their number at the last shift
 
     def configure(self, config: wire.Config) -> None:
-        """Begin anew with this board's part of a configuration."""
+        """Reset, and send this board's part of a configuration."""
         theta = min(wire.MAX_THETA, config.theta + self.behind)
         self.config = config._replace(theta=theta, cap=config.cap[self.axes], slew=config.slew[self.axes])
         self.told = CommandMonitor(self.config)
-        self.answer: int | None = None  # to the configuration
+        self.answer: int | None = None  # of its ACK to the configuration
         self.last = None
-        self.states: dict[int, tuple[wire.State, int]] = {}  # by tick: a sample, and when it came [us]
+        self.states: dict[int, tuple[wire.State, int]] = {}  # by tick: a sample and its time of arrival [us]
         self.waited: dict[int, int] = {}  # [us] by source: from a sample to its answer
         self.offset: int | None = None  # its tick number less the step's
         self._shift_at: int | None = None  # step from which on the offset is smaller by one
         self._leads: deque[int] = deque(maxlen=_SMOOTHED)  # [us] by which its samples came before the leading board's
 
     def hear(self, state: wire.State, now: int, driving: bool) -> None:
-        """Take in a STATE. Raises SafetyStop where the board applies what it was not told."""
+        """Receive a STATE. Raises SafetyStop if the board applies a force that it was not sent."""
         ticks = wire.distance(state.tick, self.last.tick) if self.last else 1
         if ticks <= 0:
             return
@@ -98,7 +98,7 @@ class _Board:
         return came[0] if came else None
 
     def follow(self, step: int, at: int, driving: bool) -> None:
-        """Keep the time by which samples precede the leading board's within a period.
+        """Shift the pairing of steps so that samples precede the leading board's by less than a period.
 
         Raises SafetyStop where that would take a period that is too long, or a clock that is not the slower one.
         """
@@ -155,7 +155,7 @@ class _Board:
 
 
 def _forget(entries: dict[int, Any], count: int) -> None:
-    """Drop the oldest entries but `kept`."""
+    """Drop the oldest entries, and keep `kept`."""
     while len(entries) > count:
         entries.pop(next(iter(entries)))
 
@@ -183,18 +183,18 @@ class Boards:
         self._lead = next(board for board in self._boards if not board.behind)
         self._clock, self._wait = clock, wait
         self._infos: list[wire.Info | None] = [None] * len(devices)
-        self._asked: wire.Config | None = None  # the configuration that is not answered yet
+        self._asked: wire.Config | None = None  # the configuration that no ACK has answered yet
         self._step: int | None = None  # the last one
         self._configured, self._driving, self._misses = False, False, 0
 
     @property
     def errors(self) -> int:
-        """Frames that could not be read, so far."""
+        """Number of frames that could not be read."""
         return sum(board.device.errors for board in self._boards)
 
     @property
     def dropped(self) -> int:
-        """Bytes that the ports would not take at once."""
+        """Number of bytes that the ports did not accept at once."""
         return sum(board.device.dropped for board in self._boards)
 
     @property
@@ -203,7 +203,7 @@ class Boards:
         return [board.ages for board in self._boards]
 
     def info(self) -> wire.Info | None:
-        """INFO of all boards in one, with the axes one after the other. Raises SafetyStop where they do not fit."""
+        """Return one INFO with the axes of all boards. Raises SafetyStop if the boards do not fit together."""
         with self._together():
             for i, board in enumerate(self._boards):
                 self._infos[i] = self._infos[i] or board.device.info()
@@ -223,7 +223,7 @@ class Boards:
         return first._replace(firmware=" + ".join(dict.fromkeys(info.firmware for info in known))[:16], **columns)
 
     def configure(self, config: wire.Config) -> int | None:
-        """How to run: every board gets its part, and the delay that it has beyond the leading one's."""
+        """Send every board its part of a configuration, with its delay beyond the leading board's."""
         if config != self._asked:
             self._asked, self._step, self._driving = config, None, False
             for board in self._boards:
@@ -234,7 +234,7 @@ class Boards:
                     if board.answer is None:
                         board.answer = board.device.configure(board.config)
                     else:
-                        board.device.exchange(None)  # it speaks already; nobody needs that later
+                        board.device.exchange(None)  # it already sends STATEs, which nobody needs later
         answers = [board.answer for board in self._boards if board.answer is not None]
         if len(answers) < len(self._boards):
             self._wait(_LONGEST)
@@ -243,7 +243,7 @@ class Boards:
         return max(answers)
 
     def exchange(self, force: wire.Force | None) -> wire.State | None:
-        """Give every board its part of a force, and wait for the samples of the next step."""
+        """Send every board its part of a force, and wait for the samples of the next step."""
         if not self._configured:
             self._wait(_LONGEST)
             return None
@@ -262,7 +262,7 @@ class Boards:
         return self._next()
 
     def stop(self, reason: wire.Reason) -> None:
-        """Every board to zero force; one that is gone keeps no other from being told."""
+        """Send STOP to every board, also if one of them no longer answers."""
         for board in self._boards:
             with suppress(PortLost):
                 board.device.stop(reason)
@@ -284,7 +284,7 @@ class Boards:
         return state
 
     def _merged(self, step: int, samples: Sequence[wire.State]) -> wire.State:
-        """Return one STATE: the worst phase and margin, what is counted in all, the axes one after the other.
+        """Return one STATE: the worst phase and margin, the sums of the counters, and the axes of all boards in order.
 
         The phase is that of the last STATE of a board: a fault shows at once, whatever sample is used.
         """

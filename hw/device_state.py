@@ -1,9 +1,9 @@
-"""The device's side of the link: safety states, and forces latched at tick k + theta; no clock and no port of its own.
+"""The device's side of the link, without clock or port: safety states, and forces latched at tick k + theta.
 
 With theta = 0 a force is latched as soon as it comes, within the tick that it answers: the motors then carry `applied`.
 
-The same machine as hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/hw/test_firmware.py). Its
-rules are in docs/protocol.md. Forces are in steps, per axis, as tuples.
+The machine equals hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/hw/test_firmware.py).
+docs/protocol.md has its rules. Forces are in steps, per axis, as tuples.
 """
 
 from haptic_loop.hw import protocol as wire
@@ -21,12 +21,12 @@ class Device:
         self.info_frame = wire.encode(info)
         self.decoder = wire.Decoder()
         self.unexpected = 0  # well-formed frames that this device has no use for
-        self.deadman = False  # whether a hand holds it: yours to set, where the device has one
+        self.deadman = False  # whether a hand holds it; a firmware with a deadman sets it
         self.phase, self.cause = wire.Phase.SILENT, wire.Cause.NONE
         self.config: wire.Config | None = None
         self.k, self.now = 0, 0  # this tick, and the clock at it [us]
         self.zero = (0,) * info.axes
-        self.asked, self.ack = False, b""  # what to say at the next tick
+        self.asked, self.ack = False, b""  # whether to send INFO, and the ACK to send, at the next tick
         self.clear()
         self.misses = 0
 
@@ -42,7 +42,7 @@ class Device:
         return self.phase | self.cause << 4 | wire.DEADMAN * self.deadman
 
     def tick(self, now_us: int, counts: tuple[int, ...]) -> tuple[tuple[int, ...], bytes]:
-        """A period begins: the forces that act from now on, and the bytes to send. `counts` was sampled just before."""
+        """Begin a period: return the forces that act from now on, and the bytes to send. `counts` was just sampled."""
         self.k, self.now = (self.k + 1) & 0xFFFF, now_us & 0xFFFFFFFF
         at_once = self.config is not None and not self.config.theta
         slot = (self.k - at_once) % _SLOTS  # what came during the tick before has been latched, if anything came
@@ -56,14 +56,14 @@ class Device:
         return self.applied, self._speak(counts)
 
     def take(self, frame: wire.Force | None) -> None:
-        """The force for this tick, if there is one, may act from now on."""
+        """Apply the force for this tick, if one has come."""
         if self.phase in (wire.Phase.ARMED, wire.Phase.HOLDING):
             self.latch(frame)
         elif self.phase == wire.Phase.DISARMED and frame is not None and frame.command == wire.Command.ARM:
             self.phase = wire.Phase.ARMED
 
     def latch(self, frame: wire.Force | None) -> None:
-        """The force for this tick, or without one the last one held, for `hold` ticks."""
+        """Return the force for this tick. Without one the last force is held for `hold` ticks."""
         assert self.config is not None
         if frame is None:
             self.phase = wire.Phase.HOLDING
@@ -85,7 +85,7 @@ class Device:
             self.phase = wire.Phase.STOPPED
 
     def halt(self, cause: wire.Cause) -> None:
-        """To zero force, for a named cause: by a ramp while armed, at once before. The first cause stays."""
+        """Go to zero force, by a ramp while armed and otherwise at once. The first cause stays."""
         if self.phase in (wire.Phase.ARMED, wire.Phase.HOLDING):
             assert self.config is not None
             self.phase, self.cause = wire.Phase.RAMP, cause
@@ -94,17 +94,17 @@ class Device:
             self.phase, self.cause = wire.Phase.STOPPED, cause
 
     def fault(self) -> None:
-        """The firmware found a fault of its own (an encoder, a driver)."""
+        """Stop because the firmware found a fault of its own (an encoder, a driver)."""
         self.halt(wire.Cause.DEVICE)
 
     def estop(self, cause: wire.Cause = wire.Cause.ESTOP_DEVICE) -> None:
-        """Zero force at once, until the device is reset."""
+        """Go to zero force at once, until the device is reset."""
         if self.phase != wire.Phase.ESTOP:
             self.clear()
             self.phase, self.cause = wire.Phase.ESTOP, cause
 
     def _speak(self, counts: tuple[int, ...]) -> bytes:
-        """INFO where asked for and the motors rest, then ACK, then STATE once configured."""
+        """Return INFO if requested and the motors rest, then ACK, then STATE once configured."""
         out, self.ack = self.ack, b""
         if self.asked and self.phase not in RUNNING:
             out, self.asked = self.info_frame + out, False
@@ -116,7 +116,7 @@ class Device:
         return out + wire.encode(state)
 
     def receive(self, data: bytes, now_us: int) -> None:
-        """Bytes that came at `now_us`, in any pieces."""
+        """Process bytes that came at `now_us`, in pieces of any length."""
         for message in self.decoder.feed(data):
             self._understand(message, now_us)
 
@@ -135,7 +135,7 @@ class Device:
             self.unexpected += 1
 
     def accept(self, frame: wire.Force, now_us: int) -> None:
-        """A force waits for its tick where that is ahead, answers the right tick, and is the first for it."""
+        """Keep a force until its tick, if that is ahead, belongs to the tick answered, and has no force yet."""
         known = frame.command == wire.Command.RUN or (
             frame.command in (wire.Command.IDLE, wire.Command.ARM) and not any(frame.force)
         )
@@ -164,7 +164,7 @@ class Device:
             self.config, self.phase, self.cause = config, wire.Phase.DISARMED, wire.Cause.NONE
 
     def _refuse(self, config: wire.Config) -> wire.Refused:
-        """Why this CONFIG cannot be taken, ACCEPTED where it can."""
+        """Return the reason for refusing this CONFIG, or ACCEPTED."""
         release = (config.hold + config.ramp) * self.info.period_ns
         reasons = (
             (self.phase == wire.Phase.ESTOP, wire.Refused.ESTOP),

@@ -4,7 +4,7 @@ The balance, with h a Gaussian window that both sides are filtered by (modulatin
 
     m x'' + b x' + p x''' + r x'''' + k x + f0 + f1 t + (1 + a D^2)(g + q x'|x'|) + periodic(x) = (1 + l D + a D^2) f
 
-with D = d/dt. m x'' and b x' are what is asked for. k x is a cable, a spring or gravity that changes with position,
+with D = d/dt. The fit estimates m and b. k x is a cable, a spring or gravity that changes with position,
 f0 + f1 t a constant force and its drift. A handle (m2) behind a transmission (k12, d12) is a = m2/k12, l = d12/k12,
 p = a b + l m, r = a m1: polynomials, since both sides were multiplied by a s^2 + l s + 1. A lag tau of the amplifier
 is l - tau and a + tau^2/2, so that it is not taken for negative damping. Derivatives are of h, never of the encoder; a
@@ -31,12 +31,12 @@ from numpy.typing import NDArray
 
 from haptic_loop.controller.lti import Array
 
-_WINDOW = 0.012  # [s] least standard deviation of h: half the amplitude at 16 Hz
+_WINDOW = 0.012  # [s] least standard deviation of h, which halves the amplitude at 16 Hz
 _ACCELERATION_NOISE = 1.5e-3  # [m/s2] that rounding of the encoder may leave: a coarse one has a longer window
-_SPEED_NOISE = 3e-4  # [m/s] of the speed that friction is told by: makes its window as short as the encoder allows
-_SPACING = 0.4  # standard deviations of the window between two rows: what it lets pass has nothing finer
-_NEARBY = 3.5  # standard deviations that a row keeps from where the balance does not hold
-_REACH = 6  # standard deviations that a window is cut at
+_SPEED_NOISE = 3e-4  # [m/s] allowed in the speed that decides friction; sets the shortest window for this encoder
+_SPACING = 0.4  # standard deviations of the window between two rows; the filtered signals have no finer detail
+_NEARBY = 3.5  # standard deviations between a row and the nearest tick at which the balance does not hold
+_REACH = 6  # standard deviations at which a window is cut off
 _STILL = 0.02  # [s] within one count of which an encoder stands still
 #: [m/s] speed at which dry friction is at 3/4
 _SLIPS = (5e-4, 1e-3, 2e-3, 3.5e-3, 6e-3, 1e-2, 1.4e-2, 2e-2, 3e-2, 5e-2, 8e-2, 0.12)
@@ -44,43 +44,44 @@ _BRISTLES = (1e-5, 1.7e-5, 3e-5, 5.5e-5, 1e-4, 1.7e-4)  # [m] over which frictio
 _STRIBECK = 0.02  # [m/s] above which the rest of static friction is gone
 _SLOW, _WEAK = 0.2, 0.05  # part of a force that the window has to pass, unless it is so small a part of the strongest
 _SLIP = 0.002  # [m/s] of dry friction where its law is of another kind
-_BLOCKS = 10  # of the record, that are left out in turn
-_HIDDEN = 0.03  # of what is left unexplained, that may be damping in disguise
-SCALE = 5e-3  # of the encoder, that nobody can tell: 20 um of eccentricity over a part of a turn of 40 mm are 3e-3
+_BLOCKS = 10  # parts of the record that are left out in turn
+_HIDDEN = 0.03  # part of the damping that the residual could hide, subtracted from the bound
+#: error of the encoder's scale, which no recording shows: 20 um of eccentricity over part of a turn of 40 mm give 3e-3
+SCALE = 5e-3
 _QUANTILE = 1.833  # of Student's t with 9 degrees of freedom, 95 % to one side
-_FEW = 200  # rows
+_FEW = 200  # rows below which a record is too short
 _ALMOST = 4.0  # by which a log likelihood ratio may be worse than the best law's
-_ROUNDS = 3  # in which the transmission's part of friction is found
-_PERIODS = np.geomspace(5e-4, 0.08, 60)  # [m] where a periodic disturbance is looked for
+_ROUNDS = 3  # iterations that settle the transmission's part of friction
+_PERIODS = np.geomspace(5e-4, 0.08, 60)  # [m] periods of the disturbances that are searched
 _NEAR = np.geomspace(0.92, 1.09, 24)  # times the best one of these, once more
-_PERIODIC = 4  # at most so many
-_CHANCE = 2.0  # by which the log likelihood of a periodic one exceeds what the best of so many explains of noise
+_PERIODIC = 4  # most periodic disturbances in a fit
+_CHANCE = 2.0  # least gain of log likelihood beyond that of the best pair among noise
 _MASS, _VISCOUS, _CONSTANT, _SLOPE, _SPRING, _TAU, _MODE, _LOSS, _STIFF, _DRAG, _DRY, _STATIC = range(12)
 _NOT_NEGATIVE = (_VISCOUS, _MODE, _DRAG, _DRY, _STATIC)
 
 
 @dataclass(frozen=True)
 class Friction:
-    """What the balance of one axis says, with standard errors."""
+    """The parameters of one axis that fit its balance of forces best, with standard errors."""
 
     mass: float  # [kg]
     viscous: float  # b [N s/m]
     coulomb: float  # [N]
     stiffness: float  # [N/m] to ground
-    constant: float  # [N]
-    drift: float  # [N/s] of it
-    static: float  # [N] of it that is gone at speed
+    constant: float  # [N] constant force
+    drift: float  # [N/s] of the constant force
+    static: float  # [N] Stribeck part of dry friction, which is gone at speed
     drag: float  # [N s2/m2]
     slip: float  # [m/s] of dry friction's law that fits best; 0 where it reverses by position
     reach: float  # [m] over which it does; 0 where it reverses by speed
     periods: tuple[float, ...]  # [m] of periodic disturbances that were found
     errors: dict[str, float]  # standard errors of mass, viscous, coulomb, stiffness
     delta: float  # [N s/m] lower bound of b
-    rms: float  # [N] that the balance leaves
+    rms: float  # [N] residual of the balance
 
 
 def _window(order: int, sigma: float, T: float) -> Array:
-    """Samples of the derivative of a Gaussian of standard deviation sigma [s], times T."""
+    """Return samples of the derivative of a Gaussian of standard deviation sigma [s], times T."""
     t = np.arange(-round(_REACH * sigma / T), round(_REACH * sigma / T) + 1) * T / sigma
     hermite = np.polynomial.hermite_e.hermeval(t, [0.0] * order + [1.0])
     return T * (-1) ** order * hermite * np.exp(-(t**2) / 2) / (np.sqrt(2 * np.pi) * sigma ** (order + 1))
@@ -93,7 +94,7 @@ def _filtered(signal: Array, order: int, sigma: float, T: float) -> Array:
 
 
 def _held(force: Array, sigma: float, T: float) -> tuple[Array, Array, Array]:
-    """A force held for each tick, filtered, and its two derivatives."""
+    """Return the filtered force, held for each tick, and its first two derivatives."""
     import scipy
 
     n = round(_REACH * sigma / T)
@@ -107,7 +108,7 @@ def _held(force: Array, sigma: float, T: float) -> tuple[Array, Array, Array]:
 
 
 def _moving(x: Array, step: float, T: float) -> NDArray[np.bool_]:
-    """The ticks at which the encoder moves."""
+    """Return the ticks at which the encoder moves."""
     counts, n = np.round(x / step), max(2, round(_STILL / T))
     moves = np.ones(len(x), dtype=bool)
     view = np.lib.stride_tricks.sliding_window_view(counts, n)
@@ -117,7 +118,7 @@ def _moving(x: Array, step: float, T: float) -> NDArray[np.bool_]:
 
 
 def _bristle(x: Array, reach: float) -> Array:
-    """Friction (N,) within +-1 that displacements x (N,) [m] wind up over `reach` [m] and keep where they slip."""
+    """Return friction (N,) within +-1 that displacements x (N,) [m] build up over `reach` [m] before they slip."""
     z, out = 0.0, []
     for moved in np.diff(x, prepend=x[0]).tolist():
         z = max(-reach, min(reach, z + moved))
@@ -126,13 +127,13 @@ def _bristle(x: Array, reach: float) -> Array:
 
 
 def _slow(force: Array, sigma: float, T: float) -> NDArray[np.bool_]:
-    """Where the force is not mostly faster than the window: there friction is turned by motion that is not seen."""
+    """Return where the force is mostly slower than the window. Elsewhere unseen motion changes the friction."""
     strong, left = (_filtered(f**2, 0, sigma, T) for f in (force, _filtered(force, 0, sigma, T)))
     return (left > _SLOW**2 * strong) | (strong < _WEAK**2 * strong.max())
 
 
 class _Balance:
-    """The rows of the balance where the axis moves."""
+    """The balance of forces as rows of a linear fit, at the ticks at which the axis moves."""
 
     def __init__(self, x: Array, force: Array, T: float, step: float) -> None:
         import scipy
@@ -141,7 +142,7 @@ class _Balance:
         self.T, self.sigma, self.force = T, max(_WINDOW, 3 * T, noise**0.2), force
         self.x = x - x[0]
         self._reach = round(_REACH * self.sigma / T)
-        # what holds a body at rest, or dithers it, is not in g
+        # g does not model the friction of a body that rests or dithers
         clear = _moving(x, step, T) & _slow(force, self.sigma, T)
         spoilt = scipy.ndimage.binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T)).astype(bool)
         rows = np.flatnonzero(~spoilt[self._reach : -self._reach]) + self._reach
@@ -163,7 +164,7 @@ class _Balance:
         self.drag = self.speed * np.abs(self.speed)
 
     def _complex(self, signal: NDArray[np.complex128] | Array, *orders: int) -> list[NDArray[np.complex128]]:
-        """Derivatives (rows,) of the filtered signal (N,)."""
+        """Return derivatives (rows,) of the filtered signal (N,)."""
         spectrum = np.fft.fft(signal, self._length)
         return [np.fft.ifft(spectrum * self._filters[order])[self.rows + self._reach] for order in orders]
 
@@ -171,12 +172,12 @@ class _Balance:
         return [one.real for one in self._complex(signal, *orders)]
 
     def laws(self, step: float) -> list[tuple[float, float, Array]]:
-        """Slip [m/s], reach [m] and dry friction (N,) within +-1 of every law; it has one of the two lengths."""
+        """Return slip [m/s], reach [m] and dry friction (N,) within +-1 of every law; either slip or reach is 0."""
         bristles = [(0.0, reach, _bristle(self.x, reach)) for reach in _BRISTLES if reach > step]
         return [(slip, 0.0, np.tanh(self.speed / slip)) for slip in _SLIPS] + bristles
 
     def matrix(self, dry: Array, periodic: list[_Pair]) -> Callable[[float], Array]:
-        """Columns (rows, p) of the balance, by how much of friction's second derivative is in it."""
+        """Return the columns (rows, p) of the balance, given the weight of friction's second derivative."""
         laws = [self.drag, dry, dry * np.exp(-((self.speed / _STRIBECK) ** 2))]
         plain, bent = zip(*(self._of(law, 0, 2) for law in laws), strict=True)
 
@@ -187,14 +188,14 @@ class _Balance:
         return columns
 
     def waves(self, periods: Array) -> list[_Pair]:
-        """For every period [m] a force that repeats with position, and an encoder's error that does."""
+        """Return for every period [m] the pairs of a force and of an encoder error that repeat with position."""
         waves = [(p, wave) for p in periods.tolist() for wave in self._complex(np.exp(2j * np.pi * self.x / p), 0, 2)]
         return [_Pair(period, np.stack([wave.real, wave.imag], axis=1)) for period, wave in waves]
 
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """What repeats with position: columns (rows, 2) of its cosine and sine."""
+    """A periodic disturbance: the columns (rows, 2) of its cosine and sine over position."""
 
     period: float  # [m]
     columns: Array
@@ -212,12 +213,12 @@ class _Fit:
 
     @property
     def price(self) -> float:
-        """Akaike's penalty for friction that is not viscous: of laws that fit alike the simplest is taken."""
+        """Akaike's penalty for friction that is not viscous, by which the simplest of equally good laws is chosen."""
         return 2.0 * int(np.count_nonzero(self.p[[_DRAG, _DRY, _STATIC]]))
 
 
 def _solve(columns: Array, force: Array) -> Array:
-    """Least squares where some parameters are not negative."""
+    """Solve least squares with some parameters that must not be negative."""
     import scipy
 
     scale = np.linalg.norm(columns, axis=0) + 1e-300
@@ -238,7 +239,7 @@ def _fitted(balance: _Balance, dry: Array, periodic: list[_Pair]) -> _Fit:
 
 
 def _strongest(pairs: list[_Pair], columns: Array, residual: Array) -> tuple[float, _Pair]:
-    """The pair that explains most of what `columns` (rows, p) leave of `residual` (rows,), and which part of it."""
+    """Return the gain and the pair that explains most of what `columns` (rows, p) leave of `residual` (rows,)."""
     q = np.linalg.qr(columns)[0]
     left, most, strongest = residual - q @ (q.T @ residual), 0.0, pairs[0]
     for pair in pairs:
@@ -250,9 +251,10 @@ def _strongest(pairs: list[_Pair], columns: Array, residual: Array) -> tuple[flo
 
 
 def _disturbances(balance: _Balance, fit: _Fit) -> list[_Pair]:
-    """Periodic disturbances that explain what the fit leaves, strongest first.
+    """Return the periodic disturbances that explain the residual of the fit, strongest first.
 
-    Among noise the best of n pairs explains about 2 log n of `independent` parts: one that counts has _CHANCE more.
+    Among noise the best of n pairs explains about 2 log n of `independent` parts. A pair counts if it explains _CHANCE
+    more.
     """
     pairs: list[_Pair] = []
     grid = balance.waves(_PERIODS[np.ptp(balance.x) > _PERIODS])
@@ -269,7 +271,7 @@ def _disturbances(balance: _Balance, fit: _Fit) -> list[_Pair]:
 
 
 def _scatter(fit: _Fit, force: Array) -> Array:
-    """Covariance (p, p) of the free parameters by leaving out each of _BLOCKS parts of the record in turn."""
+    """Return the covariance (p, p) of the free parameters from fits without each of _BLOCKS parts of the record."""
     group = np.arange(len(force)) * _BLOCKS // len(force)
     others = []
     for g in range(_BLOCKS):
@@ -280,13 +282,13 @@ def _scatter(fit: _Fit, force: Array) -> Array:
 
 
 def _apart(columns: Array, i: int) -> Array:
-    """The part of a column that the others do not explain."""
+    """Return the part of a column that the other columns do not explain."""
     others = np.linalg.qr(np.delete(columns, i, axis=1))[0]
     return columns[:, i] - others @ (others.T @ columns[:, i])
 
 
 def dry_friction(x: Array, T: float, found: Friction) -> Array:
-    """Dry friction [N] of displacements x (N,) [m] by the law that fits best, without its Stribeck part."""
+    """Return dry friction [N] of displacements x (N,) [m] by the law that fits best, without its Stribeck part."""
     return found.coulomb * np.tanh(np.diff(x, append=x[-1]) / T / (found.slip or _SLIP))
 
 
@@ -302,12 +304,12 @@ def nonviscous(x: Array, T: float, step: float, found: Friction) -> Array:
 
 
 def _speed_window(step: float, T: float) -> float:
-    """Standard deviation [s] of the shortest window in which rounding leaves _SPEED_NOISE."""
+    """Return the standard deviation [s] of the shortest window in which rounding leaves _SPEED_NOISE."""
     return max(T, (step**2 / 12 * T / (4 * np.sqrt(np.pi) * _SPEED_NOISE**2)) ** (1 / 3))
 
 
 def friction(x: Array, force: Array, T: float, step: float) -> Friction:
-    """Of displacements x (N,) [m] under forces (N,) [N] held for T [s]; `step` [m] is the encoder's."""
+    """Fit the balance to displacements x (N,) [m] under forces (N,) [N] held for T [s]; `step` [m] is the encoder's."""
     balance = _Balance(x, force, T, step)
     laws = balance.laws(step)
     plain = min((_fitted(balance, dry, []) for *_, dry in laws), key=lambda fit: fit.squares)

@@ -29,11 +29,11 @@ from haptic_loop.sim.trace import Trace
 
 #: what the link adds, one entry per tick and name
 _LINK = ("tick", "arming", "received", "asked", "test", "gain", "sent", "margin_us", "status")
-_ONCE = ("tick", "arming", "margin_us", "status")  # whole numbers of which a row of the record has one
+_ONCE = ("tick", "arming", "margin_us", "status")  # integers that a row has once, not per axis
 
 
 class Recorder:
-    """Collects rows as bytes: about 100 a tick."""
+    """Collect rows as bytes, about 100 per tick."""
 
     def __init__(self, channels: int) -> None:
         m = self.channels = channels
@@ -43,7 +43,7 @@ class Recorder:
         self._rows, self._zero = bytearray(), (0,) * m
 
     def __call__(self, row: TraceRow) -> None:
-        """Take in one tick."""
+        """Record one tick."""
         state, zero = row.state, self._zero
         if state is None:
             sent, applied, margin, status = zero, zero, NO_MARGIN, 0
@@ -56,12 +56,12 @@ class Recorder:
         return len(self._rows) // self._form.size
 
     def link(self) -> dict[str, NDArray[Any]]:
-        """Arrays by the names of _LINK, with `x` (N, m) [m] and `applied` (N, m) [steps] beside them."""
+        """Return arrays by the names of _LINK, with `x` (N, m) [m] and `applied` (N, m) [steps] beside them."""
         rows = np.frombuffer(bytes(self._rows), self._row)
         return {name: rows[name] for name in rows.dtype.names or ()}
 
     def steady_ticks(self, force_step: Sequence[float], limits: SafetyLimits) -> list[list[int]]:
-        """[first, stop) of each arming in which the loop was one linear loop: full gain, until cap or slew rate cuts.
+        """Return [first, stop) of each arming in which the loop was linear: full gain, until cap or slew rate cuts.
 
         Missed ticks are not left out. `force_step` (m,) [N].
         """
@@ -77,7 +77,7 @@ class Recorder:
         return stretches
 
     def trace(self, units: Units, T: float, meta: dict[str, Any], names: tuple[str, ...] = ()) -> Trace:
-        """The trace in the terms of sim.run. Handles and outside forces are not measured: nan, and no column."""
+        """Return a trace as of sim.run. Handles and outside forces are not measured (nan, or no column)."""
         link = self.link()
         n, m = len(self), self.channels
         last = np.maximum.accumulate(
@@ -89,7 +89,7 @@ class Recorder:
         return Trace(t, link["x"], f, unknown, unknown, np.zeros((n, 0)), meta, names=names)
 
     def save(self, path: Path, result: Trace) -> Path:
-        """An npz that sim.trace reads, with the arrays of _LINK beside its own."""
+        """Write an npz that sim.trace reads, with the arrays of _LINK beside its own."""
         recorded = self.link()
         link = {f"link_{name}": recorded[name] for name in _LINK}
         arrays: dict[str, Any] = {**result.arrays, **link}
@@ -101,7 +101,7 @@ class Recorder:
 
 
 def _digest(arrays: Mapping[str, Array]) -> str:
-    """SHA-256 of everything in a trace: it tells a record from one that was changed, cut or put together."""
+    """Return the SHA-256 of everything in a trace, which detects a changed, cut or merged record."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         digest.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape} ".encode() + arrays[name].tobytes())
@@ -109,7 +109,7 @@ def _digest(arrays: Mapping[str, Array]) -> str:
 
 
 def load(path: Path) -> tuple[Trace, dict[str, Array]]:
-    """A trace with its link arrays. Raises InputError where the file is not as a session of a bridge wrote it."""
+    """Read a trace with its link arrays. Raises InputError if the file is not as a session of the bridge wrote it."""
     arrays = read_arrays(path, "a trace of this program")
     result = Trace.of_arrays(path, arrays)
     if not all(f"link_{name}" in arrays for name in _LINK):
@@ -120,7 +120,7 @@ def load(path: Path) -> tuple[Trace, dict[str, Array]]:
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The controller of one arming, as a trace's metadata have it."""
+    """The controller of one arming, as stored in the metadata of a trace."""
 
     scenario: Scenario
     coupling: Form
@@ -134,7 +134,7 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, arming: Arming, limits: SafetyLimits, units: Units) -> dict[str, Any]:
-        """As plain data."""
+        """Return the recipe as plain data."""
         program, budget = arming.program, arming.budget
         assert isinstance(program, CertifiedCoupling)
         rho = program.assessment.force_limits.rho
@@ -178,14 +178,14 @@ def replay(result: Trace, link: dict[str, Array]) -> _Comparison:
 
 
 def _recipes_of(result: Trace) -> list[Recipe]:
-    """The recipes in a trace, one for each arming."""
+    """Return the recipes in a trace, one for each arming."""
     return msgspec.convert(result.meta["replay"], Annotated[list[Recipe], msgspec.Meta(min_length=1)])
 
 
 def _again(
     recipe: Recipe, ticks: NDArray[np.intp], result: Trace, link: dict[str, Array], into: tuple[Array, Array]
 ) -> None:
-    """The `ticks` of one arming: forces asked for and steps sent, written to `into`."""
+    """Replay the `ticks` of one arming, and write the controller's forces and the steps sent to `into`."""
     if recipe.scenario.environment.world:
         raise ValueError("its forces came from a MuJoCo world, which is not in the trace")
     m, coupling, (wanted, sent) = len(recipe.cap), recipe.coupling.build(recipe.scenario.T), into

@@ -1,7 +1,7 @@
-"""A session in real time over a serial port, by pyserial, and one thread that waits for nothing else.
+"""Run a session in real time over a serial port (pyserial), in one thread that waits for the port only.
 
-Python holds up a loop by itself: a full garbage collection takes 30 ms with MuJoCo and SciPy loaded. So what is loaded
-is frozen and the collector is off while forces act.
+A full garbage collection takes 30 ms with MuJoCo and SciPy loaded. So loaded objects are frozen, and the collector is
+off while forces act.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from haptic_loop.hw.session import Session
 from haptic_loop.sim.scenario import InputError
 
 _CHUNK = 4096  # bytes read at once; a tick brings a few dozen
-_UNUSED = 9600  # baud that a port without UART is told: it does nothing, but 1200 resets many boards
-_STALL_SECONDS, _STALL_MS = 2.0, 2.0  # how long stalls are measured, and from which on something is said
-_GRACE_US = 50_000  # after the end, in which a STOP that was lost is repeated
+_UNUSED = 9600  # baud set on a port without UART: it has no effect, whereas 1200 resets many boards
+_STALL_SECONDS, _STALL_MS = 2.0, 2.0  # duration of the measurement of stalls, and the least stall that is reported
+_GRACE_US = 50_000  # time after the end in which a lost STOP is repeated
 
 
 class SerialPort:
-    """A port in raw mode: whole bytes in, whole bytes out, no echo, no flow control."""
+    """A serial port in raw mode: eight-bit bytes, no echo, no flow control."""
 
     def __init__(self, path: str, baud: int | None) -> None:
-        """Open `path` for ourselves alone, at `baud` where it has a UART. Raises InputError where that cannot be."""
+        """Open `path` exclusively, at `baud` if it has a UART. Raises InputError if it cannot be opened."""
         try:
             import serial
         except ImportError:
@@ -54,13 +54,13 @@ class SerialPort:
         return self._fd
 
     def wait(self, seconds: float) -> bool:
-        """Whether there is something to read, at the latest after so many seconds."""
+        """Wait for bytes at most so many seconds, and return whether there are any."""
         return bool(select.select([self._fd], [], [], seconds)[0])
 
     def read(self) -> bytes:
-        """What is there, once wait() has said that something is. Raises PortLost.
+        """Return the bytes that have come, after wait() returned True. Raises PortLost.
 
-        By the file descriptor, as write(): pyserial's own take 31 us of every tick.
+        read() and write() use the file descriptor: pyserial's own calls take 31 us of every tick.
         """
         try:
             data = os.read(self._fd, _CHUNK)
@@ -73,7 +73,7 @@ class SerialPort:
         return data
 
     def write(self, data: bytes) -> int:
-        """How many of these bytes could be sent without waiting. Raises PortLost."""
+        """Send bytes without waiting, and return how many were sent. Raises PortLost."""
         try:
             return os.write(self._fd, data)
         except BlockingIOError:
@@ -82,7 +82,7 @@ class SerialPort:
             raise PortLost(f"the port cannot be written: {error}") from None
 
     def discard(self) -> None:
-        """Forget what has come in. Raises PortLost."""
+        """Discard the bytes that have come. Raises PortLost."""
         try:
             self._serial.reset_input_buffer()
         except (self._error, OSError, TypeError) as error:
@@ -97,7 +97,7 @@ class SerialPort:
 
 
 def preflight(paths: Sequence[str]) -> str:
-    """How well this machine can keep time, and what to do where it cannot, as one line.
+    """Return one line that says how well this machine keeps time, and what to do where it does not.
 
     It asks the system for real-time scheduling and locked memory, and measures for two seconds how late it wakes us.
     """
@@ -148,7 +148,7 @@ def _clock_source() -> str:
 
 
 def _worst_stall() -> float:
-    """By how much a sleep of a millisecond is late at worst [s]."""
+    """Return the largest delay [s] of a sleep of a millisecond."""
     worst, begun = 0.0, time.monotonic()
     last = begun
     while last < begun + _STALL_SECONDS:
@@ -159,7 +159,7 @@ def _worst_stall() -> float:
 
 
 class Live(Driver):
-    """A session with a device until it has ended, with a person at the keyboard."""
+    """Run a session with a device until it ends, with a person at the keyboard."""
 
     def __init__(
         self,
@@ -178,7 +178,7 @@ class Live(Driver):
         self._watched = 0
 
     def run(self) -> Session:
-        """From HELLO to the end. Whatever is raised in between, the device is stopped first."""
+        """Run the session from HELLO to its end. After any exception the device is stopped first."""
         session = self.session
         with _signals(self.signals), _no_collections():
             try:
@@ -195,7 +195,7 @@ class Live(Driver):
         return session
 
     def turn(self) -> None:
-        """Everything but the answer: keys, arming, the planned end, signals."""
+        """Handle keys, arming, the planned end and signals: everything but the answer to a STATE."""
         super().turn()
         try:
             self._steer(self.clock())
@@ -218,8 +218,8 @@ class Live(Driver):
             self._watch(session)
 
     def _designed(self, ages: Ages) -> Sequence[Armable]:
-        """A design may be interrupted, and what was typed meanwhile is read before its coupling can be armed."""
-        self._watch(self.session)  # for it takes a while
+        """Design a coupling, interruptibly. Keys typed meanwhile are read before it can be armed."""
+        self._watch(self.session)  # the design takes a while
         try:
             with _interruptible():
                 programs = self._design(ages)
@@ -228,7 +228,7 @@ class Live(Driver):
             raise SafetyStop("SIGINT during the design") from None
         if self._typed():
             self._pressed()
-        gc.collect()  # the solver is loaded now
+        gc.collect()  # the design has loaded the solver
         gc.freeze()
         return programs
 
@@ -236,7 +236,7 @@ class Live(Driver):
         return self._keyboard is not None and bool(select.select([self._keyboard], [], [], 0)[0])
 
     def _pressed(self) -> None:
-        """Do what was typed; a terminal that is gone is a person who is gone, as SIGHUP says it."""
+        """Carry out the keys typed. A lost terminal counts as SIGHUP: the person is gone."""
         assert self._keyboard is not None
         keys = b""
         with suppress(OSError):
@@ -250,7 +250,7 @@ class Live(Driver):
 
 @contextmanager
 def _signals(received: list[int]) -> Iterator[None]:
-    """SIGINT, SIGTERM, SIGHUP, SIGQUIT and SIGUSR1 (emergency stop) are noted, and dealt with between two ticks."""
+    """Note SIGINT, SIGTERM, SIGHUP, SIGQUIT and SIGUSR1 (emergency stop), which are handled between two ticks."""
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1)
     before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in numbers}
     try:
@@ -262,7 +262,7 @@ def _signals(received: list[int]) -> Iterator[None]:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """SIGINT is a KeyboardInterrupt: a design may take long, and nothing moves meanwhile."""
+    """Let SIGINT raise KeyboardInterrupt during a design, which may take long while nothing moves."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield
