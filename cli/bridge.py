@@ -36,7 +36,7 @@ _LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
 
 
 def main(argv: list[str]) -> int:
-    """One session. 0: it ended as planned, 1: refused, stopped, lost or e-stop, 130: interrupted, after a ramp."""
+    """Run a session. 0: it ended as planned, 1: refused, stopped, lost or e-stop, 130: interrupted, after a ramp."""
     args = _parser().parse_args(argv)
     scenario, settings = session_cli.steady_scenario(args, "hw.bridge"), session_cli.check_link(args)
     seconds = scenario.duration if args.duration is None else args.duration
@@ -119,7 +119,7 @@ def _parser() -> argparse.ArgumentParser:
 def _print_certificate(
     ages: Ages, link: int, programs: Sequence[CertifiedCoupling], caps: Sequence[float], console: render.Screen
 ) -> None:
-    """What is certified and what was measured for it: printed before anything is armed."""
+    """Print what is certified and what was measured for it, before anything is armed."""
     console.print(verdict(programs[0].assessment), soft_wrap=True)
     at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
     console.print(
@@ -144,7 +144,7 @@ def _print_certificate(
 
 
 def _certified(program: CertifiedCoupling) -> tuple[str, ...]:
-    """A row: the coupling, and the first condition that certifies it."""
+    """Return the row of a coupling with the first condition that certifies it."""
     assessment = program.assessment
     gains, asked = assessment.gains, (assessment.decisive, *assessment.requirements.values())
     found = next(need for need in asked if need.certified)
@@ -165,7 +165,7 @@ def _link(link: int, scenario: Scenario) -> str:
 
 
 def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
-    """How long ticks are, and how much energy a tick longer than the certified one may give."""
+    """Say how long ticks are, and how much energy a tick longer than the certified one may give."""
     least, most = (f"{1e-3 * side(ages.ticks, default=1e6 * scenario.T):.4g}" for side in (min, max))
     span = least if least == most else f"{least} to {most}"
     longest = 1e3 * (scenario.T_max or scenario.T)
@@ -177,12 +177,12 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
 
 
 def _overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
-    """[W] what a tick longer than T_max may give a hand, at most, for each second of its length: sum f^2/(4 delta)."""
+    """Bound the power [W] that a tick longer than T_max gives a hand, per second of its length: sum f^2/(4 delta)."""
     return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
 
 
 def _print_session(report: SessionReport, console: render.Screen, details: bool) -> None:
-    """The log, then what the link did."""
+    """Print the log, then what the link did."""
     cells = {"after": "{r.t_s:.3f} s", "stage": lambda r: _colour(r.stage), "cause": "{r.cause}"}
     console.print(render.columns(f"case {report.case} · {report.scenario}", cells, report.session.log, left=(1, 2)))
     link = report.link

@@ -94,7 +94,7 @@ class _Report:
     no_transmissions: str | None = off_table("if given", None)  # why there are none, where they were requested
 
     def lines(self) -> list[str]:
-        """What stands below the table."""
+        """Return the lines below the table."""
         reason = [f"no bound: {self.reason}"] if self.reason else []
         if self.no_transmissions:
             reason.append(f"no bounds of motor and transmission: {self.no_transmissions}")
@@ -224,7 +224,7 @@ def _sitting(
 
 
 def _identified(scenario: Scenario, sittings: list[_Sitting]) -> _Report:
-    """The report of all sittings, with one estimate per axis."""
+    """Report all sittings, with one estimate per axis."""
     session, told = sittings[-1].session, [sitting.axes for sitting in sittings if sitting.axes]
     left_out = [f"sitting {k}: {sitting.reason}" for k, sitting in enumerate(sittings, start=1) if sitting.reason]
     axes, reason, warnings = (told[0] if told else []), "; ".join(left_out), left_out
@@ -244,7 +244,7 @@ def _identified(scenario: Scenario, sittings: list[_Sitting]) -> _Report:
 def _with_transmissions(
     report: _Report, scenario: Scenario, sittings: list[_Sitting], clamped: list[_Sitting]
 ) -> _Report:
-    """The report with bounds of every motor and transmission, or with the reason why there are none."""
+    """Add bounds of every motor and transmission to the report, or the reason why there are none."""
     if reason := "; ".join(sitting.reason for sitting in clamped if sitting.reason):
         return replace(report, no_transmissions=reason)
     bounds = list[TransmissionBounds]()
@@ -260,7 +260,7 @@ def _with_transmissions(
 
 
 def _table(e: Estimate, scenario: Scenario, i: int, bounds: Sequence[TransmissionBounds] | None) -> str:
-    """One [[device]] table for a scenario file; a transmission that was not found is the scenario's."""
+    """Write one [[device]] table for a scenario file; a transmission that was not identified is the scenario's."""
     device, mass = scenario.axis_devices[i], e.friction.mass
     lines = ["[[device]]", f"damping = {e.viscous:.6g}", f"delta = {np.floor(1e6 * e.delta) / 1e6:.6f}"]
     speed = np.floor(1e3 * e.viscosity.speed) / 1e3
@@ -287,7 +287,7 @@ def _table(e: Estimate, scenario: Scenario, i: int, bounds: Sequence[Transmissio
 
 
 def _bounds(known: Sequence[TransmissionBounds]) -> render.Table:
-    """The bounds of motors and transmissions, axis by axis."""
+    """Return the bounds of motors and transmissions, axis by axis."""
     cells = []
     for i, each in enumerate(known, start=1):
         least, most = each.transmission_damping_min, each.transmission_damping_max

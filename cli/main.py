@@ -54,7 +54,7 @@ def door(command: str) -> NoReturn:
 
 
 def main() -> NoReturn:
-    """The console script."""
+    """Run the console script."""
     words = sys.argv[1:]
     if not words or words[0] in ("-h", "--help"):
         width = max(map(len, COMMANDS))

@@ -124,7 +124,7 @@ class Parser(argparse.ArgumentParser):
     # options of several commands
 
     def add_loop(self) -> None:
-        """The options that describe a loop, which every command takes."""
+        """Add the options that describe a loop, which every command takes."""
         loop = self.add_argument_group("the loop")
         reference = "the ideal that a coupling is compared with: I with the loop's delays (default), II without delay"
         loop.add_argument("--reference", choices=("I", "II"), help=reference)

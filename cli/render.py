@@ -278,7 +278,7 @@ _MUCH = 2.0  # times the damping that is needed nearby: then the report says wha
 
 
 def robustness_rows(nearby: Nearby) -> Rows:
-    """What a wrong model of the environment costs, and what a design that allows for it would."""
+    """Yield what a wrong model of the environment costs, and what a design that allows for it would cost."""
     if there := nearby.robustness:
         words = f"{there.required_over_available:.3f} of the damping is needed at {there.where}"
         yield "robustness", f"{words}, the worst within {there.percent:g} %"
@@ -289,7 +289,7 @@ def robustness_rows(nearby: Nearby) -> Rows:
 
 
 def price_words(price: Spread) -> str:
-    """What a design for more than one environment reaches and costs."""
+    """Describe what a design for more than one environment reaches and costs."""
     worse = f"at most {price.price_db:.2f} dB worse" if price.price_db >= 0 else f"{-price.price_db:.2f} dB better"
     costs = worse if math.isfinite(price.price_db) else "not exact"
     proved = f"proved in {price.proved} of {price.environments} environments"
@@ -299,12 +299,12 @@ def price_words(price: Spread) -> str:
 
 
 def verdict(word: str | None) -> str:
-    """Stable or not."""
+    """Return "stable" or "unstable" with its colour."""
     return {"stable": "[green]stable[/]", "unstable": "[red]unstable[/]"}.get(word or "", "not decided")
 
 
 def timing_row(part: UnevenTicks | None) -> tuple[str, str | None]:
-    """Periods and latencies of a run or of a validation that are not even."""
+    """Return the row on uneven periods and latencies of a run or of a validation."""
     if part is None:
         return "ticks", None
     period, words = part.period_s, []

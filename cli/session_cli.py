@@ -43,7 +43,7 @@ _SHOWN = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "s
 
 
 def add_link_options(parser: options.Parser) -> None:
-    """Which device, over which line, and how its delay is judged."""
+    """Add options for the device, its line, and how its delay is judged."""
     link = parser.add_argument_group("the link")
     add, number = link.add_argument, options.number
     port = "serial port of the device, such as /dev/ttyACM0; A,B: one board at each port, one for each device; or "
@@ -74,7 +74,7 @@ def add_link_options(parser: options.Parser) -> None:
 
 
 def add_safety_options(parser: options.Parser) -> None:
-    """Limits of force and speed, and the switch that the user has to hold."""
+    """Add limits of force and speed, and the switch that the user has to hold."""
     add, number = parser.add_argument_group("safety").add_argument, options.number
     cap = "largest force, of rotary devices at the radius of the hand (default 2, for first sessions)"
     add("--force-cap", type=number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
@@ -104,7 +104,7 @@ def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
 
 
 def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
-    """The limits of the safety options, with `cap`. Raises InputError."""
+    """Return the limits of the safety options, with `cap`. Raises InputError."""
     more: dict[str, Any] = {"cap": args.force_cap, "speed": _speed(args, scenario), "thermal": args.thermal_time}
     if args.continuous_force is not None:
         more["continuous"] = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)
@@ -131,7 +131,7 @@ def _speed(args: argparse.Namespace, scenario: Scenario) -> float:
 
 
 def touched(path: str) -> Callable[[], bool]:
-    """Whether a file was touched since the last call; False where there is no such file."""
+    """Return whether a file was touched since the last call; False if there is no such file."""
     last = [_mtime(path)]
 
     def touched_again() -> bool:
@@ -143,7 +143,7 @@ def touched(path: str) -> Callable[[], bool]:
 
 
 def _deadman(named: str | None) -> Callable[[], bool] | None:
-    """A function that says whether the file was touched of --deadman; keys are read elsewhere.
+    """Return a function that tells whether the file of --deadman was touched; keys are read elsewhere.
 
     None where no one has to be present, or where the device has a switch of its own.
     """
@@ -160,7 +160,7 @@ def _mtime(path: str) -> int | None:
 
 
 def check_link(args: argparse.Namespace) -> LinkSettings:
-    """The settings of a session. Raises InputError where the options contradict each other."""
+    """Return the settings of a session. Raises InputError if the options contradict each other."""
     if bool(args.port) == args.rehearse:
         raise InputError("give either --port PATH or --rehearse")
     if args.port and not args.arm and not sys.stdin.isatty():
@@ -169,7 +169,7 @@ def check_link(args: argparse.Namespace) -> LinkSettings:
 
 
 def _baud(args: argparse.Namespace) -> int | None:
-    """The speed of the UART in the line, or None without a UART.
+    """Return the speed of the UART in the line, or None without a UART.
 
     A pseudo-terminal has none. /dev/ttyACM0 may be native USB, or a USB chip with a UART behind it: a UART is assumed.
     """
@@ -204,7 +204,7 @@ def _ports(args: argparse.Namespace) -> list[str]:
 
 
 def host_clocked(args: argparse.Namespace) -> bool:
-    """Whether the host gives the clock, because the device has none."""
+    """Return whether the host gives the clock, because the device has none."""
     return (args.port or "").split(":")[0] == FORCE_DIMENSION
 
 
@@ -225,7 +225,7 @@ def hold_session(
     alone: Scenario | None = None,
     coulomb: float = 0.0,
 ) -> _Held:
-    """From opening the port to the end of the session, or the same in virtual time with an emulated device.
+    """Run a session from opening the port to its end, or in virtual time with an emulated device.
 
     Where nobody is to hold an emulated device, `alone` is its scenario; `coulomb` [N] is its dry friction.
     """
@@ -308,7 +308,7 @@ def _rehearsed(
     alone: Scenario | None,
     coulomb: float,
 ) -> _Held:
-    """The session in virtual time; the emulated person arms once and holds the deadman."""
+    """Run the session in virtual time; the emulated person arms once and holds the deadman."""
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
     with options.refused("the scenario cannot stand behind a serial link: "):
         emulator = Emulator(alone or options.scenario_from(args), faults, coulomb=coulomb)
@@ -331,7 +331,7 @@ def _rehearsed(
 
 
 def _show(session: Session) -> None:
-    """One line on the terminal, over the one before, where that can be written without waiting for it."""
+    """Write one line over the one before, where the terminal takes it without waiting."""
     words, drive, counters = [str(session.stage)], session.drive, session.counters
     if session.stage == Stage.MEASURING:
         words.append(f"{len(session.measurement.ages)} of {session.settings.measure} answers")
@@ -356,7 +356,7 @@ def _clear() -> None:
 
 @contextmanager
 def _keys() -> Iterator[int]:
-    """Standard input, key by key."""
+    """Switch the terminal to single keys, and yield the file descriptor of standard input."""
     keyboard = sys.stdin.fileno()
     before: list[Any] = termios.tcgetattr(keyboard)
     tty.setcbreak(keyboard, termios.TCSANOW)

@@ -62,7 +62,7 @@ class _Report:
 
 
 def _reported(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, start: float) -> _Report:
-    """The parts of a report that need no run."""
+    """Return the parts of a report that need no run."""
     with render.progress("assessing the coupling"):
         assessment = assessed(
             scenario, args.case, chosen, energy_budget=start, limiter=False, seed=getattr(args, "seed", 0)
@@ -86,7 +86,7 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
 
 
 def world_start(args: argparse.Namespace) -> float:
-    """W0 [J] of --energy-budget. Raises InputError for a cap, which the account of a world does not have."""
+    """Return W0 [J] of --energy-budget. Raises InputError for a cap, which the account of a world does not have."""
     if not args.energy_budget:
         return START_J
     start, *cap = args.energy_budget

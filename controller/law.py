@@ -388,7 +388,7 @@ class Limiter(Law):
         return walled_tick
 
     def together(self, laws: Sequence[Law]) -> Transition:
-        """Only those with a force beyond its limit solve their problem."""
+        """Return a transition in which only laws with a force beyond its limit solve their problem."""
         if self.walls:
             return _one_by_one(laws)
         limiters = cast("Sequence[Limiter]", laws)
@@ -422,5 +422,5 @@ class Limiter(Law):
         return np.concatenate([free.at_rest(x - e), e, lines, np.zeros(len(self.walls))])
 
     def slips(self, z: Array) -> Array:
-        """e [m] at each tick but the last, (ticks - 1, m, ..), not zero where a force was limited."""
+        """Return the slips e [m] at each tick but the last, (ticks - 1, m, ..): not zero where a force was limited."""
         return z[1:, self.sent.order : self.sent.order + self.channels]

@@ -106,7 +106,7 @@ def instead(loop: Loop, kind: str, condition: str | Condition | None = None) -> 
 
 
 def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None = None) -> dict[str, Requirement[str]]:
-    """What both conditions, "any-environment" and "this-environment", ask of a coupling in its loop.
+    """Judge a coupling in its loop by both conditions, "any-environment" and "this-environment".
 
     Beside them that of the design, or a `condition` of your own, under its name.
 

@@ -109,7 +109,7 @@ def any_environment_demand(V: Block, loop: Loop, phi: Sequence[Any] | Array | No
     paid = np.flatnonzero(shortage)
 
     def excess(H: Any, corner: Any) -> tuple[Array, Any]:
-        """H(1); the block of H with this corner, linear in both."""
+        """Return H(1) and the block of H with this corner, linear in both."""
         H1, regular = v_hat(H)
         if not paid.size:
             return H1, regular

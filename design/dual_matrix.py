@@ -164,7 +164,7 @@ class DualMatrix:
 
 
 def dilogarithm(x: Array) -> Complex:
-    """Li2(e^jx) for |x| <= 2 pi."""
+    """Return Li2(e^jx) for |x| <= 2 pi."""
     import scipy
 
     short = np.where(np.abs(x) > np.pi, x - 2 * np.pi * np.sign(x), x)

@@ -375,7 +375,7 @@ class ThisEnvironment(Multiplied):
         return super().beyond(loop)
 
     def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
-        """As in the base class, with rounding relative to each channel's and wall's own size: their units differ."""
+        """Check the static part, with rounding relative to the size of each channel and wall: their units differ."""
         if not loop.environment.walls:
             return super().unsound_static(G, loop, asked)
         m, S1 = loop.channels, G.dc()

@@ -94,7 +94,7 @@ class NothingToExport(ValueError):
 
 
 def coupling_block(stored: Stored) -> ExportedBlock:
-    """V(z), force to displacement. Raises NothingToExport where the coupling is no V in feedback."""
+    """Return V(z), force to displacement. Raises NothingToExport if the coupling is no V in feedback."""
     V = stored.built().compliance(stored.loop.T)
     if V is None:
         reason = "this coupling is no V in feedback around the environment; the whole process can be had (--process)"
@@ -109,7 +109,7 @@ def process_block(
     force_limit: Sequence[float] | None = None,
     balls: Sequence[slice] = (),
 ) -> ExportedBlock:
-    """F(z) (6), device displacements to forces; Theta is left out where the link to the devices is the delay.
+    """Return F(z) (6), displacements to forces, without Theta if the link to the devices is the delay.
 
     With `force_limit` (m,) [N] they leave through the limiter of the certificate, which limits the channels of each of
     `balls` as one vector. Raises NothingToExport where the certificate covers none.
@@ -147,7 +147,7 @@ def _limited_block(
 
 
 def _with_a_state(system: Lti) -> Lti:
-    """The same block, with a state that stays zero where it has none: C has no empty arrays."""
+    """Return the same block with at least one state, which stays zero: C has no empty arrays."""
     if system.order:
         return system
     m = system.inputs
@@ -155,7 +155,7 @@ def _with_a_state(system: Lti) -> Lti:
 
 
 def trial(block: ExportedBlock, seed: int = 0) -> _Trial:
-    """Normally distributed inputs, with a limiter such that a third of the ticks are limited, and the outputs."""
+    """Return normally distributed inputs and their outputs; a limiter acts on a third of the ticks."""
     rng = np.random.default_rng(seed)
     inputs = block.input.size * rng.standard_normal((_TICKS, block.system.inputs))
     if block.limiter:
@@ -194,7 +194,7 @@ def _limits(limiter: Limiter, dtype: type[np.floating]) -> Array:
 def sequential(
     system: Lti, inputs: Array, limiter: Limiter | None = None, dtype: type[np.floating] = np.float64
 ) -> Array:
-    """Outputs (ticks, p) for inputs (ticks, m), from rest, every sum in the order that the module states."""
+    """Return outputs (ticks, p) for inputs (ticks, m) from rest, each sum in the order that the module states."""
     rows = np.block([[system.C, system.D], [system.A, system.B]]).astype(dtype)
     z, outputs = np.zeros(system.order, dtype), []
     limits = _limits(limiter, dtype) if limiter else None
@@ -217,7 +217,7 @@ def sequential(
 
 
 def _box_matrix(limiter: Limiter) -> Array:
-    """M of the box problem, (m, m), regular also where nothing holds the environment."""
+    """Return M of the box problem (m, m), regular also where nothing holds the environment."""
     problem = limiter.problem
     assert isinstance(problem, BoxProblem)  # the exported tick limits channel by channel
     M = problem.M
@@ -225,7 +225,7 @@ def _box_matrix(limiter: Limiter) -> Array:
 
 
 def _turns(m: int) -> int:
-    """A bound on the number of switches after which the box problem is solved."""
+    """Bound the number of switches after which the box problem is solved."""
     return min(3**m, _MOST_TURNS)
 
 
@@ -772,7 +772,7 @@ $reached        }
 
 
 def c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
-    """The file's text; numbers are hexadecimal, so that no compiler's decimal conversion matters."""
+    """Return the text of the file; numbers are hexadecimal, so that no compiler's decimal conversion matters."""
     system, name, dtype = block.system, block.name, block.dtype
     words = {
         "name": name,
@@ -858,7 +858,7 @@ def _row(values: Array, suffix: str) -> str:
 def with_origin(
     block: ExportedBlock, file: str, stored: Stored, verdict: Verdict, claim: str | None = None
 ) -> ExportedBlock:
-    """The block with lines on the file that it comes from, and on what is proved there; `claim` is a further one."""
+    """Add comment lines on the block's file and on what is proved there; `claim` is a further line."""
     written = f"Written by python -m design.export from {file}: {_gains(stored)}"
     proved = _guarantee(stored, verdict, block.limiter is not None)
     return replace(block, about=(written, *block.about, proved, *([claim] if claim else [])))

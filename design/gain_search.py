@@ -254,7 +254,7 @@ class SampledLoop:
 
 
 def _shared(loop: Loop) -> tuple[list[int], Array]:
-    """The first channel of each device, and the mean over the axes of a device, (m, m): they share one multiplier."""
+    """Return each device's first channel and the mean over its axes (m, m): axes of a device share a multiplier."""
     of = np.array(loop.per_channel(range(len(loop.devices))))
     return [own.start for own in loop.devices], (of[:, None] == of) / np.bincount(of)[of]
 

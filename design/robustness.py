@@ -55,7 +55,7 @@ class Nearby:
 
 
 def at(loop: Loop, network: Network) -> Loop:
-    """The loop around this environment, its delays constant."""
+    """Return the loop around this environment with constant delays."""
     return loop.at(network).switching(None)
 
 

@@ -173,7 +173,7 @@ def step(shaping: Shaping, gains: GainSet, at: Array, norm: float, w: Array) -> 
 
 
 def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> Inequality:
-    """[[g0* g + g* g0 - g0* g0, (W1 L g W2)*], [W1 L g W2, t norm^2]], scaled to order one; t is the last variable."""
+    """Return [[g0* g + g* g0 - g0* g0, (W1 L g W2)*], [W1 L g W2, t norm^2]], scaled; t is the last variable."""
     N = shaping.loop.channels
     left, right, late = shaping.parts(w)
     basis = np.eye(N)[:, None, :] * np.ones((w.size, 1))  # (N, k, N): e_i at every frequency
@@ -584,7 +584,7 @@ def _switched_chi(loop: Loop, i: int, delta: float) -> Array:
 
 
 def _best_charge(loop: Loop, i: int, theta: int) -> Array:
-    """Q (2, 2) [1/s] of least trace of Q^-1 M, M the inner products of the windows of theta + 2 and theta + 1 terms."""
+    """Return Q (2, 2) [1/s] of least trace of Q^-1 M, M the inner products of both windows."""
     hands, scale = Latency(), 1 / loop.T
     root = np.linalg.cholesky(np.array([[theta + 2.0, theta + 1.0], [theta + 1.0, theta + 1.0]]))
     one = loop.channel(i)

@@ -273,7 +273,7 @@ class Port:
 
 
 def directions(axes: int) -> _Array:
-    """The directions of springs whose sums are all diagonally dominant matrices, (axes^2, axes).
+    """Return the directions (axes^2, axes) of springs whose sums are all diagonally dominant matrices.
 
     These are e_i + e_j and e_i - e_j for every two axes, then the axes themselves.
     """

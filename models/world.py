@@ -272,7 +272,7 @@ class World:
     # -------------------------------------------------------------------------------------------- what is in it
 
     def settings(self) -> str:
-        """The settings that the program forces on the scene, in one line."""
+        """Return in one line the settings that the program forces on the scene."""
         slow = f" = {self.every} ticks" if self.every > 1 else ""
         solver = f"Newton, {ITERATIONS} iterations, tolerance {TOLERANCE:g}, no noslip"
         return f"integrator discrete, timestep {self.h:g} s{slow}, elliptic cones, {solver}"

@@ -117,7 +117,7 @@ def simulate(
     energy_budget: float | None = None,
     limiter: bool = True,
 ) -> Trace:
-    """The scenario's run, from rest, for `scenario.duration` seconds.
+    """Run the scenario from rest for `scenario.duration` seconds.
 
     `coupling` None is the loop without one, "design.json" the file of a design; `engine` is "mujoco", "exact" (the
     linear loop, no Coulomb friction) or of your own (sim.engines.Engine), as it is or as what makes it of a

@@ -20,7 +20,7 @@ from haptic_loop.sim.scenario import Scenario
 
 
 def nearby(loop: Loop, coupling: Coupling) -> Nearby:
-    """What a coupling needs within ten percent; beside an optimal one what a design for that would cost."""
+    """Return what a coupling needs within ten percent and, for an optimal one, what a design for that costs."""
     filters_forces = coupling.in_series(loop.T) is not None
     return nearby_with_price(loop, coupling) if filters_forces else Nearby(robustness_nearby(loop, coupling))
 

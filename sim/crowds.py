@@ -309,7 +309,7 @@ def _geometric_mean(values: Array) -> Array:
 def _witnessed(
     validation: Validation, index: NDArray[np.intp], growth: Array, lossless: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """Numbers of the humans of one group that the other engine simulates, too.
+    """Return the numbers of the humans of one group that the other engine simulates, too.
 
     These are all lossless ones, the _NEAREST whose `growth` [1/s] is nearest to zero, and whoever is among the
     _AT_RANDOM of all humans. They follow from the question and the group alone, whoever works on it.

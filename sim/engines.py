@@ -62,7 +62,7 @@ class Engine(Protocol):
         ...
 
     def troubled(self) -> bool:
-        """Whether the engine itself has reported numbers that it cannot go on with."""
+        """Return whether the engine itself has reported numbers that it cannot go on with."""
         ...
 
 
@@ -191,13 +191,13 @@ def least_substeps(integrator: str) -> int:
 
 
 def default_integrator(scene: Scene) -> str:
-    """exponential where the scene is smooth; RK4 where something rubs, which is nearer there at equal cost."""
+    """Return "exponential" for a smooth scene, and "RK4" for friction, which is nearer there at equal cost."""
     rubs = scene.model.dof_frictionloss.any() or scene.model.tendon_frictionloss.any()
     return "RK4" if rubs else EXPONENTIAL
 
 
 def _segments(late: tuple[float, ...] | None, T: float) -> list[tuple[float, NDArray[np.bool_]]]:
-    """(seconds, channels whose last force still acts) between the latch times of a tick, (m,) or (0,) each."""
+    """Return (seconds, channels whose last force still acts) between the latch times of a tick, (m,) or (0,) each."""
     taus = np.array(late or ())
     ends = np.unique(np.concatenate([[0.0], taus, [T]]))
     return [(float(b - a), taus > a) for a, b in pairwise(ends)]
@@ -228,7 +228,7 @@ class _Access:
         self.state[...] = buffer.s[k, : 2 * len(self.qacc)].reshape(self.state.shape)
 
     def ticks(self, buffer: StepBuffer, timing: Timing | None) -> Callable[[int], None]:
-        """What moves tick k of the buffer, from where the plant is."""
+        """Return a function that moves tick k of the buffer from the plant's present state."""
         one = (..., 0) if self.ctrl.ndim == 1 else ...
         states = buffer.s[:, : self.size][one]
         rows, inputs = list(states), list(buffer.rows[:, -len(self.ctrl) :][one])
@@ -240,7 +240,7 @@ class _Access:
         return self._by_exponentials(rows, inputs, shaped) if self.move else self._by_steps(inputs, shaped)
 
     def _shaped(self, states: Array) -> Array:
-        """A view of [q; v] of states (ticks, size, ..), as `state` is."""
+        """Return a view of [q; v] of states (ticks, size, ..), shaped like `state`."""
         return states[:, : 2 * len(self.qacc)].reshape(-1, *self.state.shape)
 
     def _by_both(self, rows: list[Array], inputs: list[Array]) -> Callable[[int], None]:
@@ -286,7 +286,7 @@ class _Access:
     def _timed(
         self, buffer: StepBuffer, timing: Timing, rows: list[Array], inputs: list[Array]
     ) -> Callable[[int], None]:
-        """From latch to latch; of the next row also the forces that are held, behind the state."""
+        """Move from latch to latch; the next row also holds the acting forces, behind the state."""
         kinds, which = [_segments(late, T) for T, late in timing.kinds], timing.which
         m, states = 0 if timing.late is None else timing.late.shape[1], len(rows[0])
         forces = self.ctrl[len(self.ctrl) - m :]
@@ -484,20 +484,20 @@ class MujocoBatchEngine:
 
 @lru_cache(64)  # runs of the same plant follow each other
 def _step_of(plant: Plant, n: int, h: float) -> Array:
-    """[s; a] to s then, of one plant with n joints, in h seconds."""
+    """Return the step from [s; a] to s after h seconds, for one plant with n joints."""
     stacked = _stacked(plant)
     return exponential_step(stacked.A, h, n, stacked.felt)[0]
 
 
 def _stacked(plant: Plant) -> Plant:
-    """One plant, or many, as a stack."""
+    """Return one plant, or many, as a stack."""
     if plant.A.ndim > 2:
         return plant
     return Plant(plant.A[None], plant.B[None], plant.C, None if plant.felt is None else plant.felt[None])
 
 
 def _kicks(plants: Plant) -> Callable[[float], Product] | None:
-    """Seconds to what makes the states after the impedances alone have acted; None where there are none."""
+    """Return a function from seconds to the product for impedances alone; None if there are none."""
     felt = plants.felt
     if felt is None:
         return None
@@ -510,12 +510,12 @@ def _kicks(plants: Plant) -> Callable[[float], Product] | None:
 
 
 def _product_of_each(steps: Array) -> Product:
-    """Of a stack of matrices with as many states, one for all where it is the only one."""
+    """Return the product with each of a stack of matrices; a single matrix serves all columns."""
     return product_of(steps if len(steps) > 1 else steps[0])
 
 
 def _discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
-    """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T."""
+    """Copy the scene's model for `substeps` steps of `integrator` in a period T."""
     import mujoco
 
     if integrator not in INTEGRATORS:
@@ -570,7 +570,7 @@ class _PlantSpeed:
     rate: float  # [1/s] its strongest damping
 
     def within(self, h: float) -> bool:
-        """Whether a step of h seconds follows it."""
+        """Return whether a step of h seconds follows the plant."""
         return self.mode * h <= _RESOLVED and self.rate * h < _FOLLOWED
 
     def substeps(self, T: float) -> int:
@@ -580,14 +580,14 @@ class _PlantSpeed:
         )
 
     def hardest(self, h: float) -> str:
-        """What a step of h seconds has most trouble with, in words."""
+        """Return in words what a step of h seconds has most trouble with."""
         if self.mode / _RESOLVED >= self.rate / _FOLLOWED:
             return f"the mode at {self.mode / (2 * math.pi):.4g} Hz advances {self.mode * h:.3g} rad in a step"
         return f"the damping of {self.rate:.4g} 1/s times the step is {self.rate * h:.3g}"
 
 
 def pace(A: Array) -> _PlantSpeed:
-    """The pace of x' = A x, or the fastest of many. Weakly damped is what turns faster than it decays."""
+    """Return the pace of x' = A x, or of the fastest of many; weakly damped modes turn faster than they decay."""
     values = np.linalg.eigvals(A)
     weak = np.abs(values.imag) > np.abs(values.real)
     return _PlantSpeed(float(np.abs(values[weak]).max(initial=0.0)), float(-values.real.min(initial=0.0)))

@@ -35,7 +35,7 @@ _OWN_LINE: dict[str, Any] = plots.STYLES[4] | {"linestyle": ":", "linewidth": 2.
 
 
 def plot_zwidth(drawn: Map, report: MapReport, path: Path) -> Path:
-    """Stiffness over damping; cells are the population's verdict, lines the certificates' edges, symbols MuJoCo's."""
+    """Plot stiffness over damping: cells for the population, lines for certificates' edges, symbols for MuJoCo."""
     figure = Figure((8, 5.6), layout="constrained")
     axes = figure.subplots()  # areas in place of a grid
     about_environment = report.fixed is not None
@@ -66,7 +66,7 @@ def _cells(axes: Axes, drawn: Map, report: MapReport) -> list[Patch]:
 
 
 def _cell_edges(axis: Array, scale: str) -> Array:
-    """Borders halfway between grid values, with the first and the last value on the border of the picture."""
+    """Return borders halfway between grid values, with the first and the last value on the picture's border."""
     values = np.log(axis) if scale == "log" else axis
     borders = np.concatenate([values[:1], (values[1:] + values[:-1]) / 2, values[-1:]])
     return np.exp(borders) if scale == "log" else borders
@@ -91,7 +91,7 @@ def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
 
 
 def _designed_for(axes: Axes, drawn: Map, report: MapReport) -> list[Line2D]:
-    """The contact springs of the environment that the coupling was designed for, where they lie on the map."""
+    """Return the contact springs of the coupling's own environment, where they lie on the map."""
     style: dict[str, Any] = {"marker": "P", "markersize": 9, "color": "black", "linestyle": "none"}
     shown = [(s.B, s.K) for s in report.fixed.contact_springs] if report.fixed else []
     for b, k in shown:
@@ -151,5 +151,5 @@ def _title(report: MapReport) -> str:
 
 
 def _list(values: Sequence[float]) -> str:
-    """The numbers, or the one that all of them are."""
+    """Write the numbers, or one number if all are equal."""
     return ", ".join(f"{v:g}" for v in (values if len(set(values)) > 1 else values[:1]))

@@ -100,7 +100,7 @@ class Wanted(Protocol):
 
 
 def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> Simulation:
-    """The same loop with a net under it, for runs of up to `ticks` (default: the scenario's).
+    """Return the same loop with a net under it, for runs of up to `ticks` (default: the scenario's).
 
     What is linear about a loop, such as certificates and modes, ask the simulation without. Delays that vary are those
     that it has. Raises InputError for numbers that no budget can have.
@@ -118,7 +118,7 @@ def netted(simulation: Simulation, wanted: Wanted, ticks: int | None = None) -> 
 
 
 def idle(simulation: Simulation, requirements: Iterable[Requirement], budget: BudgetFigures) -> str | None:
-    """Why the budget never acts in this run from rest; None where it may, or where no proof says so."""
+    """Return why the budget never acts in this run from rest, or None where it may act."""
     scenario = simulation.scenario
     if (
         budget.cap_J is not None

@@ -83,7 +83,7 @@ class RunReport:
         return bool(self.varying_delay and self.varying_delay.met)
 
     def notes(self) -> list[str]:
-        """Remarks that explain the figures."""
+        """Return remarks that explain the figures."""
         lines, guarantee = [], self.assessment.guarantee
         certificates, part = self.assessment.requirements, self.assessment.decisive
         transparency, where = self.assessment.transparency, guarantee and guarantee.environments
@@ -123,7 +123,7 @@ def run_report(
     environment: str,
     check: bool,
 ) -> RunReport:
-    """The report of a run in the environment of this name; `check` runs another integrator beside it."""
+    """Report a run in the environment of this name; `check` runs another integrator beside it."""
     simulation, trace, loop, requirements = run.simulation, run.trace, scenario.loop(case), assessment.requirements
     delays, grows = None, None
     if simulation.scenario.varying_delay:

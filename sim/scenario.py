@@ -313,7 +313,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return self.period is not None or any(least < most for least, most in self.latency or ())
 
     def timing(self, seed: int, ticks: int) -> Timing | None:
-        """When the ticks of a run begin and its forces latch, of the seed only; None where both are at k T."""
+        """Return when ticks begin and forces latch, as the seed draws it; None if both are at k T."""
         rng = np.random.default_rng(np.random.SeedSequence((seed, _TIMING_STREAM)))
         timing = drawn(self.T, self.period, self.latency, ticks, rng)
         if timing is None or timing.late is None or self.axis_devices is self.device:

@@ -435,7 +435,7 @@ class Balance:
         return buffer.f[:count] * moved, self._spent(self.damping, moved)
 
     def _spent(self, damping: Array, moved: Array) -> Array:
-        """The least that is dissipated over steps (count, m, nsim), `damping` (m, 1) of them; a matrix is scaled."""
+        """Return the least dissipation over steps (count, m, nsim) for `damping` (m, 1); a matrix is scaled."""
         if self.Delta is None:
             return damping * moved**2
         return damping * moved * np.einsum("ij,kjn->kin", self.Delta / np.diag(self.Delta)[:, None], moved)

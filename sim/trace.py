@@ -41,14 +41,14 @@ _UNITS = {"x": "m", "f": "N", "x_handle": "m", "v_handle": "m/s"}
 
 
 def _real(name: str, values: NDArray[Any]) -> Array:
-    """Raises ValueError for an array that holds anything but real numbers."""
+    """Raise ValueError for an array that holds anything but real numbers."""
     if values.dtype.kind not in "fiu":
         raise ValueError(f"{name} is of type {values.dtype}, expected real numbers")
     return values
 
 
 def _is_frozen(value: Any, ndim: int) -> bool:
-    """Whether it is read-only, so that a long run needs no second copy."""
+    """Return whether an array is read-only, so that a long run needs no second copy."""
     own = isinstance(value, np.ndarray) and value.dtype == np.float64 and value.ndim == ndim
     return own and not value.flags.writeable and not (isinstance(value.base, np.ndarray) and value.base.flags.writeable)
 

@@ -246,7 +246,7 @@ def _ratio(sweep: Sweep, drawn: Map, name: str) -> _Ratio:
 
 
 def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
-    """Why some cells have no figure, by the example of one of them; None where all have one."""
+    """Return why some cells have no figure, by the example of one of them; None if all have one."""
     if name in sweep.refusals:
         return sweep.refusals[name]
     ratio, (K, B) = drawn.ratio[name], drawn.grid.flat
@@ -274,7 +274,7 @@ def _population(drawn: Map, humans: int, seed: int) -> _Population:
 
 
 def save_csv(drawn: Map, path: Path) -> Path:
-    """One line per cell, SI units in the header; empty where nothing is known."""
+    """Write one line per cell, SI units in the header; unknown figures are empty."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     figures = [f"{name} required/available" for name in drawn.ratio]
