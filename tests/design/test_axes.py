@@ -298,7 +298,7 @@ def test_rigid_wall_with_a_stiffness_matrix() -> None:
 
 
 @pytest.mark.parametrize(("theta", "damping", "needs"), [(0, 2.0, 3.5), (1, 2.0, 4.2221), (1, 0.0, 4.5)])
-def test_a_wall_in_space_faces_the_level_along_its_normal(theta: int, damping: float, needs: float) -> None:
+def test_a_wall_meets_the_level_along_its_normal(theta: int, damping: float, needs: float) -> None:
     """s Delta >= c n n' holds for s = c n' Delta^-1 n, with the c [N s/m] that a bare wall needs of a single axis."""
     normal, level = np.array([0.6, 0.8]), np.array(LEVELS[0])
     wall = Wall(("a", "ground"), 3000.0, damping, normal=tuple(normal))
@@ -381,7 +381,7 @@ def test_decoupled_axes_need_what_one_needs() -> None:
         assert ratios[1] == pytest.approx(ratios[0], rel=1e-6), condition
 
 
-def test_what_is_not_proved_is_refused_in_a_line() -> None:
+def test_unproved_combinations_are_refused_in_one_line() -> None:
     bounds = DeviceBounds(0.1, 4e4, 2.0, 4.0)
     known = msgspec.structs.replace(LOOP, known_devices=(bounds,) * 4, T_min=1e-3)
     assert "Delta_i is diagonal" in str(KNOWN_DEVICE.beyond(known))

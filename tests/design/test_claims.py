@@ -459,7 +459,7 @@ class Resonant(Environment):
         return Lti(A, B, C, D, T) @ step
 
 
-def test_an_active_object_of_ones_own_is_not_any_passive():
+def test_an_own_active_object_gets_no_guarantee():
     """Behind a coupling of K = 900 N/m and B = 0.6 N s/m; a passive resonance as narrow keeps the guarantee."""
     coupling = SpringDamper([900.0], [0.6])
     for size, angle, passive in ((1.5, 1.536, False), (-0.2, 0.0, False), (1e-4, 0.0, True)):

@@ -185,13 +185,13 @@ def anywhere(further, delta=10.0, coupling=ANYWHERE, **network):
         ({"varying_delay": DelayRange((1,), (3,))}, 1, 9.6),
     ],
 )
-def test_a_spring_before_any_environment_needs_the_closed_form(further, theta, needs):
+def test_springs_before_any_environment_need_the_closed_form(further, theta, needs):
     loop = loop_of(Network(("tip",), (Spring(("tip", GROUND), 1000.0),)), theta=theta, **further)
     found = required_damping(loop, SpringDamper([1000.0], [0.0]), ANY_ENVIRONMENT)
     assert found.required[0] == pytest.approx(needs, rel=1e-7)
 
 
-def test_the_requirement_before_any_environment_is_that_of_chi():
+def test_any_environment_requirements_follow_from_chi():
     """He[V/(1-z)] against chi = (tau |1 + .. + z^-(theta+1)|^2 + (T - tau) |1 + .. + z^-theta|^2)/(4 delta)."""
     tau, theta, T = 0.3e-3, 2, 1.2e-3
     coupling = SpringDamper([900.0], [0.3])
@@ -241,7 +241,7 @@ def test_no_hand_gains_energy_before_lossless_environments(further, limited):
 
 
 @pytest.mark.parametrize("further", [LATE, SWITCHED], ids=["latency", "switching"])
-def test_some_hands_gain_energy_before_a_stiff_spring_below(further):
+def test_below_the_requirement_some_hands_gain_energy(further):
     loop, least = anywhere(further)
     stiff = change(loop, environment=Network(("tip",), (Spring(("tip", GROUND), 1e6),)))
     assert growing(stiff, ANYWHERE, 0.5 * least, None, ticks=6000) > 0

@@ -257,7 +257,7 @@ def test_single_precision_repeats_its_own_test_vector(limited_files, name, limit
 
 
 @pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
-def test_the_error_of_single_precision_is_below_its_bound(data):
+def test_single_precision_stays_within_its_error_bound(data):
     """Coefficients, inputs and sums are rounded to 2^-24: each row errs by gamma_(N+2) |row| |v|, carried on by A."""
     block = process_block(Stored.of(PAIR, data))
     G, inputs = block.system, trial(block).inputs

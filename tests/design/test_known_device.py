@@ -807,7 +807,7 @@ WALLS = [(1000.0, 5.0, 0, 0.566, 5.5), (3000.0, 2.0, 0, 1.524, 3.5)]
 
 
 @pytest.mark.parametrize(("k", "damping", "theta", "known", "plain"), WALLS)
-def test_a_damped_wall_needs_less_than_the_known_figure(k, damping, theta, known, plain):
+def test_damped_walls_need_less_than_known_figures(k, damping, theta, known, plain):
     """Separate code needs `known` with a coarse sweep and m = 0; the touched wall alone needs less."""
     touched = ThisEnvironmentSweep(wall(k, damping, theta, 1e-3), one(1e-3, 1.0, theta)).best(plain).share
     assert touched * (1 - 1e-4) < wall_needs(k, damping, theta) < known
@@ -844,7 +844,7 @@ def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3, coupling=None, *
 
 
 @pytest.mark.parametrize(("k", "damping", "theta", "known", "plain"), WALLS)
-def test_no_hand_behind_the_transmission_grows_on_a_wall(k, damping, theta, known, plain):
+def test_no_hand_behind_transmissions_grows_on_walls(k, damping, theta, known, plain):
     loop = on_a_wall(k, damping, theta)
     assert hands_on_a_wall(loop, 1.01 * wall_needs(k, damping, theta)) == 0
 
@@ -868,7 +868,7 @@ def test_some_hands_grow_on_a_wall_far_below():
     assert hands_on_a_wall(on_a_wall(3000.0, 2.0, 1), 0.3) > 0
 
 
-def test_a_wall_on_a_known_device_is_proved_from_its_file():
+def test_walls_on_known_devices_are_proved_from_files():
     loop = on_a_wall(1000.0, 5.0, 0)
     stored = Stored.of(loop, NoCoupling(), prove(loop, NoCoupling(), "known-device"))
     assert stored.certificate.facts == ("walls",)
@@ -943,7 +943,7 @@ def test_the_block_is_the_energy_of_limited_periods():
     assert paid == pytest.approx(f @ (dx + beta[0] * (after - v)) + sum(cost_of) - M @ de, rel=1e-4)
 
 
-def test_limited_forces_on_known_devices_are_proved_from_files():
+def test_limited_known_devices_are_proved_from_files():
     loop = change(KNOWN, delta=(1.0, 1.0))  # the published gains need 0.966 with the limiter
     certificate = prove(loop, PUBLISHED["I"], LimitedKnownDevice())
     assert (certificate.condition, certificate.facts) == ("known-device", ("limiter",))

@@ -467,7 +467,7 @@ def test_a_rehearsed_wall_pushes_and_never_pulls():
     np.testing.assert_allclose(felt, pushes[399:-121], atol=6e-4)  # the force is rounded to steps of 0.5 mN
 
 
-def test_a_wall_on_the_bridge_replays_bit_by_bit(tmp_path, capsys):
+def test_walls_on_the_bridge_replay_bit_by_bit(tmp_path, capsys):
     words = ["--scenario", "one-wall", "--duration", "1", "--out", str(tmp_path), "--no-plot"]
     assert bridge.main(["--rehearse", *words]) == 0
     shown = " ".join(capsys.readouterr().out.split())

@@ -111,7 +111,7 @@ def read_coupling_of(trace):
     return recipe.coupling.build(recipe.scenario.T)
 
 
-def test_the_host_delays_what_waits_longer_than_the_link():
+def test_the_host_delays_forces_beyond_the_link():
     world = WorldController(load("world-ball"), SpringDamper([800.0, 800.0], [0.4, 0.4]), 0.0, [2.0, 2.0], [0, 3])
     sent = [world.later((k, 10 * k), 1) for k in range(1, 6)]
     assert sent == [(1, 0), (2, 0), (3, 0), (4, 10), (5, 20)]

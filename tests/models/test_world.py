@@ -293,7 +293,7 @@ def test_the_linear_model_is_mujocos_own_derivative(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:flex")  # MuJoCo warns of a flex whose elasticity it does integrate
-def test_a_soft_body_only_loses_energy_and_is_listed(tmp_path):
+def test_soft_bodies_lose_energy_and_are_listed(tmp_path):
     """MuJoCo's sensors leave elastic energy out, so that it never counts as released."""
     text = f"""<mujoco><option gravity="0 0 0"/><worldbody><body name="left" pos="-1 0 0">{FREE}</body>
     <body name="right" pos="1 0 0">{FREE}</body>

@@ -54,7 +54,7 @@ def test_numpy_alone_finds_the_published_requirements():
 
 
 @pytest.mark.parametrize("name", ["o01-wall-light-device", "o02-soft-wall"])
-def test_growth_without_a_coupling_is_that_of_the_held_body(name):
+def test_growth_without_coupling_is_that_of_the_body(name):
     """One body of device and hand before a spring with a damper, by the exponential of its own matrix."""
     loop = tomllib.loads((ROOT / "loops" / f"{name}.toml").read_text())
     T, (theta,), (device,), (human,) = loop["T"], loop["theta"], loop["device"], loop["human"]

@@ -77,7 +77,7 @@ def test_verdicts():
     assert Mode(np.array(0.0), 1e-3).growth == -np.inf
 
 
-def test_how_a_knock_dies_away_is_that_of_the_held_plant():
+def test_knocks_die_away_as_the_held_plant():
     """One body of device and hand before a spring: the exponential of its own matrices, without the program's."""
     T, K = 2e-3, 900.0
     text = """
@@ -104,7 +104,7 @@ springs = [{ between = ["a", "ground"], stiffness = 900.0 }]
     assert said.damping_ratio == said.least_damping_ratio == pytest.approx(-pair.real / abs(pair), rel=1e-9)
 
 
-def test_a_design_for_a_damping_ratio_has_it_in_both_engines(tmp_path, capsys):
+def test_designs_reach_the_damping_ratio_in_both_engines(tmp_path, capsys):
     path = tmp_path / "soft.json"
     assert design_command(["--decay", "0.01", "--out", str(path), "--json", str(tmp_path / "r.json")]) == 0
     report = json.loads((tmp_path / "r.json").read_text())
@@ -129,6 +129,6 @@ def test_a_design_for_a_damping_ratio_has_it_in_both_engines(tmp_path, capsys):
         (["--scenario", "world-cube"], "--decay: a damping ratio is of a linear loop with constant delays"),
     ],
 )
-def test_a_damping_ratio_is_refused_where_there_is_none(options, message, tmp_path):
+def test_unreachable_damping_ratios_are_refused(options, message, tmp_path):
     with pytest.raises(InputError, match=message):
         design_command([*options, "--decay", "0.01", "--out", str(tmp_path / "c.json")])

@@ -437,7 +437,7 @@ def test_held_devices_hold_the_object(none):
 
 
 @pytest.mark.parametrize("name", ["omega-pair", "three-rigid", "one-wall", "omega-space", "world-cube"])
-def test_the_scene_file_shows_the_object_beside_the_devices(name):
+def test_scene_files_show_the_object_beside_devices(name):
     scenario = load(name)
     simulation = assemble(scenario, SpringDamper([900.0] * scenario.channels, [0.4] * scenario.channels))
     drawn, bare = (mujoco.MjModel.from_xml_string(xml) for xml in (scene_xml(simulation), simulation.scene.xml))
@@ -681,7 +681,7 @@ def ball():
     return first_loop(Menu("I"), load("world-ball"), "moving-average")
 
 
-def test_a_world_is_felt_live_as_in_a_run(ball):
+def test_live_worlds_feel_as_in_a_run(ball):
     """The session delays forces by itself; sim.run does it by packets."""
     running = LiveLoop(ball, Inline(), (), math.inf)
     trace = simulate(ball.scenario.replace(duration=0.5), ball.coupling, engine="exact")

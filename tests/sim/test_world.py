@@ -453,7 +453,7 @@ def test_a_world_becomes_a_network_for_a_design(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("every", [2, 4])
-def test_the_default_coupling_of_a_slow_world_does_not_ring(every):
+def test_default_couplings_of_slow_worlds_do_not_ring(every):
     """Between its steps the scene is a wall: what alternates from tick to tick, (f - 2 f_- + f_--)/4, dies away."""
     loop = load("world-cube").replace(duration=1.5)
     world = replace(loop.environment.world, every=every)
