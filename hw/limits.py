@@ -60,7 +60,7 @@ DRIVING = frozenset({Stage.ARMING, Stage.ARMED, Stage.DISARMING})
 
 
 class _Shaped(NamedTuple):
-    """A force that may be sent, and which limits it has reached."""
+    """A force that may be sent, and the limits that it has reached."""
 
     force: tuple[float, ...]  # (m,) [N]
     clipped: bool  # whether an entry is at its cap, by the limiter or by clipping here

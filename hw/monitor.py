@@ -1,10 +1,10 @@
-"""Whether link and device do what was agreed: the delay that is measured, the clock, lateness, and obedience.
+"""Check that link and device keep to the agreement: measured delay, clock, lateness, applied forces.
 
 The certificate is for a period T and for delays up to theta, and every ramp and limit counts ticks. So the device's
 clock is compared with its tick number, and so is the host's; answers that come late or never are counted; and the force
-that the device says it applies is compared with what it was told. Docs/protocol.md leaves a conforming device no choice
-there: in ARMED it moved from its last force towards the one for this tick, within slew and growing cap; in HOLDING it
-kept the last one; in DISARMED there is none.
+that the device reports is compared with what it was sent. By docs/protocol.md a device has no choice there: in ARMED it
+moves from its last force towards the one for this tick, within slew and growing cap; in HOLDING it keeps the last one;
+in DISARMED there is none.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # of a clock over a block; a bus
 _BLOCK = 200  # ticks over which a clock is compared
 _CLOCK_US = 1.5  # [us] by which two stamps of the device's clock may err together
 _REMEMBERED = 64  # forces on their way, of which at most theta matter
-_ROUNDING = 1  # [steps] for a firmware that rounds otherwise
+_ROUNDING = 1  # [steps] by which a firmware may round differently
 _PATIENCE = 5  # ticks in a row
 _CHANGE = 1.0  # [N] of force that moves any handle which is not against a stop
 _IMPULSE = 0.1  # [N s] of such a change without a motion: 100 ms of 1 N, 20 ms of 5 N
@@ -44,7 +44,7 @@ _DEGREE = 5  # of the polynomials that contain a hand's own motion: 1 % is left 
 _FIT = 0.8  # of the power: a free handle moved by a hand has 0.93 or more, a held one at most 0.5
 _ALIVE = 0.06  # of the expected swing: a firm hand (0.5 kg, 20 N s/m, 1500 N/m) leaves 0.09, a dead motor shows 0.03
 _STRONG = 2  # the block with which the test at the end begins
-_REST = 0.1  # [s] in which a handle rests
+_REST = 0.1  # [s] within which a handle rests at least once
 _PRESSING, _PRESSED = 0.3, 0.5  # [N], [s]
 _FORGETTING = 8  # right ticks that make up for a wrong one: seldom wrong is stopped too, just later
 
@@ -72,7 +72,7 @@ class LinkSettings:
 
 @dataclass(frozen=True)
 class Ages:
-    """How old a force is when it reaches the device, counted from its sample [us], and how many never do."""
+    """The ages [us] of forces when they reach the device, counted from their sample, and the number that never do."""
 
     values: tuple[int, ...]
     missing: int = 0
@@ -94,28 +94,28 @@ class Ages:
         return ordered[place]
 
     def link_delay(self, T_us: float, q: float, guard_us: float) -> int:
-        """Ticks from a sample to its latch: what a fraction q of the answers keeps, with a guard, and at least one."""
+        """Return the ticks [>= 1] from a sample to its latch that a fraction q of the answers keeps, with a guard."""
         return max(1, int(-(-(self.quantile(q) + guard_us) // T_us)))
 
     @property
     def median(self) -> int:
-        """Of those that arrived [us]."""
+        """The median age of the answers that arrived [us]."""
         return sorted(self.values)[len(self.values) // 2]
 
 
 class Measurement:
-    """The ages of answers at zero force, until `needed` have arrived or are missing. It ends in any case.
+    """Measure the ages of answers at zero force, until `needed` have arrived or are missing. It ends in any case.
 
     A STATE tells the margin of the youngest answer only. Where a burst brings n answers between two STATEs, `echo`
-    advances by n, and the answers that it skips are up to (n-1) T older: they are counted with that age, as the
-    delay has to cover them too.
+    advances by n, and the answers that it skips are up to (n-1) T older. They count with that age, because the delay
+    must cover them too.
     """
 
     def __init__(self, needed: int, theta: int, T: float, most_missing: float) -> None:
         self._needed, self._theta, self._T_us, self._most_missing = needed, theta, 1e6 * T, most_missing
         self._ages: dict[int, int] = {}  # [us] by the number of the tick that the answer is for, never wrapped
         self._unanswered: set[int] = set()  # ticks whose answer was not there at its latch
-        self._youngest: int | None = None  # the last one that came
+        self._youngest: int | None = None  # tick of the youngest answer that came
         self._tick = 0  # of the last STATE, never wrapped
         self._missed = 0
         self._first: State | None = None
@@ -131,7 +131,7 @@ class Measurement:
             self._ticks.append((state.t_us - self._last.t_us) & 0xFFFFFFFF)
         self._last, self._tick = state, self._tick + passed
         self._states += 1
-        counted = self._states - 2 * self._theta  # before, the device misses answers to ticks that nobody saw
+        counted = self._states - 2 * self._theta  # earlier, the device misses answers to ticks before the first STATE
         if counted <= 0:
             return False
         self._note_missed(missed, passed)
@@ -147,16 +147,16 @@ class Measurement:
         return True
 
     def _note_missed(self, missed: int, passed: int) -> None:
-        """Count `missed` latches without an answer. Where it is known which, that answer has no age."""
+        """Count `missed` latches without an answer. An answer that is known to be missed gets no age."""
         self._missed += missed
         if missed == passed:
             unanswered = range(self._tick - self._theta - missed + 1, self._tick - self._theta + 1)
             self._unanswered.update(unanswered)
             for tick in unanswered:
-                self._ages.pop(tick, None)  # it was skipped because it was lost
+                self._ages.pop(tick, None)  # a lost answer has no age
 
     def _note_answers(self, youngest: int, margin: int) -> None:
-        """Note the age of the answer to tick `youngest`, and of those that it skips."""
+        """Record the age of the answer to tick `youngest`, and of the answers that it skips."""
         age = round(self._theta * self._T_us) - margin
         after = youngest - 1 if self._youngest is None else self._youngest
         skipped = range(max(after + 1, youngest - 2 * self._theta), youngest)  # older ones were missed long ago
@@ -195,13 +195,13 @@ class Measurement:
 
 @dataclass
 class Counters:
-    """Since the session began; the device's own counts are differences modulo 256, summed."""
+    """Counts since the session began. Those of the device are sums of differences modulo 256."""
 
     states: int = 0  # STATEs that were acted upon
     gaps: int = 0  # ticks of which no STATE came
     duplicates: int = 0  # the same tick again
     stale: int = 0  # an older tick than the last: late or reordered
-    unexpected: int = 0  # messages that have no place here
+    unexpected: int = 0  # messages of a type that no session expects
     late: int = 0  # answers that reached the device after their latch
     misses: int = 0  # ticks without an answer in time, by the device's count
     device_errors: int = 0  # frames that the device rejected
@@ -213,7 +213,7 @@ class Counters:
 
 
 class LinkMonitor:
-    """The order of STATEs, and over a sliding window late answers, missed answers and ticks without a STATE."""
+    """Check the order of STATEs, and count late answers, missed answers and ticks without STATE in a sliding window."""
 
     def __init__(self, settings: LinkSettings, counters: Counters) -> None:
         self.settings, self.counters = settings, counters
@@ -221,15 +221,15 @@ class LinkMonitor:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the window: the delay has been configured anew."""
+        """Clear the window after a new delay was configured."""
         self.last: State | None = None
         self.margin: int | None = None  # [us] of the answer that the last fresh STATE tells; None: no answer came
         self.missed = 0  # ticks that the last fresh STATE tells of
         self._window: deque[_Tick] = deque()
-        self._late = self._missed = self._untold = self._gaps = 0  # sums over it: adding up takes longer than a tick
+        self._late = self._missed = self._untold = self._gaps = 0  # sums over the window; sum() takes too long
 
     def take(self, state: State) -> int:
-        """Take in a STATE: ticks since the one before, or 0 where it is no news (the same tick again, or an older)."""
+        """Process a STATE and return the ticks since the previous one, or 0 for a repeated or older tick."""
         ahead = 1 if self.last is None else distance(state.tick, self.last.tick)
         if ahead <= 0:
             self.counters.duplicates += ahead == 0
@@ -263,13 +263,13 @@ class LinkMonitor:
 
     @property
     def least_margin(self) -> int | None:
-        """[us] over the window; None where no answer came."""
+        """The least margin [us] in the window; None if no answer came."""
         return min((tick.margin for tick in self._window if tick.margin is not None), default=None)
 
     def too_late(self) -> str | None:
-        """Whether the link has become slower than the coupling was certified for, in words.
+        """Return a message if the link has become slower than the coupling was certified for, else None.
 
-        Parts are of a whole window, however few ticks there were yet. Raises SafetyStop where too little arrives.
+        Shares are of a full window, however few ticks have passed. Raises SafetyStop where too little arrives.
         """
         window, most = self.settings.window, self.settings.missed
         late, missed = self._late / window, min(1.0, self._missed / window)
@@ -303,7 +303,7 @@ class _Tick(NamedTuple):
 
 @dataclass
 class _ClockDrift:
-    """One clock against ticks of `T_us`, in blocks, each without its longest delay: a freeze is no drift."""
+    """Compare a clock with ticks of `T_us` in blocks, without the longest delay of each: a freeze is no drift."""
 
     whose: str
     T_us: float
@@ -315,7 +315,7 @@ class _ClockDrift:
     _freeze: float = 0.0  # [us] the longest single part of it
 
     def note(self, at_us: int, ticks: int) -> None:
-        """The clock shows `at_us` (modulo 2^32), `ticks` after the call before. Raises SafetyStop where it drifts."""
+        """Process the clock `at_us` (modulo 2^32), `ticks` after the last call. Raises SafetyStop if it drifts."""
         if self._last is not None:
             elapsed = (at_us - self._last + 2**31) % 2**32 - 2**31
             late = elapsed - ticks * self.T_us
@@ -335,7 +335,7 @@ class _ClockDrift:
 
 
 class ClockMonitor:
-    """Both clocks, and the number of the tick, while forces act."""
+    """Check both clocks and the tick number while forces act."""
 
     def __init__(self, watchdog_us: int, T: float) -> None:
         T_us = 1e6 * T
@@ -355,26 +355,26 @@ class ClockMonitor:
 
 
 class CommandMonitor:
-    """The forces that a device was told, and whether it applies them."""
+    """Keep the forces that a device was sent, and check that it applies them."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self._forces: dict[int, tuple[int, ...]] = {}  # by the tick that they are for
         self._last: State | None = None
-        self._ready = False  # whether it was armed in that one
+        self._ready = False  # whether the last STATE was not DISARMED
         self._run = (0, 0)  # fewest and most forces latched since arming, where STATEs were lost
         self._unlike = self._holding = 0
 
     def tell(self, tick: int, steps: tuple[int, ...]) -> None:
-        """`steps` answer `tick`."""
+        """Record that `steps` were sent as the answer to `tick`."""
         self._forces[(tick + self._config.due) & 0xFFFF] = steps
         if len(self._forces) > _REMEMBERED:
             self._forces.pop(next(iter(self._forces)))
 
     def unlike(self, state: State, ticks: int) -> bool:
-        """Whether the device applies what it cannot have been told; a STATE after a gap is not judged.
+        """Return whether the device applies a force that it was not sent. A STATE after a gap is not judged.
 
-        Raises SafetyStop where that goes on.
+        Raises SafetyStop if that goes on.
         """
         phase = state.phase
         self._holding = self._holding + 1 if phase == Phase.HOLDING else 0
@@ -438,7 +438,7 @@ class EncoderNoise:
 
     @property
     def still(self) -> tuple[int, ...]:
-        """Counts within which an encoder stands still: 1 where there is no noise, since one channel may be broken.
+        """Return the counts (m,) within which an encoder stands still: 1 without noise, as one channel may be broken.
 
         Noise leaves twice the range of a tenth of a second in a longer one with a chance below 1e-6.
         """
@@ -468,7 +468,7 @@ class Expected:
 
 
 class EncoderTest:
-    """Whether encoders answer a small force that acts on one axis after the other.
+    """Test whether encoders answer a small force that acts on one axis after the other.
 
     The force changes its sign every 30 ms, in blocks of 120 ms; each block is twice as strong as the one before. After
     a block, polynomials of degree 5 are removed from all positions: they contain what a hand does on purpose in this
@@ -580,11 +580,11 @@ class EncoderTest:
 
 
 class EncoderMonitor:
-    """Whether encoders follow the force, while it acts.
+    """Check that encoders follow the force while it acts.
 
-    The handle that a changing force does not move by more than one count is held by nothing that lives: an encoder of
-    which one channel is broken still toggles between two counts. What is compared is the force that the device says
-    it applies, with the one at the last motion; a change of more than 1 N is summed up over time. A mass M that a
+    No living hand holds a handle within one count under a changing force; an encoder with one broken channel still
+    toggles between two counts. The force that the device reports is compared with that at the last motion, and a change
+    of more than 1 N is summed up over time. A mass M that a
     change F turns around stays within two counts of q for 4 sqrt(q M / F): a coarse encoder gets twice as long. Under
     a force that does not change, of more than 0.3 N, no hand holds still for half a second: its tremor shows.
     """
@@ -631,7 +631,7 @@ class EncoderMonitor:
 
     @property
     def dead(self) -> str | None:
-        """What to say of an encoder that does not move although a force acts on it for long; None: there is none."""
+        """Return a message about an encoder that stands still under a long force, or None."""
         for i, seconds in enumerate(self._quiet):
             if seconds > _PRESSED:
                 return f"encoder or motor of axis {i + 1} is dead: nothing moves for {_PRESSED:g} s under a force"
