@@ -29,6 +29,11 @@ def speak(unit: PositionUnit) -> None:
     _spoken.set(unit)
 
 
+def speak_of(meta: Any) -> None:
+    """Set the unit of a stored trace, from its meta data as they were read."""
+    speak("rad" if isinstance(meta, dict) and meta.get("unit") == "rad" else "m")
+
+
 def spoken() -> PositionUnit:
     """Return the unit of what this command prints and writes."""
     return _spoken.get()

@@ -423,19 +423,22 @@ def table() -> int:
         device=tuple(msgspec.structs.replace(d, force_limit=_DEFAULT_CAP) for d in scenario.device)
     )
     made, capped = (certified_couplings(s, "I", None, None, 1, spare=1) for s in (scenario, limited))
-    wrong = 0
+    wrong, finished, fastest = 0, [], 0.0
     print(f"{'fault':46s} {'peak N':>7s} {'held m/s':>8s} {'free m/s':>8s} {'zero ms':>8s}  verdict")
     for case in CASES:
         held = _rehearse_case(case, scenario, made)[1]
         free = _rehearse_case(case, limited, capped, free=True)[1]
         bad = [*held.wrong, *[f"free handle at {free.peak_speed:.2f} m/s"] * (free.peak_speed > _MOST_SPEED)]
-        wrong += bool(bad)
+        wrong, fastest = wrong + bool(bad), max(fastest, free.peak_speed)
+        finished += [case.name] * (held.stage == Stage.FINISHED)
         zero = "-" if held.zero_force_ms is None else f"{held.zero_force_ms:.1f}"
         print(
             f"{case.name[:46]:46s} {held.peak_force_n:7.2f} {held.peak_speed:8.2f} {free.peak_speed:8.2f} {zero:>8s}  "
             f"{held.stage}{': ' + '; '.join(bad) if bad else ''}"
         )
-    print(f"{len(CASES)} faults, {wrong} wrong")
+    print(
+        f"{len(CASES)} faults, {wrong} wrong; free handles at most {fastest:.2f} m/s; finished: {', '.join(finished)}"
+    )
     return wrong
 
 
