@@ -1,6 +1,6 @@
-"""An emulated device: the scenario's plant under the firmware's own state machine, with faults to order.
+"""Emulate a device: the scenario's plant under the firmware's own state machine, with faults on request.
 
-Faults are what a cable, a process or a device can do wrong. They are written KIND[=VALUE][@START[+DURATION]], with
+A fault of a cable, a process or a device is written KIND[=VALUE][@START[+DURATION]], with
 `up:` (device to host) or `down:` in front for one direction of the line, `axis2:` for another axis than the first:
 
     drop=0.1          a tenth of all frames never arrives
@@ -89,7 +89,7 @@ _FORM = re.compile(r"(?:(up|down|axis[1-8]):)?([a-z]+)(?:=([^@+]+))?(?:@([^+]+)(
 
 @dataclass(frozen=True)
 class FaultInjection:
-    """One thing that goes wrong."""
+    """One fault of the line, the host or a device."""
 
     kind: str
     value: float
@@ -99,7 +99,7 @@ class FaultInjection:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """The fault that `text` describes. Raises InputError naming what is wrong with it."""
+        """Return the fault that `text` describes. Raises InputError naming the part that is wrong."""
         match = _FORM.fullmatch(text)
         if not match or match[2] not in KINDS:
             names = ", ".join(KINDS)
@@ -125,18 +125,18 @@ class FaultInjection:
 
     @property
     def axis(self) -> int:
-        """Which axis it happens to, from 0."""
+        """The index of the axis concerned, from 0."""
         return int(self.where.removeprefix("axis")) - 1
 
     def active(self, since_armed: float | None) -> bool:
-        """Whether it happens now, `since_armed` seconds after arming (None: not armed yet)."""
+        """Return whether the fault is present, `since_armed` seconds after arming (None: not armed yet)."""
         if self.start is None:
             return True
         return since_armed is not None and self.start <= since_armed < self.start + self.duration
 
 
 class Line:
-    """One direction of the link: frames go in, bytes come out later, some of them wrong."""
+    """One direction of the link. It delivers the bytes of frames later, with the faults injected."""
 
     def __init__(self, direction: str, faults: tuple[FaultInjection, ...], seed: int, latency_us: float = 0.0) -> None:
         self._faults = [u for u in faults if u.kind in _LINE and u.where in (direction, "both")]
@@ -145,7 +145,7 @@ class Line:
         self._held: bytes | None = None  # a frame that lets the next one pass
 
     def send(self, frame: bytes, now_us: float, since_armed: float | None) -> list[tuple[float, bytes]]:
-        """When which bytes arrive [us]: the frame with what happens to it."""
+        """Return the times of arrival [us] and the bytes of a frame, with its faults."""
         frames, due = [frame], now_us + self._latency
         for fault in self._faults:
             if fault.active(since_armed):
@@ -207,11 +207,11 @@ class _EmulatedPlant:
         return self.scenario.channels
 
     def begin(self) -> None:
-        """From the next tick on the scenario's outside forces act, voluntary motion and tap."""
+        """Let the scenario's outside forces (voluntary motion, tap) act from the next tick on."""
         self.tick = 0 if self.tick is None else self.tick
 
     def counts(self) -> tuple[int, ...]:
-        """What the encoders show [counts]."""
+        """Return the counts of the encoders."""
         return tuple(int(n) for n in np.round(self.s[: self.channels] / self.encoder_step))
 
     def advance(self, f: Array, share: float = 1.0, begins: bool = True) -> None:
@@ -268,7 +268,7 @@ def info_of(scenario: Scenario) -> Info:
 
 
 class Emulator:
-    """Ticks when it is told to. Knows no clock of its own."""
+    """An emulated device without a clock: its caller calls tick() and advance()."""
 
     def __init__(
         self,
@@ -306,7 +306,7 @@ class Emulator:
         return None if self.armed_at is None else 1e-6 * (now - self.armed_at)
 
     def receive(self, data: bytes, now: int) -> None:
-        """Bytes from the host; a device without a cable, or frozen, hears nothing."""
+        """Process bytes from the host. A device without a cable, or frozen, receives none."""
         if self.unplugged or now < self.stalled_until:
             return
         before = self.device.applied
@@ -316,7 +316,7 @@ class Emulator:
             self.applied = np.array(self.device.applied) * self.force_step * self._motor
 
     def _move(self, now: float) -> None:
-        """The plant moves on up to `now` [us], within the tick."""
+        """Advance the plant to `now` [us], within the tick."""
         period = 1e-3 * self.info.period_ns * self.stretch
         portion = min(1.0, (now - self._begun) / period)
         share = min(self._rest, max(0.0, portion - (1.0 - self._rest)))
@@ -325,7 +325,7 @@ class Emulator:
             self._rest, self._at_tick = self._rest - share, False
 
     def tick(self, now: int) -> bytes:
-        """A period begins: sample, latch, answer. `now` is the device's clock [us]; advance() goes with every tick."""
+        """Begin a period: sample, latch, answer. `now` is the device's clock [us]; advance() must follow every tick."""
         if self._rest:  # what is left of the tick before
             self.plant.advance(-self.applied, self._rest, self._at_tick)
             self._rest = 0.0
@@ -345,7 +345,7 @@ class Emulator:
         return b"" if self.unplugged else data
 
     def advance(self) -> None:
-        """The plant moves on by a period, while the answer is on its way; piece by piece where that acts at once."""
+        """Advance the plant by a period while the answer travels, in pieces if forces act on arrival."""
         if self.device.config is not None and not self.device.config.theta:
             self._rest, self._at_tick = 1.0, True
         else:
@@ -355,7 +355,7 @@ class Emulator:
         return round(1e-3 * fault.value / (1e-12 * self.info.encoder_step[fault.axis]))
 
     def _broken(self, fault: FaultInjection) -> Callable[[int], int]:
-        """What an encoder that breaks now makes of its counts."""
+        """Return how an encoder that breaks now alters its counts."""
         step = self.info.encoder_step[fault.axis]
         now, most = self.plant.counts()[fault.axis] + self._offset[fault.axis], self._in_counts(fault)
         match fault.kind:

@@ -1,8 +1,8 @@
-"""What a device must be able to do: four calls that a session needs of it (`Driver` in hw/session.py makes them).
+"""The four calls that a session needs of a device. `Driver` in hw/driver.py makes them.
 
 A device at a serial port (docs/protocol.md) is one implementation, one that the host clocks another
-(hw/force_dimension.py). None of the calls waits for longer than a tick: keys, signals and time-outs
-are looked at between any two.
+(hw/force_dimension.py). No call waits for longer than a tick, because keys, signals and time-outs
+are handled between two calls.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _LONGEST_WAIT = 5e-4  # [s] of one call
 
 
 class PortLost(OSError):
-    """The device is gone."""
+    """The port or the device no longer answers."""
 
 
 class HapticDevice(Protocol):
@@ -27,23 +27,23 @@ class HapticDevice(Protocol):
 
     @property
     def errors(self) -> int:
-        """Frames that could not be read, so far."""
+        """Number of frames that could not be read."""
         ...
 
     def info(self) -> wire.Info | None:
-        """The device's INFO; None as long as it has not answered."""
+        """Return the device's INFO, or None until it has answered."""
         ...
 
     def configure(self, config: wire.Config) -> int | None:
-        """How to run; Refused.ACCEPTED, or why not, or None as long as it has not answered."""
+        """Send a configuration. Return Refused.ACCEPTED or the reason for a refusal, or None until it has answered."""
         ...
 
     def exchange(self, force: wire.Force | None) -> wire.State | None:
-        """Give the force that answers the last STATE (None: there is none), and wait for the next, if one comes."""
+        """Send the force that answers the last STATE, if any, and return the next STATE, if one comes."""
         ...
 
     def stop(self, reason: wire.Reason) -> None:
-        """To zero force: by the device's ramp, for an emergency stop at once."""
+        """Go to zero force: by the device's ramp, or at once for an emergency stop."""
         ...
 
 
@@ -51,16 +51,16 @@ class BytePort(Protocol):
     """A port for bytes. Every method raises PortLost where the port is gone."""
 
     def wait(self, seconds: float) -> bool:
-        """Whether there is something to read, at the latest after so many seconds."""
+        """Wait for bytes at most so many seconds, and return whether there are any."""
         ...
 
     def read(self) -> bytes: ...
     def write(self, data: bytes) -> int:
-        """How many of these bytes could be sent."""
+        """Send bytes, and return how many were sent."""
         ...
 
     def discard(self) -> None:
-        """Forget what has come in."""
+        """Discard the bytes that have come."""
         ...
 
 
@@ -86,7 +86,7 @@ class SerialDevice:
         return answer if isinstance(answer, wire.Info) else None
 
     def configure(self, config: wire.Config) -> int | None:
-        """Asked again while the device is on its way to zero force. Raises SafetyStop where it drives by itself."""
+        """Send CONFIG, repeatedly while the device ramps to zero. Raises SafetyStop if it drives by itself."""
         answer = self._answer(config)
         if (
             not isinstance(answer, wire.Ack)
@@ -104,14 +104,14 @@ class SerialDevice:
         return message if isinstance(message, wire.State) else None
 
     def send(self, force: wire.Force) -> None:
-        """Give a force, and wait for nothing."""
+        """Send a force without waiting."""
         self._write(wire.encode(force))
 
     def stop(self, reason: wire.Reason) -> None:
         self._write(wire.encode(wire.Stop(reason)))
 
     def _answer(self, question: wire.Hello | wire.Config) -> wire.Message | None:
-        """The answer to a question that is repeated; a device that drives meanwhile is told to stop."""
+        """Repeat a question and return its answer. A device that drives meanwhile gets STOP."""
         now = self._clock()
         if question != self._question:  # what came before is of no use
             self._port.discard()

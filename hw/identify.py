@@ -81,7 +81,7 @@ class Excitation:
 
 
 class _Player:
-    """Plays an excitation tick by tick, then zero."""
+    """Play an excitation tick by tick, then zero force."""
 
     def __init__(self, excitation: Excitation) -> None:
         self.T = excitation.T
@@ -165,7 +165,7 @@ class _Transmission:
 
 @dataclass(frozen=True)
 class Estimate:
-    """One axis."""
+    """The estimate of one axis."""
 
     friction: Friction
     transmission: _Transmission | None  # None for a rigid device, and where none explains the record
@@ -213,7 +213,7 @@ def identify(x: Array, force: Array, T: float, step: float, rigid: bool) -> Esti
 
 
 class _Spectrum:
-    """What a motor (m1) with a handle (m2) behind a spring (k) should answer; p = [log m1, log b, log m2, log k]."""
+    """The expected response of a motor m1 and a handle m2 behind a spring k; p = [log m1, log b, log m2, log k]."""
 
     def __init__(self, x: Array, force: Array, T: float) -> None:
         F, steps, hz = np.fft.rfft(force), np.fft.rfft(np.diff(x, append=x[-1])), np.fft.rfftfreq(len(x), T)
@@ -223,7 +223,7 @@ class _Spectrum:
         self.motion = steps[heard] / (self.z - 1)
 
     def model(self, p: Array, every: int = 1) -> NDArray[np.complex128]:
-        """The motion by this model, at every so many frequencies; between ticks it is exact for a held force."""
+        """Return the motion of this model at every so many frequencies, exact for a force held between ticks."""
         import scipy
 
         m1, b, m2, k = np.exp(p)
@@ -236,16 +236,16 @@ class _Spectrum:
         return np.linalg.solve(apart, drive)[:, 0, 0] * self.force[::every]
 
     def decades(self, p: Array, every: int = 1) -> Array:
-        """How far apart model and motion are in size, as logarithms: tells from afar where the mode is."""
+        """Return the logarithms of the ratio of model and motion, by which a fit finds the mode from far away."""
         return np.log(np.abs(self.model(p, every)) + _FLOOR) - np.log(np.abs(self.motion[::every]) + _FLOOR)
 
     def error(self, p: Array) -> Array:
-        """Motion less model, real and imaginary parts."""
+        """Return motion less model, real and imaginary parts."""
         error = self.motion - self.model(p)
         return np.concatenate([error.real, error.imag])
 
     def starts(self, found: Friction) -> list[Array]:
-        """Parameters to begin with, from those of a stiff device."""
+        """Return initial parameters from those of a stiff device."""
         every, points = max(1, self.z.size // _SPECTRUM), list[tuple[float, Array]]()
         for hz, part in product(_MODES_HZ, _PARTS):
             m1, m2 = part * found.mass, (1 - part) * found.mass
@@ -260,7 +260,7 @@ class _Spectrum:
 
 
 def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmission | None:
-    """The transmission that explains a record, None where there is none."""
+    """Return the transmission that explains a record, or None."""
     import scipy
 
     spectrum, fits = _Spectrum(x, force - dry_friction(x, T, found), T), []
@@ -280,10 +280,10 @@ def _transmission(x: Array, force: Array, T: float, found: Friction) -> _Transmi
 
 
 def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[str]:
-    """Warnings for axes with far more damping than INFO and the scenario declare.
+    """Return warnings for axes with far more damping than INFO and the scenario declare.
 
-    Of an honest device the estimate scatters about what is declared, and one bound in twenty lies above it: that alone
-    is no reason to ask.
+    The estimate of a correct device scatters about the declared value, and one bound in twenty lies above it, which
+    alone gives no warning.
     """
     causes = []
     for i, (e, said) in enumerate(zip(estimates, _declared(scenario, session), strict=False), start=1):
@@ -296,7 +296,7 @@ def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> lis
 
 
 def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], list[str]]:
-    """One estimate per axis from two or more sittings, and warnings where a hand damped only some of them.
+    """Return one estimate per axis from two or more recordings, and warnings if a hand damped only some of them.
 
     The least damped sitting of an axis counts, with the least bound of all. A passive hand adds damping to a device,
     and takes none away (docs/hardware.md): it is enough that one sitting was free of it. Raises ValueError where the
@@ -320,7 +320,7 @@ def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], lis
 
 
 def unbounded(estimates: Sequence[Estimate]) -> str:
-    """Why a record gives no bound, for the first axis without one; "" where all have one."""
+    """Return why the first axis without a bound has none, or "" if all have one."""
     for i, e in enumerate(estimates, start=1):
         if e.delta <= 0:
             return (
@@ -331,19 +331,19 @@ def unbounded(estimates: Sequence[Estimate]) -> str:
 
 
 def _more_damped(one: Estimate, least: Estimate) -> bool:
-    """Whether a sitting has more damping than two records of one free device differ by."""
+    """Return whether a recording has more damping than two recordings of one free device can differ by."""
     scatter = 2 * np.hypot(one.friction.errors["viscous"], least.friction.errors["viscous"])
     return one.viscous - least.viscous > _SUSPICIOUS * least.viscous + scatter
 
 
 def _declared(scenario: Scenario, session: Session) -> list[float]:
-    """Damping of every axis [N s/m], the larger of the scenario's and INFO's."""
+    """Return the damping of every axis [N s/m], the larger of the scenario's and INFO's."""
     guaranteed = [1e-6 * d for d in session.info.osp_damping] if session.info else [0.0] * scenario.channels
     return [max(device.damping, said) for device, said in zip(scenario.axis_devices, guaranteed, strict=True)]
 
 
 def capped(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[Estimate]:
-    """The bounds, at most the declared damping: more may be a hand's."""
+    """Return the bounds, cut to the declared damping, because more may come from a hand."""
     said = _declared(scenario, session)
     return [
         replace(e, friction=replace(e.friction, delta=min(e.delta, limit)))

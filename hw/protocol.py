@@ -1,4 +1,4 @@
-"""What host and device say to each other: messages as tuples of integers, and the frames that carry them.
+"""The messages between host and device, as tuples of integers, and the frames that carry them.
 
 A frame on the wire is payload + CRC-32, COBS-stuffed, ended by 0x00; docs/protocol.md draws every byte. A payload is a
 type byte, fixed fields, then one group of fields per axis: the number of axes follows from the length. All integers are
@@ -126,13 +126,13 @@ class Config(NamedTuple):
 
     @property
     def due(self) -> int:
-        """Ticks after its sample until which a force may come, and after which a STATE shows it."""
+        """Latest ticks after its sample at which a force may come, and after which a STATE shows it."""
         return max(1, self.theta)
 
     def limited(self, run: int, last: Sequence[int], asked: Sequence[int]) -> tuple[int, ...]:
-        """What the device makes of the forces asked for, after the `last` ones, the `run`-th time since arming [steps].
+        """Return the forces [steps] that the device applies for `asked` after `last`, the `run`-th time since arming.
 
-        They are within the cap, which grows from zero as it is armed, and within the slew rate of the last.
+        They are within the cap, which grows from zero after arming, and within the slew rate of the last forces.
         """
         caps: Sequence[int] = self.cap
         if run < self.ramp_in:
@@ -178,7 +178,7 @@ class State(NamedTuple):
 
     @property
     def drives(self) -> bool:
-        """Whether the motors are driven as if no STOP had come; a ramp to zero is not that."""
+        """True if the motors are driven as if no STOP had come. A ramp to zero does not count."""
         return self.phase in (Phase.ARMED, Phase.HOLDING) or (self.phase != Phase.RAMP and any(self.applied))
 
     @property
@@ -268,7 +268,7 @@ _CHECKED = (Hello, Info, Config, Ack, Stop)  # seldom sent: every field looked a
 
 
 def wire_bytes(kind: type, axes: int) -> int:
-    """Length of a frame, delimiter included: STATE 20 + 6N, FORCE 12 + 2N."""
+    """Return the length of a frame with its delimiter: STATE 20 + 6N, FORCE 12 + 2N."""
     f = _FORMS.get((kind, axes if _LAYOUTS[kind].axis else 0))
     if f is None:
         raise ValueError(f"axes: {axes}; the protocol carries 1 to {_MAX_AXES}")
@@ -276,7 +276,7 @@ def wire_bytes(kind: type, axes: int) -> int:
 
 
 def encode(message: Message) -> bytes:
-    """The frame of a message. Raises ValueError that names the field, what it held and what it may hold."""
+    """Return the frame of a message. Raises ValueError naming field, value and allowed values."""
     if type(message) in _CHECKED:
         _check(message)
     payload = pack(message)
@@ -289,7 +289,7 @@ _CODES = [bytes((n + 1,)) for n in range(254)]
 
 
 def pack(message: Message) -> bytes:
-    """The payload of a message."""
+    """Return the payload of a message."""
     kind = type(message)
     layout = _LAYOUTS[kind]
     values: Any = message
@@ -339,7 +339,7 @@ def _check_integer(name: str, value: Any, limits: tuple[int, int]) -> None:
 
 
 def _unpack(payload: bytes) -> Message | None:
-    """The message of a payload; None where type and length fit none, a status has no name or a text is not ASCII."""
+    """Return the message of a payload, or None for an unknown type, length or status, or a text that is not ASCII."""
     f = _READ.get((payload[0], len(payload)))
     if f is None or (f.kind is State and payload[1] not in _STATUSES):
         return None
@@ -354,12 +354,12 @@ def _unpack(payload: bytes) -> Message | None:
 
 
 def config_crc(config: Config) -> int:
-    """CRC-32 of a CONFIG's payload: what the ACK for it carries."""
+    """Return the CRC-32 of a CONFIG's payload, which its ACK carries."""
     return crc32(pack(config))
 
 
 class Decoder:
-    """Bytes in any pieces -> messages. Whatever cannot be read is counted and dropped up to the next delimiter."""
+    """Decode bytes in any pieces to messages. Unreadable bytes are counted and dropped up to the next delimiter."""
 
     def __init__(self) -> None:
         self.crc_errors = 0
@@ -373,7 +373,7 @@ class Decoder:
         return self.crc_errors + self.malformed + self.oversize
 
     def feed(self, data: bytes) -> list[Message]:
-        """The messages completed by these bytes, oldest first."""
+        """Return the messages completed by these bytes, oldest first."""
         *frames, tail = (self.tail + data).split(b"\0")
         messages = []
         for frame in frames:
@@ -387,7 +387,7 @@ class Decoder:
         return messages
 
     def read(self, frame: bytes) -> Message | None:
-        """One frame without its delimiter."""
+        """Return the message of one frame without its delimiter."""
         if len(frame) >= _MAX_WIRE:
             self.oversize += not self.skipping
             return None
@@ -408,5 +408,5 @@ class Decoder:
 
 
 def distance(a: int, b: int) -> int:
-    """How many ticks a lies after b: -32768 to 32767, ticks counted modulo 2^16."""
+    """Return by how many ticks a is later than b: -32768 to 32767, for ticks modulo 2^16."""
     return ((a - b + 0x8000) & 0xFFFF) - 0x8000

@@ -1,6 +1,6 @@
-"""A whole session in virtual time: the bridge's session and emulated devices, with serial lines between them.
+"""Run a whole session in virtual time: the bridge's session and emulated devices, with serial lines between them.
 
-Nothing waits and nothing is random but by seed, so a session of seconds runs in a fraction of one and always the same.
+Nothing waits, and all random numbers have a seed: a session of seconds runs in less than one, always the same.
 """
 
 from __future__ import annotations
@@ -63,18 +63,18 @@ class _Cable:
     gone: bool = False
 
     def wait(self, seconds: float) -> bool:
-        """Time goes on until something has come in, or so many seconds are over."""
+        """Advance time until bytes have come, or by so many seconds."""
         return self.rehearsal.wait(seconds, (self,))
 
     def read(self) -> bytes:
-        """What has come in. Raises PortLost where the cable was pulled."""
+        """Return the bytes that have come. Raises PortLost if the cable was pulled."""
         if self.gone:
             raise PortLost("the port is gone")
         data, self.data = self.data, b""
         return data
 
     def write(self, data: bytes) -> int:
-        """Frames to the device, one by one: the line may lose them."""
+        """Send frames to the device one by one, since the line may lose each."""
         rehearsal, now = self.rehearsal, self.rehearsal.now
         since = self.emulator.since_armed(round(now))
         for frame in filter(None, data.split(b"\0")):
@@ -86,7 +86,7 @@ class _Cable:
         self.data = b""
 
     def tick(self) -> None:
-        """A tick of the device."""
+        """Advance the device by a tick."""
         rehearsal, emulator = self.rehearsal, self.emulator
         now, clock = rehearsal.now, round(rehearsal.now)
         if clock < emulator.stalled_until:  # late once, and then in step again: no catching up
@@ -160,19 +160,19 @@ class Rehearsal:
         self._driver = Driver(self.session, device, self.plan, lambda: round(self.now))
 
     def run(self, seconds: float) -> Session:
-        """Until `seconds` of virtual time are over. Returns the session."""
+        """Run until `seconds` of virtual time are over, and return the session."""
         while self.now <= 1e6 * seconds:
             self._turn()
         return self.session
 
     def run_until_armed(self, seconds: float) -> Session:
-        """Until `seconds` after arming, or a little longer than a session that is never armed."""
+        """Run until `seconds` after arming, or a little longer than a session that is never armed."""
         while self.armed_us is None and not self._over:
             self._turn()
         return self.run(1e-6 * self.armed_us + seconds) if self.armed_us is not None else self.session
 
     def run_to_the_end(self, most: float) -> Session:
-        """Until the session has ended and its device has come to rest, or for `most` seconds of virtual time."""
+        """Run until the session has ended and its device rests, or for `most` seconds of virtual time."""
         while not self._over and self.now <= 1e6 * most:
             self._turn()
         return self.session
@@ -182,7 +182,7 @@ class Rehearsal:
         return self.session.stage in ENDED and self.now > self._ended + _GRACE_US
 
     def _turn(self) -> None:
-        """One call of the device, then what a person does."""
+        """Make one call of the device, then the actions of the person."""
         if not self.session.log:
             self._pass(_BEGIN_US)
             self.session.start(round(self.now))
@@ -205,7 +205,7 @@ class Rehearsal:
             self._ended = self.now
 
     def wait(self, seconds: float, cables: Sequence[_Cable] = ()) -> bool:
-        """Time goes on until something has come in, or so many seconds are over, and as long as the host is frozen."""
+        """Advance time until bytes have come, or by so many seconds, and as long as the host is frozen."""
         until, cables = self.now + 1e6 * seconds, cables or self._cables
         while not (ready := any(cable.data or cable.gone for cable in cables)) and self._queue[0][0] <= until:
             self._next()
@@ -216,7 +216,7 @@ class Rehearsal:
         return any(cable.data or cable.gone for cable in cables)
 
     def _frozen_for(self) -> float:
-        """[us] for which the host does nothing."""
+        """Return the time [us] for which the host does nothing."""
         since = self.emulator.since_armed(round(self.now))
         if since is None:
             return 0.0
@@ -245,7 +245,7 @@ class Rehearsal:
         return self.emulator.armed_at
 
     def zero_after(self, seconds: float) -> float | None:
-        """Seconds from `seconds` after arming to the tick from which on no motor does anything; None: never."""
+        """Return the time [s] from `seconds` after arming until all motors stay at zero, or None if they never do."""
         assert self.armed_us is not None
         begin = self.armed_us + 1e6 * seconds
         driving = [m.t_us for m in self.moments if np.any(m.applied)]
@@ -306,7 +306,7 @@ def rehearse(
     seed: int = 0,
     latch_on_arrival: bool = False,
 ) -> Rehearsed:
-    """A session with the scenario's devices behind the real protocol, without a device, a port or waiting.
+    """Rehearse a session with the scenario's devices behind the real protocol, without device, port or waiting.
 
     Handshake, delay measured, coupling designed for it (or `coupling`, judged for it), certified, armed, run for
     `seconds`, ramped out. The scenario's theta is the least delay; a slower link makes it longer. With

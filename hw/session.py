@@ -1,4 +1,4 @@
-"""One session with a device: its messages and the time go in, forces and stops come out. No port, no clock, no thread.
+"""One session with a device: it turns messages and the time into forces and stops, without port, clock or thread.
 
     connecting -> configuring -> measuring -> measured -> configuring -> disarmed
                      (load: a certified coupling)     (arm: a person)  -> arming -> armed -> disarming -> finished

@@ -1,4 +1,4 @@
-"""The report of a session: how far it came, what the link did, what grew; and a log that survives a crash."""
+"""The report of a session (its end, its link, oscillations that grew), and a log that survives a crash."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PERCENTILES = (50, 90, 99, 100)
 
 
 class IncidentLog:
-    """A log that is complete up to the last second however the process ends: it is appended to, not kept in memory.
+    """A log file that is complete up to the last second, however the process ends.
 
     One JSON object a line: every change of the stage at once, and every second where things stand. What was written
     survives SIGKILL, though not a power failure.
@@ -78,7 +78,7 @@ class _Event:
 
 @dataclass(frozen=True)
 class _Ended:
-    """How far the session came."""
+    """The last stage of the session and its cause."""
 
     stage: str
     cause: str
@@ -88,7 +88,7 @@ class _Ended:
 
 @dataclass(frozen=True)
 class _Link:
-    """What the link did: when it was measured, and while forces acted (None where they never did)."""
+    """The figures of the link during its measurement and while forces acted (None if they never did)."""
 
     measured_age_us: dict[str, float] | None
     measured_missing: int
@@ -138,7 +138,7 @@ class WorldSession(WorldRecord):
 
     @classmethod
     def all_of(cls, session: Session, trace: Trace, arming: np.ndarray) -> list[WorldSession]:
-        """One for each arming; `trace` is that of the session, `arming` (N,) counts them from 0."""
+        """Return the figures of each arming. `trace` is that of the session; `arming` (N,) counts armings from 0."""
         sessions, delta, T = [], np.array(session.scenario.delta), session.scenario.T_max or session.scenario.T
         for i, world in enumerate(session.worlds):
             x, f = trace.x[arming == i], trace.f[arming == i]
@@ -162,7 +162,7 @@ class WorldSession(WorldRecord):
 
 @dataclass(frozen=True)
 class SessionReport:
-    """What a session came to, without a verdict: the coupling with its certificates, the log, the link."""
+    """The result of a session without a verdict: the coupling with its certificates, the log, the link."""
 
     case: str
     scenario: str
@@ -180,7 +180,7 @@ class SessionReport:
 
 
 def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> SessionReport:
-    """The report of a session that has ended."""
+    """Return the report of a session that has ended."""
     begin = session.log[0].t_us if session.log else 0
     log = [_Event(1e-6 * (e.t_us - begin), str(e.stage), e.cause) for e in session.log]
     ticks, T = len(recorder), session.scenario.T
@@ -213,7 +213,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
 
 
 def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str | None:
-    """Why a session that came to its end has not finished; None where forces acted as they were asked for."""
+    """Return why a session that ended as planned has not finished, or None if forces acted as requested."""
     ticks, link = len(recorder), recorder.link()
     if 2 * session.counters.slowed > ticks > 0:
         return f"{100 * session.counters.slowed / ticks:.0f} % of its forces were cut by the slew rate"
@@ -234,7 +234,7 @@ def _percentiles(values: np.ndarray) -> dict[str, float] | None:
 
 
 def save(out: Path, session: Session, recorder: Recorder, report: SessionReport, plot: bool) -> list[Path]:
-    """The trace (where forces acted), its picture, and the report."""
+    """Write the trace (if forces acted), its picture and the report."""
     files = []
     if len(recorder):
         replay = [Recipe.of(arming, session.limits, session.units) for arming in session.armings]

@@ -50,7 +50,7 @@ _SURE = 100.0  # log likelihood ratio from which on a memory is not chance, nor 
 
 @dataclass(frozen=True)
 class Viscosity:
-    """What a record says beyond one number."""
+    """The loss of damping with speed and with frequency that a record shows."""
 
     speed: float  # [m/s] highest speed of the record
     thinning: float  # [N s/m] damping that is lost from slow motion to that speed; 0 where friction does not thin
@@ -70,7 +70,7 @@ def viscosity(x: Array, force: Array, T: float, step: float, friction: Friction)
 
 
 def doubt(found: Viscosity, friction: Friction) -> str | None:
-    """Why one number does not describe the damping, within the error of its bound; None where it does."""
+    """Return why one number does not describe the damping within the error of its bound, or None if it does."""
     error = friction.viscous - friction.delta
     if found.thinning > _SIGMAS * found.thinning_error + error:
         return (
@@ -89,7 +89,7 @@ def doubt(found: Viscosity, friction: Friction) -> str | None:
 
 
 def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
-    """Highest speed [m/s], the damping that is lost up to it, at least 0, and its standard error [N s/m]."""
+    """Return the highest speed [m/s], the damping lost up to it (>= 0), and its standard error [N s/m]."""
     import scipy
 
     n = max(3, round(6e-3 / T) | 1)  # a cubic over 6 ms: its error in a stroke of 3 Hz is far below an encoder's count
@@ -129,7 +129,7 @@ def _thinning(x: Array, force: Array, T: float) -> tuple[float, float, float]:
 
 
 class Spectra:
-    """The spectrum of a motion, and of what a model makes of the force's."""
+    """The spectrum of a motion, and that of a model's response to the force."""
 
     def __init__(
         self,
@@ -155,7 +155,7 @@ class Spectra:
         self._hold = -np.expm1(-self._s * T) / (self._s * T)
 
     def model(self, p: Array, tau: float, end: float = 0.0) -> NDArray[np.complex128]:
-        """The motion by p = [log m1, log m2, log k, log d, b, lag, delay, c] and a memory of `tau` [s].
+        """Return the motion for p = [log m1, log m2, log k, log d, b, lag, delay, c] and a memory of `tau` [s].
 
         `end` [N] is the force of one tick that would stop what still moves when the record ends.
         """
@@ -166,12 +166,12 @@ class Spectra:
         return (self._hold * np.exp(-s * late) / (1 + lag * s) / (s * impedance)).sum(axis=0) * (self.force + end)
 
     def error(self, p: Array, tau: float, end: float = 0.0) -> Array:
-        """Motion less model: real and imaginary parts."""
+        """Return motion less model, real and imaginary parts."""
         error = self.motion - self.model(p, tau, end)
         return np.concatenate([error.real, error.imag]) / np.abs(self.motion).max()
 
     def starts(self, friction: Friction) -> list[Array]:
-        """Parameters to begin with: the two splits of the mass that explain the spectrum's size best."""
+        """Return initial parameters: the two splits of the mass that explain the spectrum's size best."""
         tried = []
         for hz, part in product(_MODES_HZ, _PARTS):
             m1, m2 = part * friction.mass, (1 - part) * friction.mass
@@ -201,7 +201,7 @@ def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[floa
         return spectra.error(p[:8], tau, p[8])
 
     def fitted(spectra: Spectra, start: Array, tau: float | None = None) -> Any:
-        """The fit from a start; without tau c stays next to 0."""
+        """Return the fit from a start; without tau, c stays near 0."""
         top = np.where(np.arange(9) == _C, 1e-12, high) if tau is None else high
         begin = np.clip(start, low + 1e-13, top - 1e-13)
         how: dict[str, Any] = {"bounds": (low, top), "x_scale": "jac", "max_nfev": _STEPS}
@@ -216,7 +216,7 @@ def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[floa
     vague = noise * np.diag([1 / _VAGUE] * 4 + [0.0] + [1 / T] * 2 + [0.0] * 2)
 
     def linear(jacobian: Array, errors: Array) -> tuple[Array, Array, float]:
-        """(best change of p, its standard errors, squares that are left), (9,) each."""
+        """Return (best change of p, its standard errors, remaining squares), (9,) each."""
         columns = np.vstack([jacobian, vague])
         size = np.linalg.norm(columns, axis=0) + 1e-300
         q, r = np.linalg.qr(columns / size)
@@ -253,7 +253,7 @@ def _lasting(x: Array, force: Array, T: float, friction: Friction) -> tuple[floa
 
 
 def _split(p: Array, viscous: float) -> Array:
-    """The parameters with most of the damping [N s/m] in the memory."""
+    """Return the parameters with most of the damping [N s/m] in the memory."""
     p = p.copy()
     p[[_B, _C]] = 0.3 * viscous, 0.7 * viscous
     return p
