@@ -321,7 +321,7 @@ def _without_joints(spec: Any) -> list[str]:
 
 def _touchable(spec: Any, name: str, contacts: Sequence[str]) -> Any:
     """Return the body of a contact. Raises ValueError for a body that cannot be one."""
-    body = spec.body(name)
+    body = spec.body(name) if name else None
     free = _without_joints(spec)
     if body is None or body.parent is None:  # the latter is the world body
         named = ", ".join(free) or "none"
@@ -628,7 +628,8 @@ _SHELL = "the shell only"
 
 def _parts(m: mujoco.MjModel, slides: set[int]) -> Iterator[Part]:
     joints = [i for i in range(m.njnt) if i not in slides]
-    movable, turns = set(m.jnt_bodyid[joints].tolist()), np.zeros(m.nbody, dtype=bool)
+    soft = {*m.flex_vertbodyid.tolist(), *m.flex_nodebodyid.tolist()}  # points of soft bodies
+    movable, turns = set(m.jnt_bodyid[joints].tolist()) - soft, np.zeros(m.nbody, dtype=bool)
     turns[m.jnt_bodyid[m.jnt_type != mujoco.mjtJoint.mjJNT_SLIDE]] = True
     for body in range(1, m.nbody):  # parents come before their children
         turns[body] |= turns[m.body_parentid[body]]

@@ -49,6 +49,11 @@ BAD = [
 ]
 
 
+def test_a_misspelt_scenario_is_corrected():
+    with pytest.raises(InputError, match=r"\(did you mean world-cube\?\); give a TOML file"):
+        load("world-cub")
+
+
 @pytest.mark.parametrize(("old", "new", "message"), BAD, ids=[new for _, new, _ in BAD])
 def test_bad_scenarios_are_one_line(old, new, message):
     assert old in TEXT

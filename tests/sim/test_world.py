@@ -356,6 +356,8 @@ def test_a_design_for_a_world_is_proved_exactly(tmp_path, capsys):
     assert "proof: rational" in shown
     stored = read_coupling(tmp_path / "door.json")
     assert stored.loop.environment.world.file == "door.xml"
+    with pytest.raises(InputError, match="a MuJoCo world is no linear block: export the coupling alone"):
+        command(capsys, "export", str(tmp_path / "door.json"), "--process")
     _, shown = command(capsys, "check", str(tmp_path / "door.json"))
     assert "no passive hand is given more than 0.002 J" in " ".join(shown.split())
 
