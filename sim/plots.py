@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.lines import Line2D
@@ -107,6 +108,9 @@ def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     relabel(figure)
     if kind != ".png":
         _fit_paper(figure)
+    if kind == ".png":
+        figure.set_dpi(dpi)
+        return write(path, FigureCanvasAgg(figure).print_png)  # savefig would draw a figure with a layout twice
     return write(path, lambda file: figure.savefig(file, format=kind[1:], dpi=dpi))
 
 
@@ -134,9 +138,12 @@ def _fit_paper(figure: Figure) -> None:
 def _literal(figure: Figure) -> None:
     """Escape names of users: dollars start no mathematics, and characters that the font lacks become a mark."""
     glyphs = get_font(findfont(FontProperties())).get_charmap()
-    axes = [axis for panel in figure.axes for axis in (panel.xaxis, panel.yaxis)]
-    ticks = {label for axis in axes for label in (*axis.get_ticklabels(which="both"), axis.get_offset_text())}
-    for text in set(figure.findobj(Text)) - ticks:
+    texts = list(figure.texts)  # findobj would make all ticks, which the layout makes again
+    for axis in figure.axes:
+        texts += [axis.title, axis.xaxis.label, axis.yaxis.label, *axis.texts]
+    for legend in (*figure.legends, *filter(None, (axis.get_legend() for axis in figure.axes))):
+        texts += [legend.get_title(), *legend.get_texts()]
+    for text in texts:
         text.set_parse_math(False)
         shown = printable(text.get_text())
         text.set_text("".join(c if ord(c) in glyphs or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in shown))
