@@ -186,7 +186,7 @@ class Rehearsal:
         if not self.session.log:
             self._pass(_BEGIN_US)
             self.session.start(round(self.now))
-        if self.session.stage == Stage.LOST and any(cable.gone for cable in self._cables):
+        if self.session.stage in ENDED and any(cable.gone for cable in self._cables):
             self._pass(1000)
         else:
             self._driver.turn()

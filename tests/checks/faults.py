@@ -347,7 +347,7 @@ def _rehearse_case(
     session = Session(
         scenario,
         SafetyLimits(cap, continuous=tuple(map(min, case.continuous, cap)), thermal=1.0),
-        LinkSettings(case.baud, _MEASURED, deadman=case.deadman, held=not case.free),
+        LinkSettings(case.baud, _MEASURED, deadman=case.deadman, held=not (free or case.free)),
     )
     faults = tuple(FaultInjection.parse(text) for text in case.faults)
     emulator = Emulator(

@@ -57,6 +57,18 @@ def test_every_fault_ends_where_it_must(case, scenario, rungs):
     assert _rehearse_case(case, scenario, rungs)[1].wrong == ()
 
 
+def test_a_cable_pulled_after_the_end_ends_nothing(scenario, rungs):
+    rehearsal = rehearsal_of(scenario, rungs, "motor=-1", "unplug@0.5")
+    assert rehearsal.run_until_armed(0.6).stage == Stage.STOPPED
+    assert rehearsal.now >= 1e6 * 0.6
+
+
+def test_free_handles_arm_in_the_table(scenario, rungs):
+    """Its speeds of free handles are those of sessions that nobody holds."""
+    session = _rehearse_case(CASES[0], scenario, rungs, free=True)[0].session
+    assert session.stage == Stage.ARMED, session.cause
+
+
 def test_there_are_enough_faults():
     assert len(CASES) >= 30
     assert len({case.name for case in CASES}) == len(CASES)
