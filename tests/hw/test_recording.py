@@ -311,3 +311,10 @@ def test_result_of_holds_the_last_known_force(trace):
     result = recorder.trace(Units((1e-6,) * 2, (4e-4,) * 2, (10**5,) * 2), 1.2e-3, {})
     k = int(np.flatnonzero(~link["received"])[0])
     np.testing.assert_array_equal(result.f[k], result.f[k - 1])
+
+
+def test_sessions_state_damping_axis_by_axis():
+    full = PLANAR.replace("axes = 2 }", "axes = 2, damping = [[1.5, 0.4], [0.4, 0.9]] MORE }", 1)
+    with pytest.raises(InputError, match=r"delta is a full matrix, .* numbers below the matrix, 0.7, 1.37 are"):
+        session_for(parse(full.replace("MORE", "")), LinkSettings())
+    assert session_for(parse(full.replace("MORE", ", delta = 0.7")), LinkSettings()).scenario.delta[:2] == (0.7, 0.7)
