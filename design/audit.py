@@ -143,7 +143,7 @@ def stiffest(loop: Loop, coupling: Coupling, condition: _Asked) -> _Stiffest:
 
     scale = _STIFFEST / K.max()
     if suffices(ratio(scale)):
-        return _Stiffest(unknown, f"certified up to the stiffest K tried, {_STIFFEST:g} N/m")
+        return _Stiffest(unknown, f"certified at the stiffest K tried, {_STIFFEST:g} N/m")
     while scale * K.max() > _SOFTEST:
         softer = scale / _STEP
         if suffices(ratio(softer)):

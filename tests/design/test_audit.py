@@ -388,6 +388,14 @@ def test_a_rigid_audit_names_the_stiffest_wall(run, B):
     assert "No wall with B = 2 N s/m was found to be certified" in out.replace("\n", " ")
 
 
+def test_a_certified_wall_is_not_denied(run):
+    code, out, _ = run(*["--rigid", "--K", "1000", "--B", "0", "--T", "1e-3", "--theta", "0", "--delta", "1e4"])
+    assert code == 0
+    words = out.replace("\n", " ")
+    assert "The stiffest wall with B = 0 N s/m was not found: certified at the stiffest K tried, 1e+06 N/m" in words
+    assert "No wall" not in words
+
+
 def test_help_has_an_example(run):
     code, out, _ = run("--help")
     assert code == 0
