@@ -17,6 +17,7 @@ from __future__ import annotations
 import hashlib
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -296,23 +297,26 @@ class World:
 
 def _spec(path: Path) -> Any:
     files_of(path)  # raises ValueError with the name of a file that is missing
-    try:
+    with _refused(path):
         spec = mujoco.MjSpec.from_file(str(path))
-    except (ValueError, mujoco.FatalError) as error:
-        raise ValueError(f"world {path}: {_one_line(error)}") from None
     spec.compiler.fusestatic = False  # which would take the contacts away
     return spec
 
 
 def _compiled(spec: Any, path: Path) -> mujoco.MjModel:
+    with _refused(path):
+        model = spec.compile()
+        mujoco.mj_forward(model, mujoco.MjData(model))  # raises where the scene's memory is too small
+    return model
+
+
+@contextmanager
+def _refused(path: Path) -> Iterator[None]:
+    """Raise ValueError in one line for what MuJoCo refuses."""
     try:
-        return spec.compile()
+        yield
     except (ValueError, mujoco.FatalError) as error:
-        raise ValueError(f"world {path}: {_one_line(error)}") from None
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+        raise ValueError(f"world {path}: {' '.join(str(error).split())}") from None
 
 
 def _without_joints(spec: Any) -> list[str]:
@@ -518,7 +522,7 @@ class Port:
             else:
                 force = self._limited(goal, self._saved)
         except mujoco.FatalError as error:
-            raise ValueError(f"world {world.path}: {_one_line(error)}") from None
+            raise ValueError(f"world {world.path}: {' '.join(str(error).split())}") from None
         if data.nefc and np.isfinite(created := self._creates()):
             self.created += created
         self.released = max(self.released, self._at_first - self._potential())
