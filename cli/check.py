@@ -5,30 +5,31 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 from haptic_loop.cli import options, render
 from haptic_loop.cli import verdict as verdicts
 from haptic_loop.controller.loop import Loop
-from haptic_loop.controller.ranges import regions
 from haptic_loop.controller.units import speak
 from haptic_loop.design.assessment import Assessment, SearchFigures, assess, violated_between
 from haptic_loop.design.certificate import (
     NotProved,
     Verdict,
+    condition_of,
     lag,
     named,
+    on_file,
     prove,
     required_damping,
     verify,
 )
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Stored
+from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import HERE, RANGES
 from haptic_loop.design.known_device import described
 from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, listed, suffices, switching_guarantee
-from haptic_loop.design.worst_member import Searched, search, search_ranges
+from haptic_loop.design.worst_member import Searched, search_ranges
 from haptic_loop.sim.couplings import read_coupling
 
 
@@ -127,11 +128,13 @@ def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
         return None
     loop, coupling = stored.loop, stored.built()
     with render.progress("searching the ranges between their vertices") as move:
-        if condition is None:
+        asked = condition_of(stored.certificate, condition)
+        if asked is THIS_ENVIRONMENT and not asked.multiplier_sizes(loop):
             return search_ranges(loop, coupling, move)
-        assert loop.ranges
-        need = partial(required_damping, coupling=coupling, condition=condition)
-        return search(regions(loop.network, loop.ranges), lambda m: need(loop.at(m.network)).ratio, move)
+        values = on_file(asked, loop, stored.certificate.multipliers)
+        return search_ranges(
+            loop, coupling, move, ratio=lambda there: required_damping(there, coupling, asked, values).ratio
+        )
 
 
 def _guarantee(loop: Loop, condition: Condition) -> str:

@@ -246,7 +246,7 @@ def _member(name: str, network: Network, parts: Sequence[_Part], values: Sequenc
         else:
             springs.append(value)
     labels = "; ".join(part.label(value) for part, value in zip(parts, values, strict=True))
-    return Member(f"{name} ({labels})", Network(network.contacts, tuple(springs), masses, points=network.points))
+    return Member(f"{name} ({labels})", msgspec.structs.replace(network, springs=tuple(springs), masses=masses))
 
 
 def _check_inside(field: str, uncertain: UncertainSpring, own: Spring) -> None:

@@ -16,9 +16,10 @@ from haptic_loop.design.certificate import judged, lag, named, prove, requiremen
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Certificate, Stored, digest, save
 from haptic_loop.design.designs import KINDS, design_by_kind, name_and_own, usual_condition
-from haptic_loop.design.environments import SWITCHING, LimitedForces
+from haptic_loop.design.environments import SWITCHING, THIS_ENVIRONMENT, LimitedForces
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import ANY, HERE, RANGES
+from haptic_loop.design.known_device import KNOWN_DEVICE
 from haptic_loop.design.result import ConditionName, Design, NotProved, Requirement, switching_guarantee
 from haptic_loop.design.transparency import BAND_HZ, Transparency, decibels, transparency
 
@@ -127,7 +128,10 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     alone = fitting(loop, coupling)
     _, asked = name_and_own(condition)
     requirements: dict[str, Requirement[str]] = dict(requirements_of(loop, alone, own=asked or own))
-    if ranges := check_ranges(loop, alone, samples=0):
+    over = (THIS_ENVIRONMENT, KNOWN_DEVICE) if loop.known_devices else (THIS_ENVIRONMENT,)
+    for each in over if loop.ranges else ():
+        ranges = check_ranges(loop, alone, samples=0, condition=each)
+        assert ranges  # the loop has ranges
         _, worst = ranges.worst if ranges.proved else ranges.worst_found
         here = requirements[worst.condition].guarantee
         proof, held = ("rational", RANGES) if ranges.proved else ("sampled", here)

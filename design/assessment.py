@@ -29,6 +29,7 @@ from haptic_loop.design.certificate import (
     judged,
     lag,
     named,
+    on_file,
     prove,
     proves,
     recheck,
@@ -40,7 +41,7 @@ from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.environments import LIMITER, SWITCHING, THIS_ENVIRONMENT, LimitedForces, beta_of, in_each, worst
 from haptic_loop.design.frequency import too_long
 from haptic_loop.design.guarantees import ANY, AT_VERTICES, RANGES
-from haptic_loop.design.known_device import KNOWN_DEVICE, LimitedKnownDevice, described
+from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, LimitedKnownDevice, described
 from haptic_loop.design.lmi import ANY_ENVIRONMENT
 from haptic_loop.design.result import CONDITIONS, KNOWN_CONDITIONS, Design, NotProved, Requirement, suffices
 from haptic_loop.design.transparency import BAND_HZ, Transparency, silent, transparency
@@ -58,7 +59,7 @@ SAMPLES = 64  # environments drawn evenly from inside the ranges, beside what th
 
 @dataclass(frozen=True, eq=False)
 class RangesResult:
-    """The this-environment condition over ranges: every vertex, a search between them, and random samples.
+    """A condition over ranges: every vertex, a search between them, and random samples.
 
     Attributes:
         members: The nominal environment and the vertices.
@@ -158,23 +159,30 @@ def check_ranges(
     progress: Progress = lambda done, total: None,
     searched: Searched | None = None,
     certificate: Certificate | None = None,
+    condition: Condition = THIS_ENVIRONMENT,
 ) -> RangesResult | None:
-    """Check a coupling over the ranges of its loop; None where it has none, or where walls stand in it.
+    """Check a coupling over the ranges of its loop by this-environment or known-device; None where it has none.
 
     The search is the same every time; `samples` more environments are drawn from inside, by the seed. A design that
-    has already searched, or proved the ranges, passes `searched` and `certificate`. Before walls only single
-    environments can be proved, so nothing is said of ranges.
+    has already searched, or proved the ranges, passes `searched` and `certificate`. One set of multipliers serves all
+    environments, those between the vertices included.
     """
-    if loop.ranges is None or loop.environment.walls:
+    if loop.ranges is None:
         return None
-    searched = searched or search_ranges(loop, coupling, progress)
+    certificate, reason, multiplier = _proved_ranges(loop, coupling, condition, certificate)
+    simple = condition is THIS_ENVIRONMENT and not multiplier
+
+    def need(there: Loop) -> Requirement:
+        return required_damping(there, coupling, condition, multiplier)
+
+    def needs(there: Sequence[Member]) -> list[Requirement]:
+        return in_each(loop, coupling, there) if simple else [need(loop.at(one.network)) for one in there]
+
+    ratio = None if simple else (lambda there: need(there).ratio)
+    searched = searched or search_ranges(loop, coupling, progress, ratio=ratio)
     members, drawn = loop.members(), inside(loop.network, loop.ranges, samples, seed)
-    try:
-        certificate, reason = certificate or prove(loop, coupling, "this-environment"), None
-    except NotProved as error:
-        certificate, reason = None, str(error)
-    at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)
-    (at_found,) = in_each(loop, coupling, [searched.worst[0].member])
+    at_members, at_samples = needs(members), needs(drawn)
+    (at_found,) = needs([searched.worst[0].member])
     result = RangesResult(
         members,
         tuple(at_members),
@@ -191,6 +199,22 @@ def check_ranges(
         place, requirement = result.worst_found
         result = replace(result, reason=violated_between(place, requirement.ratio))
     return result
+
+
+def _proved_ranges(
+    loop: Loop, coupling: Coupling, condition: Condition, certificate: Certificate | None
+) -> tuple[Certificate | None, str | None, Sequence[Any] | None]:
+    """Return (the certificate for all members or None, the reason why there is none, the multipliers)."""
+    if certificate and certificate.guarantee == RANGES and certificate.condition == condition.name:
+        asked = condition_of(certificate)
+        values = on_file(asked, loop, certificate.multipliers)
+        return certificate, None, values[: sum(condition.multiplier_sizes(loop).values())] if values else None
+    swept = required_damping(loop, coupling, condition) if condition.multiplier_sizes(loop) else None
+    multiplier = swept.multiplier if swept else None
+    try:
+        return prove(loop, coupling, condition, multiplier, swept), None, multiplier
+    except NotProved as error:
+        return None, str(error), multiplier
 
 
 def violated_between(place: Member, ratio: float) -> str:
@@ -524,9 +548,11 @@ def assess(
     by = own if own and certificate and own.name == certificate.condition else None
     known = certificate if certificate and proves(loop, coupling, certificate, by) else None
     requirements = requirements_of(here, coupling, known, own=own)
-    ranges = check_ranges(loop, coupling, ranges_seed, ranges_samples, progress, searched, known)
+    over = KNOWN_DEVICE if loop.known_devices and not KNOWN_DEVICE.beyond(loop) else THIS_ENVIRONMENT
+    ranges = check_ranges(loop, coupling, ranges_seed, ranges_samples, progress, searched, known, over)
     if loop.varying_delay:
-        switched = (SWITCHING, ANY_ENVIRONMENT) if not any(loop.psi) else (SWITCHING,)
+        switched = (SWITCHING, *(() if any(loop.psi) else (ANY_ENVIRONMENT,)))
+        switched += (KNOWN_DEVICE, KNOWN_DEVICE_ANY) if loop.known_devices else ()
         requirements |= {each.name: judged(loop.at(network), coupling, each) for each in switched}
     if limiter_proof is None and known and known.limiter:
         limiter_proof = known.limiter
@@ -630,18 +656,20 @@ def _guarantee(assessment: Assessment) -> tuple[Guarantee | None, str | None]:
     if limits.energy_budget is not None:
         return _account(assessment, "whatever computes the forces"), None
     if loop.varying_delay:
-        anywhere = requirements[ANY_ENVIRONMENT.name]
-        if anywhere.certified and anywhere.guarantee == ANY and not any(loop.psi):
-            return _stated(assessment, anywhere, ANY), None
-        needs = requirements[SWITCHING.name]
-        if not needs.certified:
-            return None, f"delays that switch within {loop.varying_delay} are not covered: {needs.shortfall}"
-        return _stated(assessment, needs, loop.environment.here), None
+        anywhere = () if any(loop.psi) else (ANY_ENVIRONMENT.name, KNOWN_DEVICE_ANY.name)
+        here = [name for name in (SWITCHING.name, KNOWN_DEVICE.name) if name in requirements]
+        for name in (*anywhere, *here):
+            if name in requirements and requirements[name].certified:
+                environments = ANY if name in anywhere else loop.environment.here
+                return _stated(assessment, requirements[name], environments), None
+        shortfall = requirements[here[-1]].shortfall
+        return None, f"delays that switch within {loop.varying_delay} are not covered: {shortfall}"
     held = [need for need in requirements.values() if need.certified and need.guarantee]
     if anywhere := [need for need in held if need.guarantee == ANY]:
         return _stated(assessment, anywhere[0], ANY), None
     if assessment.ranges and assessment.ranges.proved and _within(assessment):
-        return _stated(assessment, replace(requirements[THIS_ENVIRONMENT.name], proof="rational"), RANGES), None
+        by = requirements[assessment.ranges.worst[1].condition]
+        return _stated(assessment, replace(by, proof="rational"), RANGES), None
     if held:
         return _stated(assessment, held[0], str(held[0].guarantee)), None
     return None, f"{own.shortfall} ({own.condition})"

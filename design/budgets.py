@@ -66,9 +66,9 @@ BOUND_SWEEPS, BOUND_SUMS, BOUND_INTERVALS = 6, 240, 20_000
 #: Case I takes 32 in all by inner approximation; fixed poles (105) and complementarity (103, 20 for one norm) spend
 #: them; a choice of poles takes 2 cuts.
 FIXED_ORDER_PROBLEMS, COMPLEMENTARITY_PROBLEMS, FIXED_POLE_CUTS = 100, 20, 20
-#: Cuts of the least share of a known device, moves of beta on one channel, and turns of beta and multipliers. The
-#: pair of omega.3 with known transmissions takes 4, 2 and 3.
-BETA_CUTS, BETA_MOVES, BETA_TURNS = 40, 12, 6
+#: Cuts of the least share of a known device at one beta, and rounds of tangents for beta and multipliers. The pair of
+#: omega.3 with known transmissions takes 4 and 11, one with walls and limited forces 20.
+BETA_CUTS, BETA_ROUNDS = 40, 60
 #: Points between the vertices of ranges: on all edges, least and most on one, on faces and inside, starts uphill.
 #: These are the some 500 sweeps of RANGES.
 RANGE_EDGES, RANGE_ALONG, RANGE_DRAWN, RANGE_STARTS = 240, (3, 9), 48, 4

@@ -361,7 +361,7 @@ def _check_part(
     Raises NotProved if the figures differ from those on file, or the matrices are no proof.
     """
     _require_limits(loop, coupling, condition)
-    multiplier = _on_file(condition, loop, claim.multipliers)
+    multiplier = on_file(condition, loop, claim.multipliers)
     requirement, place = required_damping(loop, coupling, condition, multiplier), condition.place(loop)
     reason = requirement.reason or _other_figures(claim, requirement)
     if not (reason or requirement.certified):
@@ -393,7 +393,7 @@ def _margin(requirement: Requirement) -> float:
     return 1 / max(requirement.ratio, 1e-12)
 
 
-def _on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[float]]) -> Sequence[float] | None:
+def on_file(condition: Condition, loop: Loop, stored: Mapping[str, Sequence[float]]) -> Sequence[float] | None:
     """Return the condition's multipliers in one sequence, or None if it has none. Raises NotProved."""
     sizes = condition.multiplier_sizes(loop)
     expected = sizes | {name: len(values) for name, values in condition.parameters(loop).items()}

@@ -62,6 +62,10 @@ class Multiplied(Condition):
     def block(self, G: Block, loop: Loop, multiplier: Any = None) -> Demand[Block]:
         """Return the block of a map G, in any arithmetic."""
 
+    def facts(self, loop: Loop) -> tuple[Fact, ...]:
+        """Return the facts of this loop beyond a linear network with constant delays."""
+        return ()
+
     def demand(self, loop: Loop, coupling: Coupling, exact: bool = False, multiplier: Any = None) -> Demand[Lti]:
         return self.block(self.map(loop, coupling, exact), loop, multiplier)
 
@@ -288,7 +292,6 @@ class ThisEnvironment(Multiplied):
         return type(self) is ThisEnvironment
 
     def facts(self, loop: Loop) -> tuple[Fact, ...]:
-        """Return the facts of this loop beyond a linear network with constant delays."""
         walls = (Walls(),) if loop.environment.walls else ()
         return (*walls, Switching()) if loop.varying_delay else walls
 
@@ -372,11 +375,6 @@ class ThisEnvironment(Multiplied):
         best, _ = most(super().required(hardest, coupling).multiplier)
         return min(usual, best, key=lambda requirement: requirement.ratio)
 
-    def beyond(self, loop: Loop) -> str | None:
-        if loop.environment.walls and loop.ranges:
-            return "walls and ranges: walls are proved in one environment"
-        return super().beyond(loop)
-
     def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
         """Check the static part, with rounding relative to the size of each channel and wall: their units differ."""
         if not loop.environment.walls:
@@ -403,7 +401,7 @@ class ThisEnvironment(Multiplied):
         return f"{switching_guarantee(loop.delays)}: " if loop.varying_delay else super().place(loop, matrix)
 
     def words(self, loop: Loop) -> str:
-        return MAKING if loop.environment.walls else super().words(loop)
+        return MAKING if loop.environment.walls and not loop.ranges else super().words(loop)
 
 
 THIS_ENVIRONMENT = ThisEnvironment()
@@ -468,7 +466,7 @@ class LimitedForces(ThisEnvironment):
     beta: float = BETA
     lags: int = 1  # weights c_ij per device
     held: tuple[float, ...] | None = None  # rho [N/m] per device of a certificate; None: computed from beta
-    name, covers = "limiter", ("psi", "T_max", "latency", "varying_delay", "walls")
+    name, covers = "limiter", BEYOND
 
     def __post_init__(self) -> None:
         if not 0 <= self.beta < np.inf:
@@ -504,11 +502,6 @@ class LimitedForces(ThisEnvironment):
             what = "walls" if loop.environment.walls else "a latency"
             return f"limiter: designs for limited forces are made in linear environments without {what}"
         return self.beyond(loop)
-
-    def beyond(self, loop: Loop) -> str | None:
-        if loop.ranges:
-            return "limiter: limited forces are proved for one environment, not for ranges"
-        return None
 
     def place(self, loop: Loop, matrix: str = "P") -> str:
         return f"limiter: {switching_guarantee(loop.delays)}: " if loop.varying_delay else "limiter: "

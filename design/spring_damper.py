@@ -17,13 +17,13 @@ import numpy as np
 from haptic_loop.controller.coupling import Compliance, Coupling, MovingAverage, SpringDamper
 from haptic_loop.controller.delay import moving_sum
 from haptic_loop.controller.loop import Loop
-from haptic_loop.controller.lti import Array, Lti, hstack, taps, vstack
+from haptic_loop.controller.lti import Array, Complex, Lti, hstack, taps, vstack
 from haptic_loop.design import budgets
 from haptic_loop.design.certificate import named
 from haptic_loop.design.conditions import even_damping, even_level, theta_hat, this_environment
 from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.environments import LIMITER
-from haptic_loop.design.facts import Latency
+from haptic_loop.design.facts import Latency, PeriodCost
 from haptic_loop.design.frequency import on_circle, peaks, too_long
 from haptic_loop.design.gain_search import (
     FEW,
@@ -35,7 +35,7 @@ from haptic_loop.design.gain_search import (
     least_rms,
     likeliest_first,
 )
-from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, chi, largest_beta, period_cost
+from haptic_loop.design.known_device import KNOWN_DEVICE, KNOWN_DEVICE_ANY, device_rows, largest_beta, period_cost
 from haptic_loop.design.lmi import (
     ANY_ENVIRONMENT,
     RESERVE,
@@ -372,6 +372,16 @@ _ETAS = np.concatenate([np.geomspace(0.05, 0.6, 16), 1 - np.geomspace(0.3, 1e-4,
 _ON_CIRCLE = 721  # number of frequencies from 0 to pi at which the set of gains is imposed
 
 
+def _chi(z: Complex, theta: Sequence[int], cost: PeriodCost, beta: Array) -> Array:
+    """l Lam^-1 l*/4 with l = [(z^n - 1)/(z - 1), beta z^n], n = theta + 1: what V must exceed, (k, m) [m/N]."""
+    own, cross, speed = device_rows(z, cost)
+    n = np.array(theta) + 1
+    window = np.stack([sum(z**i for i in range(each)) for each in n], axis=1)
+    last, cross = beta * z[:, None] ** n, cross / 2
+    both = speed * np.abs(window) ** 2 + own * beta**2 - 2 * (last * cross * np.conj(window)).real
+    return both / (4 * (own * speed - np.abs(cross) ** 2))
+
+
 def _stiffest_known(loop: Loop) -> Design:
     """Return the stiffest spring-damper that known-device-any certifies; the objective is the sum of K [N/m].
 
@@ -419,7 +429,7 @@ def _stiffest_channel(loop: Loop) -> tuple[float, float]:
         """Return (-K, B) of the best B for this share of the largest beta."""
         beta = eta * largest_beta(loop, 1 - _STIFF_RESERVE)
         cost = period_cost(loop, np.full(z.size, 1 - _STIFF_RESERVE), beta)
-        limits = chi(z, loop.theta, cost, beta)[:, 0]
+        limits = _chi(z, loop.theta, cost, beta)[:, 0]
         most = 1 / (limits * steps).max()
         optimum = minimize_scalar(lambda B: -stiffest(B, limits), bounds=(0.0, most), method="bounded")
         return float(optimum.fun), float(optimum.x)
@@ -454,7 +464,7 @@ def _stiffest_linear(loop: Loop) -> Design:
 
         def needed(eta: float, one: Loop = one) -> Array:
             beta = eta * largest_beta(one, 1 - RESERVE)
-            return chi(z, one.theta, period_cost(one, np.full(z.size, 1 - RESERVE), beta), beta)[:, 0]
+            return _chi(z, one.theta, period_cost(one, np.full(z.size, 1 - RESERVE), beta), beta)[:, 0]
 
         best = int(np.argmin([needed(eta).mean() for eta in _ETAS]))
         ends = _ETAS[max(best - 1, 0)], _ETAS[min(best + 1, _ETAS.size - 1)]

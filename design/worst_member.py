@@ -151,8 +151,12 @@ def search_ranges(
     coupling: Coupling,
     progress: Progress = lambda done, total: None,
     over: Callable[[], bool] = lambda: False,
+    ratio: Callable[[Loop], float] | None = None,
 ) -> Searched:
-    """Find the members of the loop's ranges in which the coupling needs the most damping."""
+    """Find the members of the loop's ranges in which the coupling needs the most damping.
+
+    `ratio` returns required over available damping in the loop of a member; None for this-environment without facts.
+    """
     assert loop.ranges
-    parts = regions(loop.network, loop.ranges)
-    return search(parts, lambda member: ratio_in(loop.at(member.network), coupling), progress, over=over)
+    parts, ratio = regions(loop.network, loop.ranges), ratio or (lambda there: ratio_in(there, coupling))
+    return search(parts, lambda member: ratio(loop.at(member.network)), progress, over=over)

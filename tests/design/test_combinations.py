@@ -10,7 +10,9 @@ from scipy.linalg import expm
 from haptic_loop.controller.coupling import NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, Network, Spring, Wall
 from haptic_loop.controller.loop import DelayRange, Loop
+from haptic_loop.controller.ranges import Ranges
 from haptic_loop.design.api import design_coupling
+from haptic_loop.design.assessment import assess
 from haptic_loop.design.certificate import prove, required_damping, verify
 from haptic_loop.design.conditions import FACTS
 from haptic_loop.design.coupling_file import Stored, sealed
@@ -162,6 +164,35 @@ def test_no_hand_gains_energy_at_the_requirement(names):
 def test_some_hands_gain_energy_far_below_the_requirement(names):
     loop, rho = combined(names)
     assert growing(loop, COUPLING, 0.5 * need(loop, COUPLING, rho), rho) > 0
+
+
+@pytest.mark.parametrize("names", [("walls",), ("limiter",), ("walls", "limiter"), ("latency", "walls")], ids="-".join)
+def test_facts_are_proved_at_every_vertex(names):
+    """One set of multipliers serves all environments, each of which asks for at most as much by its own."""
+    loop, rho = combined(names)
+    loop = change(loop, ranges=Ranges(masses={"tip": (0.04, 0.06)}))
+    least, condition = need(loop, COUPLING, rho), LimitedForces(held=(rho,)) if rho else THIS_ENVIRONMENT
+    alone = [need(loop.at(member.network), COUPLING, rho) for member in loop.members()]
+    assert max(alone) * (1 - 1e-6) < least < max(alone) * 1.01
+    assert all(member.network.walls == loop.environment.walls for member in loop.members())
+    enough = change(loop, delta=(1.001 * least,))
+    certificate = prove(enough, COUPLING, condition)
+    assert certificate.guarantee == "these ranges"
+    assert {name for name in certificate.matrices if name[0] == "P"} == {"P", "P1", "P2"}
+    assert verify(Stored.of(enough, COUPLING, certificate)).proved
+    stiffer = change(enough, ranges=Ranges(masses={"tip": (0.04, 5.0)}))
+    assert not verify(Stored(stiffer, COUPLING.form(), certificate)).proved
+
+
+def test_walls_with_ranges_are_guaranteed_as_ranges():
+    """Every vertex is proved, and the search between them takes the multipliers of the proof."""
+    network = held(wall(3000.0, 2.0))
+    loop = loop_of(network, 1e-3, 1, 1.3, ranges=Ranges(masses={"tip": (0.04, 0.06)}))
+    found = assess(loop, COUPLING, ranges_samples=2)
+    assert found.ranges.proved
+    assert found.holds
+    assert found.guarantee.environments == "these ranges"
+    assert not assess(change(loop, delta=(1.2,)), COUPLING, ranges_samples=0).holds
 
 
 # Before any passive environment behind a coupling.

@@ -15,12 +15,14 @@ from worlds import PAIR
 
 from haptic_loop.controller.coupling import PUBLISHED, NoCoupling, SpringDamper
 from haptic_loop.controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall
-from haptic_loop.controller.loop import DeviceBounds, Loop
+from haptic_loop.controller.loop import DelayRange, DeviceBounds, Loop
 from haptic_loop.controller.lti import Lti, taps
 from haptic_loop.controller.ranges import Ranges, UncertainSpring
 from haptic_loop.design.api import design_coupling
+from haptic_loop.design.assessment import assess
 from haptic_loop.design.audit import audit
 from haptic_loop.design.certificate import named, prove, required_damping, verify
+from haptic_loop.design.conditions import FACTS
 from haptic_loop.design.coupling_file import Stored, sealed
 from haptic_loop.design.environments import LimitedForces
 from haptic_loop.design.exact import find_storage, prove_positive_real
@@ -28,18 +30,16 @@ from haptic_loop.design.facts import KnownMotor, Limiter, compose, compose_any
 from haptic_loop.design.files import InputError
 from haptic_loop.design.gain_search import KnownDeviceLoop
 from haptic_loop.design.known_device import (
-    AnyEnvironmentSweep,
+    KNOWN_DEVICE,
     Best,
     LimitedKnownDevice,
-    ThisEnvironmentSweep,
-    alias_sums,
+    Sweep,
     check_q,
     exact_cost,
-    left_over,
-    necessary_share,
     period_cost,
     q_bounds,
 )
+from haptic_loop.design.necessary import alias_sums, left_over, necessary_share
 from haptic_loop.design.result import NotProved
 from haptic_loop.design.spring_damper import design
 from haptic_loop.sim.scenario import load
@@ -70,6 +70,16 @@ def known_device_any_block(V, theta, cost, beta):
     return made.static["V(1)"], made.free
 
 
+def sweep_of(F, loop) -> Sweep:
+    """The sweep of Theorem B around the map F of one environment."""
+    return Sweep(loop, [F], lambda G, values, hands: compose(G, loop, late=False, hands=hands))
+
+
+def sweep_any(V, loop) -> Sweep:
+    """The sweep before any passive environment behind the coupling V."""
+    return Sweep(loop, [V], lambda G, values, hands: compose_any(G, loop, hands=hands))
+
+
 # ----------------------------------------------------------------------------------------------------
 # Figures that were computed with separate code.
 
@@ -88,7 +98,7 @@ def test_constants_of_one_period():
 def best_for(coupling: str) -> Best:
     """The best beta for the paper's loop without coupling, or with published gains."""
     made, present = {"none": (NoCoupling(), 1.72293), "I": (PUBLISHED["I"], 1.39871)}[coupling]
-    return ThisEnvironmentSweep(KNOWN.F(made), KNOWN).best(present / 1.37)
+    return sweep_of(KNOWN.F(made), KNOWN).best(present / 1.37)
 
 
 @pytest.mark.parametrize(("coupling", "required", "beta"), [("none", 1.3120, 3.255e-5), ("I", 0.96294, 3.375e-5)])
@@ -96,7 +106,7 @@ def test_required_damping_of_the_papers_loop(coupling, required, beta):
     """One beta for both channels gives these figures; a beta per channel gives next to nothing more."""
     found = best_for(coupling)
     assert found.share * 1.37 == pytest.approx(required, rel=5e-5)
-    common = ThisEnvironmentSweep(KNOWN.F(NoCoupling() if coupling == "none" else PUBLISHED["I"]), KNOWN)
+    common = sweep_of(KNOWN.F(NoCoupling() if coupling == "none" else PUBLISHED["I"]), KNOWN)
     assert common.required(np.array([beta, beta]), 2.0)[0] * 1.37 == pytest.approx(required, rel=5e-5)
 
 
@@ -105,13 +115,13 @@ def test_required_damping_of_the_papers_loop(coupling, required, beta):
     [(1200.0, 20.0, 0, 2.5e-4, 20.15, 0.00038), (1000.0, 5.0, 1, 1e-3, 5.525, 0.28290)],
 )
 def test_required_damping_of_damped_walls(K, B, theta, T, present, required):
-    found = ThisEnvironmentSweep(wall(K, B, theta, T), one(T, 1.0, theta)).best(present)
+    found = sweep_of(wall(K, B, theta, T), one(T, 1.0, theta)).best(present)
     assert found.share == pytest.approx(required, rel=3e-3 if required < 0.001 else 1e-4)
 
 
 def test_a_bare_spring_gains_nothing():
     """The motor alone oscillates on a spring without damper as soon as delta < K T/2."""
-    found = ThisEnvironmentSweep(wall(1000.0, 0.0, 0, 1e-3), one(1e-3, 1.0)).best(0.4999)
+    found = sweep_of(wall(1000.0, 0.0, 0, 1e-3), one(1e-3, 1.0)).best(0.4999)
     assert found.share == np.inf
 
 
@@ -130,6 +140,13 @@ def test_the_stiffest_linear_coupling_for_any_environment(theta, known, present)
 
 def chi_by_hand(z, n, loop, beta):
     """l Lam^-1 l*/4, with the matrix of L on (dx, v) inverted numerically."""
+    inverse = np.linalg.inv(cost_by_hand(z, loop, beta))
+    left = np.stack([(z**n - 1) / (z - 1), beta * z**n], axis=1)
+    return np.einsum("ki,kij,kj->k", left, inverse, np.conj(left)).real / 4
+
+
+def cost_by_hand(z, loop, beta):
+    """The Hermitian matrix (k, 2, 2) of L on (dx, v)."""
     T, (device,) = loop.T, loop.known_devices
     P, b, m = (
         device.transmission_stiffness_max**2 / device.transmission_damping_min,
@@ -145,9 +162,7 @@ def chi_by_hand(z, n, loop, beta):
         scale**2 * np.array([[d * d * np.ones_like(z), d * v], [d * np.conj(v), np.abs(v) ** 2]])
         for scale, d, v in rows
     )
-    inverse = np.linalg.inv(np.moveaxis(Lam, -1, 0))
-    left = np.stack([(z**n - 1) / (z - 1), beta * z**n], axis=1)
-    return np.einsum("ki,kij,kj->k", left, inverse, np.conj(left)).real / 4
+    return np.moveaxis(Lam, -1, 0)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -186,6 +201,25 @@ def test_the_least_cost_of_a_period(seed):
     found = discretised_cost(c0, c2, T, dx, v0, v1, 600)
     assert least[0] <= found * (1 + 1e-9)
     assert found == pytest.approx(least[0], rel=1e-4)
+
+
+def test_the_cost_is_concave_in_damping_and_beta():
+    """So tangents bound a block from above, and the search for beta and multipliers bounds the requirement from below.
+
+    As a form in (dx, vb, dv), along random lines.
+    """
+    rng, loop = np.random.default_rng(8), one(1e-3, 1.0)
+
+    def form(share, beta):
+        move, cross, mean, step = (float(part[0]) for part in period_cost(loop, share, np.array([beta])))
+        return np.array([[move, -cross, 0.0], [-cross, mean, 0.0], [0.0, 0.0, step]])
+
+    for _ in range(300):
+        ends = [(share, rng.uniform(0.01, 0.99) * 2 * np.sqrt(share * 0.5) / 14500) for share in rng.uniform(0.1, 3, 2)]
+        middle = np.mean(ends, axis=0)
+        excess = form(*middle) - (form(*ends[0]) + form(*ends[1])) / 2
+        root = 1 / np.sqrt(np.diag(form(*middle)))
+        assert np.linalg.eigvalsh(root[:, None] * excess * root).min() > -1e-9
 
 
 def test_the_cost_bounds_every_period_of_a_range():
@@ -383,7 +417,7 @@ def test_some_lossless_hand_grows_below_theorem_a(K, B, theta, T):
 
 
 def required(F, loop, high=30.0) -> float:
-    return ThisEnvironmentSweep(F, loop).best(high).share
+    return sweep_of(F, loop).best(high).share
 
 
 @pytest.mark.parametrize(
@@ -406,7 +440,7 @@ def test_a_small_beta_gives_the_present_condition():
     """As beta -> 0 the cost becomes delta dx^2/T, and the requirement that of every hand at the shaft."""
     cost = period_cost(one(1e-3, 1.3), 1.0, np.array([1e-12]))
     assert cost.move[0] == pytest.approx(1300.0, rel=1e-3)
-    sweep = ThisEnvironmentSweep(wall(1000.0, 0.2, 0, 1e-3), one(1e-3, 1.0))
+    sweep = sweep_of(wall(1000.0, 0.2, 0, 1e-3), one(1e-3, 1.0))
     assert sweep.required(np.array([1e-10]), 5.0)[0] == pytest.approx(0.7, rel=1e-2)
 
 
@@ -447,7 +481,7 @@ def test_the_paper_loop_is_proved_exactly():
 def test_a_coupling_for_any_environment_is_proved_exactly():
     loop = change(KNOWN, theta=(0, 1), lam=(0, 1))
     coupling = SpringDamper([4000.0, 1300.0], [6.0, 2.5])
-    found = AnyEnvironmentSweep(coupling.compliance(loop.T), loop).best(1.0)
+    found = sweep_any(coupling.compliance(loop.T), loop).best(1.0)
     assert found.share < 1
     V, beta = coupling.compliance(loop.period(True)), [Fraction(f"{b!r}") for b in found.beta]
     _, block = exactly(loop, lambda cost: known_device_any_block(V, loop.theta, cost, beta), beta)
@@ -460,12 +494,12 @@ def test_a_sweep_sees_what_the_block_is():
     coupling = SpringDamper([4000.0, 1300.0], [6.0, 2.5])
     V, F = coupling.compliance(loop.T), loop.F(coupling)
     forms = [
-        (ThisEnvironmentSweep(F, loop), lambda cost, beta: known_device_block(F, cost, beta)),
-        (AnyEnvironmentSweep(V, loop), lambda cost, beta: known_device_any_block(V, loop.theta, cost, beta)),
+        (sweep_of(F, loop), lambda cost, beta: known_device_block(F, cost, beta)),
+        (sweep_any(V, loop), lambda cost, beta: known_device_any_block(V, loop.theta, cost, beta)),
     ]
     z = np.exp(1j * np.concatenate([np.linspace(1e-4, np.pi, 4000)]))
     for sweep, form in forms:
-        share, w, beta = sweep.best(5.0)
+        share, w, beta, *_ = sweep.best(5.0)
         for factor, holds in ((1.002, True), (0.998, False)):
             cost = period_cost(loop, factor * share, np.array(beta))
             G = form(cost, np.array(beta))[1].at(np.append(z, np.exp(1j * w)))
@@ -536,7 +570,7 @@ def test_one_beta_serves_all_environments_of_ranges():
     assert certificate.guarantee == "these ranges"
     assert {name for name in certificate.matrices if name[0] == "P"} == {f"P{i or ''}" for i in range(5)}
     assert verify(Stored.of(loop, PUBLISHED["I"], certificate)).proved
-    each = [ThisEnvironmentSweep(loop.at(m.network).F(PUBLISHED["I"]), KNOWN).best(2.0).share for m in loop.members()]
+    each = [sweep_of(loop.at(m.network).F(PUBLISHED["I"]), KNOWN).best(2.0).share for m in loop.members()]
     assert certificate.required[0] == pytest.approx(1.37 * max(each), rel=2e-3)
 
 
@@ -803,18 +837,21 @@ def wall_needs(k, damping, theta):
     return required_damping(on_a_wall(k, damping, theta), NoCoupling(), "known-device").required[0]
 
 
-WALLS = [(1000.0, 5.0, 0, 0.566, 5.5), (3000.0, 2.0, 0, 1.524, 3.5)]
+WALLS = [(1000.0, 5.0, 0, 0.566, 5.5), (3000.0, 2.0, 0, 1.524, 3.5), (1000.0, 5.0, 1, 2.07, 5.5455)]
 
 
 @pytest.mark.parametrize(("k", "damping", "theta", "known", "plain"), WALLS)
 def test_damped_walls_need_less_than_known_figures(k, damping, theta, known, plain):
     """Separate code needs `known` with a coarse sweep and m = 0; the touched wall alone needs less."""
-    touched = ThisEnvironmentSweep(wall(k, damping, theta, 1e-3), one(1e-3, 1.0, theta)).best(plain).share
+    touched = sweep_of(wall(k, damping, theta, 1e-3), one(1e-3, 1.0, theta)).best(plain).share
     assert touched * (1 - 1e-4) < wall_needs(k, damping, theta) < known
 
 
 def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3, coupling=None, **limiter):
-    """How many lossless hands behind the transmission have more energy at the end than in the middle."""
+    """How many lossless hands behind the transmission have more energy at the end than in the middle.
+
+    Where delays switch, the force acts at every tick whose age gives most energy.
+    """
     rng = np.random.default_rng(seed)
     M, k = 10 ** rng.uniform(-3.5, 0.5, hands), 10 ** rng.uniform(0, 5, hands)
     m, kt, b = DEVICE.motor_mass_min, DEVICE.transmission_stiffness_max, DEVICE.transmission_damping_min
@@ -823,18 +860,21 @@ def hands_on_a_wall(loop, delta, ticks=6000, hands=150, seed=3, coupling=None, *
     A[:, 1, :] = np.array([-kt, -delta - b, kt, b, -1]) / m
     A[:, 3, :4] = np.stack([kt + 0 * k, b + 0 * k, -kt - k, -b + 0 * k], axis=1) / M[:, None]
     step = expm(A * loop.T)[:, :4]
-    law = loop.delayed((0,)).law(coupling or NoCoupling(), **limiter)
+    law = loop.switching(None).delayed((0,)).law(coupling or NoCoupling(), **limiter)
     tick, state = law.transition(), rng.standard_normal((hands, 4)) * (1e-2, 0.1, 1e-2, 0.1)
     before, after = np.zeros((2, law.open.order + 1, hands))
-    late, energy = [np.zeros(hands)] * (loop.theta[0] + 1), np.zeros((2, hands))
+    lo, hi = loop.delays.lo[0], loop.delays.hi[0]
+    late, energy = [np.zeros(hands)] * (hi + 1), np.zeros((2, hands))
     for j in range(ticks):
         before[-1] = state[:, 0]
         tick(before, after)
         before[:-1] = after[1:]
         late = [after[0].copy(), *late[:-1]]
-        state = np.einsum("hij,hj->hi", step, np.column_stack([state, late[-1]]))
-        x, v, y, u = state.T
-        now = (m * v**2 + M * u**2 + kt * (x - y) ** 2 + k * y**2) / 2
+        found = np.stack([np.einsum("hij,hj->hi", step, np.column_stack([state, f])) for f in late[lo:]])
+        x, v, y, u = np.moveaxis(found, 2, 0)
+        each = (m * v**2 + M * u**2 + kt * (x - y) ** 2 + k * y**2) / 2
+        most = np.argmax(each, axis=0)
+        state, now = found[most, np.arange(hands)], each[most, np.arange(hands)]
         if now.max() > 1e6:  # [J]
             return int((now > 1.0).sum())
         at = 0 if 0.4 * ticks < j < 0.5 * ticks else 1 if j > 0.9 * ticks else None
@@ -953,3 +993,85 @@ def test_limited_known_devices_are_proved_from_files():
     for name in ("rho", "beta", "q_below"):
         forged = known | {name: tuple(3 * v for v in known[name])}
         assert not verify(change(stored, certificate=sealed(change(certificate, multipliers=forged)))).proved
+
+
+# ----------------------------------------------------------------------------------------------------
+# Delays that switch, and ranges with facts, on known devices.
+
+WALL = Wall(("tip", GROUND), 3000.0, 2.0)
+SWITCHED = {"varying_delay": DelayRange((0,), (1,))}
+TOGETHER = {
+    "switching": (change(limited(1), **SWITCHED), KNOWN_DEVICE),
+    "limiter-switching": (change(limited(1), **SWITCHED), LIMITED),
+    "walls-switching": (change(limited(1, WALL), **SWITCHED), KNOWN_DEVICE),
+    "walls-limiter-ranges": (change(limited(1, WALL), ranges=Ranges(masses={"tip": (0.04, 0.06)})), LIMITED),
+}
+
+
+@cache
+def together_needs(name):
+    loop, condition = TOGETHER[name]
+    return required_damping(loop, COUPLING, condition).required[0]
+
+
+@pytest.mark.parametrize("name", TOGETHER)
+def test_facts_on_known_devices_are_proved_from_files(name):
+    """For less damping than devices of which less is known need; a file without a multiplier is refused."""
+    loop, condition = TOGETHER[name]
+    needs = together_needs(name)
+    assert needs < 0.8 * condition.plain.required(loop, COUPLING).required[0]
+    enough = change(loop, delta=(1.001 * needs,))
+    certificate = prove(enough, COUPLING, condition)
+    assert certificate.facts == tuple(fact for fact in FACTS if fact in name.split("-"))
+    stored = Stored.of(enough, COUPLING, certificate)
+    assert verify(msgspec.json.decode(msgspec.json.encode(stored), type=Stored)).proved
+    for missing in certificate.multipliers:
+        fewer = {known: values for known, values in certificate.multipliers.items() if known != missing}
+        assert not verify(change(stored, certificate=sealed(change(certificate, multipliers=fewer)))).proved
+    short = change(loop, delta=(0.999 * needs,))
+    multiplier = tuple(v for part in condition.multiplier_sizes(loop) for v in certificate.multipliers[part])
+    assert not required_damping(short, COUPLING, condition, multiplier).certified
+
+
+@pytest.mark.parametrize("name", ["switching", "limiter-switching", "walls-switching"])
+def test_no_hand_gains_energy_from_ages_of_forces(name):
+    """Of lossless hands behind the transmission, each with the worst age of its force at every tick."""
+    loop, condition = TOGETHER[name]
+    bound = {"limit": [1.0], "rho": [RHO]} if condition is LIMITED else {}
+    assert hands_on_a_wall(loop, 1.01 * together_needs(name), coupling=COUPLING, **bound) == 0
+    assert hands_on_a_wall(loop, 0.1 * together_needs(name), coupling=COUPLING, **bound) > 0
+
+
+def test_switching_before_any_environment_is_that_of_chi():
+    """He[V/(1-z)] > l (Lam - alpha d d*/2)^-1 l*/4 + h^2/(2 alpha), d = (1, beta (z - 1)), l of the mean delay."""
+    loop, coupling = change(one(1e-3, 1.0, 1), varying_delay=DelayRange((0,), (2,))), SpringDamper([600.0], [1.2])
+    found = required_damping(loop, coupling, "known-device-any")
+    beta, alpha, share = found.multiplier[0], found.multiplier[3], found.required[0]
+    assert share < 0.9 * required_damping(loop, coupling, "any-environment").required[0]
+    z = np.exp(1j * np.append(np.linspace(1e-3, np.pi, 6001), 2 * np.pi * loop.T * found.frequency_hz))
+    V = 1 / (600.0 + 1.2 * (1 - 1 / z) / loop.T)
+    device = change(loop, delta=(share,))
+
+    def left(scale):
+        Lam = cost_by_hand(z, change(device, delta=(scale * share,)), beta)
+        d = np.stack([np.ones_like(z), beta * (z - 1)], axis=1)
+        Lam = Lam - alpha / 2 * np.conj(d)[:, :, None] * d[:, None, :]
+        windows = [sum(z**k for k in range(n)) for n in (1, 3)]
+        row = np.stack([sum(windows) / 2, beta * (z + z**3) / 2], axis=1)
+        charge = np.einsum("ki,kij,kj->k", row, np.linalg.inv(Lam), np.conj(row)).real / 4
+        assert (np.linalg.eigvalsh(Lam) > 0).all()
+        return ((V / (1 - z)).real - charge - 1 / (2 * alpha)).min()
+
+    assert left(1.002) > 0 > left(0.998)
+    certificate = prove(change(loop, delta=(1.001 * share,)), coupling, "known-device-any")
+    assert certificate.facts == ("switching",)
+    assert verify(Stored.of(change(loop, delta=(1.001 * share,)), coupling, certificate)).proved
+
+
+def test_an_assessment_guarantees_switching_on_known_devices():
+    loop = change(TOGETHER["switching"][0], delta=(0.85,))
+    found = assess(loop, COUPLING)
+    assert not found.requirements["switching"].certified
+    assert found.guarantee.condition == "known-device"
+    assert found.guarantee.delays == loop.varying_delay
+    assert "at least 60 g" in found.guarantee.hands

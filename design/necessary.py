@@ -1,0 +1,166 @@
+"""What no condition for devices of known motor and transmission can undercut (Theorem A), by a sweep.
+
+For one linear motor (mass m, damping delta) behind a spring k and a damper b the sampled response to a held force
+fills a disk as the passive hand varies: at each alias w_n = (w + 2 pi n)/T the hand may answer as it likes. The loop
+is stable for every passive hand if no response in the disk closes it and it is stable with the far end of the
+transmission held. With one channel, or channels with equal devices, some lossless hand attains every point of the
+disk. The member of the class is the one with the least mass and damping, the stiffest spring and the least damper.
+Compare Fardad and Bamieh, IEEE Transactions on Automatic Control 54 (2009), for one channel. docs/theory.md has the
+proof.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from haptic_loop.controller.arithmetic import SingularLoop
+from haptic_loop.controller.coupling import Coupling
+from haptic_loop.controller.loop import Loop
+from haptic_loop.controller.lti import Array, Complex, Lti
+from haptic_loop.design.frequency import frequencies, largest_eigenvalue, on_circle, supremum
+from haptic_loop.design.known_device import KNOWN_DEVICE
+from haptic_loop.design.result import Requirement
+
+
+def alias_sums(w: Array, T: float, mass: float, damping: Array, k: float, b: float) -> tuple[Array, Complex]:
+    """Return sig0 and sig2 (k,) [m/(N s)] at w (k,) [rad/sample] for motors of `damping` (k,) [N s/m], in closed form.
+
+    sig_i = |z - 1|^2 S_i/T^2 with S0 = sum 1/(w_n^2 c_n), S2 = sum g_n conj(a_n)/(w_n^2 c_n), a_n = delta + j m w_n,
+    g_n = b w_n^2/(k^2 + b^2 w_n^2) and c_n = delta + g_n |a_n|^2. Both are rational in W = w_n^2 with the denominator
+    b m^2 W^2 + (delta b^2 + b delta^2) W + delta k^2, and sums of partial fractions are cotangents.
+    """
+    high, middle, low = b * mass**2, damping * b * (b + damping), damping * k**2
+    root: Complex = np.sqrt((middle**2 - 4 * high * low).astype(np.complex128))
+    W1, W2 = (-middle - root) / (2 * high), (-middle + root) / (2 * high)
+    W2 = np.where(np.abs(W2) < np.abs(W1), low / (high * W1), W2)  # without cancellation
+
+    def sums(W: Any) -> tuple[Any, Any]:
+        """Return the sums of 1/(w_n^2 - W) and of w_n/(w_n^2 - W)."""
+        y = np.sqrt(W) * T
+        less, more = 1 / np.tan((w - y) / 2), 1 / np.tan((w + y) / 2)
+        return T**2 / (4 * y) * (less - more), T / 4 * (less + more)
+
+    (even1, odd1), (even2, odd2) = sums(W1), sums(W2)
+    apart = high * (W1 - W2)
+    numerator = [(k**2 + b**2 * W) / W for W in (W1, W2)]
+    S0 = k**2 / low * T**2 / (4 * np.sin(w / 2) ** 2) + (numerator[0] * even1 - numerator[1] * even2) / apart
+    S2 = b / apart * (damping * (even1 - even2) - 1j * mass * (odd1 - odd2))
+    turn = 4 * np.sin(w / 2) ** 2 / T**2
+    return turn * S0.real, turn * S2
+
+
+class Necessary(NamedTuple):
+    """The least share of the damping for which Theorem A holds."""
+
+    share: float
+    w: float  # where it binds [rad/sample]
+    held: bool  # whether the loop is stable at this share with the far ends of the transmissions held
+
+
+_LOWEST = 1e-4  # [rad/sample]: at z = 1 the disk touches the point that it must not contain
+_SMALL, _LARGE = 1e-6, 1e3  # shares of the damping between which the least one is searched
+
+
+def necessary_share(F: Lti, loop: Loop) -> Necessary:
+    """Return the least share of the damping at which no passive hand destabilises linear motors, by a refined sweep.
+
+    It is a lower bound for every condition of this class of devices where the loop has one channel or equal devices;
+    otherwise it is sufficient, and close.
+    """
+    assert loop.known_devices
+    known, T, m = loop.known_devices, loop.T, loop.channels
+
+    def holds(w: Array, response: Complex, share: Array) -> Any:
+        sums = [
+            alias_sums(w, T, d.motor_mass_min, share * delta, d.transmission_stiffness_max, d.transmission_damping_min)
+            for d, delta in zip(known, loop.delta, strict=True)
+        ]
+        radius = np.stack([np.maximum(sig0, 1e-300) / 2 for sig0, _ in sums], axis=1)
+        centre = radius + np.stack([sig2 for _, sig2 in sums], axis=1)
+        root = np.sqrt(radius)
+        z = on_circle(w)
+        closed = (z - 1)[:, None, None] * np.eye(m) + T * centre[..., None] * response
+        left, right = closed / root[..., None], T * root[..., None] * response
+        adjoint = [np.conj(np.swapaxes(part, 1, 2)) for part in (left, right)]
+        return -largest_eigenvalue(adjoint[1] @ right - adjoint[0] @ left) > 0
+
+    def shares(w: Array) -> Array:
+        response = F.at(on_circle(w))
+        least, most = np.full(w.size, _SMALL), np.full(w.size, _LARGE)
+        plenty = holds(w, response, most)
+        for _ in range(52):  # to 2e-16 of the interval's length
+            middle = (least + most) / 2
+            enough = holds(w, response, middle)
+            least, most = np.where(enough, least, middle), np.where(enough, middle, most)
+        return np.where(plenty, most, np.inf)
+
+    share, w = supremum(shares, frequencies(F, low=_LOWEST))
+    return Necessary(share, w, bool(np.isfinite(share)) and _stable_with_held_ends(F, loop, share * (1 + 1e-6)))
+
+
+@dataclass(frozen=True)
+class LeftOver:
+    """What Theorem A asks of linear motors beside what is proved: how much a better proof could still gain."""
+
+    required_damping: tuple[
+        float, ...
+    ]  # (m,) [N s/m], by a sweep; no condition for these devices asks less if `attained`
+    frequency_hz: float
+    attained: bool  # one channel, or equal devices: some lossless hand destabilises the loop at any smaller damping
+    proved_damping: tuple[float, ...] | None  # (m,) [N s/m] by known-device; None where it certifies nothing
+
+    @property
+    def words(self) -> str:
+        """The comparison as a sentence without its full stop."""
+        need = ", ".join(f"{d:.5g}" for d in self.required_damping)
+        exact = "no proof for every passive hand can ask less" if self.attained else "that is enough, by a sweep"
+        if self.proved_damping is None:
+            return f"known devices with linear motors need {need} N s/m (Theorem A): {exact}"
+        given = ", ".join(f"{d:.3g}" for d in np.subtract(self.proved_damping, self.required_damping))
+        said = f"known devices with linear motors need {need} N s/m (Theorem A): {exact}"
+        return f"{said}; the proof gives away {given} N s/m"
+
+
+def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None) -> LeftOver | None:
+    """Return what Theorem A asks of this loop; None where it says nothing of it or finds no damping that is enough.
+
+    `proved` is what known-device asks, if it has been asked already.
+    """
+    if KNOWN_DEVICE.beyond(loop) or loop.ranges or loop.T_max not in (None, loop.T):
+        return None
+    equal, walls = len(set(zip(loop.known_devices or (), loop.delta, strict=True))) == 1, bool(loop.environment.walls)
+    if walls and not equal:
+        return None  # touched walls give a lower bound, unlike devices a sufficient figure: together neither
+    try:
+        maps = loop.law(coupling).frozen().values() if walls else [loop.F(coupling)]
+    except SingularLoop:
+        return None
+    if not all(F.is_stable() for F in maps):
+        return None
+    each, proved = [necessary_share(F, loop) for F in maps], proved or KNOWN_DEVICE.judge(loop, coupling)
+    found = max(each, key=lambda one: one.share)
+    if not (all(one.held for one in each) and np.isfinite(found.share)):
+        return None
+    needed = tuple(found.share * d for d in loop.delta)
+    asked = proved.required if np.isfinite(proved.ratio) else None
+    return LeftOver(needed, found.w / (2 * np.pi * loop.T), equal, asked)
+
+
+def _stable_with_held_ends(F: Lti, loop: Loop, share: float) -> bool:
+    """Whether the loop is stable at `share` of the damping with the far end of every transmission held."""
+    import scipy
+
+    m, known = loop.channels, loop.known_devices or ()
+    generator = np.zeros((3 * m, 3 * m))
+    for i, (device, delta) in enumerate(zip(known, loop.delta, strict=True)):
+        mass, k, b = device.motor_mass_min, device.transmission_stiffness_max, device.transmission_damping_min
+        generator[i, m + i] = 1
+        generator[m + i, [i, m + i, 2 * m + i]] = -k / mass, -(share * delta + b) / mass, -1 / mass
+    step = scipy.linalg.expm(generator * loop.T)[: 2 * m]
+    A, B = step[:, : 2 * m], step[:, 2 * m :]
+    C = np.eye(m, 2 * m)
+    closed = np.block([[A + B @ F.D @ C, B @ F.C], [F.B @ C, F.A]])
+    return bool(np.abs(np.linalg.eigvals(closed)).max() < 1)
