@@ -45,6 +45,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
     That is: designs, bounds, the price of a wrong model, what limited forces ask, and how the couplings beside a run's
     own are judged. What makes them, design.designs and the modules behind it, is as it was.
     """
+    import haptic_loop.cli.check
     import haptic_loop.cli.design
     from haptic_loop.design import api, assessment, bound, designs, optimal
     from haptic_loop.sim import couplings
@@ -55,7 +56,7 @@ def share_designs(folder: Path, patch=setattr) -> None:
         (optimal.spread, (optimal,)),
         (assessment.required_damping, (assessment,)),
         (assessment.requirements_of, (assessment,)),
-        (assessment.search_ranges, (assessment,)),
+        (assessment.search_ranges, (assessment, haptic_loop.cli.check)),
         (api.instead, (api,)),
     ):
         for module in modules:

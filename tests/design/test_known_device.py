@@ -701,7 +701,7 @@ def test_the_audit_says_what_is_left():
     assert left.proved_damping[0] == pytest.approx(0.96294, rel=1e-4)
     other = change(KNOWN, known_devices=(DEVICE, change(DEVICE, motor_mass_min=0.1)))
     assert not left_over(other, PUBLISHED["I"]).attained
-    assert audit(PAIR, PUBLISHED["I"]).left_over is None
+    assert left_over(PAIR, PUBLISHED["I"]) is None
 
 
 def random_walls(rng, T):

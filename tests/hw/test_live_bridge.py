@@ -41,7 +41,7 @@ from tests.pseudo_terminal import EmulatorProcess, emulated
 pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
 ROOT = Path(__file__).parent.parent.parent
 PACE = 0.2  # seconds of a session per second: the patience of a session (1 s of silence) is 5 s of the machine
-PACES = (0.3, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05)  # of attempts
+PACES = (0.3, 0.2, 0.1, 0.1, 0.05, 0.02, 0.01)  # of attempts: at the last one, 6 ms without a STATE are 0.6 s
 AT_REST = ("silent", "disarmed", "stopped", "estop", "ramp")
 
 
