@@ -141,6 +141,6 @@ def test_the_bridge_rehearses_it(files, form):
     couplings = certified_couplings(scenario, "I", str(path), None, 1, spare=0)
     session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: couplings)
-    assert rehearsal.run_until_armed(0.4).stage == Stage.ARMED
+    assert rehearsal.run_until_armed(0.6).stage == Stage.ARMED
     assert any(np.any(moment.applied) for moment in rehearsal.moments[-100:])
     assert choose(scenario, "I", str(path)).notes == ()

@@ -116,14 +116,17 @@ def press(running, *names):
 
 
 def test_the_session_is_the_simulation(none):
-    """Bit for bit, whatever the times at which it is looked at."""
+    """Whatever the times at which it is looked at: but for a rounding a tick, which the unstable mode grows sevenfold.
+
+    A block of ticks sums in another order than tick after tick.
+    """
     running = session(none)
     for now in np.cumsum(np.random.default_rng(1).uniform(0.001, 0.2, 12)):
         frame = running.frame(now)
     ticks = round(frame.t / SCENARIO.T)
     record = close_loop(none.simulation, "exact", ticks=ticks + 1)
-    assert np.array_equal(running.state, record.s[ticks])
-    assert np.array_equal(frame.history, record.f[:ticks])
+    for shown, run in ((running.state, record.s[ticks]), (frame.history, record.f[:ticks])):
+        np.testing.assert_allclose(shown, run, rtol=0, atol=7 * ticks * np.finfo(float).eps * np.abs(run).max())
     assert np.array_equal(frame.q, record.s[ticks, : frame.q.size])
 
 
