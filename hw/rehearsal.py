@@ -280,7 +280,8 @@ class Rehearsed:
         coupling: The coupling with which the device was armed, or would have been.
         assessment: The assessment of that coupling in the loop with the measured delay.
         result: A Trace with t, x and f of every tick; handles are not measured.
-        zero_after: The time from the wish to stop until no motor does anything [s]; None where it never ran.
+        zero_after: The time from the wish to stop until no motor does anything [s], the last test of the motors
+            included; None where it never ran.
     """
 
     stage: str

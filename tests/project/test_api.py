@@ -102,7 +102,7 @@ def test_a_session_is_rehearsed():
     assert session.delay == pytest.approx(130e-6, abs=2e-6)  # the clock ticks in us, and each way is rounded
     designed = design_coupling(scenario.loop("I")).coupling
     np.testing.assert_array_equal(session.coupling.K, designed.K)
-    assert 0.1 - 1e-9 <= session.zero_after <= 0.25  # planned stops ramp the gain over 100 to 250 ms
+    assert 0.364 - 1e-9 <= session.zero_after <= 0.52  # a ramp of 100 to 250 ms, then 132 ms for each motor
     assert session.result.x.shape == session.result.f.shape == (len(session.result.t), 2)
     force = np.abs(session.result.f).max(axis=1)
     assert force[-1] < 0.05 * force.max()  # the last tick of a ramp of 100 to 250
