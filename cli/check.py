@@ -24,7 +24,6 @@ from haptic_loop.design.certificate import (
 )
 from haptic_loop.design.conditions import Condition
 from haptic_loop.design.coupling_file import Stored
-from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.design.files import off_table
 from haptic_loop.design.guarantees import HERE, RANGES
 from haptic_loop.design.known_device import described
@@ -129,7 +128,7 @@ def _searched(stored: Stored, condition: Condition | None) -> Searched | None:
     loop, coupling = stored.loop, stored.built()
     with render.progress("searching the ranges between their vertices") as move:
         asked = condition_of(stored.certificate, condition)
-        if asked is THIS_ENVIRONMENT and not asked.multiplier_sizes(loop):
+        if asked.extensible and not asked.multiplier_sizes(loop):
             return search_ranges(loop, coupling, move)
         values = on_file(asked, loop, stored.certificate.multipliers)
         return search_ranges(

@@ -170,7 +170,7 @@ def check_ranges(
     if loop.ranges is None:
         return None
     certificate, reason, multiplier = _proved_ranges(loop, coupling, condition, certificate)
-    simple = condition is THIS_ENVIRONMENT and not multiplier
+    simple = condition.extensible and not multiplier  # The fast sweeps of members are for such conditions.
 
     def need(there: Loop) -> Requirement:
         return required_damping(there, coupling, condition, multiplier)

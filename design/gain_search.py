@@ -10,9 +10,10 @@ by channel, so these responses determine all its values and slopes.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +29,10 @@ from haptic_loop.design.frequency import frequencies, hermitian, least_eigenpair
 from haptic_loop.design.known_device import KNOWN_DEVICE, device_rows, largest_beta, period_cost
 from haptic_loop.design.lmi import RESERVE
 from haptic_loop.design.result import Requirement
-from haptic_loop.design.sqp import Optimum, minimise
 from haptic_loop.design.transparency import BAND_HZ, transparency
+
+if TYPE_CHECKING:  # slow to load
+    from scipy.optimize import OptimizeResult
 
 #: reserve of the sampled condition, 1.5 times that of the design, for frequencies between the samples
 _SAMPLED_RESERVE = 1.5 * RESERVE
@@ -39,8 +42,6 @@ _STUCK = 1e-3  # violation at the end of a search from which there is no feasibl
 FEW = 12  # largest number of devices for which steps are cheap
 _ROUGH = 0.01  # violation that further steps can remove
 _DIFFERENCE = 1e-7
-_SAME = 1e-6  # difference of the logarithm of the square mismatch of one optimum from two starts
-_SETTLED = 1e-7  # change of the logarithm of the square mismatch at which a search ends
 
 
 def damper_rate(z: Complex, T: float) -> Complex:
@@ -84,6 +85,12 @@ class SampledLoop:
         self._rate: dict[str, Complex] = {}  # derivative of 1/V by B/delta
         self._sample("band", self.band)
         self._impose(frequencies(self.E, low=1e-3, points=80))
+
+    def fresh(self) -> Self:
+        """Return a copy to which another search may add frequencies: responses that both share are sampled once."""
+        other = copy(self)
+        other._known, other._delayed, other._rate = {}, dict(self._delayed), dict(self._rate)
+        return other
 
     def coupling(self, x: Array) -> SpringDamper:
         log_k, b = np.split(self._gains(x), 2)
@@ -244,13 +251,16 @@ class SampledLoop:
         poles = self.loop.F(self.coupling(x)).poles()
         return float(1 - _CLOSEST_POLE - np.abs(poles).max(initial=0.0))
 
-    def search(self, x: Array, most: int, curvature: Array | None = None) -> Optimum:
-        """Return the local optimum from x, by at most `most` steps; `curvature` is that of a search before."""
+    def search(self, x: Array, most: int) -> OptimizeResult:
+        """Return the local optimum from x, by at most `most` steps."""
+        from scipy.optimize import minimize  # slow to load
+
         m = self.loop.channels
-        ends = [(np.log(SOFTEST), np.log(STIFFEST))] * m + [(0.0, 20.0)] * m + [self.bounds] * self.active.size
-        low, high = np.array(ends).T
-        functions = self.square_mismatch, self.square_mismatch_slope, self.room, self.room_slope
-        return minimise(*functions, x, (low, high), most, _SETTLED, curvature)
+        bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * m + [(0.0, 20.0)] * m + [self.bounds] * self.active.size
+        condition = {"type": "ineq", "fun": self.room, "jac": self.room_slope}
+        options = {"maxiter": most, "ftol": 1e-7}
+        problem = {"bounds": bounds, "constraints": condition, "options": options}
+        return minimize(self.square_mismatch, x, jac=self.square_mismatch_slope, method="SLSQP", **problem)
 
 
 def _shared(loop: Loop) -> tuple[list[int], Array]:
@@ -401,18 +411,11 @@ class KnownDeviceLoop(SampledLoop):
 # The search, with frequencies added where a refined sweep finds a violation.
 
 
-def _optimum(sampled: SampledLoop, start: SpringDamper, below: float = np.inf) -> tuple[Array | None, int]:
-    """Return (x of a local optimum that passes the refined sweep or None, number of searches).
-
-    The search ends without a result where the square mismatch is not less than `below`, since further frequencies can
-    only raise it.
-    """
-    x, curvature = sampled.point(start), None
+def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[Array | None, int]:
+    """Return (x of a local optimum that passes the refined sweep or None, number of searches)."""
+    x = sampled.point(start)
     for searches in range(1, budgets.GAIN_ROUNDS + 1):
-        optimum = sampled.search(x, budgets.GAIN_STEPS[1 + (sampled.loop.channels <= FEW)], curvature)
-        x, curvature = optimum.x, optimum.curvature
-        if sampled.square_mismatch(x) >= below:
-            return None, searches
+        x = sampled.search(x, budgets.GAIN_STEPS[1 + (sampled.loop.channels <= FEW)]).x
         requirement = sampled.judged(x)
         if requirement.ratio <= 1 - RESERVE:
             return x, searches
@@ -424,16 +427,18 @@ def _optimum(sampled: SampledLoop, start: SpringDamper, below: float = np.inf) -
 
 
 def least_rms(
-    condition: SampledLoop, starts: Iterable[SpringDamper], band_hz: tuple[float, float] = BAND_HZ
+    sampled: Callable[[], SampledLoop], starts: Iterable[SpringDamper], band_hz: tuple[float, float] = BAND_HZ
 ) -> tuple[SpringDamper | None, float, int, Sequence[Sequence[float]] | None]:
     """Return (gains or None, rms mismatch as a ratio, number of searches, multiplier) of the best local optimum.
 
-    The frequencies that the search from one start adds also serve the later ones. For more than FEW devices, for which
-    starts hardly matter and steps are expensive, the first optimum is returned (`likeliest_first`).
+    `sampled` makes the loop, of which every start gets its own copy. For more than FEW devices, for which starts hardly
+    matter and steps are expensive, the first optimum is returned (`likeliest_first`).
     """
-    best, least, searches, multiplier, below, loop = None, np.inf, 0, None, np.inf, condition.loop
+    first = sampled()
+    best, least, searches, multiplier = None, np.inf, 0, None
     for start in starts:
-        x, runs = _optimum(condition, start, below)
+        loop = (condition := first.fresh()).loop
+        x, runs = _optimum(condition, start)
         searches += runs
         if x is None:
             continue
@@ -441,7 +446,6 @@ def least_rms(
         rms = transparency(loop.F(coupling), loop.E(), loop.lam, band_hz).rms_mismatch
         if rms < least:
             best, least, multiplier = coupling, rms, condition.multiplier(x)
-            below = condition.square_mismatch(x) - _SAME
         if loop.channels > FEW:
             break
     return best, least, searches, multiplier

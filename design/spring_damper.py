@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -309,13 +310,13 @@ def _for_this_environment(
     band = band_hz or BAND_HZ
     if band_hz and switching:
         raise ValueError("band_hz: designs for delays that vary count 0.5 to 80 Hz, ask for one of them")
-    sampled = SwitchingLoop(loop, *switching) if switching else SampledLoop(loop, band)
+    sampled = partial(SwitchingLoop, loop, *switching) if switching else partial(SampledLoop, loop, band)
     many = loop.channels > FEW
     if many:
-        starts = likeliest_first(sampled, starts)
+        starts = likeliest_first(sampled(), starts)
     coupling, rms, searches, c = (None, np.inf, 0, None) if many and limiter else least_rms(sampled, starts, band)
     if limiter:  # The result is a little softer than without limits, so the search starts there.
-        limited = LimiterLoop(loop, band)
+        limited = partial(LimiterLoop, loop, band)
         linear, before = coupling, searches
         coupling, rms, searches, c = least_rms(limited, [linear] if linear else starts, band)
         if coupling is None and linear:
@@ -351,10 +352,11 @@ def _for_known_devices(loop: Loop, starts: Sequence[SpringDamper], band_hz: tupl
         line = f"{KNOWN_DEVICE.name}: designs are made without walls; design for this-environment, and audit the result"
         raise DesignFailed(None, (), line)
     started, band = time.perf_counter(), band_hz or BAND_HZ
-    plain = least_rms(SampledLoop(loop, band), starts or _default_starts(loop), band)
+    plain = least_rms(partial(SampledLoop, loop, band), starts or _default_starts(loop), band)
     first = [plain[0]] if plain[0] else []
-    every = [*first, *(starts or _default_starts(loop))]
-    coupling, rms, searches, _ = least_rms(KnownDeviceLoop(loop, band), every, band)
+    coupling, rms, searches, _ = least_rms(
+        partial(KnownDeviceLoop, loop, band), [*first, *(starts or _default_starts(loop))], band
+    )
     searches += plain[2]
     if plain[0] and not rms < plain[1]:
         coupling, rms = plain[0], plain[1]
