@@ -250,27 +250,27 @@ def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
 # The report as a table, and its limits.
 
 
-def _tables(found: Audit) -> list[render.Table]:
+def _tables(result: Audit) -> list[render.Table]:
     from rich.table import Table
 
-    assessment, needs = found.assessment, found.assessment.requirements
+    assessment, needs = result.assessment, result.assessment.requirements
     gains = assessment.gains
     title = f" K {listed(gains['K'])} N/m, B {listed(gains['B'])} N s/m" if "K" in gains else ""
-    table = Table("", *found.margins, title=f"{assessment.coupling.kind}{title}", title_justify="left")
+    table = Table("", *result.margins, title=f"{assessment.coupling.kind}{title}", title_justify="left")
     for name, cell in _ROWS.items():
-        table.add_row(name, *(cell(needs[condition], part) for condition, part in found.margins.items()))
+        table.add_row(name, *(cell(needs[condition], part) for condition, part in result.margins.items()))
     if not assessment.ranges:
         return [table]
     rows = verdicts.range_rows(assessment.ranges)
     return [table, render.facts("the ranges around the environment", rows, left=True)]
 
 
-def _stiffest_wall(found: Audit, coupling: SpringDamper) -> str:
+def _stiffest_wall(result: Audit, coupling: SpringDamper) -> str:
     """Answer which wall may be used with the damper of the coupling."""
-    condition, damper = found.assessment.condition, f"B = {listed(coupling.B)} N s/m"
-    margin = found.margins[condition].stiffest
+    condition, damper = result.assessment.condition, f"B = {listed(coupling.B)} N s/m"
+    margin = result.margins[condition].stiffest
     if None in margin.K:
-        if found.assessment.requirements[condition].certified:  # so at least this wall is
+        if result.assessment.requirements[condition].certified:  # so at least this wall is
             return f"The stiffest wall with {damper} was not found: {margin.reason}."
         return f"No wall with {damper} was found to be certified: {margin.reason}."
     return f"The stiffest wall with {damper}: {_stiffest(margin.K)} ({condition})."
@@ -336,13 +336,13 @@ def _proposed(helps: Sequence[Help]) -> Iterator[str]:
         yield f"What helps: {each.change} ({needs})."
 
 
-def _switching_remarks(found: Switching) -> Iterator[str]:
-    needs, buffered = found.requirement, found.playout
-    span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(found.lo, found.hi, strict=True))
+def _switching_remarks(switching: Switching) -> Iterator[str]:
+    needs, buffered = switching.requirement, switching.playout
+    span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(switching.lo, switching.hi, strict=True))
     yield f"Any switching of the delays ({span} samples) needs {render.needs(needs)}: {render.certified(needs)}."
     if buffered is None:
         yield f"any switching: {needs.reason}."
         return
     enough = "certified" if buffered.certified else "not certified"
     needed = listed(buffered.required_damping)
-    yield f"A playout buffer to the constant {listed(found.hi)} needs {needed} N s/m: {enough}."
+    yield f"A playout buffer to the constant {listed(switching.hi)} needs {needed} N s/m: {enough}."

@@ -44,9 +44,9 @@ def main(argv: list[str]) -> int:
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
     at_once = args.latch == "arrival" or session_cli.host_clocked(args)  # a host that is the clock sends at once
     if at_once and args.condition:
-        asked, late = named(args.condition), ((0.0, scenario.T / 2),) * scenario.channels
-        if reason := asked.beyond(msgspec.structs.replace(scenario.loop(args.case), latency=late)):
-            raise InputError(f"--latch arrival with --condition {asked.name}: {reason}")
+        choice, late = named(args.condition), ((0.0, scenario.T / 2),) * scenario.channels
+        if reason := choice.beyond(msgspec.structs.replace(scenario.loop(args.case), latency=late)):
+            raise InputError(f"--latch arrival with --condition {choice.name}: {reason}")
     start = world_start(args) if is_world(scenario) else START_J
     if is_world(scenario):
         args.energy_budget = None  # the account is that of the contacts
@@ -71,8 +71,8 @@ def main(argv: list[str]) -> int:
 
     def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
         met, link = timed(scenario, ages, args.quantile, 1e6 * args.guard, at_once)
-        asked = args.case, args.coupling, args.condition
-        programs = certified_couplings(met, *asked, link, limiter=args.limiter, start=start, behind=behind)
+        choice = args.case, args.coupling, args.condition
+        programs = certified_couplings(met, *choice, link, limiter=args.limiter, start=start, behind=behind)
         _print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         return programs
 
@@ -146,13 +146,13 @@ def _print_certificate(
 def _certified(program: CertifiedCoupling) -> tuple[str, ...]:
     """Return the row of a coupling with the first condition that certifies it."""
     assessment = program.assessment
-    gains, asked = assessment.gains, (assessment.decisive, *assessment.requirements.values())
-    found = next(need for need in asked if need.certified)
+    gains, requirements = assessment.gains, (assessment.decisive, *assessment.requirements.values())
+    certified = next(need for need in requirements if need.certified)
     return (
         f"{program.chosen.kind}, theta = {', '.join(map(str, program.scenario.theta))}",
         *(listed(gains[name], 5) if name in gains else "-" for name in "KB"),
-        f"{listed(found.required, 5)} ({found.condition}, {found.proof})",
-        listed(found.available, 5),
+        f"{listed(certified.required, 5)} ({certified.condition}, {certified.proof})",
+        listed(certified.available, 5),
         assessment.guarantee.words if assessment.guarantee else "none",
     )
 

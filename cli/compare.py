@@ -79,9 +79,9 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario) -> int:
     return options.exit_code(True)
 
 
-def _nearest(made: Sequence[Alternative]) -> str:
+def _nearest(couplings: Sequence[Alternative]) -> str:
     """Return the verdict: which coupling with a guarantee has the least force error."""
-    guaranteed = [each for each in made if each.guarantee]
+    guaranteed = [each for each in couplings if each.guarantee]
     if not guaranteed:
         return "No coupling of the table has a guarantee."
     best = min(guaranteed, key=lambda each: math.inf if each.force_error_percent is None else each.force_error_percent)
@@ -90,9 +90,9 @@ def _nearest(made: Sequence[Alternative]) -> str:
     return f"Nearest to the object with a guarantee ({best.guarantee}): {best.name}, {felt}."
 
 
-def _beside(made: Sequence[Alternative], own: Condition | None) -> render.Table:
+def _beside(couplings: Sequence[Alternative], own: Condition | None) -> render.Table:
     names, cells = [*PLAIN_CONDITIONS, *([own.name] if own else [])], []
-    for each in made:
+    for each in couplings:
         if each.reason:
             cells.append((each.name, *[""] * len(names), f"not possible: {each.reason}", "", ""))
             continue
@@ -105,12 +105,12 @@ def _beside(made: Sequence[Alternative], own: Condition | None) -> render.Table:
     return render.grid(title, heads, cells, left=(0, heads.index("guarantee")))
 
 
-def _side_by_side(made: Sequence[Alternative], path: Path, names: tuple[str, ...]) -> Path:
+def _side_by_side(couplings: Sequence[Alternative], path: Path, names: tuple[str, ...]) -> Path:
     from haptic_loop.sim.plots import Panel, plot_side_by_side
 
     panels = [
         Panel(_panel_title(each), each.trace, each.ideal, each.until_s)
-        for each in made
+        for each in couplings
         if each.trace is not None and each.ideal is not None and each.coupling != "published"
     ]
     return plot_side_by_side(panels, path, names)

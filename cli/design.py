@@ -188,7 +188,7 @@ _SHARES, _BISECTIONS = (1.0, 0.75, 0.5, 0.35, 0.2, 0.1), 4
 
 
 def _that_decays(
-    scenario: Scenario, loop: Loop, made: Callable[[Loop], Design], ratio: float
+    scenario: Scenario, loop: Loop, make: Callable[[Loop], Design], ratio: float
 ) -> tuple[Design, Ringing | None]:
     """Design for less and less damping, which gives softer couplings, until every mode has this damping ratio.
 
@@ -199,7 +199,7 @@ def _that_decays(
 
     def attempt(share: float) -> tuple[Design, Ringing]:
         part = msgspec.structs.replace(loop, delta=tuple(share * delta for delta in loop.delta))
-        design = made(part)
+        design = make(part)
         if share < 1:
             needs = named(design.asked).judge(loop.at(loop.environment), design.coupling)
             design = replace(design, requirement=needs, certificate=None)
@@ -210,17 +210,17 @@ def _that_decays(
     tried: list[Ringing] = []
     outside = 1.0
     for share in _SHARES:
-        found = attempt(share)
-        tried.append(found[1])
-        if found[1].least_damping_ratio >= ratio:
+        decaying = attempt(share)
+        tried.append(decaying[1])
+        if decaying[1].least_damping_ratio >= ratio:
             inside = share
             for _ in range(_BISECTIONS if share < 1 else 0):
                 between = attempt((inside + outside) / 2)
                 if between[1].least_damping_ratio >= ratio:
-                    inside, found = (inside + outside) / 2, between
+                    inside, decaying = (inside + outside) / 2, between
                 else:
                     outside = (inside + outside) / 2
-            return found
+            return decaying
         outside = share
     best = max(tried, key=lambda each: each.least_damping_ratio)
     reached = (
@@ -264,12 +264,12 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
     switching = coverage.Switching.of(loop, design.coupling, known) if loop.varying_delay else None
     chosen_options = Options(**_asked_of(args, "optimal")) if best else DEFAULT
     nearby, limit, interrupted = Nearby(), None, False
-    kept = f"{stored.file} is stored (Ctrl-C leaves out what follows)"
+    note = f"{stored.file} is stored (Ctrl-C leaves out what follows)"
     try:
         if best:
-            with render.progress(f"{kept}: working out the bound"):
+            with render.progress(f"{note}: working out the bound"):
                 limit = BoundBeside.of(loop, best, best.figures.rms_mismatch_db, band, chosen_options)
-        with render.progress(f"{kept}: working out robustness and its price"):
+        with render.progress(f"{note}: working out robustness and its price"):
             nearby = nearby_of(loop, design.coupling, chosen_options, named(design.asked))
     except KeyboardInterrupt:
         interrupted = True

@@ -47,9 +47,9 @@ def main(argv: list[str]) -> int:
     return options.DONE
 
 
-def _verdict(found: list[Growth]) -> str:
+def _verdict(growths: list[Growth]) -> str:
     """Return whether an oscillation grows in any part of the trace."""
-    rates = [one for one in found if one.trend]
+    rates = [one for one in growths if one.trend]
     if not rates:
         return "No growth rate can be given."
     words = {"grows": "An oscillation grows", "neither": "An oscillation neither grows nor decays"}

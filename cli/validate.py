@@ -119,17 +119,17 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     return scenario
 
 
-def _environments(args: argparse.Namespace, whole: RangesResult | None) -> tuple[Member, ...]:
+def _environments(args: argparse.Namespace, ranges: RangesResult | None) -> tuple[Member, ...]:
     """Return the vertices of the ranges and as many other points, the worst one first. Raises InputError.
 
     Without `--environments ranges` the result is empty, and every loop has the nominal environment.
     """
     if args.environments == "nominal":
         return ()
-    if whole is None:
+    if ranges is None:
         raise InputError(f"--environments {args.environments}: the scenario has no ranges (docs/scenario.md, [ranges])")
-    others = (whole.searched.worst[0].member, *whole.samples)
-    return (*whole.members, *others[: len(whole.members)])
+    others = (ranges.searched.worst[0].member, *ranges.samples)
+    return (*ranges.members, *others[: len(ranges.members)])
 
 
 def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, assessment: Assessment) -> Validation:

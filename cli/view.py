@@ -155,7 +155,7 @@ class _Report:
 
 
 def _parser() -> options.Parser:
-    keys = ", ".join(f"{name} {word}" for name, word in keys_help(given=True))
+    keys = ", ".join(f"{name} {word}" for name, word in keys_help(with_file=True))
     parser = options.Parser(
         "sim.view",
         f"Feel the loop in a window, or film it.\n\nKeys: {keys}.",

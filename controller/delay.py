@@ -189,7 +189,7 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         lost = (delays == LOST) | (rng.random(delays.shape) < self.loss)
         return np.where(lost, LOST, np.array(self.hi) if self.playout else delays)
 
-    def _delays(self, rng: np.random.Generator, ticks: int, given: ArrayLike | None) -> Ticks:
+    def _delays(self, rng: np.random.Generator, ticks: int, recorded: ArrayLike | None) -> Ticks:
         lo, hi = np.array(self.lo), np.array(self.hi)
         match self.pattern:
             case "random":
@@ -200,9 +200,9 @@ class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             case "recorded":
                 return np.resize(np.array(self.recorded, dtype=np.int64), (ticks, lo.size))
             case "constant" | "adversarial":
-                if given is None:
+                if recorded is None:
                     raise ValueError(f"the {self.pattern} pattern depends on the loop: give its delays")
-                return np.resize(np.asarray(given, dtype=np.int64), (ticks, lo.size))
+                return np.resize(np.asarray(recorded, dtype=np.int64), (ticks, lo.size))
 
     def _bursts(self, rng: np.random.Generator, ticks: int) -> NDArray[np.bool_]:
         """Return where (ticks, m) a packet is in a burst: two states per channel, geometric stretches, calm first."""

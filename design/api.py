@@ -126,8 +126,8 @@ def certify(loop: Loop, coupling: Coupling | Design, condition: Condition | None
     of_kind("loop", loop, Loop, _LOOP)
     own = coupling.own if isinstance(coupling, Design) else None
     alone = fitting(loop, coupling)
-    _, asked = name_and_own(condition)
-    requirements: dict[str, Requirement[str]] = dict(requirements_of(loop, alone, own=asked or own))
+    _, own_condition = name_and_own(condition)
+    requirements: dict[str, Requirement[str]] = dict(requirements_of(loop, alone, own=own_condition or own))
     over = (THIS_ENVIRONMENT, KNOWN_DEVICE) if loop.known_devices else (THIS_ENVIRONMENT,)
     for each in over if loop.ranges else ():
         ranges = check_ranges(loop, alone, samples=0, condition=each)

@@ -49,15 +49,15 @@ _Asked = ConditionName | Condition
 
 def requirement(loop: Loop, coupling: Coupling, condition: _Asked) -> Requirement:
     """Return the damping that the condition requires of the devices."""
-    asked = named(condition)
+    resolved = named(condition)
     try:
-        return asked.judge(loop, coupling)
+        return resolved.judge(loop, coupling)
     except (TooLong, InputError):
         raise
     except ValueError as error:  # no solution of the algebraic loop
         if place_of(error):  # an error in the user's own code
             raise
-        return refusal(asked.name, loop.delta, str(error))
+        return refusal(resolved.name, loop.delta, str(error))
 
 
 def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any) -> Requirement:
@@ -127,20 +127,20 @@ class _Sensitivity:
 
 def stiffest(loop: Loop, coupling: Coupling, condition: _Asked) -> _Stiffest:
     """Return the largest certified K: a common scale, or channel by channel if the condition is separable."""
-    unknown, asked = (None,) * loop.channels, named(condition)
+    unknown, resolved = (None,) * loop.channels, named(condition)
     gains = coupling.figures(loop.T)
     if "K" not in gains:
         return _Stiffest(unknown, "only a spring-damper has a K")
-    if asked.separable:
-        reason = asked.not_varied(loop) or asked.beyond(loop)
-        return _Stiffest(unknown, reason) if reason else _stiffest_of_each(loop, gains["B"], asked)
-    if reason := asked.not_varied(loop):
+    if resolved.separable:
+        reason = resolved.not_varied(loop) or resolved.beyond(loop)
+        return _Stiffest(unknown, reason) if reason else _stiffest_of_each(loop, gains["B"], resolved)
+    if reason := resolved.not_varied(loop):
         return _Stiffest(unknown, reason)
     K = np.array(gains["K"])
 
     @cache
     def ratio(scale: float) -> float:
-        return requirement(loop, coupling.scaled(stiffness=scale), asked).ratio
+        return requirement(loop, coupling.scaled(stiffness=scale), resolved).ratio
 
     scale = _STIFFEST / K.max()
     if suffices(ratio(scale)):
@@ -174,14 +174,14 @@ def _stiffest_of_each(loop: Loop, dampers: Sequence[float], condition: Condition
 
 def sensitivity(loop: Loop, coupling: Coupling, condition: _Asked) -> _Sensitivity:
     """Return the errors in delta, T and delay that the certificate of this condition tolerates."""
-    asked, needs = named(condition), requirement(loop, coupling, condition)
+    resolved, needs = named(condition), requirement(loop, coupling, condition)
     if not needs.certified:
         return _Sensitivity(reason=_NOT_CERTIFIED)
-    if reason := asked.not_varied(loop):
+    if reason := resolved.not_varied(loop):
         return _of_delta(needs, reason)
     fixed = loop.environment.one_period
-    largest = None if fixed else _largest_period(loop, coupling, asked)
-    extra = _extra_samples(loop, coupling, asked)
+    largest = None if fixed else _largest_period(loop, coupling, resolved)
+    extra = _extra_samples(loop, coupling, resolved)
     tried = "environment.block is of one T" if fixed else f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s"
     reasons = [
         tried if largest is None else "",
@@ -281,20 +281,20 @@ class _Remedy:
 
 def remedies(loop: Loop, coupling: Coupling, condition: _Asked) -> list[_Remedy]:
     """Return single changes that certify or lower the requirement by 10 %; [] for a certified coupling."""
-    asked, needs = named(condition), requirement(loop, coupling, condition)
-    if needs.certified or asked.not_varied(loop):
+    resolved, needs = named(condition), requirement(loop, coupling, condition)
+    if needs.certified or resolved.not_varied(loop):
         return []
-    candidates = [_fewer_samples(loop, coupling, asked, name) for name in ("theta", "psi")]
+    candidates = [_fewer_samples(loop, coupling, resolved, name) for name in ("theta", "psi")]
     if any(B := coupling.figures(loop.T).get("B", ())):
         candidates.append(
             _smaller(
-                lambda x: requirement(loop, coupling.scaled(damping=x), asked),
+                lambda x: requirement(loop, coupling.scaled(damping=x), resolved),
                 lambda x: f"smaller B: {listed([x * b for b in B], 5)} N s/m",
             )
         )
     candidates.append(
         _smaller(
-            lambda x: _at_period(loop, coupling, asked, x * loop.T),
+            lambda x: _at_period(loop, coupling, resolved, x * loop.T),
             lambda x: f"faster: T = {1e3 * x * loop.T:.5g} ms",
         )
     )
@@ -422,6 +422,6 @@ def _margins(loop: Loop, coupling: Coupling, condition: Condition, needs: Requir
 
 def _helps(loop: Loop, coupling: Coupling, condition: Condition) -> list[Help]:
     """Return changes that help a condition that does not hold."""
-    found = _in_time(loop, coupling, lambda: remedies(loop, coupling, condition), lambda why: [])
-    asked = ((remedy.change, remedy.requirement) for remedy in found)
-    return [Help(change, condition.name, after.required, after.certified) for change, after in asked]
+    helpful = _in_time(loop, coupling, lambda: remedies(loop, coupling, condition), lambda why: [])
+    pairs = ((remedy.change, remedy.requirement) for remedy in helpful)
+    return [Help(change, condition.name, after.required, after.certified) for change, after in pairs]

@@ -105,24 +105,24 @@ def prove(
     """
     import scipy
 
-    asked, coupling = named(condition), filed(loop, coupling)
-    requirement, proof = _proof(asked, loop, coupling, multiplier, swept)
+    resolved, coupling = named(condition), filed(loop, coupling)
+    requirement, proof = _proof(resolved, loop, coupling, multiplier, swept)
     certificate = sealed(
         Certificate(
-            condition=asked.base,
-            facts=asked.fact_names(loop),
+            condition=resolved.base,
+            facts=resolved.fact_names(loop),
             required=requirement.required,
             available=loop.delta,
             margin=_margin(requirement),
-            guarantee=asked.guarantee(loop),
+            guarantee=resolved.guarantee(loop),
             proof="rational",
-            multipliers=asked.parameters(loop) | asked.by_name(loop, requirement.multiplier or ()),
+            multipliers=resolved.parameters(loop) | resolved.by_name(loop, requirement.multiplier or ()),
             matrices=proof,
             scenario=digest(loop, coupling.form()),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
         )
     )
-    if _is_ours(asked):
+    if _is_ours(resolved):
         _made.add(certificate.seal)
     return certificate
 
@@ -170,9 +170,9 @@ def judged(
     loop: Loop, coupling: Coupling, condition: str | Condition, multiplier: Sequence[Any] | None = None
 ) -> Requirement:
     """Return the requirement of a condition; its `proof` is "rational" if it is proved exactly."""
-    asked, coupling = named(condition), filed(loop, coupling)
-    needs = required_damping(loop, coupling, asked, multiplier)
-    return _with_proof(loop, coupling, asked, needs)
+    resolved, coupling = named(condition), filed(loop, coupling)
+    needs = required_damping(loop, coupling, resolved, multiplier)
+    return _with_proof(loop, coupling, resolved, needs)
 
 
 def _with_proof(loop: Loop, coupling: Coupling, condition: Condition, needs: Requirement) -> Requirement:
@@ -312,12 +312,12 @@ def verify(stored: Stored, condition: Condition | None = None) -> Verdict:
         return Verdict(False, f"the certificate is of {certificate.condition!r}, not of {condition.name!r}")
     coupling = stored.built()
     try:
-        asked = condition_of(certificate, condition)
+        resolved = condition_of(certificate, condition)
         with _in_time():
-            _check(loop, coupling, asked, certificate)
+            _check(loop, coupling, resolved, certificate)
     except ValueError as refused:  # NotProved, or a user's own condition
         return Verdict(False, str(refused))
-    if _is_ours(asked):
+    if _is_ours(resolved):
         _made.add(certificate.seal)
     return Verdict(True)
 
@@ -379,13 +379,13 @@ def _check_part(
     return replace(requirement, proof="rational")
 
 
-def _other_figures(claim: Certificate, found: Requirement) -> str | None:
+def _other_figures(claim: Certificate, needed: Requirement) -> str | None:
     """Return a message if the figures on file differ from those of the sweep, or None."""
-    required = found.required
+    required = needed.required
     if len(claim.required) != len(required) or not np.allclose(claim.required, required, rtol=_CLAIM_TOLERANCE):
         return f"required is {list(claim.required)}, the sweep finds {list(required)}"
-    if not np.isclose(claim.margin, _margin(found), rtol=_CLAIM_TOLERANCE):
-        return f"margin is {claim.margin:.9g}, the sweep finds {_margin(found):.9g}"
+    if not np.isclose(claim.margin, _margin(needed), rtol=_CLAIM_TOLERANCE):
+        return f"margin is {claim.margin:.9g}, the sweep finds {_margin(needed):.9g}"
     return None
 
 

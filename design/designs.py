@@ -124,15 +124,15 @@ def design_by_kind(
     """
     name, own = name_and_own(condition)
     if kind not in KINDS and ":" in kind:
-        found = own_coupling(kind, loop)
-        if not isinstance(found, Design):
-            raise ValueError(f"coupling {kind} is {found!r} for this loop, expected a design.result.Design")
+        own_design = own_coupling(kind, loop)
+        if not isinstance(own_design, Design):
+            raise ValueError(f"coupling {kind} is {own_design!r} for this loop, expected a design.result.Design")
         if own:
-            needs = own.judge(loop.at(loop.environment), found.coupling)
-            return replace(found, condition=own.name, own=own, requirement=needs, phi=None)
-        if name not in (None, found.condition):
-            raise ValueError(f"condition is {condition!r}, but {kind} is designed for {found.condition}")
-        return found
+            needs = own.judge(loop.at(loop.environment), own_design.coupling)
+            return replace(own_design, condition=own.name, own=own, requirement=needs, phi=None)
+        if name not in (None, own_design.condition):
+            raise ValueError(f"condition is {condition!r}, but {kind} is designed for {own_design.condition}")
+        return own_design
     if kind not in KINDS:
         raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)} and FILE.py:NAME of your own")
     chosen = KINDS[kind]
@@ -140,10 +140,11 @@ def design_by_kind(
         able = ", ".join(other for other in KINDS if KINDS[other].softened)
         why = f"for which {able} and functions of your own can be designed, not {kind}; a FILE.json is judged by it"
         raise ValueError(f"condition is {own.name}, {why}")
-    asked, able = usual_condition(loop, kind) if own or not name else name, {c.name: c for c in chosen.conditions}
-    if asked not in able:
-        raise ValueError(f"condition is {asked!r}, for {kind} allowed are {', '.join(able)}")
-    made_for = able[asked]
+    condition_name = usual_condition(loop, kind) if own or not name else name
+    able = {c.name: c for c in chosen.conditions}
+    if condition_name not in able:
+        raise ValueError(f"condition is {condition_name!r}, for {kind} allowed are {', '.join(able)}")
+    made_for = able[condition_name]
     if loop.levels and (reason := made_for.beyond(loop)):
         raise ValueError(reason)
     if loop.levels and kind != "moving-average":
@@ -156,20 +157,20 @@ def design_by_kind(
         raise ValueError(f"{reason}{_instead(loop, 'without --limiter', kind, **with_less)}")
     further = {"condition": made_for.name, "progress": progress}
     further = {name: value for name, value in further.items() if name in chosen.takes}
-    made = partial(getattr(import_module(f"haptic_loop.design.{chosen.module}"), chosen.function), **further, **options)
+    make = partial(getattr(import_module(f"haptic_loop.design.{chosen.module}"), chosen.function), **further, **options)
 
     if loop.latency and (reason := made_for.beyond(loop)):
         raise ValueError(f"latency: {reason}")
     if kind != "moving-average" and _without_force(loop):
         raise ValueError(f"{NO_FORCE}, or take moving-average")
     if own:
-        return replace(_with_less_damping(loop, made, own), condition=own.name, own=own, phi=None)
+        return replace(_with_less_damping(loop, make, own), condition=own.name, own=own, phi=None)
     anywhere = made_for.guarantee(loop) == ANY
     if anywhere and (loop.latency or loop.varying_delay) and kind != "moving-average":
-        return _with_less_damping(loop, made, made_for)
+        return _with_less_damping(loop, make, made_for)
     if chosen.model or anywhere or not (loop.latency or loop.environment.walls):
-        return made(loop)
-    return _with_less_damping(loop, made, made_for)
+        return make(loop)
+    return _with_less_damping(loop, make, made_for)
 
 
 def _without_force(loop: Loop) -> bool:
@@ -250,8 +251,8 @@ def _before_walls(loop: Loop) -> str:
         f"--coupling {kind} --condition {ANY_ENVIRONMENT.name}": kind for kind in ("spring-damper", "moving-average")
     }
     for words, kind in others.items():
-        if found := _instead(loop, words, kind, condition=ANY_ENVIRONMENT.name):
-            return found
+        if suffix := _instead(loop, words, kind, condition=ANY_ENVIRONMENT.name):
+            return suffix
     words = "--coupling spring-damper --condition this-environment"
     tried = f"; tried and not certified either: {', '.join((*others, words))}"
     return _instead(loop, words, "spring-damper", condition=THIS_ENVIRONMENT.name) or tried

@@ -112,10 +112,10 @@ class Multiplied(Condition):
         unknowns, delta = self.unknowns(loop), loop.delta
         values = tuple(float(v) for v in (self.usual(G, loop) if multiplier is None else multiplier))
         self.check(loop, values)
-        asked = self.is_demand(self.block(G, loop, values))
-        if reason := unsound(asked.free, delta) or self.unsound_static(G, loop, asked):
+        demand = self.is_demand(self.block(G, loop, values))
+        if reason := unsound(demand.free, delta) or self.unsound_static(G, loop, demand):
             return replace(refusal(self.name, delta, reason), multiplier=values)
-        search, bound = _Search(self, G, loop, asked), None
+        search, bound = _Search(self, G, loop, demand), None
         if multiplier is None and search.pays:
             bound, values = search.best(values)
         ratio, w = search.swept(values)
@@ -123,8 +123,8 @@ class Multiplied(Condition):
             names = ", ".join(each.name for each in unknowns)
             reason = f"no multiplier {names} that was found proves it, whatever the damping"
             return replace(refusal(self.name, delta, reason), multiplier=values)
-        found = from_ratio(self.name, max(ratio, 0.0), tuple(delta), w / (2 * np.pi * loop.T))
-        return replace(found, multiplier=values, bound=bound and min(bound, ratio))
+        needed = from_ratio(self.name, max(ratio, 0.0), tuple(delta), w / (2 * np.pi * loop.T))
+        return replace(needed, multiplier=values, bound=bound and min(bound, ratio))
 
     def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:
         """Return the reason why the block's static matrices violate it by more than rounding, or None."""
@@ -184,8 +184,8 @@ class _Search:
     def swept(self, values: Sequence[float]) -> tuple[float, float]:
         """Return (required over available damping at these values, its frequency [rad/sample]), by a refined sweep."""
         if self._last is None or self._last[0] != values:
-            asked = self._block(values)
-            self._last = values, supremum(lambda w: least_scale(asked, w), self._grid)
+            demand = self._block(values)
+            self._last = values, supremum(lambda w: least_scale(demand, w), self._grid)
         return self._last[1]
 
     def best(self, values: Sequence[float]) -> tuple[float, tuple[float, ...]]:
@@ -248,11 +248,11 @@ class _Search:
 
     def _worst(self, values: Sequence[float], bound: float) -> tuple[float, Array]:
         """Return (largest ratio at these values with the spare kept, frequencies to add); none at the bound."""
-        asked = self._block(values)
-        asked = replace(asked, free=asked.free - self._spare) if self._spare.any() else asked
+        demand = self._block(values)
+        demand = replace(demand, free=demand.free - self._spare) if self._spare.any() else demand
 
         def needed(w: Array) -> Array:
-            return least_scale(asked, w)
+            return least_scale(demand, w)
 
         w = peaks(needed, self._grid, -np.inf, near=_NEAR)
         at = needed(w)

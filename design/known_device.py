@@ -646,15 +646,15 @@ class KnownDevice(Condition):
         plain = replace(plain, condition=self.name, multiplier=(*(0.0,) * 3 * m, *(plain.multiplier or ())))
         if plain.reason or multiplier is not None:
             return plain
-        found = self.sweep(loop, coupling).best(min(plain.ratio, _MOST_SHARE))
-        if not found.share < plain.ratio:
+        best = self.sweep(loop, coupling).best(min(plain.ratio, _MOST_SHARE))
+        if not best.share < plain.ratio:
             return plain
         bounds = (0.0,) * 2 * m
-        if suffices(found.share):
-            below, above = q_bounds(loop, [rational(b) for b in found.beta])
+        if suffices(best.share):
+            below, above = q_bounds(loop, [rational(b) for b in best.beta])
             bounds = below + above
-        requirement = from_ratio(self.name, found.share, loop.delta, found.w / (2 * np.pi * loop.T))
-        return replace(requirement, multiplier=(*found.beta, *bounds, *found.values))
+        requirement = from_ratio(self.name, best.share, loop.delta, best.w / (2 * np.pi * loop.T))
+        return replace(requirement, multiplier=(*best.beta, *bounds, *best.values))
 
     def _at(self, loop: Loop, coupling: Coupling, multiplier: tuple[float, ...]) -> Requirement:
         """Return the requirement at the beta and multipliers given."""

@@ -404,12 +404,12 @@ class _AnyEnvironment(Multiplied):
             alpha = [float(f"{stiffest_alpha(*span, d):.10g}") for span, d in zip(spans, mean, strict=True)]
             closed = self.required_of(V, loop, alpha)  # A search finds no room near the stiffest coupling.
             return min(needs, replace(closed, bound=needs.bound), key=lambda requirement: requirement.ratio)
-        asked = self.block(V, loop)
+        demand = self.block(V, loop)
         if not V.is_stable():
             return refusal(self.name, loop.delta, "the coupling V has a pole on or outside the unit circle")
-        if reason := unsound(asked.free, loop.delta) or self.unsound_static(V, loop, asked):
+        if reason := unsound(demand.free, loop.delta) or self.unsound_static(V, loop, demand):
             return refusal(self.name, loop.delta, reason)
-        ratio, w = supremum(partial(conditions.least_scale, asked), np.concatenate([[0.0], frequencies(V)]))
+        ratio, w = supremum(partial(conditions.least_scale, demand), np.concatenate([[0.0], frequencies(V)]))
         return from_ratio(self.name, ratio, loop.delta, w / (2 * np.pi * loop.T))
 
     def unsound_static(self, G: Lti, loop: Loop, asked: Demand[Lti]) -> str | None:

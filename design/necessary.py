@@ -141,12 +141,12 @@ def left_over(loop: Loop, coupling: Coupling, proved: Requirement | None = None)
     if not all(F.is_stable() for F in maps):
         return None
     each, proved = [necessary_share(F, loop) for F in maps], proved or KNOWN_DEVICE.judge(loop, coupling)
-    found = max(each, key=lambda one: one.share)
-    if not (all(one.held for one in each) and np.isfinite(found.share)):
+    largest = max(each, key=lambda one: one.share)
+    if not (all(one.held for one in each) and np.isfinite(largest.share)):
         return None
-    needed = tuple(found.share * d for d in loop.delta)
-    asked = proved.required if np.isfinite(proved.ratio) else None
-    return LeftOver(needed, found.w / (2 * np.pi * loop.T), equal, asked)
+    needed = tuple(largest.share * d for d in loop.delta)
+    required = proved.required if np.isfinite(proved.ratio) else None
+    return LeftOver(needed, largest.w / (2 * np.pi * loop.T), equal, required)
 
 
 def _stable_with_held_ends(F: Lti, loop: Loop, share: float) -> bool:

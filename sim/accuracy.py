@@ -267,11 +267,11 @@ def credible(simulation: Simulation, trace: Trace) -> Credible:
     return credible_part if until is None else replace(credible_part, reason=_not_credible(credible_part, until))
 
 
-def _not_credible(found: Credible, until: float) -> str:
+def _not_credible(credible: Credible, until: float) -> str:
     """Return one sentence for report and caption."""
-    pairs = zip(found.transmission_force_n, found.credible_force_n, strict=True)
+    pairs = zip(credible.transmission_force_n, credible.credible_force_n, strict=True)
     carried = max(((f, c) for f, c in pairs if f is not None and c), key=lambda pair: pair[0] / pair[1], default=None)
-    speeds = zip(found.motor_speed_m_per_s, found.credible_speed_m_per_s, strict=True)
+    speeds = zip(credible.motor_speed_m_per_s, credible.credible_speed_m_per_s, strict=True)
     speed, most = max(speeds, key=lambda pair: pair[0] / pair[1])
     what = f"a motor moves at up to {speed:.2g} m/s (credible: {most:g})"
     if carried:

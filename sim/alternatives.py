@@ -87,11 +87,11 @@ def alternatives(
         raise InputError("varying_delay: the table of couplings is for constant delays; give --coupling NAME,..")
     case = "I" if case == "none" else case
     rows = [row for row in _ROWS if _possible(scenario, case, *row)]
-    made = []
+    designs = []
     for i, row in enumerate(rows):
         progress(i, len(rows))
-        made.append(_alternative(scenario, case, *row, also))
-    return made
+        designs.append(_alternative(scenario, case, *row, also))
+    return designs
 
 
 def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -> bool:

@@ -81,8 +81,8 @@ def _choose(
             raise InputError(f"--coupling published: the paper prints gains for 2 channels, not {scenario.channels}")
         return Chosen(PUBLISHED[case], condition or ANY_ENVIRONMENT.name, kind=name)
     if name not in KINDS and ":" in name:
-        made = own_of(name, scenario.loop(case))
-        return replace(made, condition=condition or made.condition)
+        coupled = own_of(name, scenario.loop(case))
+        return replace(coupled, condition=condition or coupled.condition)
     if name in KINDS:
         loop = scenario.loop(case)
         condition = condition or usual_condition(loop, name)

@@ -293,14 +293,14 @@ class _Access:
 
         def advance(k: int) -> None:
             self.ctrl[...] = inputs[k]
-            asked, held = inputs[k][len(self.ctrl) - m :], buffer.plant_state[k][states:].reshape(forces.shape)
+            wanted, held = inputs[k][len(self.ctrl) - m :], buffer.plant_state[k][states:].reshape(forces.shape)
             rows[k + 1][...] = rows[k]
             for seconds, waiting in kinds[which[(buffer.first + k) % len(which)]]:
-                forces[...] = asked
+                forces[...] = wanted
                 forces[waiting] = held[waiting]
                 self._move_by(seconds, rows[k + 1])
             if m:
-                buffer.plant_state[k + 1][states:] = asked.reshape(m, -1)
+                buffer.plant_state[k + 1][states:] = wanted.reshape(m, -1)
 
         return advance
 
@@ -452,8 +452,8 @@ class MujocoBatchEngine:
         time, motion = (mujoco.mj_stateSize(model, part) for part in (before, moved))
 
         # Runge-Kutta asks for no matrix of bodies alone
-        asked = integrator == EXPONENTIAL or held_by.impedances
-        plants = held_by.plants() if asked else _stacked(held_by.scene.plant)
+        exact_step = integrator == EXPONENTIAL or held_by.impedances
+        plants = held_by.plants() if exact_step else _stacked(held_by.scene.plant)
 
         def move(h: float) -> Product:
             return _product_of_each(exponential_step(plants.A, h, model.nv, plants.felt))

@@ -191,9 +191,9 @@ def _answer(forces: Any, channels: int) -> Array:
 class _Shelled(_InLoop):
     """An environment of the user's own, its force within the actuators' limits, and the shell."""
 
-    def __init__(self, shell: Shell, asked: Plugged, process: Process) -> None:
+    def __init__(self, shell: Shell, plugged: Plugged, process: Process) -> None:
         super().__init__(process)
-        self._shell, self._asked = shell, asked
+        self._shell, self._asked = shell, plugged
 
     def send(self, x: Array, force: Array, /) -> None:
         free = self._shell.free(x)

@@ -380,10 +380,10 @@ def engine_name(engine: AnyEngine) -> str:
 
 def _own_engine(simulation: Simulation, engine: Engine | Callable[[Simulation], Engine]) -> Engine:
     name, is_made = f"engine {engine_name(engine)}", hasattr(engine, "start") and not isinstance(engine, type)
-    made: Any = engine if is_made or not callable(engine) else called(name, engine, simulation)
-    if lacking := [part for part in ("start", "troubled") if not callable(getattr(made, part, None))]:
+    own_engine: Any = engine if is_made or not callable(engine) else called(name, engine, simulation)
+    if lacking := [part for part in ("start", "troubled") if not callable(getattr(own_engine, part, None))]:
         has = "expected what has start(buffer), advance(k) and troubled() (sim.engines.Engine)"
         raise InputError(f"{name} has no {' and no '.join(lacking)}: {has}")
-    if simulation.timing and not type(made).__module__.startswith("haptic_loop."):
+    if simulation.timing and not type(own_engine).__module__.startswith("haptic_loop."):
         raise InputError(f"{name}: uneven ticks (period, latency) run in {' and '.join(ENGINES)}")
-    return made
+    return own_engine

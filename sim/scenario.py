@@ -660,7 +660,7 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
         devices = [devices] * (len(contacts) if isinstance(contacts, list) else 1)
     if not isinstance(devices, list):
         return raw
-    made = []
+    tables = []
     for i, one in enumerate(devices, start=1):
         fields = {"device": one} if isinstance(one, str) else one
         if isinstance(fields, dict) and isinstance(name := fields.get("device"), str):
@@ -668,8 +668,8 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
                 fields = fields_of(name, {key: value for key, value in fields.items() if key != "device"})
             except ValueError as error:
                 raise InputError(f"device #{i}: {error}") from None
-        made.append(fields)
-    return raw | {"device": made}
+        tables.append(fields)
+    return raw | {"device": tables}
 
 
 def _in_space(raw: dict[str, Any]) -> dict[str, Any]:
@@ -785,9 +785,9 @@ def world_environment(table: dict[str, Any], folder: Path = Path()) -> Network:
         raise InputError(str(error)) from None
 
 
-def _without_along(raw: dict[str, Any], given: Any) -> dict[str, Any]:
+def _without_along(raw: dict[str, Any], environment: Any) -> dict[str, Any]:
     """Return the file unless it gives steps or directions of a world. Raises ValueError."""
-    beside = [key for key in ("along", "every") if isinstance(given, dict) and key in given]
+    beside = [key for key in ("along", "every") if isinstance(environment, dict) and key in environment]
     if beside:
         raise ValueError(f"environment.{beside[0]} is only with environment.world")
     return raw

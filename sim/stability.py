@@ -349,14 +349,14 @@ def stability_of(simulation: Simulation, trace: Trace) -> Stability:
     if trace.diverged:
         reason = "the simulation left the range of finite numbers: reported as unstable"
     exact = eigenvalues(worst_mode(simulation))
-    found = "unstable" if trace.diverged else decided
+    decision = "unstable" if trace.diverged else decided
     seconds = len(trace.f) * simulation.scenario.T
     slow = reason is None and growth is not None and abs(growth) * seconds < _DECAY_TIMES
     if slow and growth is not None and disagree(exact.exact_growth_rate_per_s, growth):
-        found, reason = exact.exact_verdict, _not_decidable(growth, exact.exact_growth_rate_per_s, seconds)
+        decision, reason = exact.exact_verdict, _not_decidable(growth, exact.exact_growth_rate_per_s, seconds)
     return Stability(
         **vars(exact),
-        verdict=exact.exact_verdict if reason == _NOT_EXCITED else found,
+        verdict=exact.exact_verdict if reason == _NOT_EXCITED else decision,
         clipped_ticks=int(trace.clipped(simulation.process.force_limit, simulation.process.balls).sum()),
         growth_rate_per_s=growth,
         frequency_hz=trace.dominant_frequency_hz(),

@@ -61,8 +61,8 @@ def switching(simulation: Simulation, seed: int, ticks: int, index: int = 0) -> 
     varying = simulation.scenario.varying_delay
     assert varying is not None
     period = _worst_switching(simulation, varying) if varying.pattern == "adversarial" else None
-    given = period.delays if period else None
-    delays = _draw_delays(simulation.scenario, seed, index, max(ticks, _SHORTEST), given)
+    recorded = period.delays if period else None
+    delays = _draw_delays(simulation.scenario, seed, index, max(ticks, _SHORTEST), recorded)
     return replace(simulation, process=replace(simulation.process, delays=delays[:, :, None])), period
 
 
@@ -74,10 +74,10 @@ def _worst_switching(simulation: Simulation, varying: VaryingDelay) -> Period:
     return _worst_period(ages[:, :, 0], plant, process.law.sent, varying)
 
 
-def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: Ticks | None = None) -> Ticks:
+def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, recorded: Ticks | None = None) -> Ticks:
     """Draw the delays (ticks, m) of run `index`; they depend on (seed, index) and the scenario only."""
     assert scenario.varying_delay is not None
-    rows = np.array([scenario.theta]) if scenario.varying_delay.pattern == "constant" else given
+    rows = np.array([scenario.theta]) if scenario.varying_delay.pattern == "constant" else recorded
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, _STREAM)))
     delays = scenario.varying_delay.draw(rng, ticks, rows)
     return delays if scenario.axis_devices is scenario.device else delays[:, scenario.lead]
@@ -244,11 +244,11 @@ def _crowd_delays(
 ) -> Ticks:
     """Return the delays (ticks, m, nsim) of a batch."""
     assert scenario.varying_delay is not None
-    given: list[Ticks | None] = [None] * len(index)
+    recorded: list[Ticks | None] = [None] * len(index)
     if scenario.varying_delay.pattern == "adversarial":
         worst = realising(_greedy_ages(process, plants, scene, scenario.varying_delay, ticks))
-        given = [worst[:, :, j] for j in range(len(index))]
-    numbered = zip(index.tolist(), given, strict=True)
+        recorded = [worst[:, :, j] for j in range(len(index))]
+    numbered = zip(index.tolist(), recorded, strict=True)
     return np.stack([_draw_delays(scenario, seed, i, ticks, own) for i, own in numbered], axis=2)
 
 

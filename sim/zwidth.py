@@ -154,10 +154,11 @@ class CouplingSweep(_Sweep):
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """Return the requirement of one coupling by a separate sweep, to check maps."""
-        asked, (given, reason), coupling = self.asked[condition], self._multipliers[condition], self._coupling(K, B)
+        judge, coupling = self.asked[condition], self._coupling(K, B)
+        multipliers, reason = self._multipliers[condition]
         if reason:
             return refusal(condition, self.loop.delta, reason)
-        return asked.judge(self.loop, coupling, given)
+        return judge.judge(self.loop, coupling, multipliers)
 
     def _coupling(self, K: float, B: float) -> SpringDamper:
         return SpringDamper([K] * self.loop.channels, [B] * self.loop.channels)

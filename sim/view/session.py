@@ -96,9 +96,9 @@ KEYS: dict[int, tuple[str, _Event]] = {
 }
 
 
-def keys_help(given: bool) -> list[tuple[str, str]]:
+def keys_help(with_file: bool) -> list[tuple[str, str]]:
     """Return the keys and their actions; `given` adds the coupling from a file. The mouse comes last."""
-    keys = [(name, words(event)) for name, event in KEYS.values() if given or event != Couple(GIVEN)]
+    keys = [(name, words(event)) for name, event in KEYS.values() if with_file or event != Couple(GIVEN)]
     return [*keys, ("double click", "take a body"), ("Ctrl+right", "draw it")]
 
 

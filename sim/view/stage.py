@@ -154,8 +154,8 @@ def _limited(prepared: PreparedLoop) -> str:
 
 def _account(figures: WorldFigures, prepared: PreparedLoop) -> tuple[str, str]:
     """Return in words what the energy shell of a world has done."""
-    W0, given, released = (1e3 * joules for joules in (figures.start_J, figures.given_J, figures.released_J))
-    most = f"gave {given:.2f} mJ of {W0:g} + {released:.1f}" if prepared.assessment.guarantee else "no guarantee"
+    W0, given_mJ, released = (1e3 * joules for joules in (figures.start_J, figures.given_J, figures.released_J))
+    most = f"gave {given_mJ:.2f} mJ of {W0:g} + {released:.1f}" if prepared.assessment.guarantee else "no guarantee"
     return "energy shell", f"acted on {figures.limited_ticks} of {figures.ticks} ticks, {most}"
 
 
