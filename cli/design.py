@@ -53,7 +53,9 @@ def main(argv: list[str]) -> int:
     design, dies_away = _design(args, loop, scenario)
     assessment = _assessment(args, scenario, loop, design)
     stored = store(loop, design, out, assessment)
-    useless = " [red]Useless[/]: the coupling renders next to nothing." if _is_useless(assessment) else ""
+    useless = (
+        f" [red]Useless[/] on {where}: it renders next to nothing there." if (where := _useless(assessment)) else ""
+    )
     slow = args.coupling == "optimal"  # its bound and its price take seconds
     if slow:
         render.announce(args, verdicts.verdict(assessment) + useless)
@@ -300,12 +302,16 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, assessment: 
 # The report as tables.
 
 
-_USELESS = f"useless: {SOFTEST:g} N/m is the softest that the search tries, and it renders next to nothing"
+_USELESS = f"{SOFTEST:g} N/m is the softest that the search tries, and it renders next to nothing"
 
 
-def _is_useless(assessment: Assessment) -> bool:
-    """Return whether every spring is at the soft end of the search."""
-    return "K" in assessment.gains and max(assessment.gains["K"]) < 1.001 * SOFTEST
+def _useless(assessment: Assessment) -> str:
+    """Return the contacts whose springs are at the soft end of the search, or an empty text."""
+    contacts, gains = assessment.loop.environment.contacts, assessment.gains.get("K", ())
+    soft = [K < 1.001 * SOFTEST for K in gains]
+    if soft and all(soft):
+        return "all contacts"
+    return ", ".join(name for name, is_soft in zip(contacts, soft, strict=False) if is_soft)
 
 
 def _assessment_rows(assessment: Assessment) -> render.Rows:
@@ -313,7 +319,7 @@ def _assessment_rows(assessment: Assessment) -> render.Rows:
     if "K" in gains:
         yield "K [N/m]", listed(gains["K"])
         yield "", end if max(gains["K"]) > 0.999 * STIFFEST else None
-        yield "", _USELESS if _is_useless(assessment) else None
+        yield "", f"useless on {where}: {_USELESS}" if (where := _useless(assessment)) else None
         yield "B [N s/m]", listed(gains["B"])
     yield "stiffness, static [N/m]", listed(gains["stiffness"]) if "stiffness" in gains else None
     yield from render.certificate_rows(assessment.requirements, proof=False)

@@ -532,7 +532,7 @@ def certified_couplings(
     return tuple(candidates)
 
 
-_EQUAL = 1e-9  # relative rounding error of static stiffnesses
+_EQUAL = 1e-6  # relative error of static stiffnesses: that at which the search of a design ends
 
 
 def _softer(reserve: CertifiedCoupling, than: CertifiedCoupling) -> bool:

@@ -59,7 +59,7 @@ class ComparedCoupling:
                 reason = reason or f"this coupling is no V in feedback around the environment: no curve for {key}"
             conditions[key] = ConditionCurve(requirement, requirement.ratio, demand, reason)
         return cls(
-            Path(name).name,
+            name,
             chosen.kind,
             judged.F.order,
             assessment,
@@ -106,8 +106,11 @@ class Comparison:
             for name, c in chosen.items()
         }
         hz = compare.grid(loop, list(judged.values()))
+        short = [Path(name).name for name in chosen]
+        shown = short if len(set(short)) == len(short) else [*chosen]  # Two files of one name keep their paths.
         couplings = [
-            ComparedCoupling.of(loop, name, c, assessments[name], judged[name], hz) for name, c in chosen.items()
+            ComparedCoupling.of(loop, label, c, assessments[name], judged[name], hz)
+            for label, (name, c) in zip(shown, chosen.items(), strict=True)
         ]
         notes = [
             *(f"{name}: {note}" for name, c in chosen.items() for note in c.remarks(judged[name].requirements)),

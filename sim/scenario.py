@@ -9,9 +9,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import re
-import tomllib
 from collections.abc import Sequence
-from contextlib import suppress
 from inspect import isfunction
 from pathlib import Path
 from typing import Any, Self, get_args
@@ -451,9 +449,8 @@ def parse(text: str, source: str = "scenario", folder: Path = Path()) -> Scenari
     try:
         scenario: Scenario = _converted(text, Scenario, source, folder)
     except InputError as error:
-        with suppress(tomllib.TOMLDecodeError):
-            if tomllib.loads(text).get("unit") == "rad":
-                raise InputError(in_unit(str(error), "rad")) from None
+        if _is_rotary(text):
+            raise InputError(in_unit(str(error), "rad")) from None
         raise
     try:
         scenario.environment.check(scenario.psi, scenario.T)
@@ -625,6 +622,14 @@ def save_humans(
 
 
 # ---- strictness: what a file may hold, and how its errors are worded
+
+
+def _is_rotary(text: str) -> bool:
+    """Return whether a file, even one that is refused, is about rotary devices."""
+    try:
+        return toml(text, "").get("unit") == "rad"
+    except InputError:
+        return False
 
 
 _NEEDED = ("name", "T", "theta", "device", "environment")
