@@ -76,10 +76,11 @@ def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown,
     assert [a for a, b in zip(shown.splitlines(), fresh, strict=True) if not regenerate.same_line(a, b)] == []
 
 
-@pytest.mark.parametrize("command", IN_TEXT)
-def test_designs_named_in_sentences_exist(command, place):
-    done = run(command, place)
-    assert done.returncode == 0, done.stderr
+def test_designs_named_in_sentences_exist(place):
+    """No page has one at times."""
+    for command in IN_TEXT:
+        done = run(command, place)
+        assert done.returncode == 0, f"{command}: {done.stderr}"
 
 
 @pytest.mark.parametrize(("page", "command", "pattern", "shown"), MEASURED, ids=[block[1] for block in MEASURED])
