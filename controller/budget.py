@@ -334,6 +334,10 @@ class Shell(_Net):
         self._released = self._released + rise
         self._earn(rise)
 
+    def charge(self, given: float) -> None:
+        """Book an energy [J] >= 0 that reached the devices beside the port."""
+        self._earn(np.full_like(self.energy, -given))
+
     def limit(self, wanted: ArrayLike, rounded: Callable[[Array], Array] = lambda f: f) -> tuple[Array, Array]:
         """Return f = s f_wanted [N] and the port's displacement u [m], (m, nsim) each, and end the tick.
 

@@ -151,6 +151,11 @@ class SentBudget:
         rounded = np.where(sent == wanted[:, 0], steps, np.trunc(sent / self._unit))
         return tuple(int(n) for n in rounded)
 
+    @property
+    def spent(self) -> float:
+        """The most energy [J] that the forces sent so far take from the start; at least 0."""
+        return max(0.0, self.plan.start - float((self._budget.energy - self._budget.reserved)[0]))
+
     def figures(self) -> BudgetFigures:
         """Return what the budget has done since arming."""
         loss = f"more than {self.plan.start:g} J" if self.plan.start else "any energy"
@@ -163,6 +168,9 @@ class WorldController:
 
     Each tick calls `step`, then `limit` with the forces after gain, caps and rounding to whole steps: the shell treats
     these as a part of the environment. For a tick without an answer the shell books the force that the device holds.
+
+    A force that tests a motor does not pass the coupling, so its energy is measured at the device, by an energy budget.
+    That budget starts with the energy of the shell, which is charged afterwards: both together give at most W0.
     """
 
     def __init__(
@@ -178,6 +186,8 @@ class WorldController:
         self._start, self._sent = start, np.zeros((len(waits), 1))
         self._open = False  # whether the force of the current tick is still to be booked
         self._lines = [deque([0] * n) for n in waits]
+        self._test: SentBudget | None = None
+        self._tested = 0.0  # [J] charged for tests of motors
 
     def step(self, x: Sequence[float]) -> list[float]:
         """Return the scene's forces (m,) [N] for displacements x (m,) [m]."""
@@ -198,8 +208,23 @@ class WorldController:
         wanted = np.array(steps)[:, None] * each
         self._sent, _ = self.shell.limit(wanted, lambda f: np.where(f == wanted, f, np.trunc(f / each) * each))
         self._open = False
-        self.least = min(self.least, float(self.shell.energy[0]) - self._start - self.port.released)
+        self.least = min(self.least, float(self.shell.energy[0]) + self._tested - self._start - self.port.released)
         return tuple(int(n) for n in np.round(self._sent / each)[:, 0])
+
+    def limit_test(
+        self, plan: BudgetPlan, steps: Sequence[int], x: Sequence[float], applied: Array, missed: int
+    ) -> tuple[int, ...]:
+        """Return the steps of a test force that the energy of the shell allows; arguments as SentBudget.limit."""
+        if self._test is None:
+            start, missed = float(self.shell.energy[0]), 0
+            self._test = SentBudget(replace(plan, start=start, cap=max(start, self._start)))
+        return self._test.limit(steps, x, applied, missed)
+
+    def end_test(self) -> None:
+        """Charge the shell with the energy that a test gave, if one has ended."""
+        if self._test is not None:
+            self.shell.charge(self._test.spent)
+            self._tested, self._test = self._tested + self._test.spent, None
 
     def later(self, steps: Sequence[int], ticks: int) -> tuple[int, ...]:
         """Put `steps`, computed `ticks` after the previous ones, into the delay lines and return the steps to send."""
@@ -231,6 +256,7 @@ class Arming:
     program: Armable
     config: Config  # configuration of the device
     budget: SentBudget | None = None
+    test_plan: BudgetPlan | None = None  # of the test forces in a world; None where its shell limits them too
 
 
 class Drive:
@@ -267,6 +293,7 @@ class Drive:
         self._before: tuple[float, ...] | None = None  # [m] displacements one tick before self.x; None after a gap
         self.world = self.controller if isinstance(self.controller, WorldController) else None
         self._counters, self._record, self._arming, self._budget = counters, record, arming.number, arming.budget
+        self._test_plan = arming.test_plan
         self._commands = None if settings.behind else monitor.CommandMonitor(config)  # boards have one each
         self._clock = monitor.ClockMonitor(limits.watchdog_us, T)
 
@@ -317,10 +344,7 @@ class Drive:
                 force, steps = self.units.forces(limited), limited
                 self._counters.limited += 1
         if self.world:
-            limited = self.world.limit(steps, self.units.force_step)
-            if limited != steps:
-                force, steps = self.units.forces(limited), limited
-            steps = self.world.later(steps, ticks)
+            force, steps = self._through_shell(self.world, force, steps, x, state, ticks, test)
         self._before, self.x, self.force = self.x if ticks == 1 else None, x, force
         self._counters.clipped += shaped.clipped
         self._counters.slowed += shaped.slowed
@@ -328,6 +352,31 @@ class Drive:
             self._commands.tell(state.tick, steps)
         self._record(TraceRow(state.tick, x, wanted, self.gain.value, steps, state, self._arming, test))
         return steps
+
+    def _through_shell(
+        self,
+        world: WorldController,
+        force: tuple[float, ...],
+        steps: tuple[int, ...],
+        x: tuple[float, ...],
+        state: State,
+        ticks: int,
+        test: tuple[float, ...] | None,
+    ) -> tuple[tuple[float, ...], tuple[int, ...]]:
+        """Return force (m,) [N] and steps that a world's account of energy allows; the scene rests during a test."""
+        nothing, plan = (0,) * len(steps), self._test_plan
+        pushes = plan is not None and test is not None and any(test)
+        allowed = world.limit(nothing if pushes else steps, self.units.force_step)
+        sent = world.later(allowed, ticks)
+        if plan is None or test is None:
+            world.end_test()
+        else:
+            applied = np.array(self.units.forces(state.applied))
+            tested = world.limit_test(plan, steps if pushes else nothing, x, applied, ticks - 1)
+            if pushes:
+                allowed = tested
+                sent = tuple(max(-c, min(c, a + b)) for a, b, c in zip(sent, tested, self.config.cap, strict=True))
+        return (force if allowed == steps else self.units.forces(allowed)), sent
 
     def _check_motion(self, x: tuple[float, ...], ticks: int) -> None:
         """Raise SafetyStop where no hand can have moved the handles to x (m,) [m] within `ticks` ticks."""

@@ -43,6 +43,7 @@ _TEST_RATIO = 2.0  # between a motion and the expected one
 _DEGREE = 5  # of the polynomials that contain a hand's own motion: 1 % is left of 2 Hz
 _FIT = 0.8  # of the power: a free handle moved by a hand has 0.93 or more, a held one at most 0.5
 _ALIVE = 0.06  # of the expected swing: a firm hand (0.5 kg, 20 N s/m, 1500 N/m) leaves 0.09, a dead motor shows 0.03
+_PUSHED = 0.5  # of the strongest test force: less is no test
 _STRONG = 2  # the block with which the test at the end begins
 _REST = 0.1  # [s] within which a handle rests at least once
 _PRESSING, _PRESSED = 0.3, 0.5  # [N], [s]
@@ -507,6 +508,7 @@ class EncoderTest:
         self._axis, self._ticks, self._block = self._axis + 1, 0, _STRONG if self._alive else 0
         self._expected.rest()
         self._rows: list[tuple[float, ...]] = []  # tick, expected position [m] and counts (m,) in this block
+        self._pushed = 0.0  # [N] largest force on the axis in this block
 
     def force(self, state: State, ticks: int) -> tuple[float, ...] | None:
         """Return the forces fed back (m,) [N], `ticks` after the call before; None once every encoder has answered.
@@ -516,7 +518,7 @@ class EncoderTest:
         acted: State | None = state if self._at_once else self._last
         pushed = acted.applied[self._axis] * self._units.force_step[self._axis] if acted else 0.0
         position = [self._expected.advance(self._axis, pushed) for _ in range(ticks)][-1]
-        self._last, self._ticks = state, self._ticks + ticks
+        self._last, self._ticks, self._pushed = state, self._ticks + ticks, max(self._pushed, abs(pushed))
         self._rows.append((self._ticks, position, *state.counts))
         before, half = max(1, round(_TEST_BEFORE / self._T)), max(2, round(_TEST_HALF / self._T))
         if self._ticks > before + 4 * half:
@@ -528,6 +530,7 @@ class EncoderTest:
                 raise SafetyStop(self._unanswered())
             else:
                 self._ticks, self._block, self._rows = before, self._block + 1, [(before, position, *state.counts)]
+                self._pushed = 0.0
         since = self._ticks - before
         if since <= 0:
             return (0.0,) * len(self._cap)
@@ -573,7 +576,11 @@ class EncoderTest:
 
     def _unanswered(self) -> str:
         """Return a message about an axis whose encoder has not answered."""
-        axis, at = self._axis + 1, f"a test force of up to {min(self._strongest, self._cap[self._axis]):g} N"
+        axis, most = self._axis + 1, min(self._strongest, self._cap[self._axis])
+        at = f"a test force of up to {most:g} N"
+        if self._pushed < _PUSHED * most:
+            tested = f"motor and encoder of axis {axis} are not tested"
+            return f"energy left for {self._pushed:.2g} of {most:g} N: {tested}. Give more (--energy-budget)"
         if self._alive:
             return f"motor or encoder of axis {axis} did not answer {at} at the end of the session"
         if (moved := self._counted(self._axis)) > self._still[self._axis]:

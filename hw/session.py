@@ -24,7 +24,7 @@ from haptic_loop.hw.limits import (
     watchdog_for,
 )
 from haptic_loop.hw.monitor import Counters, EncoderNoise, Expected, LinkMonitor, LinkSettings, Measurement
-from haptic_loop.sim.scenario import InputError, Scenario
+from haptic_loop.sim.scenario import InputError, Scenario, is_world
 
 _PATIENCE_US = 2_000_000  # a question without an answer is given up after this time
 _ARMING_US = 600_000  # per axis: the device must follow ARM and pass the test of its encoders within this time
@@ -141,7 +141,7 @@ class Session:
         elif self.stage == Stage.DISARMED:
             assert self.program
             assert self.config
-            arming = Arming(len(self.armings), self.program, self.config, self._fresh_budget(self.config))
+            arming = Arming(len(self.armings), self.program, self.config, *self._accounts(self.config))
             self.armings.append(arming)
             assert self._noise
             told = self.units, self.limits, self.settings, self.counters, self.record
@@ -151,12 +151,15 @@ class Session:
             self._enter(Stage.ARMING, "asked to")
         return ()
 
-    def _fresh_budget(self, config: wire.Config) -> SentBudget | None:
-        if self.settings.energy_budget is None:
-            return None
-        scenario = self.scenario
+    def _accounts(self, config: wire.Config) -> tuple[SentBudget | None, BudgetPlan | None]:
+        """Return the energy budget of an arming, and the plan of one for the tests of motors in a world."""
+        scenario, budget = self.scenario, self.settings.energy_budget
+        tests = is_world(scenario) and config.theta > 0  # forces that latch on arrival act for no whole tick
+        if budget is None and not tests:
+            return None, None
         longest = max(scenario.T_max or 0.0, 1e-6 * self.measurement.result.longest_tick(1e6 * scenario.T))
-        return SentBudget(BudgetPlan.of(*self.settings.energy_budget, scenario.delta, self.units, config, longest))
+        plan = BudgetPlan.of(*(budget or (0.0, 0.0)), scenario.delta, self.units, config, longest)
+        return (SentBudget(plan) if budget else None), (plan if tests else None)
 
     def stop(self, cause: str, now: int, let_go: bool = False) -> Said:
         """End the session as planned: by a ramp where forces act, at once where none do.

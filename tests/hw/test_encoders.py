@@ -129,6 +129,21 @@ def test_the_test_force_stays_within_the_cap(cap):
     assert abs(moved.sum()) < 0.5 * np.abs(moved).sum()  # a free handle is not pushed away
 
 
+def cut(test, most):
+    """Play a test to encoders that stand still, with forces that are cut to `most` [N]."""
+    sent = (0, 0)
+    for k in range(900):
+        asked = test.force(State(Phase.ARMED, k, k, 0, 0, 0, 0, (0, 0), sent), 1)
+        sent = tuple(round(max(-most, min(most, one)) / STEP) for one in asked)
+
+
+@pytest.mark.parametrize("alive", [False, True])
+def test_a_force_cut_short_is_no_test(alive):
+    """An energy budget lets 0.1 N of 1 N through: nobody can say that the motor is dead."""
+    with pytest.raises(SafetyStop, match=r"energy left for 0.1 of 1 N: motor and encoder of axis 1 are not tested"):
+        cut(arming_test(alive=alive), 0.1)
+
+
 @pytest.mark.parametrize("axis", [1, 2])
 def test_a_wrong_sign_is_named_with_its_axis(axis):
     signs = (-1, 1) if axis == 1 else (1, -1)

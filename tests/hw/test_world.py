@@ -9,9 +9,13 @@ from haptic_loop.cli import bridge
 from haptic_loop.controller.budget import Shell
 from haptic_loop.controller.coupling import SpringDamper
 from haptic_loop.controller.lti import Lti
-from haptic_loop.hw.control import WorldController
+from haptic_loop.hw.control import WorldController, certified_couplings, timed
+from haptic_loop.hw.emulator import Emulator, FaultInjection
+from haptic_loop.hw.limits import Stage
+from haptic_loop.hw.monitor import LinkSettings
 from haptic_loop.hw.recording import load as read
-from haptic_loop.hw.rehearsal import rehearse
+from haptic_loop.hw.rehearsal import Rehearsal, rehearse
+from haptic_loop.hw.session import session_for
 from haptic_loop.models import world as world_of
 from haptic_loop.sim.scenario import InputError, load
 
@@ -50,9 +54,12 @@ links = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]
 
 
 def account(trace, link, coupling, T):
-    """The least sum of f'(u - u_-) [J] with f as it was sent and u = x - V f, without the program's shell."""
+    """The least sum of f'(u - u_-) [J] with f as it was sent and u = x - V f, without the program's shell.
+
+    Forces that test a motor are not the scene's.
+    """
     V: Lti = coupling.compliance(T)
-    f = -4e-4 * link["sent"]
+    f = -4e-4 * link["sent"] * ~link["test"].any(axis=1, keepdims=True)
     state, before, total, least = np.zeros(V.order), np.zeros(2), 0.0, 0.0
     for x, force in zip(trace.x, f, strict=True):
         u = x - (V.C @ state + V.D @ force)
@@ -109,6 +116,38 @@ def read_coupling_of(trace):
 
     (recipe,) = _recipes_of(trace)
     return recipe.coupling.build(recipe.scenario.T)
+
+
+def in_the_ball_world(*faults):
+    """A session of 0.5 s in the world with a ball and two three-axis devices; of both, what was given [J]."""
+    scenario, rows = load("world-space"), []
+    faults = tuple(map(FaultInjection.parse, faults))
+    session = session_for(scenario, LinkSettings(measure=60), 2.0)
+    session.record = rows.append
+
+    def plan(ages):
+        met, link = timed(scenario, ages, 0.99, 100.0)
+        return certified_couplings(met, "I", "moving-average", None, link)
+
+    stop = [(1.5, lambda session, now: session.stop("asked to", now))]
+    Rehearsal(session, Emulator(scenario, faults), plan, faults, actions=stop).run_until_armed(3.0)
+    x = np.array([row.x for row in rows])
+    f = -4e-4 * np.array([row.state.applied for row in rows])[:-1]
+    dx = np.diff(x, axis=0)
+    return session, -(f * dx + scenario.delta / np.array(scenario.T) * dx**2).sum(axis=1).cumsum()
+
+
+def test_motors_in_a_world_are_tested_at_the_end():
+    """Within W0; the account is that of the devices, by their motion and the applied forces."""
+    session, given = in_the_ball_world()
+    assert session.stage == Stage.FINISHED, session.cause
+    assert given.max() <= 2e-3 + session.worlds[0].port.released
+
+
+def test_a_dead_motor_in_a_world_never_finishes():
+    session, _ = in_the_ball_world("axis6:motor=0@1.2")
+    assert session.stage == Stage.STOPPED
+    assert session.cause.startswith("motor or encoder of axis 6 did not answer a test force of up to 1 N")
 
 
 def test_the_host_delays_forces_beyond_the_link():
