@@ -85,7 +85,8 @@ def files_of(path: Path) -> list[Path]:
         for node in _xml(file, path).iter():
             name = node.get("file")
             if node.tag == "include" and name:
-                visit(base / name, base)
+                beside = file.parent / name  # where MuJoCo looks if the main file's folder has none
+                visit(base / name if (base / name).exists() or not beside.exists() else beside, base)
             elif node.tag == "model" and name and (part := base / name).suffix == ".xml":
                 if part not in files:
                     visit(part, part.parent)
@@ -196,7 +197,8 @@ class World:
         self._dof = np.array([joint.dofadr[0] for joint in joints])
         self._joint = np.array([joint.id for joint in joints])
         weightless = self.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
-        self._afloat = self.model.body_mass * (0.0 if weightless else self.model.body_gravcomp)  # (nbody,) [kg]
+        carried = 0.0 if weightless else self.model.body_gravcomp * ~_lifted_by_actuators(self.model)
+        self._afloat = self.model.body_mass * carried  # (nbody,) [kg] whose weight a passive force carries
 
     @property
     def channels(self) -> int:
@@ -295,6 +297,15 @@ class World:
         return list(_parts(self.model, set(self._joint.tolist())))
 
 
+def _lifted_by_actuators(m: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Return the bodies (nbody,) whose gravity compensation acts through actuators, which may limit it."""
+    lifted = np.zeros(m.nbody, dtype=bool)
+    lifted[m.jnt_bodyid[m.jnt_actgravcomp != 0]] = True
+    for body in range(1, m.nbody):  # parents come before their children
+        lifted[body] |= lifted[m.body_parentid[body]]
+    return lifted
+
+
 def _spec(path: Path) -> Any:
     files_of(path)  # raises ValueError with the name of a file that is missing
     with _refused(path):
@@ -381,7 +392,8 @@ def _slide(spec: Any, body: Any, contact: Contact, Q: Array, stiffness: Array, t
         joint.stiffness = [k, 0.0, 0.0]
         joint.damping = [0.0, 0.0, 0.0]
         joint.armature = joint.frictionloss = joint.ref = joint.springref = joint.springyield = 0.0
-        joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+        joint.limited = joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        joint.actgravcomp = 0
     if not body.explicitinertial and all(np.isnan(geom.mass) for geom in body.geoms):
         body.explicitinertial, body.mass, body.inertia = True, PROXY_MASS, [1e-5] * 3
         body.ipos = [0.0, 0.0, 0.0]
@@ -653,6 +665,9 @@ def _parts(m: mujoco.MjModel, slides: set[int]) -> Iterator[Part]:
     curved = sum(int((values != 0).any(axis=1).sum()) for values in higher)
     if curved:
         yield Part("springs and dampers that are not linear", curved, _SHELL)
+    yielding = int((m.jnt_springyield != 0).sum() + (m.tendon_springyield != 0).sum())
+    if yielding:
+        yield Part("springs that yield", yielding, _SHELL)
     if m.ntendon:
         yield Part("tendons", m.ntendon, _SMALL)
     rubbing = int((m.dof_frictionloss > 0).sum() + (m.tendon_frictionloss > 0).sum())

@@ -131,10 +131,12 @@ def scene_of(scenario: Scenario, coupling: Coupling, gravity: bool = True) -> Wo
     V = coupling.compliance(scenario.T)
     if V is None or not V.D.any():
         raise InputError(f"environment.world needs a coupling: {_no_spring(coupling)}")
-    from haptic_loop.models.world import World
+    from haptic_loop.models.world import World, digest_of
 
     contacts = contacts_of(scenario.environment)
     try:
+        if digest_of(Path(world.file)) != world.digest:
+            raise ValueError(f"world {world.file} has changed since the scenario was loaded; load it again")
         return World(world.file, contacts, _springs(V, contacts), scenario.T, world.every, gravity)
     except ValueError as error:
         raise InputError(f"environment: {error}") from None
@@ -318,6 +320,7 @@ def thrown(
     from haptic_loop.sim.crowds import Validation
 
     links = getattr(scenario.population, "links", 1)
+    scenario = scenario.replace(duration=max(scenario.duration, duration))
     question = Validation(scenario, coupling, seed, humans, links, "exact", duration)
     nobody, runs = assemble(scenario, coupling), []
     for i in range(humans):

@@ -511,3 +511,38 @@ if __name__ == "__main__":
 
     with TemporaryDirectory() as place:
         print(sum(count_of_the_lemma(Path(place), scene, 6000) for scene in SCENES), "constraints within their bounds")
+
+
+def test_compensation_by_actuators_releases_nothing_itself(tmp_path):
+    """A motor that carries a weight may be limited: raising the body stores m g z, whatever it asks for."""
+    text = f"""<mujoco><worldbody><body name="left">{FREE}</body><body name="right">{FREE}</body>
+<body name="lift" gravcomp="100"><joint name="up" type="slide" axis="0 0 1" actuatorgravcomp="true"
+actuatorfrcrange="-.01 .01"/><geom type="box" size="0.01 0.01 0.01" mass="0.3"/></body></worldbody></mujoco>"""
+    port = world(tmp_path, text).port()
+    low = port._potential()
+    port.data.joint("up").qpos[0] = 0.2
+    assert port._potential() - low == pytest.approx(0.3 * 9.81 * 0.2, rel=1e-12)
+
+
+def test_defaults_do_not_change_the_slides(tmp_path):
+    default = """<default><joint actuatorgravcomp="true" actuatorfrclimited="true" actuatorfrcrange="-.001 .001"/>
+</default>"""
+    text = f"""<mujoco>{default}<worldbody><body name="left">{FREE}</body><body name="right">{FREE}</body></worldbody>
+</mujoco>"""
+    model = world(tmp_path, text, along=((0.0, 0.0, 1.0),)).model
+    assert not model.jnt_actgravcomp.any()
+    assert not model.jnt_actfrclimited.any()
+
+
+def test_includes_beside_the_including_file_are_read(tmp_path):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "part.xml").write_text('<mujoco><worldbody><body name="left"/></worldbody></mujoco>')
+    (tmp_path / "sub" / "more.xml").write_text('<mujoco><include file="part.xml"/></mujoco>')
+    (tmp_path / "main.xml").write_text('<mujoco><include file="sub/more.xml"/></mujoco>')
+    assert files_of(tmp_path / "main.xml")[-1] == tmp_path / "sub" / "part.xml"
+
+
+def test_springs_that_yield_are_not_in_the_lemma(tmp_path):
+    yields = LINE.replace('axis="1 0 0"/>', 'axis="1 0 0" stiffness="100" springyield="0.004"/>')
+    parts = {part.what: part.at_the_port for part in world(tmp_path, yields).parts()}
+    assert "shell" in parts["springs that yield"]

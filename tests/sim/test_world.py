@@ -18,10 +18,10 @@ from haptic_loop.design.api import store
 from haptic_loop.design.designs import design_by_kind
 from haptic_loop.design.environments import THIS_ENVIRONMENT
 from haptic_loop.models import world as world_of
-from haptic_loop.sim.couplings import read_coupling
+from haptic_loop.sim.couplings import choose, read_coupling
 from haptic_loop.sim.run import assemble
 from haptic_loop.sim.scenario import SCENARIOS, InputError, Scenario, load, parse
-from haptic_loop.sim.world import START_J, Touched, contacts_of, linearise, scene_of
+from haptic_loop.sim.world import START_J, Touched, contacts_of, linearise, scene_of, thrown
 
 T = 1e-3
 NAMES = ("cube", "ball", "peg", "door", "stack", "space")
@@ -476,3 +476,17 @@ def test_a_slow_world_keeps_the_account(tmp_path):
         for _ in range(1000):
             assert touch.tick() <= START_J + touch.port.released + 1e-12
         assert not touch.shell.limited[0]
+
+
+def test_thrown_hands_may_outlast_the_scenario(tmp_path):
+    short = scenario(tmp_path, TRAY, more=UP, duration=0.1)
+    (runs,) = thrown(short, choose(short, "I", "moving-average").coupling, 1, 0, 0.3)
+    assert runs.figures.ticks == 300
+
+
+def test_a_scene_that_changed_is_refused(tmp_path):
+    loaded = scenario(tmp_path, TRAY, more=UP)
+    coupling = choose(loaded, "I", "moving-average").coupling
+    (tmp_path / "scene.xml").write_text(TRAY.replace('mass="0.3"', 'mass="0.4"'))
+    with pytest.raises(InputError, match=r"scene\.xml has changed since the scenario was loaded"):
+        scene_of(loaded, coupling)
