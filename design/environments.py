@@ -501,6 +501,8 @@ class LimitedForces(ThisEnvironment):
         if loop.environment.walls or loop.latency:
             what = "walls" if loop.environment.walls else "a latency"
             return f"limiter: designs for limited forces are made in linear environments without {what}"
+        if loop.ranges:
+            return "limiter: designs for limited forces are made for one environment, not for ranges"
         return self.beyond(loop)
 
     def place(self, loop: Loop, matrix: str = "P") -> str:

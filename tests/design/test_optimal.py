@@ -714,10 +714,10 @@ def test_limited_forces_are_part_of_designs(name):
     assert m == len(proof.multipliers["c"])
 
 
-def test_limited_forces_are_not_proved_for_ranges():
+def test_limited_forces_are_not_designed_for_ranges():
     loop = loop_of("n3")
     ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
-    with pytest.raises(ValueError, match="limited forces are proved for one environment"):
+    with pytest.raises(ValueError, match="limited forces are made for one environment, not for ranges"):
         design(ranged, replace(SHORT, limiter=True))
 
 
