@@ -43,7 +43,10 @@ def symmetric(field: str, value: Any, axes: int) -> _Matrix:
         return float(value) * np.eye(axes)
     rows = [row if isinstance(row, Real) else tuple(row) for row in value]
     if len(rows) == axes and all(isinstance(row, Real) for row in rows):
-        return np.diag(np.array(rows, dtype=float))
+        numbers = np.array(rows, dtype=float)
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"{field} is {_listed(value)}, expected finite numbers")
+        return np.diag(numbers)
     if len(rows) != axes or not all(isinstance(row, tuple) and len(row) == axes for row in rows):
         shape = f"{axes} numbers or {axes} rows of {axes} numbers"
         raise ValueError(f"{field} is {_listed(value)}, expected one number, {shape}")

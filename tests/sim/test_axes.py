@@ -85,6 +85,7 @@ def rows(matrix: Array) -> str:
         ("damping = [[1, 0, 0], [0.5, 1, 0], [0, 0, 1]]", "", ("damping is", "symmetric")),
         ("damping = [[1, 2, 0], [2, 1, 0], [0, 0, 1]]", "", ("damping is", "eigenvalues -1 to 3")),
         ("damping = [1, 2]", "", ("damping is [1", "expected one number, 3 numbers or 3 rows")),
+        ("damping = [1, inf, 1]", "", ("damping is [1", "expected finite numbers")),
         ("damping = 1.0\ndelta = [1.0, 1.0, 1.1]", "", ("delta is", "delta <= damping as matrices")),
         ("force_limit = [3, 3]", "", ("force_limit is", "expected one number or 3")),
         ("friction = [0, 0, -1]", "", ("friction #3 is -1", "0 to 1000 N")),
