@@ -134,7 +134,7 @@ def _print_certificate(
     shared = set(remarks[0]).intersection(*remarks) if len(programs) > 1 else set()
     for program, own in zip(programs, remarks, strict=True):
         for remark in (each for each in own if each not in shared):
-            console.print(f"[dim]·[/] theta = {list(program.scenario.theta)}: {remark}", highlight=False)
+            console.print(f"[dim]·[/] {program.name}: {remark}", highlight=False)
     for remark in (each for each in remarks[0] if each in shared):
         console.print(f"[dim]·[/] {remark}", highlight=False)
     if len(programs) == 1:
@@ -148,8 +148,10 @@ def _certified(program: CertifiedCoupling) -> tuple[str, ...]:
     assessment = program.assessment
     gains, requirements = assessment.gains, (assessment.decisive, *assessment.requirements.values())
     certified = next(need for need in requirements if need.certified)
+    latency = program.scenario.latency
+    late = f" and {1e6 * latency[0][0]:.0f} to {1e6 * latency[0][1]:.0f} us" if latency else ""
     return (
-        f"{program.chosen.kind}, theta = {', '.join(map(str, program.scenario.theta))}",
+        f"{program.chosen.kind}, theta = {', '.join(map(str, program.scenario.theta))}{late}",
         *(listed(gains[name], 5) if name in gains else "-" for name in "KB"),
         f"{listed(certified.required, 5)} ({certified.condition}, {certified.proof})",
         listed(certified.available, 5),
