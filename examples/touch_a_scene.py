@@ -20,6 +20,7 @@ from msgspec.structs import replace
 
 from haptic_loop import design_coupling, load
 from haptic_loop.controller.budget import Shell
+from haptic_loop.models.world import digest_of
 from haptic_loop.sim.world import START_J, scene_of
 
 BLOCK = """<mujoco><default><geom solref="0.005 1" solimp="0.9 0.9 0.001"/></default><worldbody>
@@ -94,7 +95,8 @@ def scenes(folder):
     """The packaged stack of boxes, and a fixed block touched by tips of 2 kg, as of a robot, in contacts of 5 ms."""
     stack = load("world-stack")
     (Path(folder) / "block.xml").write_text(BLOCK)
-    world = replace(stack.environment.world, file=str(Path(folder) / "block.xml"))
+    block = Path(folder) / "block.xml"
+    world = replace(stack.environment.world, file=str(block), digest=digest_of(block))
     return {"stack": stack, "block": stack.replace(environment=replace(stack.environment, world=world))}
 
 
