@@ -41,8 +41,6 @@ SETTINGS = (
     _Settings("loose", {**_LOOSE, "static_regularization_constant": 1e-7}),
 )
 INTERIOR = _Settings("interior")  # `_interior`, for large blocks with few unknowns
-#: `_interior` first: in a small problem it takes less time than loading the part of SciPy that Clarabel calls
-LIGHT = (INTERIOR, *SETTINGS)
 
 
 @dataclass(frozen=True)
@@ -74,12 +72,12 @@ class Inequality:
 
     @classmethod
     def least(cls, unknowns: Sequence[int], value: float) -> Inequality:
-        """Add x >= value for each of the unknowns."""
+        """x >= value, for each of the unknowns."""
         return cls(np.full((len(unknowns), 1, 1), -value), np.eye(len(unknowns))[:, :, None, None], unknowns)
 
     @classmethod
     def most(cls, unknowns: Sequence[int], value: float) -> Inequality:
-        """Add x <= value for each of the unknowns."""
+        """x <= value, for each of the unknowns."""
         return cls(np.full((len(unknowns), 1, 1), value), -np.eye(len(unknowns))[:, :, None, None], unknowns)
 
     def at(self, x: Array) -> Array | Complex:
@@ -92,7 +90,7 @@ class Inequality:
         return rows * (rows + 1) // 2 > max(_LARGE, _MANY * len(self.unknowns))
 
     def rows(self) -> tuple[Array, Array]:
-        """Return the lower triangles row by row, (k, r) and (q, k, r) real, scaled to keep inner products."""
+        """(k, r) and (q, k, r) real: the lower triangles row by row, such that inner products stay the same."""
         constant, slopes = (_real(part) for part in (self.constant, self.slopes))
         i, j = np.tril_indices(constant.shape[-1])
         weight = np.where(i == j, 1.0, np.sqrt(2))
@@ -100,7 +98,7 @@ class Inequality:
 
 
 def _real(H: Array | Complex) -> Array:
-    """Return [[X, -Y], [Y, X]] of H = X + jY, (..., n, n) -> (..., 2n, 2n): Hermitian >= 0 iff symmetric >= 0."""
+    """[[X, -Y], [Y, X]] of H = X + jY, (..., n, n) -> (..., 2n, 2n): Hermitian >= 0 iff symmetric >= 0."""
     if not np.iscomplexobj(H):
         return np.asarray(H, dtype=float)
     top, low = np.concatenate([H.real, -H.imag], axis=-1), np.concatenate([H.imag, H.real], axis=-1)
@@ -206,7 +204,6 @@ def _clarabel(problem: ConeProgram, options: Mapping[str, Any]) -> tuple[Array, 
 _GAP = 1e-8  # relative gap and violation at which the iteration ends
 _ENOUGH = 1e-6  # the best point counts as solved below this error if rounding stops the iteration
 _KEPT = 0.98  # share of the way to the boundary that a step may go
-_SMALL = 2**12  # largest number of coefficients of a block that is stacked with others
 _SHORT, _CENTRING = 0.2, 0.8  # a predictor step shorter than _SHORT is replaced by one towards _CENTRING mu
 
 
@@ -215,7 +212,6 @@ _Parts = list[Any]  # a stack of Hermitian matrices for each block
 
 def _interior(problem: ConeProgram) -> tuple[Array, str]:
     """Solve the problem by a primal-dual method; return x and a status named as by Clarabel."""
-    problem = ConeProgram(problem.cost, _stacked(problem.blocks))
     blocks, cost, x = problem.blocks, problem.cost, np.zeros(len(problem.cost))
     size = max(np.abs(part).max(initial=1.0) for block in blocks for part in (block.constant, block.slopes, cost))
     S: _Parts = [10 * size * (np.zeros_like(block.constant) + np.eye(block.constant.shape[-1])) for block in blocks]
@@ -246,25 +242,6 @@ def _interior(problem: ConeProgram) -> tuple[Array, str]:
     return best, "Solved" if least < _ENOUGH else "NumericalError"
 
 
-def _stacked(blocks: Sequence[Inequality]) -> list[Inequality]:
-    """Return small blocks of one size as one stack, for which the iteration makes fewer calls of NumPy."""
-    unknowns = sorted({i for block in blocks for i in block.unknowns})
-    alike: dict[int, list[Inequality]] = {}
-    for number, block in enumerate(blocks):
-        cells = block.constant.size * len(unknowns)
-        alike.setdefault(-1 - number if cells > _SMALL else block.constant.shape[-1], []).append(block)
-    stacks = []
-    for parts in alike.values():
-        if len(parts) > 1:
-            slopes: Any = [np.zeros((len(unknowns), *part.constant.shape), part.slopes.dtype) for part in parts]
-            for own, part in zip(slopes, parts, strict=True):
-                own[np.searchsorted(unknowns, part.unknowns)] = part.slopes
-            constant: Any = np.concatenate([part.constant for part in parts])
-            parts = [Inequality(constant, np.concatenate(slopes, axis=1), unknowns)]
-        stacks += parts
-    return stacks
-
-
 class _Newton:
     """The linearised equations at (S, Z), with the residuals `missing` of the blocks and `wrong` of the costs.
 
@@ -273,6 +250,8 @@ class _Newton:
     """
 
     def __init__(self, problem: ConeProgram, S: _Parts, Z: _Parts, missing: _Parts, wrong: Array) -> None:
+        import scipy
+
         self._problem, self._Z, self._missing, self._wrong = problem, Z, missing, wrong
         self._roots = [[np.linalg.inv(np.linalg.cholesky(part)) for part in parts] for parts in (S, Z)]
         self._inverse = [_adjoint(root) @ root for root in self._roots[0]]
@@ -283,12 +262,14 @@ class _Newton:
             normal[np.ix_(block.unknowns, block.unknowns)] += np.real(slopes.conj() @ turned.T)
         self._scale = 1 / np.sqrt(np.where(np.diag(normal) > 0, np.diag(normal), 1.0))
         unit = self._scale[:, None] * (normal + normal.T) / 2 * self._scale
-        self._factor = np.linalg.inv(np.linalg.cholesky(unit + 1e-14 * np.eye(wrong.size)))
+        self._factor = scipy.linalg.cho_factor(unit + 1e-14 * np.eye(wrong.size))
 
     def direction(self, mu: float, left: _Parts) -> tuple[Array, _Parts, _Parts, float, float]:
         """Return dx, dS, dZ towards S Z = mu I with dZ dS = `left`, and the longest steps in S and Z, up to 1."""
+        import scipy
+
         right = _inner(self._problem, self._change(self._missing, mu, left)) - self._wrong
-        dx = self._scale * (self._factor.T @ (self._factor @ (self._scale * right)))
+        dx = self._scale * scipy.linalg.cho_solve(self._factor, self._scale * right)
         blocks = zip(self._problem.blocks, self._missing, strict=True)
         dS = [missing + np.tensordot(dx[list(block.unknowns)], block.slopes, axes=1) for block, missing in blocks]
         dZ = self._change(dS, mu, left)

@@ -33,7 +33,7 @@ from haptic_loop.design.conditions import (
     unsound,
     unsound_static,
 )
-from haptic_loop.design.cone import LIGHT, ConeProgram, Inequality
+from haptic_loop.design.cone import ConeProgram, Inequality
 from haptic_loop.design.coupling_file import Certificate
 from haptic_loop.design.exact import require_size
 from haptic_loop.design.facts import Fact, HandsSide, Limiter, Switching, Unknowns, Walls, compose, hands_side
@@ -156,8 +156,6 @@ def _parted(unknowns: Sequence[Unknowns], values: Sequence[Any]) -> list[Sequenc
 _MOST_PEAKS = 3  # largest number of frequencies that are added in a round
 _NEAR = 0.1  # Peaks that are lower than the highest by more than this share are not added.
 _SETTLED = 5e-7  # relative gap between the sweep and the bound at which the search ends
-#: Widest bounds of multipliers, those of c, for a method that ends amid all optima: of walls it asked .03 % too much.
-_NARROW = 10.0
 _DIGITS, _NOTHING = 8, 1e-6  # significant digits of a multiplier; smaller ones are 0, in units
 
 
@@ -173,7 +171,6 @@ class _Search:
         self._searched = np.flatnonzero(self._units)
         bounds = [(each.least, each.most) for each in unknowns for _ in each.units]
         self._least, self._most = np.array(bounds).reshape(-1, 2)[self._searched].T
-        self._settings = LIGHT if self._most.max(initial=0.0) <= _NARROW else None
         self._last: tuple[Sequence[float], tuple[float, float]] | None = None  # last values and result of `swept`
         self._grid = np.concatenate([[0.0], frequencies(system)])
         self._spare = np.diag(np.zeros(system.outputs) if asked.spare is None else asked.spare)
@@ -208,9 +205,7 @@ class _Search:
                 break
             blocks.append(self._inequality(w))
             try:
-                solution = ConeProgram(np.eye(count + 1)[-1], blocks).solve(
-                    f"the multiplier {self._names}", settings=self._settings
-                )
+                solution = ConeProgram(np.eye(count + 1)[-1], blocks).solve(f"the multiplier {self._names}")
             except DesignFailed:  # No multiplier within the bounds makes the block positive.
                 break
             stalled = 0 if solution[-1] > bound + _SETTLED * max(bound, 1.0) else stalled + 1

@@ -1048,7 +1048,7 @@ def test_switching_before_any_environment_is_that_of_chi():
     found = required_damping(loop, coupling, "known-device-any")
     beta, alpha, share = found.multiplier[0], found.multiplier[3], found.required[0]
     assert share < 0.9 * required_damping(loop, coupling, "any-environment").required[0]
-    z = np.exp(1j * np.append(np.linspace(1e-3, np.pi, 6001), 2 * np.pi * loop.T * found.frequency_hz))
+    z = np.exp(1j * np.append(np.linspace(1e-3, np.pi, 6001), max(1e-4, 2 * np.pi * loop.T * found.frequency_hz)))
     V = 1 / (600.0 + 1.2 * (1 - 1 / z) / loop.T)
     device = change(loop, delta=(share,))
 
