@@ -361,7 +361,7 @@ class _BallBlock:
         return high * f, f
 
     def _split(self, q: Array) -> tuple[Array, Array]:
-        """Iterate by Douglas and Rachford, which converges for every monotone M; Newton steps finish the solution."""
+        """Solve by Douglas and Rachford's iteration, which converges for every monotone M; end by Newton steps."""
         v, f = self._of(q)
         u, resolvent = q.copy(), np.linalg.inv(self._by_tau + np.eye(len(q)))
         for turn in range(_SPLIT):

@@ -55,7 +55,7 @@ class _Board:
         self._steps = self._shifted = 0  # steps since it was first paired; their number at the last shift
 
     def configure(self, config: wire.Config) -> None:
-        """Reset, and send this board's part of a configuration."""
+        """Reset the board and send its part of a configuration."""
         theta = min(wire.MAX_THETA, config.theta + self.behind)
         self.config = config._replace(theta=theta, cap=config.cap[self.axes], slew=config.slew[self.axes])
         self.told = CommandMonitor(self.config)

@@ -408,5 +408,5 @@ class Decoder:
 
 
 def distance(a: int, b: int) -> int:
-    """Return by how many ticks a is later than b: -32768 to 32767, for ticks modulo 2^16."""
+    """Return the difference a - b of two ticks counted modulo 2^16, from -32768 to 32767."""
     return ((a - b + 0x8000) & 0xFFFF) - 0x8000

@@ -54,7 +54,7 @@ links = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]
 
 
 def account(trace, link, coupling, T):
-    """The least sum of f'(u - u_-) [J] with f as it was sent and u = x - V f, without the program's shell.
+    """Return the least sum of f'(u - u_-) [J] with f as it was sent and u = x - V f, without the program's shell.
 
     Forces that test a motor are not the scene's.
     """
