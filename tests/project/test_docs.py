@@ -23,10 +23,7 @@ SLOW = regenerate.SLOW
 COMMANDS = {s.text: page.name for page in reversed(PAGES) for s in regenerate.steps(TEXTS[page]) if s.kind == "command"}
 IN_ORDER = list(dict.fromkeys(s.text for page in PAGES for s in regenerate.steps(TEXTS[page]) if s.kind == "command"))
 IN_ORDER = [command for command in IN_ORDER if not SLOW.search(command)]
-# code that a page shows of our own files needs their imports
-SNIPPETS = {
-    p: [s.text for s in regenerate.steps(regenerate.SOURCE.sub("", TEXTS[p])) if s.kind == "python"] for p in PAGES
-}
+SNIPPETS = {p: [s.text for s in regenerate.steps(TEXTS[p]) if s.kind == "python"] for p in PAGES}
 SHOWN = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.SHOWN.finditer(TEXTS[page])]
 QUICK = [block for block in SHOWN if not SLOW.search(block[1])]
 MEASURED = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.MEASURED.finditer(TEXTS[page])]
@@ -101,11 +98,6 @@ def test_every_snippet_runs(page, place, monkeypatch):
     with contextlib.redirect_stdout(io.StringIO()):
         for number, snippet in enumerate(SNIPPETS[page], start=1):
             exec(compile(snippet, f"{page.name}, Python block {number}", "exec"), namespace)
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
-def test_code_that_a_page_shows_is_the_code(page):
-    assert regenerate.sourced(TEXTS[page]) == TEXTS[page]
 
 
 def test_pages_get_the_lines_they_request():

@@ -13,15 +13,13 @@ what is measured all but times: exit code 1 where that is something else.
     $ python -m sim.accuracy
 
 A toml or python block whose first line is `# NAME.toml` or `# NAME.py` is a file for the commands after it;
-`<!-- picture: FROM TO -->` keeps a picture that a command has drawn; `<!-- source: FILE FUNCTION -->` before a python
-block puts that function there.
+`<!-- picture: FROM TO -->` keeps a picture that a command has drawn.
 tests/project/test_docs.py runs the same steps and compares, but for what is measured.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
 import itertools
 import math
 import os
@@ -41,7 +39,6 @@ _BLOCK = r"(<!-- {}(?:: (.+))? -->\n```{}\n\$ (python (?:-m|examples/).+)\n)((?:
 SHOWN = re.compile(_BLOCK.format("output", "console"))
 MEASURED = re.compile(_BLOCK.format("measured", "text"))
 BLOCK = re.compile(r"^```(sh|console|toml|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
-SOURCE = re.compile(r"(<!-- source: (\S+) (\S+) -->\n)```python\n(?:.*\n)*?```")
 PICTURE = re.compile(r"<!-- picture: (\S+) (\S+) -->")
 #: a design that a sentence names
 IN_SENTENCES = re.compile(r"`(python -m design -[^`]*)`")
@@ -65,17 +62,6 @@ def steps(text: str) -> Iterator[Step]:
         elif kind in ("sh", "console"):
             lines = (line.removeprefix("$ ") for line in body.splitlines())
             yield from (Step("command", line) for line in lines if line.startswith(("python -m", "python examples/")))
-
-
-def sourced(text: str) -> str:
-    """The page with the code of its own functions where it asks for them: <!-- source: FILE FUNCTION -->."""
-
-    def code(match: re.Match[str]) -> str:
-        lines = (ROOT / match[2]).read_text(encoding="utf-8").splitlines()
-        node = next(n for n in ast.parse("\n".join(lines)).body if getattr(n, "name", "") == match[3])
-        return f"{match[1]}```python\n" + "\n".join(lines[node.lineno - 1 : node.end_lineno]) + "\n```"
-
-    return SOURCE.sub(code, text)
 
 
 def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -183,9 +169,7 @@ def main() -> int:
         folder = Path(place)
         for page in PAGES:
             text = page.read_text(encoding="utf-8")
-            if (some and page.name not in some) or not any(
-                kind.search(text) for kind in (SHOWN, MEASURED, PICTURE, SOURCE)
-            ):
+            if (some and page.name not in some) or not any(kind.search(text) for kind in (SHOWN, MEASURED, PICTURE)):
                 continue
             measured = [] if some else [Step("command", block[3]) for block in MEASURED.finditer(text)]
             for step in [*steps(text), *measured]:
@@ -199,7 +183,7 @@ def main() -> int:
                     printed[step.text] = done.stdout
             for source, target in PICTURE.findall(text):
                 shutil.copyfile(folder / source, page.parent / target)
-            fresh = sourced(renewed(text, printed))
+            fresh = renewed(text, printed)
             if fresh != text:
                 page.write_text(fresh, encoding="utf-8")
                 print(f"changed: {page.relative_to(ROOT)}")
