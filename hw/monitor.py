@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,6 +26,7 @@ from haptic_loop.models.scene import build
 from haptic_loop.sim.scenario import Scenario
 
 _STATES_PER_ANSWER = 8  # at most: a USB frame of 1 ms may bring several FORCEs, of which one margin is told
+_INFERRED = 0.005  # part of ages: half of what the usual quantile leaves
 _MEASURED_TOLERANCE = 0.01  # of the device's clock against T, over the measurement
 _UNTOLD = 0.9  # part of STATEs without a margin above which nobody can judge the link; a USB frame may carry several
 _DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # of a clock over a block; a busy host and its buffers blur the second
@@ -104,25 +105,85 @@ class Ages:
         return sorted(self.values)[len(self.values) // 2]
 
 
-class Measurement:
-    """Measure the ages of answers at zero force, until `needed` have arrived or are missing. It ends in any case.
+class AnswerAges:
+    """The ages of answers, by the number of the tick that each is for, from what STATEs tell.
 
-    A STATE tells the margin of the youngest answer only. Where a burst brings n answers between two STATEs, `echo`
+    A STATE tells the margin of the last answer that came. Where a burst brings n answers between two STATEs, `echo`
     advances by n, and the answers that it skips are up to (n-1) T older. They count with that age, because the delay
     must cover them too.
     """
 
-    def __init__(self, needed: int, theta: int, T: float, most_missing: float) -> None:
-        self._needed, self._theta, self._T_us, self._most_missing = needed, theta, 1e6 * T, most_missing
-        self._ages: dict[int, int] = {}  # [us] by the number of the tick that the answer is for, never wrapped
+    def __init__(self, due: int, T_us: float) -> None:
+        """Take the ticks `due` from a sample to the latch of its answer."""
+        self._due, self._T_us = due, T_us
+        self.by_tick: dict[int, int] = {}  # [us]
+        self.inferred: set[int] = set()  # ticks whose answer was skipped, so that its age is inferred
         self._unanswered: set[int] = set()  # ticks whose answer was not there at its latch
         self._youngest: int | None = None  # tick of the youngest answer that came
-        self._tick = 0  # of the last STATE, never wrapped
-        self._missed = 0
+
+    def age(self, margin: int) -> int:
+        """Return the age [us] of an answer with this margin."""
+        return round(self._due * self._T_us) - margin
+
+    def note_unanswered(self, ticks: range) -> None:
+        """Remove the ages of answers that were not there at their latch: they are late or lost."""
+        self._unanswered.update(ticks)
+        for tick in ticks:
+            self.by_tick.pop(tick, None)
+            self.inferred.discard(tick)
+
+    def note(self, tick: int, margin: int) -> None:
+        """Record the age of the answer to `tick`, and of the answers that it skips."""
+        age = self.age(margin)
+        after = tick - 1 if self._youngest is None else self._youngest
+        for skipped in range(max(after + 1, tick - 2 * self._due), tick):  # older ones were missed long ago
+            if skipped not in self._unanswered:
+                self.by_tick[skipped] = age + round((tick - skipped) * self._T_us)
+                self.inferred.add(skipped)
+        self.by_tick[tick] = age
+        self.inferred.discard(tick)
+        self._youngest = tick if self._youngest is None else max(self._youngest, tick)
+
+
+class Measurement:
+    """Measure the ages of answers at zero force, until `needed` have arrived or are missing. It ends in any case.
+
+    Where too many ages are inferred, answers may have overtaken each other: a late one that comes together with a
+    younger one leaves no trace. Then a second round tells half as many ages exactly. Every STATE is still answered,
+    which keeps the load of the link, but most answers are for a wrong tick, so that the device ignores them, and those
+    that it takes are farther apart than the longest age. Their distances are random, to meet no burst more than others.
+    """
+
+    def __init__(self, needed: int, theta: int, T: float, most_missing: float) -> None:
+        self._needed, self._theta, self._T_us, self._most_missing = needed, theta, 1e6 * T, most_missing
         self._first: State | None = None
         self._last: State | None = None
+        self._tick = 0  # of the last STATE, never wrapped
         self._ticks: list[int] = []  # [us]
-        self._states = 0
+        self._apart = 1  # least distance of answers that the device takes; above 1 in the second round
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin a round."""
+        self._answers = AnswerAges(self._theta, self._T_us)
+        self._missed = self._states = 0
+        self._sent: set[int] | None = None if self._apart == 1 else set()  # ticks whose answer the device takes
+        self._next, self._distances = self._tick + 2 * self._theta, np.random.default_rng(0)
+        self.ignored: deque[int] = deque(maxlen=_REMEMBERED)  # latches whose answer the device ignores, modulo 2^16
+
+    def delay(self) -> int:
+        """Return the ticks from the last STATE to the latch for which its answer is sent: theta, or ignored if more."""
+        if self._sent is None or self._last is None:
+            return self._theta
+        meant = False
+        while self._next <= self._tick:  # one before this tick had no STATE, so its answer is missing
+            meant = self._next == self._tick
+            self._sent.add(self._next)
+            self._next += int(self._distances.integers(self._apart, 2 * self._apart))
+        if meant:
+            return self._theta
+        self.ignored.append((self._last.tick + self._theta) & 0xFFFF)
+        return self._theta + 1
 
     def note(self, state: State, margin: int | None, missed: int) -> bool:
         """Process a STATE and return whether it was the last one. Raises SafetyStop where the link cannot be used."""
@@ -135,52 +196,50 @@ class Measurement:
         counted = self._states - 2 * self._theta  # earlier, the device misses answers to ticks before the first STATE
         if counted <= 0:
             return False
-        self._note_missed(missed, passed)
-        if margin is not None:
-            self._note_answers(self._tick + distance(state.echo, state.tick), margin)
-        everything = len(self._ages) + self.missing
-        if everything < self._needed and counted < _STATES_PER_ANSWER * self._needed:
+        tick = self._tick + distance(state.echo, state.tick)
+        if self._sent is None:
+            self._note_all(tick, margin, missed, passed)
+        elif margin is not None and tick in self._sent:
+            self._answers.by_tick[tick] = self._answers.age(margin)
+        ages, needed = self._answers.by_tick, self._needed if self._sent is None else -(-self._needed // 2)
+        everything, counted = len(ages) + self.missing, counted // (2 * self._apart - 1)
+        if everything < needed and counted < _STATES_PER_ANSWER * needed:
             return False
-        part = 1 - len(self._ages) / (everything if everything >= self._needed else counted)
+        part = 1 - len(ages) / max(1, everything if everything >= needed else counted)
         if part > self._most_missing:
             raise SafetyStop(f"{100 * part:.0f} % of the answers never reached the device, {self._states} STATEs came")
         self._check_clock(state)
+        if self._sent is None and len(self._answers.inferred) > _INFERRED * len(ages):
+            self._apart = max(2, min(self._theta, math.ceil(max(ages.values()) / self._T_us)))
+            self._begin()
+            return False
         return True
 
-    def _note_missed(self, missed: int, passed: int) -> None:
-        """Count `missed` latches without an answer. An answer that is known to be missed gets no age."""
+    def _note_all(self, tick: int, margin: int | None, missed: int, passed: int) -> None:
+        """Record an answer in the first round, and count `missed` latches of the last `passed` ticks."""
         self._missed += missed
         if missed == passed:
-            unanswered = range(self._tick - self._theta - missed + 1, self._tick - self._theta + 1)
-            self._unanswered.update(unanswered)
-            for tick in unanswered:
-                self._ages.pop(tick, None)  # a lost answer has no age
-
-    def _note_answers(self, youngest: int, margin: int) -> None:
-        """Record the age of the answer to tick `youngest`, and of the answers that it skips."""
-        age = round(self._theta * self._T_us) - margin
-        after = youngest - 1 if self._youngest is None else self._youngest
-        skipped = range(max(after + 1, youngest - 2 * self._theta), youngest)  # older ones were missed long ago
-        for tick in skipped:
-            if tick not in self._unanswered:
-                self._ages[tick] = age + round((youngest - tick) * self._T_us)
-        self._ages[youngest] = age
-        self._missed -= margin < 0  # it was missed, but came after all
-        self._youngest = youngest if self._youngest is None else max(self._youngest, youngest)
+            self._answers.note_unanswered(range(self._tick - self._theta - missed + 1, self._tick - self._theta + 1))
+        if margin is not None:
+            self._answers.note(tick, margin)
+            self._missed -= margin < 0  # it was missed, but came after all
 
     @property
     def ages(self) -> list[int]:
         """Ages of the answers that arrived [us]."""
-        return list(self._ages.values())
+        return list(self._answers.by_tick.values())
 
     @property
     def missing(self) -> int:
         """Answers that did not come, not even late."""
-        return max(0, self._missed)
+        if self._sent is None:
+            return max(0, self._missed)
+        decided = self._tick - 2 * self._theta
+        return sum(tick < decided and tick not in self._answers.by_tick for tick in self._sent)
 
     @property
     def result(self) -> Ages:
-        return Ages(tuple(self._ages.values()), self.missing, tuple(self._ticks))
+        return Ages(tuple(self.ages), self.missing, tuple(self._ticks))
 
     def _check_clock(self, state: State) -> None:
         assert self._first is not None
@@ -229,8 +288,11 @@ class LinkMonitor:
         self._window: deque[_Tick] = deque()
         self._late = self._missed = self._untold = self._gaps = 0  # sums over the window; sum() takes too long
 
-    def take(self, state: State) -> int:
-        """Process a STATE and return the ticks since the previous one, or 0 for a repeated or older tick."""
+    def take(self, state: State, ignored: Container[int] = ()) -> int:
+        """Process a STATE and return the ticks since the previous one, or 0 for a repeated or older tick.
+
+        A latch among those `ignored` (modulo 2^16) is no miss, because the device was told to ignore its answer.
+        """
         ahead = 1 if self.last is None else distance(state.tick, self.last.tick)
         if ahead <= 0:
             self.counters.duplicates += ahead == 0
@@ -239,6 +301,9 @@ class LinkMonitor:
         self.missed = 0
         if self.last is not None:
             self.missed = (state.misses - self.last.misses) & 0xFF
+            if self.missed and ignored:
+                meant = sum((state.tick - back) & 0xFFFF in ignored for back in range(min(ahead, _REMEMBERED)))
+                self.missed = max(0, self.missed - meant)
             self.counters.device_errors += (state.crc_errors - self.last.crc_errors) & 0xFF
         self.margin = None if state.margin_us == NO_MARGIN else state.margin_us
         late = self.margin is not None and self.margin < self.needed

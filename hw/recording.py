@@ -29,7 +29,7 @@ from haptic_loop.sim.trace import Trace
 
 #: what the link adds, one entry per tick and name
 _LINK = ("tick", "arming", "received", "asked", "test", "gain", "sent", "margin_us", "status")
-_ONCE = ("tick", "arming", "margin_us", "status")  # integers that a row has once, not per axis
+_ONCE = ("tick", "arming", "echo", "margin_us", "status")  # integers that a row has once, not per axis
 
 
 class Recorder:
@@ -46,17 +46,17 @@ class Recorder:
         """Record one tick."""
         state, zero = row.state, self._zero
         if state is None:
-            sent, applied, margin, status = zero, zero, NO_MARGIN, 0
+            sent, applied, told = zero, zero, (0, NO_MARGIN, 0)
         else:
-            sent, applied, margin, status = row.sent, state.applied, state.margin_us, state.status
-        once = row.tick, row.arming, margin, status, state is not None
+            sent, applied, told = row.sent, state.applied, (state.echo, state.margin_us, state.status)
+        once = row.tick, row.arming, *told, state is not None
         self._rows += self._form.pack(*row.x, *row.asked, *(row.test or zero), row.gain, *sent, *applied, *once)
 
     def __len__(self) -> int:
         return len(self._rows) // self._form.size
 
     def link(self) -> dict[str, NDArray[Any]]:
-        """Return arrays by the names of _LINK, with `x` (N, m) [m] and `applied` (N, m) [steps] beside them."""
+        """Return arrays by the names of _LINK, with `x` (N, m) [m], `applied` (N, m) [steps] and `echo` beside them."""
         rows = np.frombuffer(bytes(self._rows), self._row)
         return {name: rows[name] for name in rows.dtype.names or ()}
 

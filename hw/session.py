@@ -279,7 +279,7 @@ class Session:
             return ()
         if self.stage in ENDED:
             return self._on_state_after_the_end(state)
-        ticks = self.link.take(state)
+        ticks = self.link.take(state, () if self.programs else self.measurement.ignored)
         if not ticks:
             return ()
         self.heard = self.now
@@ -334,7 +334,8 @@ class Session:
     def _measure(self, state: wire.State) -> Said:
         try:
             if not self.measurement.note(state, self.link.margin, self.link.missed):
-                return self._answer(state, wire.Command.IDLE)
+                apply_at = (state.tick + self.measurement.delay()) & 0xFFFF
+                return (wire.Force(wire.Command.IDLE, apply_at, state.tick, (0,) * state.axes),)
         except wire.SafetyStop as fault:
             return self._end(Stage.REFUSED, str(fault))
         ages = self.measurement.result

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,7 +19,8 @@ from haptic_loop.design.assessment import Assessment
 from haptic_loop.design.files import off_table, plain, remove, write_json
 from haptic_loop.hw.control import CertifiedCoupling
 from haptic_loop.hw.limits import Stage
-from haptic_loop.hw.protocol import NO_MARGIN
+from haptic_loop.hw.monitor import AnswerAges
+from haptic_loop.hw.protocol import NO_MARGIN, Phase
 from haptic_loop.hw.recording import Recipe, Recorder
 from haptic_loop.hw.session import Session
 from haptic_loop.sim.scenario import InputError
@@ -27,6 +29,7 @@ from haptic_loop.sim.world import SceneRecord, WorldRecord
 
 _AT_CAP = 1 - 1e-6  # part of the cap: a limiter stops at it
 _PERCENTILES = (50, 90, 99, 100)
+_PIECE = 100_000  # ticks whose ages are held by number at a time, for memory
 
 
 class IncidentLog:
@@ -107,11 +110,11 @@ class _Link:
         if not (len(recorder) and session.config):
             return figures
         arrays = recorder.link()
-        received = arrays["received"]
-        margins, answered = arrays["margin_us"][received & (arrays["margin_us"] != NO_MARGIN)], received.sum()
+        received, dues = arrays["received"], [arming.config.due for arming in session.armings]
+        answered = received.sum()
         return replace(
             figures,
-            age_us=_percentiles(session.config.due * 1e6 * T - margins),
+            age_us=_percentiles(_ages(arrays, dues, 1e6 * T)),
             rate_hz=float(received.mean() / T),
             missed_percent=float(100 * session.missed_while_driving / answered) if answered else None,
         )
@@ -227,6 +230,28 @@ def _doubt(session: Session, growths: list[Growth], recorder: Recorder) -> str |
         if growth.trend == "grows":
             return f"an oscillation grew in arming {i}"
     return None
+
+
+def _ages(link: Mapping[str, np.ndarray], dues: Sequence[int], T_us: float) -> np.ndarray:
+    """Return the ages [us] of the answers of all armings, with those that an `echo` skipped; `dues` [ticks] of each."""
+    ages: list[int] = []
+    for i, due in enumerate(dues):
+        rows = link["arming"] == i
+        tick, received = np.unwrap(link["tick"][rows], period=65536), link["received"][rows]
+        source = tick + (link["echo"][rows] - tick + 32768) % 65536 - 32768
+        late = received & (link["status"][rows] & 0xF == Phase.HOLDING)  # the answer that was due was not there
+        columns = tick, source, np.where(received, link["margin_us"][rows], NO_MARGIN), received, late
+        for begin in range(0, len(tick), _PIECE):
+            answers = AnswerAges(due, T_us)
+            for k, of, margin, answered, missed in zip(
+                *(c[begin : begin + _PIECE].tolist() for c in columns), strict=True
+            ):
+                if missed or not answered:
+                    answers.note_unanswered(range(k - due * answered, k - due * answered + 1))
+                if margin != NO_MARGIN:
+                    answers.note(of, margin)
+            ages.extend(answers.by_tick.values())
+    return np.array(ages)
 
 
 def _percentiles(values: np.ndarray) -> dict[str, float] | None:

@@ -12,11 +12,12 @@ from haptic_loop.hw.driver import Driver
 from haptic_loop.hw.emulator import Emulator, FaultInjection, info_of, nobody
 from haptic_loop.hw.haptic_device import SerialDevice
 from haptic_loop.hw.identify import chirp
-from haptic_loop.hw.limits import SafetyLimits, Stage
+from haptic_loop.hw.limits import DRIVING, SafetyLimits, Stage
 from haptic_loop.hw.monitor import (
     _BLOCK,
     _PATIENCE,
     Ages,
+    AnswerAges,
     ClockMonitor,
     CommandMonitor,
     LinkSettings,
@@ -34,6 +35,7 @@ from haptic_loop.hw.protocol import (
     SafetyStop,
     State,
     Stop,
+    distance,
     encode,
 )
 from haptic_loop.hw.recording import Recorder
@@ -311,17 +313,12 @@ def test_answers_that_never_arrive_count_in_the_quantile():
 
 def test_skipped_answers_are_older_than_the_youngest():
     """A USB frame of 1 ms with T = 0.3 ms: one margin for three FORCEs, of which none is missed."""
-    measurement = Measurement(50, 15, 3e-4, 0.2)
-    for k in range(1, 1000):
-        brings = k % 3 == 0
-        state = State(Phase.DISARMED, k, k - 3 - k % 3, 0, 0, 0, 300 * k, (0, 0), (0, 0))
-        if measurement.note(state, 3500 if brings else None, 0):
-            break
-    result = measurement.result
-    assert sorted(set(result.values)) == [1000, 1300, 1600]
-    assert result.missing == 0
-    assert result.longest_tick(300.0) == 300.0
-    assert result.link_delay(300.0, 0.99, 0.0) == 6  # 1600 us, not the 1000 us of the youngest
+    answers = AnswerAges(15, 300.0)
+    for k in range(3, 300, 3):
+        answers.note(k - 3, 3500)
+    assert sorted(set(answers.by_tick.values())) == [1000, 1300, 1600]
+    assert len(answers.by_tick) == 98 * 3 + 1
+    assert len(answers.inferred) == 98 * 2
 
 
 def test_lost_answers_have_no_age():
@@ -339,6 +336,28 @@ def test_lost_answers_have_no_age():
     assert measurement.missing == pytest.approx(len(ages) / 9, abs=2)
 
 
+def measured(scenario, faults, needed, seed=0):
+    """Measure a link in virtual time: the session, and the true ages [us] of all answers and of those of a round 2."""
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=needed))
+    emulator, true, exact = Emulator(scenario, faults), [], None
+    accept = emulator.device.accept
+
+    def noted(frame, now):
+        nonlocal exact
+        accept(frame, now)
+        device = emulator.device
+        age = distance(device.k, frame.source) * 1e6 * scenario.T + now - device.now
+        true.append(age)
+        if distance(frame.apply_at, frame.source) != device.config.theta:
+            exact = [] if exact is None else exact  # the device ignores it: a second round has begun
+        elif exact is not None and age >= 0:
+            exact.append(age)
+
+    emulator.device.accept = noted
+    Rehearsal(session, emulator, lambda ages: (), faults, seed=seed).run_until_armed(0.0)
+    return session, true, exact
+
+
 BURSTS = [(1.2e-3, 3e-3), (1.2e-3, 4e-3), (1.2e-3, 5e-3), (5e-4, 1e-3)]  # [s] T, and between two bursts
 
 
@@ -346,25 +365,65 @@ BURSTS = [(1.2e-3, 3e-3), (1.2e-3, 4e-3), (1.2e-3, 5e-3), (5e-4, 1e-3)]  # [s] T
 @pytest.mark.parametrize(("T", "every"), BURSTS)
 def test_the_measured_delay_covers_answers_in_bursts(scenario, T, every, where):
     """The emulator itself notes how old every FORCE was: no certified delay is shorter, nor two ticks longer."""
-    scenario = scenario.replace(T=T)
     direction = "" if where == "both" else f"{where}:"
-    faults = (FaultInjection.parse(f"{direction}burst={every}"),)
-    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=400))
-    emulator, true = Emulator(scenario, faults), []  # [us]
-    accept = emulator.device.accept
-
-    def noted(frame, now):
-        accept(frame, now)
-        ticks = (emulator.device.k - frame.source) & 0xFFFF
-        true.append(ticks * 1e6 * T + now - emulator.device.now)
-
-    emulator.device.accept = noted
-    Rehearsal(session, emulator, lambda ages: (), faults).run_until_armed(0.0)
+    session, true, _ = measured(scenario.replace(T=T), (FaultInjection.parse(f"{direction}burst={every}"),), 400)
     ages = session.measurement.result
     assert ages.missing == 0
     needed = int(-(-max(true) // (1e6 * T)))
     assert needed <= ages.link_delay(1e6 * T, 1.0, 0.0) <= needed + 1
-    assert np.percentile(true, 99) <= ages.quantile(0.99)
+    assert np.percentile(true, 98) <= ages.quantile(0.99)
+
+
+def test_answers_that_overtake_each_other_are_timed(scenario):
+    """A late answer that comes together with a younger one leaves no trace, so a second round tells them apart.
+
+    Without it the first link was measured at 2.7 ms, which needs 6 ticks of 0.5 ms in place of 7.
+    """
+    rng = np.random.default_rng(3)
+    links = [(5e-4, "down:jitter=0.0005", "down:burst=0.0017")]
+    for _ in range(12):
+        T = float(rng.choice([3e-4, 5e-4, 1e-3, 1.2e-3, 2e-3]))
+        sizes = rng.uniform(0.05, 1.0) * T, rng.uniform(0.5, 5.0) * T
+        links.append((T, *(f"down:{kind}={size:.6f}" for kind, size in zip(("jitter", "burst"), sizes, strict=True))))
+    rounds = 0
+    for seed, (T, *texts) in enumerate(links):
+        faults = tuple(FaultInjection.parse(text) for text in texts)
+        session, true, exact = measured(scenario.replace(T=T), faults, 200, seed)
+        ages = session.measurement.result
+        assert ages.missing <= 1
+        if exact is None:
+            assert np.percentile(true, 98) <= ages.quantile(0.99) + T_US
+            continue
+        rounds += 1
+        count = len(ages.values)
+        told, took = np.sort(ages.values), np.array(exact[: count + ages.missing])
+        assert 0 <= len(exact) - count <= 16
+        assert np.quantile(told, [0.5, 0.9, 0.97]) == pytest.approx(np.quantile(took, [0.5, 0.9, 0.97]), abs=1.5e6 * T)
+        assert session.counters.misses <= 2 * 15 + 2  # an answer that the device was told to ignore is no miss
+        if seed == 0:
+            assert ages.link_delay(1e6 * T, 0.99, 0.0) >= 7 == int(-(-np.percentile(true, 99) // (1e6 * T)))
+    assert rounds > 4
+
+
+def test_ages_while_forces_act_count_skipped_answers(scenario):
+    """Bursts of 4 ms bring four answers, of which a STATE tells the youngest."""
+    scenario, faults = scenario.replace(T=1e-3), (FaultInjection.parse("burst=0.004"),)
+    session, recorder = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=50)), Recorder(2)
+    session.record = recorder
+    emulator, true = Emulator(scenario, faults), []
+    accept = emulator.device.accept
+
+    def noted(frame, now):
+        accept(frame, now)
+        if session.stage in DRIVING:
+            true.append(distance(emulator.device.k, frame.source) * 1e3 + now - emulator.device.now)
+
+    emulator.device.accept = noted
+    tune = chirp(2, scenario.T, 10, 1.0, (3, 200), 0.5)
+    Rehearsal(session, emulator, lambda ages: [tune], faults).run_until_armed(0.6)
+    shown = outcome("identify", session, recorder, 0).link.age_us
+    assert shown["p50"] == pytest.approx(np.median(true), abs=501)  # 5, 6, 7 and 8 ms, a quarter each
+    assert shown["p99"] == pytest.approx(np.percentile(true, 99), abs=60)
 
 
 def test_an_identification_closes_no_loop_that_could_grow(scenario):
